@@ -81,6 +81,7 @@ _VELOCITY_TIME_CONSTANT_S = 0.3
 _LEAN_KEPT_PER_S = (1.0 - 0.02 / 0.15) ** 50
 _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
+BRAKING_SHARE = 0.7  # Share of the acceleration limit with which a vehicle plans to brake; the rest is a reserve.
 _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
 # Limits of steady motion, for which steps of 0.1 s suffice. In such a step, a constant jerk of 4 m/s³ changes the
 # position by jerk · 0.1³ / 6, which is less than 1 mm. Touchdown does not count as steady, so its time and speed come
@@ -212,9 +213,9 @@ class Motion:
         distance = math.hypot(offset_north, offset_east)
         scale = 0.0
         if distance > 1e-6:
-            deceleration = 0.7 * self.limits.acceleration_m_s2
+            deceleration = BRAKING_SHARE * self.limits.acceleration_m_s2
             scale = min(speed, approach_speed(distance, 1.0, deceleration)) / distance
-        vertical = approach_speed(abs(offset_down), 1.0, 0.7 * self.limits.vertical_acceleration_m_s2)
+        vertical = approach_speed(abs(offset_down), 1.0, BRAKING_SHARE * self.limits.vertical_acceleration_m_s2)
         vertical = min(vertical, descent if offset_down > 0 else climb)
         self.seek_velocity(offset_north * scale, offset_east * scale, math.copysign(vertical, offset_down))
 

@@ -48,10 +48,10 @@ class StalledQueue:
         self,
         system_bytes: int,
         carry: Callable[[bytes, Peer], object],
-        dropped: Callable[[int], object],
-        stalled: Callable[[bool], object],
+        on_drop: Callable[[int], object],
+        on_stall: Callable[[bool], object],
     ) -> None:
-        self._system_limit, self._carry, self._dropped, self._stalled = system_bytes, carry, dropped, stalled
+        self._system_limit, self._carry, self._on_drop, self._on_stall = system_bytes, carry, on_drop, on_stall
         self._accepted: list[tuple[bytes, Peer]] = []  # by the simulated operating system
         self._outboxes: dict[Peer, Outbox] = {}
         self._stalled_peers: set[Peer] = set()
@@ -94,7 +94,7 @@ class StalledQueue:
             partial(self._send_or_accept, peer=peer),
             partial(self._accepted_bytes_of, peer),
             limit=LIMIT,
-            dropped=self._dropped,
+            dropped=self._on_drop,
             stalled=partial(self._on_peer_stalled, peer),
         )
         if self._is_stalled and not self._system_limit:
@@ -118,7 +118,7 @@ class StalledQueue:
             self._stalled_peers.add(peer)
         else:
             self._stalled_peers.discard(peer)
-        self._stalled(bool(self._stalled_peers))
+        self._on_stall(bool(self._stalled_peers))
 
 
 class FaultyLink(Link):

@@ -86,7 +86,7 @@ class _CircleLeg:
         self._turned += abs(rate) * dt
         self._report_new_turn()
         point, speed = self._point(), rate * self._radius
-        # The velocity of the moving point, and the distance to it times 1 per second.
+        # The velocity of the moving point, plus a correction of 1 m/s per metre between the copter and the point.
         motion.seek_velocity(
             point[0] - motion.north - speed * math.sin(self._angle),
             point[1] - motion.east + speed * math.cos(self._angle),
@@ -399,8 +399,7 @@ class CopterAuto(MissionMode):
         leg.enter(force=True)
 
     def _delay(self, item: MissionItem) -> None:
-        # A delay until a time of day is not simulated, so it counts as no delay.
-        seconds = max(0.0, item.param1)
+        seconds = max(0.0, item.param1)  # A negative number means until a time of day, which is not simulated.
         self._delay_until = self.vehicle.now + seconds
         self.vehicle.info(f"Delaying {int(seconds)} sec")
 

@@ -77,7 +77,7 @@ _FALLBACK_TEXTS = {
     _SMART_RTL_OR_LAND: "SmartRTL Unavailable, Using Land Mode",
     _BRAKE: "Trying Land Mode",
 }
-# Bits of FS_OPTIONS that continue the flight in spite of a failsafe: (modes, bit, text).
+# Bits of FS_OPTIONS that continue the flight in spite of a failsafe; in the tables: (modes, bit, text).
 _IF_LANDING = 8
 _RADIO_OPTIONS = (
     (frozenset({"AUTO"}), 1, "Continuing Auto"),

@@ -224,11 +224,11 @@ class ArduPilotArming(Generic[HostT]):
         return []
 
     def mandatory_reasons(self) -> list[str]:
-        """Run the checks that a forced arming does not skip."""
+        """Return the failures of the checks that a forced arming does not skip."""
         return []
 
     def final_reasons(self) -> list[str]:
-        """Run the checks of arming requests only. The base class checks that the sticks are centred."""
+        """Return the failures of the checks that only a request to arm runs. The base class checks that the sticks are centred."""
         options = int(self.vehicle.parameters["RC_OPTIONS"])
         if not self.is_checked(ArmingCheck.RC) or not self.vehicle.rc.is_receiving:
             return []

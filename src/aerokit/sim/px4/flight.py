@@ -7,7 +7,7 @@ import math
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionType
 from aerokit.missions import MissionItem
-from aerokit.sim.motion import Ned, approach_speed
+from aerokit.sim.motion import BRAKING_SHARE, Ned, approach_speed
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.external import PrecisionLanding
 from aerokit.sim.px4.host import Px4Host
@@ -255,4 +255,4 @@ class Px4Flight:
 
 def velocity_towards(offset: float, limit: float, acceleration: float) -> float:
     """Return a signed speed along one axis towards a point ``offset`` metres away."""
-    return math.copysign(min(limit, approach_speed(abs(offset), 1.0, 0.7 * acceleration)), offset)
+    return math.copysign(min(limit, approach_speed(abs(offset), 1.0, BRAKING_SHARE * acceleration)), offset)

@@ -306,7 +306,7 @@ class Px4MissionServer(MissionServer):
             if stored_item != Result.ERROR:
                 self._warn("IGN MISSION_ITEM: Invalid item")
             return stored_item
-        # The checksum covers the values as received: floats of a MISSION_ITEM.
+        # The checksum covers the values as received, which are floats in a MISSION_ITEM.
         received = item if is_int else item.replace(x=float(item.x), y=float(item.y))
         link.opaque_id = checksum([received], link.opaque_id)
         link.items.append(stored_item)
