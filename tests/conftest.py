@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import importlib
 import os
 import signal
 import sys
 from collections import Counter
 from collections.abc import AsyncIterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -50,6 +53,24 @@ def freeze_existing_objects(hypothesis_started: None) -> None:
 def pytest_xdist_auto_num_workers() -> int:
     """Twice the number of processors: many tests wait for sockets and other processes."""
     return 2 * (os.cpu_count() or 1)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """Import a share of the test modules before the others, different ones in each worker.
+
+    pytest rewrites the assertions of a module when it is first imported, and caches the result. Workers that import
+    all modules in the same order would all rewrite all of them.
+    """
+    worker, count = os.environ.get("PYTEST_XDIST_WORKER"), os.environ.get("PYTEST_XDIST_WORKER_COUNT")
+    if worker is None or count is None:
+        return
+    modules = [file for folder in session.config.args for file in sorted(Path(folder).rglob("test_*.py"))]
+    for file in modules[int(worker.removeprefix("gw")) :: int(count)]:
+        if str(file.parent) not in sys.path:
+            sys.path.insert(0, str(file.parent))  # as pytest does
+        with contextlib.suppress(Exception, pytest.skip.Exception):  # the collection reports it
+            importlib.import_module(file.stem)
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest deselects by marker

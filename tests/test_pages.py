@@ -22,7 +22,7 @@ CHAINS = [
 WITH_CODE = [page for page in pages.pages() if pages.blocks(page)]
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("chain", CHAINS)
 def test_block_runs(chain: pages.Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

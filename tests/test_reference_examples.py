@@ -15,6 +15,7 @@ MIN_EXAMPLES = 50
 MAX_LINES = 10
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("chain", CHAINS)
 def test_examples_run(chain: pages.Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

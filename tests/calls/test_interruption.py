@@ -79,7 +79,7 @@ def test_blocking_calls_are_all_in_table() -> None:
 
 def rows() -> list[Any]:
     """Return each call; by default some of them, and none that waits for long."""
-    return [exhaustive(name) if place % 14 or name in SLOW else name for place, name in enumerate(blocking_calls())]
+    return [exhaustive(name) if place % 28 or name in SLOW else name for place, name in enumerate(blocking_calls())]
 
 
 @pytest.mark.parametrize("name", rows())

@@ -16,3 +16,5 @@ __all__ = [
     "dronekit_scenarios_orders",
     "dronekit_scenarios_state",
 ]
+
+SCENARIOS.sort(key=lambda scenario: scenario.name)  # in every worker of pytest-xdist the same order

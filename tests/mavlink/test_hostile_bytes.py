@@ -47,7 +47,7 @@ class Work:
         monkeypatch.setattr(framer, "x25", counting_x25)
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("size", [1, 7, 1200])
 @pytest.mark.parametrize("noise", NOISE.values(), ids=NOISE)
 def test_framer_work_per_byte_is_bounded(noise: bytes, size: int, monkeypatch: pytest.MonkeyPatch) -> None:

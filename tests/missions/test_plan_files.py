@@ -538,7 +538,7 @@ def damaged(value: Any, rng: random.Random, junk: Callable[[], Any]) -> Any:
     | st.text()
     | st.just([]),
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_damaged_plan_file_raises_only_our_errors(seed: int, junk: object) -> None:
     document = damaged(samples.full_document(), random.Random(seed), lambda: junk)
     try:

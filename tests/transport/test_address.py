@@ -219,7 +219,7 @@ def addresses(draw: st.DrawFn) -> LinkAddress:
     return LinkAddress(kind, host=host, port=draw(st.integers(1, 65535)))
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(addresses())
 def test_canonical_string_parses_to_the_same(address: LinkAddress) -> None:
     assert parse_address(str(address)) == address
@@ -232,7 +232,7 @@ PIECES = (
 pieces = st.sampled_from([*PIECES.split(), " "])
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.lists(pieces, max_size=7).map("".join) | st.text(max_size=30))
 def test_any_string_parses_or_raises_invalid_argument(text: str) -> None:
     address = None

@@ -91,6 +91,7 @@ async def quiet_flight() -> AsyncIterator[Flight]:
         yield flight
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("owner", OWNERS)
 async def test_connection_unused_does_nothing(owner: str) -> None:
     async with quiet_flight() as flight:

@@ -30,7 +30,7 @@ def faults_of(name: str, vehicle: str) -> Iterator[str]:
     """Return the invalid states after a message with any content."""
     dice, kind = random.Random(name), message_type(name)
     declared = {state.name for state, _ in SOURCES[name]}
-    for _ in range(12):
+    for _ in range(6):
         now = 100.0
         telemetry = Telemetry(lambda: now, autopilot=autopilot_for(HEARTBEATS[vehicle]))  # noqa: B023
         telemetry.receive(HEARTBEATS[vehicle])

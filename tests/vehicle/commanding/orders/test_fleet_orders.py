@@ -16,7 +16,7 @@ FLOWN, SEEDS_EACH = (EVERY, SEEDS) if IS_SESSION else (EVERY[::2], 1)
 """Few of them in the tests, all of them in the session."""
 
 
-@pytest.mark.sampled(12)
+@pytest.mark.sampled(20)
 @pytest.mark.parametrize("seed", range(SEEDS_EACH))
 @pytest.mark.parametrize(("action", "policy"), FLOWN)
 def test_order_table_no_rule_is_broken(action: str, policy: PolicyName, seed: int) -> None:

@@ -42,7 +42,7 @@ OVER_TWO, SEEDS_OVER_TWO = (ALL_ROWS, SEEDS) if IS_SESSION else (ALL_ROWS[::6], 
 """Few of them in the tests, all of them in the session."""
 
 
-@pytest.mark.sampled(12)
+@pytest.mark.sampled(20)
 @pytest.mark.parametrize("seed", range(SEEDS_OVER_TWO))
 @pytest.mark.parametrize(("row", "autopilot"), OVER_TWO)
 def test_order_table_two_links_no_rule_is_broken(row: Row, autopilot: str, seed: int) -> None:

@@ -17,7 +17,7 @@ ROWS, SEEDS_EACH = (ALL_ROWS, SEEDS) if IS_SESSION else (ALL_ROWS[::3], 1)
 """Few of them in the tests, all of them in the session."""
 
 
-@pytest.mark.sampled(12)
+@pytest.mark.sampled(20)
 @pytest.mark.parametrize("seed", range(SEEDS_EACH))
 @pytest.mark.parametrize(("row", "autopilot"), ROWS)
 def test_order_table_no_rule_is_broken(row: Row, autopilot: str, seed: int) -> None:
