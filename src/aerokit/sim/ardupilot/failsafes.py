@@ -228,7 +228,7 @@ class ArduPilotArming(Generic[HostT]):
         return []
 
     def final_reasons(self) -> list[str]:
-        """Return the failures of the checks that only a request to arm runs. The base class checks that the sticks are centred."""
+        """Return the failures of the checks that only a request to arm runs: here, whether the sticks are centred."""
         options = int(self.vehicle.parameters["RC_OPTIONS"])
         if not self.is_checked(ArmingCheck.RC) or not self.vehicle.rc.is_receiving:
             return []
