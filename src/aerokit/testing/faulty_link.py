@@ -52,7 +52,7 @@ class StalledQueue:
         on_stall: Callable[[bool], object],
     ) -> None:
         self._system_limit, self._carry, self._on_drop, self._on_stall = system_bytes, carry, on_drop, on_stall
-        self._accepted: list[tuple[bytes, Peer]] = []  # by the simulated operating system
+        self._accepted: list[tuple[bytes, Peer]] = []  # Sent by the operating system after the stall.
         self._outboxes: dict[Peer, Outbox] = {}
         self._stalled_peers: set[Peer] = set()
         self._is_stalled = True

@@ -70,7 +70,7 @@ class ArduPilotMissionServer(MissionServer):
         return [] if items is None else items.items()
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Store items as the upload of a file does; return a MAV_MISSION_RESULT. ``clear=False`` is for missions only."""
+        """Store items like the upload of a file; return a MAV_MISSION_RESULT. ``clear=False`` is for missions only."""
         if mission_type == MavMissionType.MISSION:
             if clear:
                 self._clear_list(self.commands)

@@ -228,9 +228,8 @@ class Px4Vehicle(Px4Host):
         first = max(self.now, self.booted_at + _HEARTBEAT_BOOT_SHARE * self._boot_time_s)
         self.rates.start(channel, self.channels.index(channel), first)
         ready_at = max(self.now, self.booted_at + self._boot_time_s)
-        self.call_at(
-            ready_at, lambda: self.send_built(m.GpsGlobalOrigin.ID, channel)
-        )  # PX4 sends the origin only once, and again when it changes.
+        # PX4 sends the origin only once, and again when it changes.
+        self.call_at(ready_at, lambda: self.send_built(m.GpsGlobalOrigin.ID, channel))
 
     def restart(self) -> None:
         self.motion.down = self.motion.ground_down

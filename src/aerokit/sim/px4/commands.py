@@ -273,9 +273,8 @@ class _Flight:
         radius = command.param1 if math.isfinite(command.param1) else orbit.radius_m
         speed = abs(command.param2) if math.isfinite(command.param2) else orbit.speed_m_s
         if px4.VEHICLE_TYPE == MavType.FIXED_WING:  # A plane circles its target in HOLD.
-            px4.flight.target = (north, east, down)
-            result = self._change(modes.HOLD)
-            px4.flight.radius_m = radius
+            result = self._change(modes.HOLD)  # sets the target to the current position
+            px4.flight.target, px4.flight.radius_m = (north, east, down), radius
             return result
         if not orbit.plan(radius, speed, (north, east), down):
             px4.send_text(MavSeverity.CRITICAL, "Orbit radius limit exceeded")
