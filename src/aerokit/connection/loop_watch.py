@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-CHECK_INTERVAL_S = 0.1
+# Longer than the interval of 10 Hz telemetry, which then postpones the check each time. Both together are 0.2 s.
+CHECK_INTERVAL_S = 0.12
 
-LATE_THRESHOLD_S = 0.1
+LATE_THRESHOLD_S = 0.08
 
 BLOCKED_THRESHOLD_S = 0.25
 

@@ -108,7 +108,11 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         name = _WINCH_CALLS.get(action, "")
         if not name or not overrides(winch, WinchDriver, name):
             raise NotSupported(f"this winch does not support action {action}")
-        arguments = {"pay_out": (length, rate), "set_rate": (rate,)}.get(name, ())
+        arguments: tuple[float | None, ...] = ()
+        if name == "pay_out":
+            arguments = (length, rate)
+        elif name == "set_rate":
+            arguments = (rate,)
         if None in arguments:
             raise InvalidArgument("length and rate are required")
         if name == "pay_out" and rate is not None and rate <= 0:
@@ -116,11 +120,12 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         await services.commands.call(getattr(winch, name), *arguments)
 
     def status() -> m.WinchStatus:
-        report, nan = winch.report(), math.nan
-        numbers = (report.length_m, report.speed_m_s, report.tension_kg)
-        length, speed, tension = (nan if number is None else number for number in numbers)
+        report = winch.report()
+        values = (report.length_m, report.speed_m_s, report.tension_kg)
+        length, speed, tension = (math.nan if value is None else value for value in values)
         time_us = round(services.host.connection.unix_time() * 1e6)
-        return m.WinchStatus(time_us, length, speed, tension, nan, nan, _TEMPERATURE_UNKNOWN, report.flags)
+        voltage = current = math.nan
+        return m.WinchStatus(time_us, length, speed, tension, voltage, current, _TEMPERATURE_UNKNOWN, report.flags)
 
     services.commands.add(MavCmd.DO_WINCH, do_winch)
     services.add_message(m.WinchStatus, status, STATUS_HZ)
@@ -152,6 +157,7 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")
             result = result_of(error)
+            # NONE says that the reason is in the status text, GENERIC that there is no specific reason.
             reason = MavArmAuthDeniedReason.NONE if result == MavResult.DENIED else MavArmAuthDeniedReason.GENERIC
             return CommandResult(MavResult.DENIED, detail=reason)
         if isinstance(seconds, CommandResult):

@@ -25,7 +25,9 @@ from aerokit.sim.faults import Faults
 TICK_S = 0.02
 """Interval of motion and modes (50 Hz) while the vehicle moves. In steady flight, several make one long tick."""
 
-_STEADY_TICKS = 5
+_STEADY_TICKS = 6
+# Decimal places of due times in seconds. Rounded, events with different intervals are due at the same instants.
+_DUE_DECIMALS = 9
 
 _TEXT_SIZE = 50
 Handler = Callable[[Any, Channel], None]
@@ -234,7 +236,7 @@ class SimulatedVehicle:
     def is_steady(self) -> bool:
         """True if a long tick gives the same result as several short ticks.
 
-        A long tick lasts at most 0.1 s. It ends before anything is received, streamed or due, so that samples are as
+        A long tick lasts at most 0.12 s. It ends before anything is received, streamed or due, so that samples are as
         recent as with short ticks.
         """
         return False
@@ -258,29 +260,32 @@ class SimulatedVehicle:
             nonlocal count
             count += 1
             if booted_at == self.booted_at:  # The vehicle did not reboot since.
-                self.call_at(start + count * interval, repeat)
+                self.call_at(round(start + count * interval, _DUE_DECIMALS), repeat)
             action()
 
         self.call_at(start, repeat)
 
     def set_ticking(self, ticking: bool) -> None:
-        """Start or stop calling ``tick`` at 50 Hz, and in steady flight at 10 Hz or more."""
+        """Start or stop calling ``tick`` at 50 Hz, and in steady flight at about 10 Hz."""
         if ticking == (self._ticks_from != math.inf):
             return
-        self._ticks_from, self._ticks_done = self.now if ticking else math.inf, 0
+        # Counted from the boot, so that ticks, timers and streams are due at the same instants.
+        passed = int(self.uptime / TICK_S + 1e-6) * TICK_S if ticking else math.inf
+        self._ticks_from, self._ticks_done = self.booted_at + passed, 0
         self._schedule_tick(1)
 
     def _schedule_tick(self, ticks: int) -> None:
         """Schedule the next tick after this many intervals; it may come earlier."""
-        self._next_tick = self._ticks_from + (self._ticks_done + ticks) * TICK_S
+        self._next_tick = round(self._ticks_from + (self._ticks_done + ticks) * TICK_S, _DUE_DECIMALS)
 
     def _tick_until(self, now: float) -> None:
         """Advance to ``now`` by a single tick that stands for all ticks since the last one."""
-        done_before = self._ticks_done
-        while self._ticks_from + (self._ticks_done + 1) * TICK_S <= now:
-            self._ticks_done += 1
-        if self._ticks_done > done_before:
-            self.tick((self._ticks_done - done_before) * TICK_S)
+        if now < self._ticks_from:
+            return
+        ticks = int((now - self._ticks_from) / TICK_S + 1e-6) - self._ticks_done
+        if ticks > 0:
+            self._ticks_done += ticks
+            self.tick(ticks * TICK_S)
             self._schedule_tick(_STEADY_TICKS if self.is_steady else 1)
 
     def _run_due(self, due: float) -> None:

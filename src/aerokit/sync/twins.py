@@ -4149,10 +4149,10 @@ class Vehicle(VehicleTwin):
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         Within the block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged or
-        their effect is reported. A newer order about the same subject ends the retries. So does a mode that neither
-        this order nor another order of the last ten seconds explains, and disarming if the order is about motion. If a
-        posted order is abandoned, aerokit neither makes the vehicle hold nor monitors late arming; use the actions for
-        that.
+        their effect is reported. The retries also end when a newer order about the same subject is given, when the
+        vehicle changes to a mode that neither this order nor another order of the last ten seconds explains, and, if
+        the order is about motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
+        vehicle hold nor monitors late arming; use the actions for that.
 
         Args:
             subjects: ``"mode"``, ``"motion"`` or ``"arm"``. A newer order about the first subject ends this order. This

@@ -182,7 +182,7 @@ class PlanePilotedMode(PlaneModeBase):
         climb = self.stick(1) * wing.wing_limits.climb_m_s  # Pulling the stick gives positive values.
         if plane.rc[2] <= _LOW_THROTTLE:
             climb = min(climb, 0.0) - wing.wing_limits.glide_sink_m_s
-        speed = throttle * 2 * plane.cruise_m_s  # Half throttle is cruise speed.
+        speed = max(0.0, throttle * 2 * plane.cruise_m_s)  # Half throttle is cruise speed.
         wing.bank_and_climb(speed, self.stick(0) * wing.wing_limits.bank_rad, climb)
 
 

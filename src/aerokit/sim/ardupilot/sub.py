@@ -61,8 +61,7 @@ class SubArming(ArduPilotArming[SubHost]):
         functions = {int(parameters[f"{prefix}FUNCTION"]) for prefix in prefixes}
         if not prefixes or functions & _DISARMS:
             return True
-        shifted_functions = {int(parameters[f"{prefix}SFUNCTION"]) for prefix in prefixes}
-        return _SHIFT in functions and bool(shifted_functions & _DISARMS)
+        return _SHIFT in functions and any(int(parameters[f"{prefix}SFUNCTION"]) in _DISARMS for prefix in prefixes)
 
 
 # Actions of FS_GCS_ENABLE; 1 only warns.
