@@ -33,6 +33,11 @@ _TEXT_SIZE = 50
 Handler = Callable[[Any, Channel], None]
 
 
+def _whole_ticks(seconds: float) -> int:
+    """Return the number of complete ticks; a rounding error does not lose one."""
+    return int(seconds / TICK_S + 1e-6)
+
+
 class MessageHost(ServerHost, Protocol):
     """Interface of a vehicle or component that its protocol servers use."""
 
@@ -270,8 +275,8 @@ class SimulatedVehicle:
         if ticking == (self._ticks_from != math.inf):
             return
         # Counted from the boot, so that ticks, timers and streams are due at the same instants.
-        passed = int(self.uptime / TICK_S + 1e-6) * TICK_S if ticking else math.inf
-        self._ticks_from, self._ticks_done = self.booted_at + passed, 0
+        self._ticks_from = self.booted_at + _whole_ticks(self.uptime) * TICK_S if ticking else math.inf
+        self._ticks_done = 0
         self._schedule_tick(1)
 
     def _schedule_tick(self, ticks: int) -> None:
@@ -282,7 +287,7 @@ class SimulatedVehicle:
         """Advance to ``now`` by a single tick that stands for all ticks since the last one."""
         if now < self._ticks_from:
             return
-        ticks = int((now - self._ticks_from) / TICK_S + 1e-6) - self._ticks_done
+        ticks = _whole_ticks(now - self._ticks_from) - self._ticks_done
         if ticks > 0:
             self._ticks_done += ticks
             self.tick(ticks * TICK_S)
