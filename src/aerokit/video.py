@@ -196,8 +196,10 @@ class _Reader(threading.Thread):
         try:
             self._read()
             error = EOFError()  # ends the iteration over the frames without an error
-        except Exception as caught:
+        except (LinkOpenError, LinkLost) as caught:
             error = caught
+        except Exception as caught:
+            error = LinkLost(f"the decoder of {self._uri} failed: {caught!r}")
         finally:
             self._call_on_loop(self._stream._on_end, error)
             self._call_on_loop(self.ended.set)

@@ -128,7 +128,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
     @property
     def image_count(self) -> int:
         """Number of images on the card."""
-        return len(self.captures.images)
+        return self.captures.image_count
 
     def angles(self) -> tuple[float, float, float] | None:
         """Roll, pitch and yaw (from north) of the view in radians; None if unknown."""
@@ -204,7 +204,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
     def store_image(self, image: CameraImageCaptured) -> str | None:
         if not self.card.store(self.image_mib):
             return None
-        path = f"/DCIM/IMG_{len(self.captures.images) + 1:04d}.JPG"
+        path = f"/DCIM/IMG_{self.captures.image_count + 1:04d}.JPG"
         picture = self.picture
         self.files.put(path, picture if isinstance(picture, bytes) else picture(image))
         return f"mftp://{path}"
