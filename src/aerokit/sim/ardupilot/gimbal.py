@@ -47,7 +47,7 @@ DEFAULTS = {
     "MNT1_PITCH_MAX": 20.0,
     "MNT1_YAW_MIN": -180.0,
     "MNT1_YAW_MAX": 180.0,
-    **dict.fromkeys((f"MNT1_{place}_{axis}" for place in ("RETRACT", "NEUTRAL") for axis in "XYZ"), 0.0),
+    **dict.fromkeys((f"MNT1_{mode_name}_{axis}" for mode_name in ("RETRACT", "NEUTRAL") for axis in "XYZ"), 0.0),
 }
 """Defaults for parameters that a vehicle with a reduced ``parameter_count`` may lack."""
 _FIXED_ANGLE_MODES = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
@@ -107,8 +107,8 @@ class ArduPilotGimbal:
         if self.mode == MavMountMode.RC_TARGETING:  # The sticks of the gimbal are not simulated; they rest centred.
             return MountTarget(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
         if self.mode in _FIXED_ANGLE_MODES:
-            place = MavMountMode(self.mode).name
-            roll, pitch, yaw = (self.setting(f"MNT1_{place}_{axis}") for axis in "XYZ")
+            mode_name = MavMountMode(self.mode).name
+            roll, pitch, yaw = (self.setting(f"MNT1_{mode_name}_{axis}") for axis in "XYZ")
             return MountTarget(roll, pitch, yaw)
         if self.mode == MavMountMode.GPS_POINT:
             return self._angles_to(self._region)

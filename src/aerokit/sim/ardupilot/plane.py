@@ -125,7 +125,7 @@ class SimulatedPlane(PlaneHost):
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def make_commands(self) -> dict[int, CommandHandler]:
-        # NAV_TAKEOFF needs lifting rotors; ArduPlane has no command to land.
+        # NAV_TAKEOFF needs the lifting rotors of a QuadPlane; ArduPlane has no command to land.
         return {
             **common_commands(self),
             MavCmd.NAV_TAKEOFF: lambda _: MavResult.FAILED,
