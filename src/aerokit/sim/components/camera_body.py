@@ -151,8 +151,8 @@ class CameraBody(SimulatedComponent, CameraDevice):
 
     async def set_source(self, source: int) -> bool:
         """Accept RGB, and IR on a thermal camera."""
-        own = CameraSource.IR if self.thermal_celsius else CameraSource.RGB
-        return source in (CameraSource.DEFAULT, CameraSource.RGB, own)
+        is_thermal = self.thermal_celsius is not None
+        return source in (CameraSource.DEFAULT, CameraSource.RGB) or (source == CameraSource.IR and is_thermal)
 
     async def reset_settings(self) -> None:
         self.reset_lens()
@@ -192,7 +192,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
             CameraImageCaptured,
             self.time_boot_ms,
             round(getattr(self.vehicle, "unix_time", 0.0) * 1e6),
-            0,
+            0,  # camera_id of a camera that is a separate component
             0 if place is None else place.latitude_e7,
             0 if place is None else place.longitude_e7,
             0 if place is None else round(place.altitude_m * 1000),
