@@ -72,13 +72,13 @@ class AccelerometerCalibration:
     def _request(self, run: int, position: int) -> None:
         self._requested = position
 
-        def request() -> None:
+        def request_until_confirmed() -> None:
             if run == self._run_number and self._requested == position:
                 params = (float(position), 0, 0, 0, 0, 0, 0)
                 self._vehicle.send(m.CommandLong(0, 0, MavCmd.ACCELCAL_VEHICLE_POS, 0, *params))
-                self._vehicle.call_later(_REPEAT_INTERVAL_S, request)
+                self._vehicle.call_later(_REPEAT_INTERVAL_S, request_until_confirmed)
 
-        request()
+        request_until_confirmed()
 
 
 _COMPASSES, _ALL = 3, 0b111
@@ -156,13 +156,16 @@ class CompassCalibration:
         self._progress_compass = self._next_compass(self._progress_compass)
         percent = self.percent
         status = MagCalStatus.RUNNING_STEP_ONE if percent < 50 else MagCalStatus.RUNNING_STEP_TWO
-        # One bit for each of 80 directions in which the vehicle has pointed.
+        # The mask has one bit for each of 80 directions in which the vehicle can point.
         direction_count = percent * 80 // 100
         directions = ((1 << direction_count) - 1).to_bytes(10, "little")
         return m.MagCalProgress(self._progress_compass, self._mask, status, 1, percent, directions, 0.0, 0.0, 0.0)
 
     def report(self) -> m.MagCalReport | None:
-        """Return the result of the next compass until it is accepted or cancelled, else None."""
+        """Return the result of one compass, each compass in turn.
+
+        Return None before the end of a calibration, and after its result was accepted or cancelled.
+        """
         if not self._mask or self.is_running:
             return None
         self._reported_compass = self._next_compass(self._reported_compass)
@@ -180,7 +183,8 @@ class CompassCalibration:
 
 _GYROS_S, _TRIM_S, _ACCELEROMETERS_S = 0.5, 1.0, 1.0
 _MIN_ACCELEROMETERS_INTERVAL_S = 5.0
-_FORCED = 76  # Keeps the present calibration (GCS_Common.cpp, _handle_command_preflight_calibration).
+# This param value accepts the present calibration (GCS_Common.cpp, _handle_command_preflight_calibration).
+_FORCED = 76
 _Accelerometers = PreflightCalibrationAccelerometer
 
 

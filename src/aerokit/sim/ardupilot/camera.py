@@ -27,10 +27,10 @@ class ArduPilotCamera:
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
-        self.image_count = 0  # Images since power-on.
-        self.interval_s: float = 0.0  # Interval of the series.
-        self.remaining = 0  # Remaining images of the series; -1 is unlimited.
-        self.trigger_distance_m: float = 0.0  # Distance in metres between images; 0 is off.
+        self.image_count = 0  # Number of images since power-on.
+        self.interval_s: float = 0.0  # Seconds between two images of a series.
+        self.remaining = 0  # Number of images that the series still has to take; -1 is unlimited.
+        self.trigger_distance_m: float = 0.0  # Metres between two images triggered by distance; 0 is off.
         self._taken_at = -math.inf
         self._taken_place: tuple[float, float] | None = None
         self._is_update_scheduled = False
@@ -69,7 +69,7 @@ class ArduPilotCamera:
         self.remaining = 0
 
     def trigger_by_distance(self, metres: float) -> None:
-        """Take an image each time the vehicle has moved this far in metres; 0 stops."""
+        """Take an image each time the vehicle has moved by this distance in metres. 0 stops the series."""
         self.trigger_distance_m = metres
         self._taken_place = None
         self._schedule_update()
@@ -100,7 +100,7 @@ class ArduPilotCamera:
             self.take()
 
     def run(self, item: MissionItem) -> None:
-        """Execute a mission command; commands that do not concern cameras are ignored."""
+        """Execute a camera command of a mission. Other commands are ignored."""
         if item.command == MavCmd.DO_DIGICAM_CONTROL and item.x == 1:
             self.take()
         elif item.command == MavCmd.DO_SET_CAM_TRIGG_DIST:
@@ -145,12 +145,12 @@ class ArduPilotCamera:
         return MavResult.ACCEPTED
 
     def zoom(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_SET_CAMERA_ZOOM, continuous or in percent; no message reports the zoom."""
+        """Handle MAV_CMD_SET_CAMERA_ZOOM by rate or in percent. No message reports the zoom."""
         is_supported = self.is_fitted and command.param1 in (1.0, 2.0)
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
     def focus(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_SET_CAMERA_FOCUS, continuous or in percent; the lens has no autofocus."""
+        """Handle MAV_CMD_SET_CAMERA_FOCUS. Focus by rate or in percent is accepted; autofocus is unsupported."""
         kind = whole(command.param1)
         if kind in (SetFocusType.STEP, SetFocusType.METERS) or kind not in list(SetFocusType):
             return MavResult.DENIED

@@ -21,7 +21,8 @@ from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance, 
 from aerokit.sim.motion import Ned, wrap_pi
 
 _STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
-_TAKE_OFF_WITHOUT_THROTTLE, _RAISED_THROTTLE = 2, 1100  # bit of AUTO_OPTIONS, and µs
+_TAKE_OFF_WITHOUT_THROTTLE = 2  # Bit of AUTO_OPTIONS.
+_RAISED_THROTTLE = 1100  # Pulse in µs above which the throttle stick counts as raised.
 
 
 class _Leg(Protocol):
@@ -78,7 +79,7 @@ class _CircleLeg:
                 self._approach = None
             return
         motion = self._copter.motion
-        # The centripetal acceleration uses 70 % of the limit; the rest keeps the copter on the circle.
+        # The turn may use 70 % of the acceleration limit. The remaining 30 % correct the distance from the circle.
         max_rate = math.sqrt(0.7 * motion.limits.acceleration_m_s2 / max(0.5, self._radius))
         rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)
         self._report_new_turn()
@@ -86,7 +87,8 @@ class _CircleLeg:
         self._turned += abs(rate) * dt
         self._report_new_turn()
         point, speed = self._point(), rate * self._radius
-        # The velocity of the moving point, plus a correction of 1 m/s per metre between the copter and the point.
+        # Follow a point that moves along the circle: command the velocity of the point, plus 1 m/s towards the point
+        # for each metre between the copter and the point.
         motion.seek_velocity(
             point[0] - motion.north - speed * math.sin(self._angle),
             point[1] - motion.east + speed * math.cos(self._angle),
@@ -144,7 +146,7 @@ class _DescendLeg:
 
 _ALLOW_ARMING, _CONTINUE_AFTER_LAND = 1, 4  # bits of AUTO_OPTIONS and of MIS_OPTIONS
 _HEADING_REACHED_RAD, _MIN_TAKE_OFF_M = math.radians(2.0), 1.0
-# A waypoint without delay is passed without a stop if one of these commands follows.
+# The copter does not stop at a waypoint without delay if one of these commands follows.
 _PASSED_BEFORE = frozenset(
     {Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_PAYLOAD_PLACE}
 )
@@ -168,9 +170,9 @@ class CopterAuto(MissionMode):
 
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
-        self.climb: float = 0.0  # Limit in m/s.
-        self.descent: float = 0.0  # Limit in m/s.
-        self._leg: _Leg | None = None  # AUTO holds the position without a leg.
+        self.climb: float = 0.0  # Maximum climb rate in m/s.
+        self.descent: float = 0.0  # Maximum sink rate in m/s.
+        self._leg: _Leg | None = None  # None: hold the position.
         self._last_reached = 0
         self._reached_at = self._condition_from = self._delay_until = 0.0
         self._list_version = -1
@@ -225,7 +227,7 @@ class CopterAuto(MissionMode):
         """Enter AUTO, which requires a mission. On the ground, its first navigation command must be a take-off."""
         copter, run = self.vehicle, self.vehicle.mission
         if copter.mode is self:
-            return True  # Arming in AUTO enters the mode again.
+            return True  # Arming enters the current mode again, which must not restart the mission.
         if not run.is_present and not force:
             return False
         if copter.is_armed and copter.is_landed and not run.starts_with_take_off():
@@ -239,15 +241,15 @@ class CopterAuto(MissionMode):
         return True
 
     def on_mission_started(self) -> None:
-        self._upcoming_changed()  # remembers the commands
+        self._check_upcoming()  # records the commands that the next call compares
 
     def update(self, dt: float) -> None:
         self.start_if_waiting()
         if not self.is_waiting:
-            if self._upcoming_changed() and isinstance(self._leg, _FlyLeg):
+            if self._check_upcoming() and isinstance(self._leg, _FlyLeg):
                 self._restart_command()
             self.vehicle.mission.update()
-            self._upcoming_changed()  # remembers the commands
+            self._check_upcoming()  # `mission.update` may have started the next command
         if self.vehicle.mode is not self:
             return
         is_stopped = self.is_paused and isinstance(self._leg, _FlyLeg)
@@ -258,8 +260,11 @@ class CopterAuto(MissionMode):
         if not is_stopped:
             self.vehicle.yaw.update()
 
-    def _upcoming_changed(self) -> bool:
-        """Return True if an upload changed the next three commands since the last call, at the same current index."""
+    def _check_upcoming(self) -> bool:
+        """Record the next three commands. Return True if an upload has changed them since the last call.
+
+        A change of the current index alone is not a change of the commands.
+        """
         run, commands = self.vehicle.mission, self.vehicle.missions.commands
         has_same_index = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
         if commands.version == self._list_version and has_same_index:
@@ -332,7 +337,10 @@ class CopterAuto(MissionMode):
         return True
 
     def _has_landed(self, index: int) -> bool:
-        """Disarm after landing and return False; return True if MIS_OPTIONS lets a following take-off continue."""
+        """Return True if the copter has landed and MIS_OPTIONS lets it continue with a following take-off.
+
+        Otherwise return False, and disarm the landed copter.
+        """
         copter = self.vehicle
         if isinstance(self._leg, _FlyLeg):
             if self._leg.is_complete:
@@ -348,11 +356,11 @@ class CopterAuto(MissionMode):
         return False
 
     def _place(self, item: MissionItem) -> Ned:
-        """Return the place of an item; zero coordinates mean the vehicle's current coordinates."""
+        """Return the place of an item. Zero latitude and longitude, or a zero altitude, keep the current values."""
         leg = self._leg
         current: Ned = self.vehicle.motion.place
         if isinstance(leg, _FlyLeg) and leg.is_complete:
-            current = leg.destination  # The copter is there, except for a small error.
+            current = leg.destination  # more exact than the copter's position, which differs a little
         point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
         if point is None:
             return current
@@ -378,7 +386,7 @@ class CopterAuto(MissionMode):
         copter, down = self.vehicle, self.vehicle.motion.down
         point = copter.world_point(0, 0, item.z, item.frame)
         copter.yaw.hold()
-        # Never descend; from the ground, climb at least this much.
+        # A take-off never descends, and climbs at least `_MIN_TAKE_OFF_M` from the ground.
         min_climb = _MIN_TAKE_OFF_M if copter.is_landed else 0.0
         target_down = min(down - min_climb, down if point is None else point[2])
         self._leg = _ClimbLeg(self, copter.ground_or_home_down - target_down)
@@ -399,7 +407,8 @@ class CopterAuto(MissionMode):
         leg.enter(force=True)
 
     def _delay(self, item: MissionItem) -> None:
-        seconds = max(0.0, item.param1)  # A negative number means until a time of day, which is not simulated.
+        # A negative param 1 means a delay until a time of day, which is not simulated.
+        seconds = max(0.0, item.param1)
         self._delay_until = self.vehicle.now + seconds
         self.vehicle.info(f"Delaying {int(seconds)} sec")
 
@@ -408,7 +417,7 @@ class CopterAuto(MissionMode):
 
     def _turn(self, item: MissionItem) -> None:
         heading, direction = math.radians(item.param1), int(item.param3)
-        if item.param4 > 0:  # The angle is relative, so that its sign is the direction.
+        if item.param4 > 0:  # The angle is relative; the direction (param 3) is its sign.
             heading = self.vehicle.motion.yaw + math.copysign(heading, direction or 1.0)
             direction = 0
         self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)
@@ -426,4 +435,4 @@ class CopterAuto(MissionMode):
     def _look_at(self, item: MissionItem) -> None:
         is_none = (item.x, item.y, item.z) == (0, 0, 0)
         point = None if is_none else self.vehicle.world_point(int(item.x), int(item.y), item.z, MavFrame.GLOBAL)
-        self.vehicle.yaw.region_of_interest(point)
+        self.vehicle.yaw.set_region_of_interest(point)

@@ -33,7 +33,8 @@ class ArduPilotExternal:
         self.latest: dict[type[Message], Message] = {}
         self._navigation_at = self._target_at = -math.inf
         self._target: tuple[float, float] = (0.0, 0.0)
-        self.wind: tuple[float, float] | None = None  # Speed in m/s, and direction in degrees that the wind comes from.
+        # Wind speed in m/s, and the direction in degrees from which the wind comes.
+        self.wind: tuple[float, float] | None = None
 
     def listen(self) -> None:
         vehicle = self._vehicle
@@ -49,7 +50,7 @@ class ArduPilotExternal:
         return self._vehicle.now - self._navigation_at
 
     def velocity_to_target(self) -> tuple[float, float]:
-        """Return the horizontal velocity of a landing towards a target that was seen recently, else zero."""
+        """Return the horizontal velocity towards the landing target; zero unless the target was seen recently."""
         if self._vehicle.now - self._target_at > _TARGET_TIMEOUT_S:
             return (0.0, 0.0)
         motion = self._vehicle.motion

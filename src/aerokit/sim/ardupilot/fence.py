@@ -261,7 +261,7 @@ class ArduPilotFence(Generic[HostT]):
             if self.active & kind and self._update_breach(kind, beyond_m):
                 new_breaches |= kind
         if not may_be_low:
-            self._raise_floor()
+            self._enable_floor_above()
         return new_breaches
 
     def _update_breach(self, kind: int, beyond_m: float) -> bool:
@@ -271,7 +271,7 @@ class ArduPilotFence(Generic[HostT]):
             return False
         if self.breached & kind and (kind == _POLYGON or beyond_m < self._new_breach_m.get(kind, math.inf)):
             return False
-        self._record(kind)
+        self._record_breach(kind)
         self._new_breach_m[kind] = beyond_m + (self.CIRCLE_BACKUP_M if kind == _CIRCLE else _BACKUP_M)
         return True
 
@@ -288,7 +288,7 @@ class ArduPilotFence(Generic[HostT]):
             _POLYGON: self.zones.breach_m(place[:2], union=union),
         }
 
-    def _raise_floor(self) -> None:
+    def _enable_floor_above(self) -> None:
         """Enable the lower limit once the vehicle is above it by FENCE_MARGIN."""
         enable, auto_enable = self._enabling_parameters
         is_enabled_in_flight = self.configured & _MIN_ALT and (enable or auto_enable > 1)
@@ -302,7 +302,7 @@ class ArduPilotFence(Generic[HostT]):
     def contains(self, place: Ned) -> bool:
         return not any(self.active & kind and beyond > 0.0 for kind, beyond in self._beyond(place).items())
 
-    def _record(self, kind: int) -> None:
+    def _record_breach(self, kind: int) -> None:
         vehicle = self.vehicle
         self.breach_count += 1
         is_first = not self.breached

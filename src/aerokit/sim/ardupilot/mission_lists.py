@@ -265,7 +265,7 @@ class FenceList(ItemList):
 
     def store(self, items: Sequence[MissionItem], warn: Warn) -> int:
         """Store a fence if it is valid."""
-        problem = _problem(items)
+        problem = _fence_problem(items)
         if problem is not None:
             warn(problem)
             warn("Fence validation failed")
@@ -301,7 +301,7 @@ def _stored_fence_item(item: MissionItem) -> MissionItem | int:
     return MissionItem(item.command, MavFrame.GLOBAL, size, x=int(item.x), y=int(item.y), z=0.0, autocontinue=False)
 
 
-def _problem(items: Sequence[MissionItem]) -> str | None:
+def _fence_problem(items: Sequence[MissionItem]) -> str | None:
     """Return the firmware's text about an invalid fence; None if it is valid."""
     # Type and number of vertices of the current polygon, and how many of them are still to come.
     polygon_type, vertices, missing = 0, 0.0, 0

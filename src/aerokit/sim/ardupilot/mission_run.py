@@ -316,7 +316,7 @@ class MissionRun:
                 return None
             if item.command not in (Cmd.DO_JUMP, Cmd.DO_JUMP_TAG):
                 return index, item
-            target = self._target(item)
+            target = self._jump_target(item)
             is_endless = not count_jumps and first_jump == index
             if self._list.command(target) is None or is_endless:
                 return None
@@ -324,7 +324,7 @@ class MissionRun:
             index = target if self._jumps_now(index, int(item.param2), count_jumps=count_jumps) else index + 1
         return None
 
-    def _target(self, item: MissionItem) -> int:
+    def _jump_target(self, item: MissionItem) -> int:
         if item.command == Cmd.DO_JUMP:
             return int(item.param1)
         for index in range(_FIRST, self._list.count):

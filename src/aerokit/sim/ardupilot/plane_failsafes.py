@@ -61,7 +61,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     @property
     def is_radio_healthy(self) -> bool:
         """True while pulses are received and the throttle is above THR_FS_VALUE."""
-        return not (self.radio or self._is_radio_bad())
+        return not (self.is_radio_lost or self._is_radio_bad())
 
     def update(self) -> None:
         self._check_radio()
@@ -82,21 +82,21 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         is_bad = self._is_radio_bad()
         bad_for = self._radio_bad.seconds(is_bad, plane.now)
         if not is_bad:
-            self._set_radio(is_lost=False)
+            self._set_radio_lost(is_lost=False)
         elif plane.parameters["THR_FAILSAFE"] == 1 and bad_for >= _COUNT_S - 1e-6:
-            self._set_radio(is_lost=True)
+            self._set_radio_lost(is_lost=True)
 
-    def _set_radio(self, *, is_lost: bool) -> None:
-        if is_lost != self.radio:
-            self.radio = is_lost
+    def _set_radio_lost(self, *, is_lost: bool) -> None:
+        if is_lost != self.is_radio_lost:
+            self.is_radio_lost = is_lost
             self.warn(f"Throttle failsafe {'on' if is_lost else 'off'}")
 
     def _check_short(self) -> None:
         action = int(self.vehicle.parameters["FS_SHORT_ACTN"])
         is_landing = self.vehicle.mode.is_landing
-        if self.state == _NONE and self.radio and action != _SHORT_DISABLED and not is_landing:
+        if self.state == _NONE and self.is_radio_lost and action != _SHORT_DISABLED and not is_landing:
             self._start_short(action)
-        elif self.state == _SHORT and (not self.radio or action == _SHORT_DISABLED):
+        elif self.state == _SHORT and (not self.is_radio_lost or action == _SHORT_DISABLED):
             self._end_short()
 
     def _start_short(self, action: int) -> None:
@@ -132,10 +132,10 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         checks_gcs = gcs_option in (_HEARTBEAT, _HEARTBEAT_OR_RSSI)
         if gcs_option == _IN_AUTO:
             checks_gcs = plane.mode.number == PlaneMode.AUTO
-        if self.radio and plane.now - lost_since > timeout:
+        if self.is_radio_lost and plane.now - lost_since > timeout:
             self._start_long(_LONG)
         elif checks_gcs and self.ground_station_silence > timeout:
-            self.ground_station = True
+            self.is_ground_station_lost = True
             self._start_long(_GCS)
 
     def _check_end_of_long(self) -> None:
@@ -143,9 +143,9 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         has_short = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
         timeout = parameters["FS_SHORT_TIMEOUT" if has_short else "FS_LONG_TIMEOUT"]
         if self.state == _GCS and self.ground_station_silence < timeout:
-            self.ground_station: bool = False
+            self.is_ground_station_lost: bool = False
             self._end_long("GCS Failsafe Off")
-        elif self.state == _LONG and not self.radio:
+        elif self.state == _LONG and not self.is_radio_lost:
             self._end_long("RC Long Failsafe Cleared")
 
     def _end_long(self, text: str) -> None:

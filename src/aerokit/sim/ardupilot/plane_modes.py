@@ -90,7 +90,7 @@ class PlaneLanding:
     def update(self, dt: float) -> None:
         plane, wing = self._plane, self._plane.wing
         if plane.is_landed:
-            self._wait()
+            self._disarm_after_stop()
         elif wing.is_on_ground:
             wing.roll_out()
         elif self._fly_to_first is not None:
@@ -133,7 +133,7 @@ class PlaneLanding:
         speed, sink = wing.ground_speed_m_s, wing.velocity_down
         self._plane.info(f"Flare {height:.1f}m sink={sink:.2f} speed={speed:.1f} dist={remaining:.1f}")
 
-    def _wait(self) -> None:
+    def _disarm_after_stop(self) -> None:
         """Disarm LAND_DISARMDELAY seconds after the plane has stopped."""
         plane, wing = self._plane, self._plane.wing
         if math.isnan(self._stopped_at):

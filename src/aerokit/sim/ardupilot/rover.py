@@ -46,7 +46,7 @@ class RoverArming(ArduPilotArming[RoverHost]):
         reasons = super().position_reasons() or super().ahrs_reasons()
         if reasons:
             return reasons
-        if rover.failsafes.estimator:
+        if rover.failsafes.has_estimator_failed:
             return ("EKF failsafe",)
         return () if rover.navigation.has_position else ("Need Position Estimate",)
 
@@ -112,7 +112,9 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     @property
     def is_any_active(self) -> bool:
-        return bool(self._triggered) or self.estimator  # On Rover, a low battery does not cause MAV_STATE_CRITICAL.
+        return (
+            bool(self._triggered) or self.has_estimator_failed
+        )  # On Rover, a low battery does not cause MAV_STATE_CRITICAL.
 
     def update(self) -> None:
         self._check_radio()
@@ -126,18 +128,18 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         if rover.rc.is_receiving:
             self.radio_received_at: float = rover.now
         if not parameters["FS_THR_ENABLE"]:
-            self.radio = False
+            self.is_radio_lost = False
             return
         is_throttle_low = rover.rc[2] < parameters["FS_THR_VALUE"]
-        self.radio: bool = is_throttle_low or rover.now - self.radio_received_at > _SILENT_S
-        self._update_link(_RADIO, is_lost=self.radio)
+        self.is_radio_lost: bool = is_throttle_low or rover.now - self.radio_received_at > _SILENT_S
+        self._update_link(_RADIO, is_lost=self.is_radio_lost)
 
     def _check_ground_station(self) -> None:
         parameters = self.vehicle.parameters
         if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
             return
-        self.ground_station: bool = self.ground_station_silence >= parameters["FS_GCS_TIMEOUT"]
-        self._update_link(_GCS, is_lost=self.ground_station)
+        self.is_ground_station_lost: bool = self.ground_station_silence >= parameters["FS_GCS_TIMEOUT"]
+        self._update_link(_GCS, is_lost=self.is_ground_station_lost)
 
     def _update_link(self, name: str, *, is_lost: bool) -> None:
         """Record whether a link is lost, and start or end the common failsafe of both links."""
@@ -178,13 +180,13 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         is_lost = rover.is_armed and not rover.navigation.has_position
         lost_for = self._position_lost.seconds(is_lost, rover.now)
         if not is_lost:
-            if self.estimator:
-                self.estimator = False
+            if self.has_estimator_failed:
+                self.has_estimator_failed = False
                 self.warn("EKF failsafe cleared", MavSeverity.CRITICAL)
             return
-        if self.estimator or lost_for < _ESTIMATOR_TIMEOUT_S:
+        if self.has_estimator_failed or lost_for < _ESTIMATOR_TIMEOUT_S:
             return
-        self.estimator: bool = True
+        self.has_estimator_failed: bool = True
         self.warn("EKF variance", MavSeverity.CRITICAL)
         action = int(rover.parameters["FS_EKF_ACTION"])
         if action and rover.mode.needs_position:

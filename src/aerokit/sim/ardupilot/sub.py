@@ -19,7 +19,7 @@ from aerokit.mavlink.enums import (
     SubMode,
 )
 from aerokit.mavlink.messages import SetAttitudeTarget
-from aerokit.sim.ardupilot.commands import relative_heading
+from aerokit.sim.ardupilot.commands import commanded_heading
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors
 from aerokit.sim.ardupilot.kinds import Kind
@@ -82,8 +82,8 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
 
     def __init__(self, sub: SubHost) -> None:
         super().__init__(sub)
-        self.pilot: bool = False  # True without RC pulses and MANUAL_CONTROL for FS_PILOT_TIMEOUT.
-        self.leak: bool = False
+        self.is_pilot_lost: bool = False  # True without RC pulses and MANUAL_CONTROL for FS_PILOT_TIMEOUT.
+        self.is_leak_detected: bool = False
         self.pressure: _HullLimit = _HullLimit("pressure", "FS_PRESS")
         self.temperature: _HullLimit = _HullLimit("temperature", "FS_TEMP")
         self._gcs_reported_at = self._leak_reported_at = -math.inf
@@ -92,7 +92,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
     def is_any_active(self) -> bool:
         # On Sub, a lost radio alone does not cause MAV_STATE_CRITICAL.
         hull = self.pressure.is_exceeded or self.temperature.is_exceeded
-        return self.pilot or self.battery_is_low or self.ground_station or self.leak or hull
+        return self.is_pilot_lost or self.battery_is_low or self.is_ground_station_lost or self.is_leak_detected or hull
 
     def update(self) -> None:
         self._check_radio()
@@ -115,9 +115,9 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
             is_lost = False
         elif not is_receiving and not is_lost:  # A short silence neither starts nor ends the failsafe.
             return
-        if is_lost == self.radio:
+        if is_lost == self.is_radio_lost:
             return
-        self.radio = is_lost
+        self.is_radio_lost = is_lost
         self.warn("RC Failsafe" if is_lost else "Radio Failsafe Cleared")
         if is_lost and enabled == _RADIO_SURFACE:
             sub.set_mode(SubMode.SURFACE)
@@ -126,11 +126,11 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_PILOT_INPUT"])
         silence = sub.now - self.radio_received_at
         if not enabled or not silence >= sub.parameters["FS_PILOT_TIMEOUT"]:
-            self.pilot = False
+            self.is_pilot_lost = False
             return
-        if self.pilot:
+        if self.is_pilot_lost:
             return
-        self.pilot = True
+        self.is_pilot_lost = True
         self.warn("Lost manual control", MavSeverity.CRITICAL)
         for index in range(_STICKS):
             sub.rc[index] = _STICK_MIDDLE
@@ -142,16 +142,16 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         if not action or math.isnan(self.ground_station_seen_at):
             return
         if self.ground_station_silence < sub.parameters["FS_GCS_TIMEOUT"]:
-            if self.ground_station:
-                self.ground_station = False
+            if self.is_ground_station_lost:
+                self.is_ground_station_lost = False
                 self.warn("GCS Failsafe Cleared")
             return
         if sub.now - self._gcs_reported_at > _GCS_REPORT_INTERVAL_S:
             self._gcs_reported_at = sub.now
             self.warn(f"MYGCS: {int(sub.parameters['MAV_GCS_SYSID'])}, heartbeat lost")
-        if self.ground_station or not sub.is_armed:
+        if self.is_ground_station_lost or not sub.is_armed:
             return
-        self.ground_station: bool = True
+        self.is_ground_station_lost: bool = True
         if action == _FAILSAFE_DISARM or (action in _GCS_MODES and not sub.set_mode(_GCS_MODES[action])):
             sub.arming.disarm()
 
@@ -164,13 +164,13 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
     def _check_leak(self) -> None:
         sub, action = self.vehicle, int(self.vehicle.parameters["FS_LEAK_ENABLE"])
         if not sub.faults.leak or not action:
-            self.leak = False
+            self.is_leak_detected = False
             return
         if sub.now - self._leak_reported_at > _LEAK_REPORT_INTERVAL_S:
             self._leak_reported_at = sub.now
             self.warn("Leak Detected", MavSeverity.CRITICAL)
-        if not self.leak:
-            self.leak = True
+        if not self.is_leak_detected:
+            self.is_leak_detected = True
             if action == _LEAK_SURFACE and sub.is_armed:
                 sub.set_mode(SubMode.SURFACE)
 
@@ -325,7 +325,7 @@ class SimulatedSub(SubHost):
         return MavResult.ACCEPTED
 
     def _turn(self, command: ReceivedCommand) -> int:
-        heading = relative_heading(command, self.motion.yaw)
+        heading = commanded_heading(command, self.motion.yaw)
         if heading is None:
             return MavResult.FAILED
         if self.mode is self.guided:

@@ -298,7 +298,7 @@ class ArduPilotVehicle(ArduPilotHost):
             self.send_text(*refusal_by_fence)
             return False
         is_armed = self.motors.is_armed
-        has_position = self.navigation.has_position and not self.failsafes.estimator
+        has_position = self.navigation.has_position and not self.failsafes.has_estimator_failed
         if is_armed and mode.needs_position and not has_position:
             self.send_text(MavSeverity.WARNING, self.refusal(mode, "requires position"))
             return False
