@@ -19,7 +19,7 @@ from aerokit.mavlink.enums import (
     SpeedType,
 )
 from aerokit.sim.ardupilot import copter_modes as modes
-from aerokit.sim.ardupilot.commands import common_commands, commanded_heading
+from aerokit.sim.ardupilot.commands import commanded_heading, common_commands
 from aerokit.sim.ardupilot.copter_auto import CopterAuto
 from aerokit.sim.ardupilot.copter_failsafes import CopterArming, CopterFailsafes, CopterFence
 from aerokit.sim.ardupilot.copter_guided import CopterGuided, CopterSetpoints

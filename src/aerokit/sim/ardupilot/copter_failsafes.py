@@ -16,7 +16,7 @@ _STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 
 
 class CopterArming(ArduPilotArming[CopterHost]):
-    """ArduCopter's arming checks. Only modes that use a position require one; the throttle stick must be low or centred."""
+    """ArduCopter's arming checks. Only modes that use a position require it; the throttle must be low or centred."""
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"

@@ -50,7 +50,7 @@ class BatteryFailsafe:
             self._act(action)
 
     def reason_not_to_arm(self) -> str | None:
-        """Return the text of the failing arming check, if any."""
+        """Return the text of the first failing arming check, or None."""
         battery, parameters = self._vehicle.battery, self._vehicle.parameters
         if battery.voltage_v < parameters["BATT_ARM_VOLT"]:
             return "Battery 1 below minimum arming voltage"

@@ -54,7 +54,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         super().restart()
         self._queue: deque[tuple[FtpPacket, Channel]] = deque()
         self._is_worker_scheduled = self._is_bursting = self._is_banner_due = False
-        self._sent_at = float("-inf")  # Time of the last reply; infinitely long ago after a session was closed.
+        self._sent_at = float("-inf")  # Time of the last reply; minus infinity after a session was closed.
 
     @property
     def open_sessions(self) -> int:
@@ -72,7 +72,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             self._host.call_later(_WORKER_PERIOD_S, self._work)
 
     def _work(self) -> None:
-        """Process the queue. A burst continues by its own timer, and calls this method when it ends."""
+        """Process the queued requests. A burst interrupts this; the end of the burst calls this method again."""
         while self._queue and not self._is_bursting:
             request, channel = self._queue.popleft()
             peer = self._peer(request, channel)
@@ -84,7 +84,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._is_worker_scheduled = self._is_bursting
 
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
-        return None  # All clients share one state.
+        return None  # Like the firmware, use a single state for all clients.
 
     def _is_repeated(self, peer: FtpPeer, request: FtpPacket, last: FtpPacket) -> bool:
         is_same_session = request.client == last.client and request.session == last.session
@@ -94,10 +94,10 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return request.session
 
     def _watch(self, peer: FtpPeer, session: FtpSession) -> None:
-        """Close nothing: an idle session ends when another request needs it."""
+        """Do nothing. The firmware closes an idle session only when another client needs the session."""
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
-        """Refuse requests of another session while one has an open file, unless that session is idle."""
+        """Refuse a request while another session has an open file. If that session is idle, close it instead."""
         is_close = request.opcode in (Op.TERMINATESESSION, Op.RESETSESSION)
         if peer.sessions and request.session not in peer.sessions and not is_close:
             if not self._is_idle():
@@ -125,7 +125,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
 
     def _fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
         is_opening = request.opcode in (Op.OPENFILERO, Op.OPENFILEWO, Op.CREATEFILE)
-        # The firmware reports a folder as a missing file.
+        # If a folder is opened as a file, the firmware reports a missing file.
         errno = ENOENT if is_opening and fault.errno == EISDIR else fault.errno
         return request.refuse_errno(errno)
 
@@ -134,7 +134,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return request.refuse(MavFtpErr.FAIL)
 
     def _path(self, request: FtpPacket) -> str:
-        """Return the path; the request's size must be its length, with or without the final NUL."""
+        """Return the path in the request, whose size must be that of the path, with or without the final NUL."""
         length = len(request.data.partition(b"\0")[0])
         if request.size == 0 or request.size - length not in (0, 1):
             raise Refused(MavFtpErr.INVALIDDATASIZE)
@@ -149,7 +149,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return session
 
     def _close_all(self, peer: FtpPeer) -> None:
-        with suppress(FileFault):  # The firmware does not report the error.
+        with suppress(FileFault):  # The firmware does not report an error of a close.
             super()._close_all(peer)
 
     def _terminate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
@@ -189,7 +189,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         except FileFault as fault:
             data, refusal = b"", request.refuse_errno(fault.errno)
         if not data:
-            # The refusal has the offset and the flag of the block before it.
+            # The firmware sends the refusal with the offset and the flag burst_complete of the previous block.
             previous = peer.reply if number and peer.reply is not None else refusal
             end = refusal.replace(sequence=sequence, offset=previous.offset, burst_complete=previous.burst_complete)
             self._reply(peer, end)
@@ -199,7 +199,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         block = request.acknowledge(data, offset=offset)
         block = block.replace(sequence=sequence, burst_complete=is_short or is_last)
         self._reply(peer, block)
-        # The firmware has already advanced its last reply when it repeats this reply or refuses to read on.
+        # The firmware has already advanced its stored reply to the next block when it repeats this reply, or when it
+        # refuses to read on.
         next_offset = offset + len(data) if is_short else offset
         peer.reply = block.replace(sequence=(sequence + 1) & 0xFFFF, offset=next_offset)
         next_step = self._end_burst if is_last else partial(self._send_next, peer, session, request, number + 1)
@@ -210,7 +211,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._work()
 
     def _entries(self, path: str) -> list[Entry]:
-        """List a folder with `.` and `..`, like Linux; the root folder also contains the listed mounts."""
+        """Return the entries of a folder with `.` and `..`, as Linux lists them. The root also contains the mounts."""
         entries = super()._entries(path)
         if self.files.mounted(path) is not None:
             return entries
@@ -226,7 +227,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return self._change(request, self._remove_either)
 
     def _remove_either(self, path: str) -> None:
-        # In the firmware RemoveFile and RemoveDirectory are the same operation.
+        # In the firmware, RemoveFile also removes folders, and RemoveDirectory also removes files.
         try:
             self.files.remove_folder(path)
         except FileFault:
@@ -243,6 +244,6 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             raise Refused(MavFtpErr.INVALIDDATASIZE)
         old_path, new_path = path_in(old_name), path_in(new_name)
         if self.files.mounted(old_path) is not None or self.files.mounted(new_path) is not None:
-            raise FileFault(ENOENT)
+            raise FileFault(ENOENT)  # Virtual files, such as those of @PARAM, cannot be renamed.
         self.files.rename(old_path, new_path)
         return request.acknowledge()

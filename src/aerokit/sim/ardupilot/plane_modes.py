@@ -49,7 +49,7 @@ class PlaneHost(ArduPilotVehicle):
         return self.parameters["AIRSPEED_MIN"] <= airspeed <= self.parameters["AIRSPEED_MAX"]
 
     def lift_off(self) -> None:
-        """Leave the landed state at the start of a take-off roll."""
+        """Set ``is_landed`` to False at the start of a take-off roll."""
         if self.is_landed:
             self._read_limits()
             self.is_landed: bool = False
@@ -57,7 +57,7 @@ class PlaneHost(ArduPilotVehicle):
             self.take_off_yaw = self.wing.yaw
 
     def climb_out(self) -> None:
-        """Keep the take-off heading at cruise speed, and climb once the airspeed suffices."""
+        """Fly in the take-off direction at cruise speed, and climb as soon as the airspeed suffices."""
         wing = self.wing
         self.lift_off()
         if wing.is_on_ground:
@@ -82,7 +82,7 @@ class PlaneLanding:
     def __init__(self, plane: PlaneHost, point: Ned, start: Ned | None = None) -> None:
         self._plane = plane
         self.point: Ned = point
-        self._fly_to_first = start  # None once the approach has begun.
+        self._fly_to_first = start  # Place to fly to before the approach; None once the approach has begun.
         self._approach_start: Ned = plane.wing.place
         self._is_flaring = self._is_reported = False
         self._stopped_at = math.nan
@@ -110,7 +110,8 @@ class PlaneLanding:
         plane, wing, (north, east, down) = self._plane, self._plane.wing, self.point
         course = math.atan2(east - self._approach_start[1], north - self._approach_start[0])
         cos_course, sin_course = math.cos(course), math.sin(course)
-        # Metres to the point along the approach line (negative beyond the point), and metres beside that line.
+        # Distances in metres from the landing point: along the approach line (negative once the plane has passed the
+        # point), and across that line.
         remaining = (north - wing.north) * cos_course + (east - wing.east) * sin_course
         aside = (east - wing.east) * cos_course - (north - wing.north) * sin_course
         flare_time = wing.velocity_down * plane.parameters["LAND_FLARE_SEC"]
@@ -179,15 +180,15 @@ class PlanePilotedMode(PlaneModeBase):
             wing.roll_out()
             return
         plane.lift_off()
-        climb = self.stick(1) * wing.wing_limits.climb_m_s  # Pulling the stick gives positive values.
+        climb = self.stick(1) * wing.wing_limits.climb_m_s  # A pulled stick has a positive value, and climbs.
         if plane.rc[2] <= _LOW_THROTTLE:
             climb = min(climb, 0.0) - wing.wing_limits.glide_sink_m_s
-        speed = max(0.0, throttle * 2 * plane.cruise_m_s)  # Half throttle is cruise speed.
+        speed = max(0.0, throttle * 2 * plane.cruise_m_s)  # Half throttle flies at cruise speed.
         wing.bank_and_climb(speed, self.stick(0) * wing.wing_limits.bank_rad, climb)
 
 
 class PlaneAltitudeMode(PlaneModeBase):
-    """FBWB, and base of modes that hold altitude and speed; on the ground the plane rolls to a stop."""
+    """FBWB, and base of the modes that hold altitude and speed. On the ground, the plane rolls to a stop."""
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
@@ -216,7 +217,7 @@ class PlaneAltitudeMode(PlaneModeBase):
 
 
 class PlaneCruise(PlaneAltitudeMode):
-    """CRUISE: like FBWB, but holds the course over ground while the roll stick is centred."""
+    """CRUISE: works like FBWB, and holds the course over ground while the roll stick is centred."""
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
@@ -247,14 +248,17 @@ class PlaneCircle(PlaneAltitudeMode):
 
 
 class PlaneNavigatingMode(PlaneModeBase):
-    """LOITER, and base of modes that fly to a place (by default where the mode was entered) and circle there."""
+    """LOITER, and base of the modes that fly to a place and circle there.
+
+    By default, the place is where the mode was entered.
+    """
 
     flags: int = _NAVIGATES
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
-        self.speed: float = 0.0  # Commanded airspeed in m/s; 0 means AIRSPEED_CRUISE.
-        self.radius: float = 0.0  # Radius of the circle in metres; 0 means WP_LOITER_RAD.
+        self.speed: float = 0.0  # Commanded airspeed in m/s; 0 selects AIRSPEED_CRUISE.
+        self.radius: float = 0.0  # Radius of the circle in metres; 0 selects WP_LOITER_RAD.
         self._place: Ned | None = None
 
     def enter(self, *, force: bool) -> bool:
@@ -280,7 +284,10 @@ class PlaneNavigatingMode(PlaneModeBase):
 
 
 class PlaneRtl(PlaneNavigatingMode):
-    """RTL: flies to a rally point or home and circles there, at RTL_ALTITUDE (negative: the current altitude)."""
+    """RTL: flies to a rally point or home and circles there, at RTL_ALTITUDE.
+
+    A negative RTL_ALTITUDE keeps the current altitude.
+    """
 
     can_arm = False
 
@@ -334,14 +341,14 @@ class PlaneTakeOff(PlaneNavigatingMode):
 class PlaneAutoland(PlaneNavigatingMode):
     """AUTOLAND: lands at home in the direction of the take-off. The mode can only be entered in flight.
 
-    If the plane is armed again after landing, it disarms at once.
+    A plane that is armed again after the landing disarms at once.
     """
 
     is_landing = True
 
     def enter(self, *, force: bool) -> bool:
         plane = self.vehicle
-        if plane.mode is self and plane.is_landed:  # Arming in AUTOLAND enters the mode again.
+        if plane.mode is self and plane.is_landed:  # Arming enters the current mode again.
             return True
         if plane.is_landed:
             plane.send_text(MavSeverity.WARNING, "Must already be flying!")

@@ -36,10 +36,10 @@ class RoverArming(ArduPilotArming[RoverHost]):
     """ArduRover's arming checks: a position only in modes that use it, or in all modes with ARMING_NEED_LOC."""
 
     def ahrs_reasons(self) -> Sequence[str]:
-        return ()  # `position_reasons` checks the estimator after GPS.
+        return ()  # `position_reasons` includes these checks, because ArduRover runs them after those of GPS.
 
     def position_reasons(self) -> Sequence[str]:
-        """Check GPS, then the estimator and its position."""
+        """Return the failures of the checks of GPS, then of the estimator and its position."""
         rover = self.vehicle
         if not rover.mode.needs_position and rover.parameters["ARMING_NEED_LOC"] != _NEEDS_LOCATION:
             return ()
@@ -71,7 +71,7 @@ class RoverArming(ArduPilotArming[RoverHost]):
         return True
 
 
-# FS_ACTION, FENCE_ACTION and the battery actions.
+# Values of FS_ACTION, of FENCE_ACTION and of the battery actions.
 _NONE, _RTL, _HOLD, _SMART_RTL, _SMART_RTL_OR_HOLD, _TERMINATE, _LOITER_OR_HOLD = range(7)
 _MODES: dict[int, tuple[int, ...]] = {
     _RTL: (RoverMode.RTL, RoverMode.HOLD),
@@ -93,10 +93,11 @@ _DRIVES_ITSELF = frozenset(
 
 
 class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
-    """Failsafes. FS_ACTION is executed FS_TIMEOUT after radio or ground station are lost, except in RTL and HOLD.
+    """ArduRover's failsafes.
 
-    The action is also executed on a disarmed rover. The firmware treats both links as one failsafe. If the check of the
-    radio is enabled, the firmware reports a lost ground station as "Radio Failsafe", too.
+    FS_TIMEOUT seconds after the loss of the radio or the ground station, the rover executes FS_ACTION, even while
+    disarmed, but not in RTL and HOLD. The firmware treats both links as one failsafe. If the radio check is enabled,
+    the firmware also reports a lost ground station as "Radio Failsafe".
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
@@ -143,15 +144,15 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     def _update_link(self, name: str, *, is_lost: bool) -> None:
         """Record whether a link is lost, and start or end the common failsafe of both links."""
-        rover, was_any_lost = self.vehicle, bool(self._lost)
+        rover, was_any_link_lost = self.vehicle, bool(self._lost)
         self._lost = self._lost | {name} if is_lost else self._lost - {name}
-        if self._lost and not was_any_lost:
+        if self._lost and not was_any_link_lost:
             self._lost_since = rover.now
         if self._triggered and not self._lost:
             self.warn(f"{name} Failsafe Cleared", MavSeverity.INFO)
         self._triggered &= self._lost
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
-        if self._triggered or not self._lost or is_waiting or not self._may_act():
+        if not self._lost or self._triggered or is_waiting or not self._may_act():
             return
         self._triggered = set(self._lost)
         self.warn(f"{name} Failsafe")
@@ -160,6 +161,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         if rover.mode.number == RoverMode.AUTO and enabled == _CONTINUE_MISSION:
             self.warn("Failsafe - Continuing Auto Mode")
         else:
+            # The values of FS_ACTION have the same meanings as the battery actions.
             self.act_on_battery(int(rover.parameters["FS_ACTION"]))
 
     def _may_act(self) -> bool:
@@ -211,9 +213,9 @@ _HOLD_BEYOND_M = 100.0
 
 
 class RoverFence(ArduPilotFence[RoverHost]):
-    """Fence. FENCE_ACTION has the actions of FS_ACTION. A rover more than 100 m outside changes to HOLD.
+    """ArduRover's fence, which has no altitude limits and sends no texts.
 
-    It has no altitude limits and sends no texts.
+    FENCE_ACTION has the values of FS_ACTION. A rover more than 100 m outside the fence changes to HOLD.
     """
 
     PERIOD_S: ClassVar[float] = 0.1
@@ -231,7 +233,8 @@ class RoverFence(ArduPilotFence[RoverHost]):
             vehicle.arming.disarm()
         else:
             modes = _MODES.get(action, ())
-            self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)  # until one is not refused
+            # Try the modes in turn, until one of them is not refused.
+            self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
 
     def on_mode_changed(self) -> None:
         super().on_mode_changed()
@@ -239,9 +242,9 @@ class RoverFence(ArduPilotFence[RoverHost]):
 
 
 class RoverSetpoints(GuidedSetpoints):
-    """Handlers of set-point messages. ArduRover also accepts a heading or a turn rate without a velocity.
+    """Handlers of the set-point messages. ArduRover also accepts a heading or a turn rate without a velocity.
 
-    Thrust is a share of the waypoint speed.
+    A thrust of 1 means the waypoint speed.
     """
 
     vehicle: RoverHost  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -250,20 +253,21 @@ class RoverSetpoints(GuidedSetpoints):
         self.vehicle.info(f"Ignoring {message.NAME}; set ACC_IGNORE in mask")
 
     def is_complete(self, target: GuidedTarget) -> bool:
-        # Without a velocity, either a heading or a turn rate is accepted, but not both.
+        # A target without a velocity must have either a heading or a turn rate, but not both.
         return super().is_complete(target) or (target.yaw is None) != (target.yaw_rate is None)
 
     def steer(self, message: SetAttitudeTarget) -> None:
-        """Drive at the speed of the thrust; a turn rate has precedence over the heading."""
+        """Drive at the speed that the thrust commands. A turn rate has precedence over the heading."""
         if message.type_mask & AttitudeMask.THROTTLE_IGNORE:
             return
         speed = self.vehicle.waypoint_speed * max(-1.0, min(1.0, message.thrust))
         heading = euler_from_quaternion(*message.q)[2]
         velocity = (abs(speed) * math.cos(heading), abs(speed) * math.sin(heading), 0.0)
+        backwards = speed < 0
         if message.type_mask & AttitudeMask.BODY_YAW_RATE_IGNORE:
-            self.mode.set_target(GuidedTarget(None, velocity, speed < 0, heading))
+            self.mode.set_target(GuidedTarget(None, velocity, backwards, yaw=heading))
         else:
-            self.mode.set_target(GuidedTarget(None, velocity, speed < 0, None, message.body_yaw_rate))
+            self.mode.set_target(GuidedTarget(None, velocity, backwards, yaw_rate=message.body_yaw_rate))
 
 
 _AMPERES_AT_FULL = 16.0
@@ -311,7 +315,7 @@ class SimulatedRover(RoverHost):
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = RoverJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
-        """Create the motion model with the limits of the parameters; wind is reported but has no effect."""
+        """Create the motion model with limits from the parameters. Wind is reported, but does not move the rover."""
         parameters = self.parameters
         limits = GroundLimits(
             acceleration_m_s2=parameters["ATC_ACCEL_MAX"] or 1.0,
