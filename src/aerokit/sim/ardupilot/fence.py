@@ -125,7 +125,7 @@ _WHEN_ARMED = 3
 _DEFAULTS = {"FENCE_ALT_MAX": 100.0, "FENCE_ALT_MIN": -10.0, "FENCE_AUTOENABLE": 0.0}
 
 REPORT_ONLY = 0
-"""FENCE_ACTION that only reports, on every kind of vehicle."""
+"""Value of FENCE_ACTION that only reports a breach, on every kind of vehicle."""
 
 
 class ArduPilotFence(Generic[HostT]):

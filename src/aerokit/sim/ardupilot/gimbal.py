@@ -55,7 +55,7 @@ _FIXED_ANGLE_MODES = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
 
 @dataclass(frozen=True)
 class MountTarget:
-    """Target angles in degrees at the time ``since``. From then on, ``rates`` (degrees per second) change the angles."""
+    """Target angles in degrees at the time ``since``. From then on, ``rates`` (degrees per second) change them."""
 
     roll: float = 0.0
     pitch: float = 0.0

@@ -54,7 +54,7 @@ class MissionMode(ArduPilotMode):
 
     def on_disarmed(self) -> None:
         """Called after the motors have stopped."""
-        # The vehicle on the ground waits for the start of the mission, which disarming has reset.
+        # Disarming restarts an unfinished mission. The vehicle then waits on the ground.
         if self.vehicle.mode is self:
             self.vehicle.mission.update()
 

@@ -113,9 +113,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     @property
     def is_any_active(self) -> bool:
-        return (
-            bool(self._triggered) or self.has_estimator_failed
-        )  # On Rover, a low battery does not cause MAV_STATE_CRITICAL.
+        # A low battery does not count, because it does not cause MAV_STATE_CRITICAL on Rover.
+        return bool(self._triggered) or self.has_estimator_failed
 
     def update(self) -> None:
         self._check_radio()

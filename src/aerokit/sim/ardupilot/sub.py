@@ -33,15 +33,15 @@ from aerokit.sim.motion import SimulatedWind, euler_from_quaternion
 from aerokit.sim.vehicle_motion import UnderwaterMotion
 
 _BUTTONS = range(16)
-# BTNn_FUNCTION.
+# Values of the parameters BTNn_FUNCTION.
 _SHIFT, _ARM_TOGGLE, _DISARM = 1, 2, 4
 _DISARMS = frozenset({_ARM_TOGGLE, _DISARM})
 
 
 class SubArming(ArduPilotArming[SubHost]):
-    """ArduSub's arming checks: by default radio and battery (ARMING_CHECK 448), never a position.
+    """ArduSub's arming checks, by default of radio and battery (ARMING_CHECK 448). No check requires a position.
 
-    A joystick button must have a disarm function.
+    One of the joystick buttons must have a function that disarms.
     """
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
@@ -64,7 +64,7 @@ class SubArming(ArduPilotArming[SubHost]):
         return _SHIFT in functions and any(int(parameters[f"{prefix}SFUNCTION"]) in _DISARMS for prefix in prefixes)
 
 
-# Actions of FS_GCS_ENABLE; 1 only warns.
+# Values of FS_GCS_ENABLE. The value 1 only warns.
 _FAILSAFE_DISARM, _HOLD, _SURFACE = 2, 3, 4
 _GCS_MODES = {_HOLD: SubMode.ALT_HOLD, _SURFACE: SubMode.SURFACE}
 _BATTERY_DISARM, _BATTERY_SURFACE = 2, 3
@@ -76,13 +76,14 @@ _STICKS, _STICK_MIDDLE = 6, 1500
 
 
 class SubFailsafes(ArduPilotFailsafes[SubHost]):
-    """ArduSub's failsafes, most of which act only while armed. Terrain, estimator and crash are not simulated."""
+    """ArduSub's failsafes. Most of them act only while armed. Those of terrain, estimator and crash are not simulated."""
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_BATTERY_DISARM, _BATTERY_SURFACE, 1, 0)
 
     def __init__(self, sub: SubHost) -> None:
         super().__init__(sub)
-        self.is_pilot_lost: bool = False  # True without RC pulses and MANUAL_CONTROL for FS_PILOT_TIMEOUT.
+        # True while neither RC pulses nor MANUAL_CONTROL have arrived for FS_PILOT_TIMEOUT.
+        self.is_pilot_lost: bool = False
         self.is_leak_detected: bool = False
         self.pressure: _HullLimit = _HullLimit("pressure", "FS_PRESS")
         self.temperature: _HullLimit = _HullLimit("temperature", "FS_TEMP")
@@ -90,7 +91,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
 
     @property
     def is_any_active(self) -> bool:
-        # On Sub, a lost radio alone does not cause MAV_STATE_CRITICAL.
+        # A lost radio is missing here, because it alone does not cause MAV_STATE_CRITICAL on Sub.
         hull = self.pressure.is_exceeded or self.temperature.is_exceeded
         return self.is_pilot_lost or self.battery_is_low or self.is_ground_station_lost or self.is_leak_detected or hull
 
@@ -104,7 +105,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         super().update()
 
     def _check_radio(self) -> None:
-        """Apply FS_THR_ENABLE: 1 warns, 2 surfaces."""
+        """Detect the loss of the radio and apply FS_THR_ENABLE: 1 warns, 2 surfaces."""
         sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_THR_ENABLE"])
         is_receiving = sub.rc.is_receiving
         if is_receiving:
@@ -176,7 +177,10 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
 
 
 class _HullLimit:
-    """Limit FS_PRESS_MAX (Pa) or FS_TEMP_MAX (°C): its failsafe triggers after two seconds and warns every 30 s."""
+    """A limit of the hull, FS_PRESS_MAX (Pa) or FS_TEMP_MAX (°C).
+
+    The failsafe triggers when the limit was exceeded for two seconds, and then warns every 30 s.
+    """
 
     def __init__(self, quantity: str, prefix: str) -> None:
         self.is_exceeded: bool = False
@@ -198,9 +202,9 @@ class _HullLimit:
 
 
 class SubSetpoints(GuidedSetpoints):
-    """Handlers of set-point messages. Thrust is a climb rate, 0.5 holds the depth; roll and pitch have no effect.
+    """Handlers of the set-point messages. Yaw is relative to the heading only in BODY_OFFSET_NED.
 
-    Yaw is relative to the heading only in BODY_OFFSET_NED.
+    In SET_ATTITUDE_TARGET, thrust sets a climb rate (0.5 holds the depth). Roll and pitch have no effect.
     """
 
     BODY_FRAMES: ClassVar[frozenset[int]] = GuidedSetpoints.BODY_FRAMES | {MavFrame.BODY_FRD}
@@ -208,7 +212,7 @@ class SubSetpoints(GuidedSetpoints):
     GLOBAL_YAW: ClassVar[bool] = False
 
     def steer(self, message: SetAttitudeTarget) -> None:
-        """Follow attitude and thrust together for one second."""
+        """Follow the yaw and the thrust for one second. The message must have both an attitude and a thrust."""
         if message.type_mask & (AttitudeMask.ATTITUDE_IGNORE | AttitudeMask.THROTTLE_IGNORE):
             return
         climb_share = 2.0 * (max(0.0, min(1.0, message.thrust)) - 0.5)
@@ -224,7 +228,7 @@ _THROTTLE = 2
 
 
 class SubMotors(ArduPilotMotors):
-    """Thrusters, which hold the depth or follow the throttle stick; a throttle of 0.5 is no thrust."""
+    """The thrusters, which hold the depth or follow the throttle stick. At a throttle of 0.5 they do not push."""
 
     @property
     def current_a(self) -> float:
@@ -266,7 +270,7 @@ class SimulatedSub(SubHost):
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = SubJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> UnderwaterMotion:
-        """Create the motion model. SIM_BUOYANCY 1 is an upward acceleration of 0.1 m/s²; wind has no effect."""
+        """Create the motion model. A SIM_BUOYANCY of 1 accelerates upwards by 0.1 m/s². Wind has no effect."""
         return UnderwaterMotion(self.rng, buoyancy_m_s2=self.parameters["SIM_BUOYANCY"] / 10.0)
 
     def listen_for_setpoints(self) -> None:
@@ -317,7 +321,7 @@ class SimulatedSub(SubHost):
         }
 
     def _change_speed_at_any_time(self, command: ReceivedCommand) -> int:
-        """Accept a speed in every mode; only GUIDED and AUTO use it."""
+        """Accept a speed in every mode, although only GUIDED and AUTO use the speed."""
         if not command.param2 > 0 or command.param1 not in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
             return MavResult.DENIED
         if isinstance(self.mode, SubGuided | SubAuto):

@@ -126,9 +126,9 @@ _VELOCITY_ONLY = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE | _NO_YAW
 _POSITION_ONLY = (
     Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE | Mask.AX_IGNORE | Mask.AY_IGNORE | Mask.AZ_IGNORE | _NO_YAW
 )  # fmt: skip
-# Undefined bits that ArduPilot sets in the global message only (GCS_MAVLink_Copter.cpp).
+# ArduPilot sets these undefined mask bits in the global message, but not in the local one (GCS_MAVLink_Copter.cpp).
 _LAST_BYTE = 0xF000
-# Size and lower left corner of the terrain block around the vehicle, in metres and degrees.
+# Spacing of the terrain grid in metres, and the distance in degrees from the vehicle to the corner of its terrain block.
 _GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
 _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which the vehicle stands.
 
@@ -182,7 +182,7 @@ def _home_position(vehicle: ArduPilotVehicle) -> m.HomePosition | None:
         return None
     place, local = vehicle.navigation.frame.to_global(*home), vehicle.navigation.local(home)
     position = (place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000))
-    # ArduPilot sends NaN as the quaternion.
+    # ArduPilot sends NaN as the quaternion of home.
     return m.HomePosition(*position, *local, _NAN4, 0.0, 0.0, 0.0, vehicle.time_boot_us)
 
 
@@ -218,7 +218,7 @@ def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
 
 
 def _is_navigating(vehicle: ArduPilotVehicle) -> bool:
-    """Return True in modes with NAV_CONTROLLER_OUTPUT: on Plane all but MANUAL, on Rover the navigating modes."""
+    """Return True if the firmware sends NAV_CONTROLLER_OUTPUT in the present mode."""
     mode = vehicle.mode
     if vehicle.KIND == "plane":
         return mode.number != PlaneMode.MANUAL
@@ -247,7 +247,7 @@ def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
 
 
 def _terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
-    """Build a request for all terrain data around the vehicle, because no data is stored."""
+    """Build TERRAIN_REQUEST for all data around the vehicle, because the simulated vehicle stores no terrain data."""
     place = vehicle.navigation.position
     if place is None:
         return None
