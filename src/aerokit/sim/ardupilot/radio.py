@@ -69,7 +69,7 @@ class ArduPilotRadio:
         return any(value and since > expired_before for value, since in self._overrides.values())
 
     def override(self, pulses: Mapping[int, int]) -> None:
-        """Override channels for RC_OVERRIDE_TIME. ``values`` maps a channel index to µs; 0 releases the channel."""
+        """Override channels for RC_OVERRIDE_TIME. ``pulses`` maps a channel index to µs; 0 releases the channel."""
         for index, value in pulses.items():
             self._overrides[index] = (value, self._vehicle.now)
 

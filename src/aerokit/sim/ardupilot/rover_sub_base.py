@@ -50,7 +50,7 @@ class GuidedTargetMode(Protocol):
 
 
 class GuidedSetpoints:
-    """Handlers of the set-point messages, which ignore invalid messages. A subclass selects what its firmware supports."""
+    """Handlers of the set-point messages. Invalid messages are ignored. A subclass selects what a firmware supports."""
 
     BODY_FRAMES: ClassVar[frozenset[int]] = _BODY
     """MAV_FRAMEs whose vectors are relative to the heading."""

@@ -128,7 +128,7 @@ _POSITION_ONLY = (
 )  # fmt: skip
 # ArduPilot sets these undefined mask bits in the global message, but not in the local one (GCS_MAVLink_Copter.cpp).
 _LAST_BYTE = 0xF000
-# Spacing of the terrain grid in metres, and the distance in degrees from the vehicle to the corner of its terrain block.
+# Spacing of the terrain grid in metres, and the offset in degrees from the vehicle to the corner of its terrain block.
 _GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
 _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which the vehicle stands.
 
