@@ -66,7 +66,7 @@ def true_place(vehicle: Any) -> GlobalPoint:
     """
     frame, motion = getattr(vehicle, "frame", None), getattr(vehicle, "motion", None)
     if frame is None or motion is None:
-        raise InvalidArgument(f"{type(vehicle).__name__} is not simulated in motion and has no true position")
+        raise InvalidArgument(f"{type(vehicle).__name__} has no true position, because its motion is not simulated")
     place: GlobalPoint = frame.to_global(*motion.place)
     return place
 

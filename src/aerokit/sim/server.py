@@ -61,7 +61,8 @@ class SimulatorServer:
         self.vehicles_on: list[Sequence[SimulatedVehicle]] = list(on_all if vehicles_on is None else vehicles_on)
         if len(self.vehicles_on) != len(self._links):
             raise InvalidArgument(
-                f"vehicles_on has {len(self.vehicles_on)} entries for {len(self._links)} links; pass one entry for each link"
+                f"vehicles_on has {len(self.vehicles_on)} entries for {len(self._links)} links;"
+                " pass one entry for each link"
             )
         self._speedup = speedup
         self._dues = [0.0] * len(self.vehicles)  # The simulated time of each vehicle's next event.

@@ -27,13 +27,13 @@ class Px4External:
         self._px4 = px4
         self.latest: dict[type[Message], Message] = {}
         self.clock_answers: int = 0
-        """Number of answers to TIMESYNC requests."""
+        """Number of answers to the vehicle's TIMESYNC requests."""
         self.origin: GlobalPoint | None = None
         """Origin set by SET_GPS_GLOBAL_ORIGIN."""
         self._vision_at = self._target_at = -math.inf
         self._target: tuple[float, float] = (0.0, 0.0)
         self.wind: tuple[float, float] | None = None
-        """Speed in m/s, and direction in degrees that the wind comes from, by EXTERNAL_WIND_ESTIMATE."""
+        """Wind of EXTERNAL_WIND_ESTIMATE: the speed in m/s, and the direction in degrees from which it comes."""
         px4.on(m.Odometry, self._on_vision)
         px4.on(m.VisionPositionEstimate, self._on_vision)
         px4.on(m.LandingTarget, self._on_target)
@@ -49,13 +49,13 @@ class Px4External:
 
     @property
     def has_vision(self) -> bool:
-        """True if the estimator uses external vision, received within five seconds."""
+        """True if the estimator uses external vision, and the latest measurement is at most five seconds old."""
         is_used = int(self._px4.parameters["EKF2_EV_CTRL"]) & _HORIZONTAL
         return bool(is_used) and self._px4.now - self._vision_at <= _VISION_TIMEOUT_S
 
     @property
     def target(self) -> tuple[float, float] | None:
-        """Landing target (north, east) in the world frame; None if the target was lost for PLD_BTOUT seconds."""
+        """Landing target (north, east) in the world frame; None if it was not seen for PLD_BTOUT seconds."""
         is_fresh = self._px4.now - self._target_at <= self._px4.parameters["PLD_BTOUT"]
         return self._target if is_fresh else None
 
@@ -88,7 +88,10 @@ class Px4External:
 
 
 class PrecisionLanding:
-    """Approach above the target, descent, and PLD_MAX_SRCH climbs to PLD_SRCH_ALT while the target is lost."""
+    """Precision landing: approaches the target from above, then descends.
+
+    If the target is lost, the vehicle climbs to PLD_SRCH_ALT to search for it, at most PLD_MAX_SRCH times.
+    """
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4

@@ -25,14 +25,14 @@ from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.telemetry_details import IDENTITY_BUILDERS, SENSOR_BUILDERS
 
-# Sensor bits of SYS_STATUS: present, enabled, healthy, and healthy during the boot.
+# Masks of sensor bits in SYS_STATUS: the present, the enabled, the healthy, and those healthy during the boot.
 _PRESENT, _ENABLED = 0x0300402F, 0x0301402F
 _HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
 _GPS_BIT, _RC_BIT = int(MavSysStatusSensor.GPS), int(MavSysStatusSensor.RC_RECEIVER)
 _PREARM_BIT = int(MavSysStatusSensor.MAV_SYS_STATUS_PREARM_CHECK)
-# Mode → MAV_STANDARD_MODE.
+# The MAV_STANDARD_MODE of each mode that has one.
 _STANDARD = {mode: number for number, mode in modes.STANDARD_MODES.items()}
-# Modes in the order of AVAILABLE_MODES; eight external modes follow.
+# Modes in the order of AVAILABLE_MODES. After these modes, PX4 lists eight external modes.
 _AVAILABLE_MODES = (
     modes.MANUAL, modes.ALTITUDE, modes.POSITION, modes.MISSION, modes.HOLD, modes.RTL, modes.POSITION_SLOW,
     modes.ALTITUDE_CRUISE, modes.ACRO, modes.TERMINATION, modes.OFFBOARD, modes.STABILIZED, modes.TAKEOFF,
@@ -97,7 +97,7 @@ def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
         flags |= Ekf.POS_HORIZ_REL if px4.external.has_vision else 0
     if not px4.is_ready:
         flags = _BOOT_FLAGS
-    ratio = 0.02 if px4.is_ready else math.nan  # Test ratio of velocity, position and magnetometer.
+    ratio = 0.02 if px4.is_ready else math.nan  # The test ratio of velocity, position and magnetometer.
     return m.EstimatorStatus(px4.time_boot_us, flags, ratio, ratio, 0.003, ratio, 0.002, math.nan, 0.3, 0.3)
 
 
@@ -119,7 +119,7 @@ def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
         id=0,
         battery_function=MavBatteryFunction.ALL,
         type=MavBatteryType.LIPO,
-        temperature=32767,  # Unknown. Current and energy are not measured either.
+        temperature=32767,  # The temperature is unknown. Current and energy are not measured either.
         voltages=voltages,
         current_battery=-100,
         current_consumed=0,
@@ -156,7 +156,7 @@ def _attitude_target(px4: Px4Vehicle) -> m.AttitudeTarget:
 
 
 def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
-    """Build GLOBAL_POSITION_INT; without a position PX4 does not send it, whereas ArduPilot sends zeros."""
+    """Build GLOBAL_POSITION_INT. Without a position, PX4 does not send the message, whereas ArduPilot sends zeros."""
     if not px4.has_position:
         return None
     motion = px4.motion
@@ -214,13 +214,13 @@ def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
         place.latitude_e7,
         place.longitude_e7,
         altitude,
-        70,  # dilution of precision times 100, horizontal and vertical
+        70,  # Horizontal and vertical dilution of precision, times 100.
         110,
         round(motion.ground_speed_m_s * 100),
         course,
-        10,  # satellites
+        10,  # Number of satellites.
         altitude,
-        900,  # accuracy of position and altitude in mm, and of the speed in mm/s
+        900,  # Accuracy of the position and of the altitude in mm, and of the speed in mm/s.
         1780,
         400,
     )
@@ -238,7 +238,7 @@ def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
 
 
 def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin | None:
-    """Return GPS_GLOBAL_ORIGIN, the origin of the local frame; None without an origin."""
+    """Return GPS_GLOBAL_ORIGIN with the origin of the local frame; None without an origin."""
     if not px4.has_origin:
         return None
     origin = px4.external.origin or px4.frame.origin
@@ -247,7 +247,7 @@ def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin | None:
 
 
 def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
-    """Build POSITION_TARGET_LOCAL_NED; while disarmed, PX4 sends only a downward acceleration of 100 m/s²."""
+    """Build POSITION_TARGET_LOCAL_NED. While disarmed, PX4 sends only a downward acceleration of 100 m/s²."""
     motion = px4.motion
     yaw = motion.yaw
     if not px4.is_armed:
@@ -289,7 +289,7 @@ def _ping(px4: Px4Vehicle) -> m.Ping:
 
 
 def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
-    """Return AVAILABLE_MODES. PX4 sends no name for a standard mode (RETURN, LAND …)."""
+    """Return the messages AVAILABLE_MODES. PX4 sends no name for a standard mode (RETURN, LAND …)."""
     count = len(_AVAILABLE_MODES) + _EXTERNAL_MODES
     messages = []
     for index, mode in enumerate(_AVAILABLE_MODES, start=1):

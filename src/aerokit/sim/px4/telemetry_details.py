@@ -187,7 +187,7 @@ def _highres_imu(px4: Px4Vehicle) -> m.HighresImu:
 
 def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
     motion = px4.motion
-    # In milli-g, mrad/s and milligauss.
+    # The fields of SCALED_IMU are in milli-g, mrad/s and milligauss.
     force_x, force_y, force_z = (round(axis / GRAVITY_M_S2 * 1000) for axis in _measured_acceleration(px4))
     rate_x, rate_y, rate_z = (round(rate * 1000) for rate in (motion.roll_rate, motion.pitch_rate, motion.yaw_rate))
     field_x, field_y, field_z = (round(axis * 1000) for axis in _magnetic_field_gauss(px4))
@@ -253,7 +253,7 @@ def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None
 
 
 def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:
-    """Build TIME_ESTIMATE_TO_TARGET with the time of a return: change of height, flight home, descent."""
+    """Build TIME_ESTIMATE_TO_TARGET with the duration of a return: the climb, the flight home and the descent."""
     if px4.is_landed:
         return m.TimeEstimateToTarget(-1, -1, -1, -1, -1)
     motion, flight = px4.motion, px4.flight

@@ -35,7 +35,7 @@ class SimulatedPx4(Px4Vehicle):
     - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: initial heading
     - ``boot_time_s``: seconds until the vehicle can be armed
     - ``version``: 1.16 accepts unknown modes, and switches to POSITION when offboard set-points stop. 1.17 refuses
-      unknown modes, switches to RTL when these stop, and refuses a COMMAND_INT in a frame other than GLOBAL_INT
+      unknown modes, switches to RTL when set-points stop, and refuses a COMMAND_INT in a frame other than GLOBAL_INT
     - ``fast_rate_hz``: rate of attitude, position and targets on "normal" links
     - ``link_modes``: MAV_n_MODE of the first link, the second …: "normal", "onboard", "config" or "minimal"
     - ``parameters``: values that differ from the defaults; ``parameter_count``: limits their number, for quick tests;
@@ -57,7 +57,7 @@ class SimulatedPx4(Px4Vehicle):
         return None if builder is None else builder(self)
 
     def refusal_of_command(self, command: ReceivedCommand) -> int | None:
-        """Refuse unsupported frames, NaN sent as integer and INT32_MAX sent as float (mavlink_receiver.cpp)."""
+        """Refuse unsupported frames, a NaN sent as integer and an INT32_MAX sent as float (mavlink_receiver.cpp)."""
         return refusal_by_place(command, checks_frame=not self.version.startswith("1.16"))
 
     def _on_set_mode(self, request: m.SetMode, channel: Channel) -> None:
@@ -71,7 +71,7 @@ class SimulatedPx4(Px4Vehicle):
 
 _FLARE_M = 3.0
 _GLIDE_SPEED_FACTOR = 1.3
-# A target this far ahead makes `FixedWing.climb_to` descend at the wanted sink rate.
+# `FixedWing.climb_to` descends at the wanted sink rate if its target is this many seconds of sinking lower.
 _SINK_TARGET_S = 2.5
 _FLARE_SINK_M_S = 0.5
 _HEIGHT_REACHED_M = 10.0
@@ -83,8 +83,8 @@ class Px4PlaneFlight(Px4Flight):
     def __init__(self, plane: SimulatedPx4Plane, motion: FixedWing) -> None:
         super().__init__(plane)
         self._motion = motion
-        self.radius_m: float = 0.0  # Radius of the circle; negative is counter-clockwise.
-        self.course: float = 0.0  # Course of the climb-out in radians.
+        self.radius_m: float = 0.0  # Radius of the circle; a negative radius is counter-clockwise.
+        self.course: float = 0.0  # Course of the climb after take-off, in radians.
         self._plane = plane
 
     @property
@@ -129,7 +129,7 @@ class Px4PlaneFlight(Px4Flight):
             self.circle()
 
     def _follow_sticks(self) -> None:
-        """Control bank, climb and airspeed by the sticks in every manual mode; forward is down."""
+        """Control bank, climb and airspeed by the sticks, in every manual mode. A stick pushed forward descends."""
         sticks, parameters = self._plane.sticks, self._plane.parameters
         climb = -sticks.pitch * parameters["FW_T_CLMB_MAX" if sticks.pitch < 0 else "FW_T_SINK_MAX"]
         min_speed, max_speed = parameters["FW_AIRSPD_MIN"], parameters["FW_AIRSPD_MAX"]
@@ -151,12 +151,12 @@ class Px4PlaneFlight(Px4Flight):
         self._motion.head(self.course, self.speed_m_s, climb)
 
     def _take_off(self) -> None:
-        """Climb out; once the altitude is reached, circle that point."""
+        """Climb straight on, and circle the point at which the altitude is reached."""
         self.climb_out()
         if self._motion.down > self.target[2]:
             return
         place = (self._motion.north, self._motion.east, self.target[2])
-        self._plane.switch_to_hold()  # sets the target to the current altitude
+        self._plane.switch_to_hold()  # This sets the target to the current altitude.
         self.target = place
 
     def circle_down(self) -> None:
@@ -186,7 +186,7 @@ class Px4PlaneFlight(Px4Flight):
         motion.head(math.atan2(east, north), self._plane.parameters["FW_AIRSPD_MIN"] * _GLIDE_SPEED_FACTOR, climb)
 
     def _return(self) -> None:
-        """Climb, fly to the destination, circle down to RTL_DESCEND_ALT; land unless RTL_LAND_DELAY is negative."""
+        """Climb, fly to the destination, circle down to RTL_DESCEND_ALT, and land unless RTL_LAND_DELAY is negative."""
         motion, plane = self._motion, self._plane
         if self._phase == "land":
             self.circle_down()
