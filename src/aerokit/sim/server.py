@@ -99,7 +99,7 @@ class SimulatorServer:
 
     async def __aenter__(self) -> Self:
         if self._loop is not None:
-            raise BusyError("this SimulatorServer was already started; create a new one")
+            raise BusyError("this SimulatorServer was already started once; create a new SimulatorServer")
         self._loop, self._owner = asyncio.get_running_loop(), asyncio.current_task()
         add_source = getattr(self._loop, "add_event_source", None)  # None unless the loop is a `VirtualClockLoop`
         if add_source is None and len(self.vehicles) > _BATCH_THRESHOLD:

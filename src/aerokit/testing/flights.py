@@ -42,7 +42,7 @@ _BOOT_TIME_S = 1.0
 
 
 class Flight:
-    """A simulated vehicle in a test. Faults can be scheduled before the flight. The track remains after it."""
+    """A simulated vehicle in a test. Faults can be scheduled before the flight, and the track remains afterwards."""
 
     def __init__(self, fleet: SimulatedFleet, number: int) -> None:
         self._fleet = fleet
@@ -142,7 +142,7 @@ class SimulatedFleet(Sequence[Flight]):
         save_picture([flight.track for flight in self], path)
 
     def _closest_approach(self) -> tuple[float, float, str]:
-        """Return the minimum distance of any two vehicles in metres, its time, and the names of the two."""
+        """Return the minimum distance of any two vehicles in metres, its time, and the names of these vehicles."""
         approaches = [
             (*min_distance_m(first.track, second.track), f"{first.track.name} and {second.track.name}")
             for first, second in combinations(self, 2)
@@ -217,7 +217,7 @@ class SimulatedFleet(Sequence[Flight]):
             )
 
     def _schedule_with(self, plan: Callable[[FlightScheduler], None]) -> None:
-        """Bring the vehicles to the current time, call ``plan`` with the scheduler, and run what is due at once."""
+        """Advance the vehicles to the current time, call ``plan`` with the scheduler, and run events that are due."""
         self._refresh()
         plan(self._scheduler)
         if self._server is not None:
@@ -227,7 +227,7 @@ class SimulatedFleet(Sequence[Flight]):
 def _side_by_side(
     kinds: Sequence[str], spacing_m: float, *, system_id: int = 1, seed: int = 0, **options: Any
 ) -> list[SimulatedVehicle]:
-    """Create a vehicle of each kind: the first at its home, the others in a row to the east of it."""
+    """Create a vehicle of each kind. The first is at its home, the others stand in a row to the east of it."""
     vehicles: list[Any] = []
     for number, kind in enumerate(kinds):
         if vehicles:
@@ -262,13 +262,13 @@ def open_fleet(*kinds: str, count: int | None = None, **options: Any) -> Abstrac
 
 
 def expand_kinds(kinds: Sequence[str], count: int | None) -> Sequence[str]:
-    """Return the kinds, or one kind ``count`` times.
+    """Return the kinds, or the single kind ``count`` times.
 
-    Raises InvalidArgument for ``count`` with several kinds or below 1.
+    Raises InvalidArgument for a ``count`` below 1, or with several kinds.
     """
     kinds = kinds or ("copter",)
     if count is None:
         return kinds
     if len(kinds) != 1 or count < 1:
-        raise InvalidArgument(f"count = {count!r} needs a single kind, and must be 1 or more")
+        raise InvalidArgument(f"count = {count!r} is not allowed: count must be 1 or more, and needs a single kind")
     return list(kinds) * count

@@ -91,7 +91,7 @@ class Journal:
         return [message for message in messages if isinstance(message, CommandLong | CommandInt)]
 
     def _command_counts(self) -> list[str]:
-        """Command names in the order of their first reception, with counts."""
+        """Return each received command as text with its count, in the order of the first receptions."""
         counts = Counter(_name(message.command) for message in self._received_commands())
         return [name if count == 1 else f"{name}, {count} times" for name, count in counts.items()]
 

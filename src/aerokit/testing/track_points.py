@@ -39,7 +39,7 @@ class TrackPoint:
 
 @dataclass(frozen=True)
 class TrackFailure:
-    """Point and limit of a failed assertion; pictures of the track show them."""
+    """The point and the limit of a failed assertion, which pictures of the track show."""
 
     point: TrackPoint
     circle: tuple[Position, float] | None = None
@@ -50,7 +50,10 @@ class TrackFailure:
 
 
 def metres_from(origin: Position) -> Callable[[Position | TrackPoint], tuple[float, float]]:
-    """Return a function that converts to metres north and east of ``origin``, on the tangent plane of the ellipsoid."""
+    """Return a function that converts a position to metres north and east of ``origin``.
+
+    The metres are measured on the tangent plane of the earth's ellipsoid at ``origin``.
+    """
     latitude, longitude = origin.latitude_deg, origin.longitude_deg
     per_latitude = geo.distance_m(latitude - 0.005, longitude, latitude + 0.005, longitude) * 100
     per_longitude = geo.distance_m(latitude, longitude - 0.005, latitude, longitude + 0.005) * 100

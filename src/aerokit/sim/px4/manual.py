@@ -162,7 +162,7 @@ class Px4ManualFlight:
         motion.seek_velocity(offset_north, offset_east, down)
 
     def _height_velocity(self) -> float:
-        """Return the vertical velocity (m/s down) that the throttle stick commands. A centred stick holds the height."""
+        """Return the vertical velocity (m/s down) that the throttle stick commands. The centre holds the height."""
         px4, motion = self._px4, self._px4.motion
         throttle = curved(px4.sticks.throttle, _EXPO, _DEAD_ZONE)
         if throttle > 0:

@@ -192,9 +192,9 @@ class Px4MissionServer(MissionServer):
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         """Start or restart a download.
 
-        A download counts as complete once all items were sent. By a bug, the firmware also applies this rule to an
-        upload, once the number of received items equals the number of stored items. The upload then ends, but other
-        uploads are refused until a download times out.
+        A download counts as complete once all items were sent. The firmware also applies this rule to an upload, if the
+        number of received items equals the number of stored items. The upload then ends, but other uploads are refused
+        until a download times out.
         """
         link = self._link(channel)
         if link.next == self.count(link.mission_type):

@@ -71,7 +71,8 @@ class SimulatedPx4(Px4Vehicle):
 
 _FLARE_M = 3.0
 _GLIDE_SPEED_FACTOR = 1.3
-# `FixedWing.climb_to` descends at the wanted sink rate if its target is this many seconds of sinking lower.
+# The target of a descent is as far below the plane as it sinks in this time, so that `FixedWing.climb_to` returns the
+# wanted sink rate.
 _SINK_TARGET_S = 2.5
 _FLARE_SINK_M_S = 0.5
 _HEIGHT_REACHED_M = 10.0
