@@ -58,24 +58,26 @@ class Flight:
 
     @property
     def vehicle(self) -> aerokit.Vehicle:
-        """The program's vehicle, connected; RuntimeError if the flight is not open."""
+        """The program's vehicle, which is connected. Raises RuntimeError if the flight is not open."""
         if self._vehicle is None:
             self._fleet._check_open()
-            raise RuntimeError("no vehicle: this flight was opened with connect=False; connect to flight.link")
+            raise RuntimeError(
+                "the flight was opened with connect=False and has no vehicle; connect your program to flight.link"
+            )
         return self._vehicle
 
     @property
     def recording(self) -> FlightRecording | None:
-        """Recording of the link, which all vehicles of a fleet share; None without ``record=True``."""
+        """Recording of the link, which all vehicles of a fleet share. None without ``record=True``."""
         return self._fleet.recording
 
     @property
     def link(self) -> Link:
-        """The program's end of the link, for programs that connect themselves; needs ``connect=False``."""
+        """The program's end of the link, for a program that connects by itself. Needs ``connect=False``."""
         return self._fleet.link
 
     def run(self, main: Callable[[Flight], Awaitable[T]]) -> T:
-        """Open the flight, run ``main(flight)`` on virtual time and close it; for tests without ``async``."""
+        """Open the flight, run ``main(flight)`` on virtual time and close the flight, in a test without ``async``."""
 
         async def fly() -> T:
             async with self._fleet.open():
@@ -151,15 +153,17 @@ class SimulatedFleet(Sequence[Flight]):
 
     @property
     def link(self) -> Link:
-        """The program's end of the link, for programs that connect themselves; needs ``connect=False``."""
+        """The program's end of the link, for a program that connects by itself. Needs ``connect=False``."""
         self._check_open()
         if self._connect:
-            raise RuntimeError("this link is in use: open the flight with connect=False to connect by yourself")
+            raise RuntimeError(
+                "the flight itself uses this link; to connect your program to the link, open the flight with connect=False"
+            )
         assert self._link is not None
         return self._link
 
     def run(self, main: Callable[[SimulatedFleet], Awaitable[T]]) -> T:
-        """Open the fleet, run ``main(fleet)`` on virtual time and close it; for tests without ``async``."""
+        """Open the fleet, run ``main(fleet)`` on virtual time and close the fleet, in a test without ``async``."""
 
         async def fly() -> T:
             async with self.open():
@@ -169,12 +173,12 @@ class SimulatedFleet(Sequence[Flight]):
 
     @asynccontextmanager
     async def open(self) -> AsyncIterator[SimulatedFleet]:
-        """Switch the vehicles on and connect; tracks and journals remain after the block.
+        """Switch the vehicles on and connect. Tracks and journals remain after the block.
 
         Raises RuntimeError if the fleet was opened before.
         """
         if self._was_opened:
-            raise RuntimeError("this flight was opened before; create a new one")
+            raise RuntimeError("this flight was already opened once; create a new flight")
         self._was_opened = True
         near_end, far_end = memory_link_pair(latency_s=self._latency_s)
         async with AsyncExitStack() as stack:
@@ -212,8 +216,8 @@ class SimulatedFleet(Sequence[Flight]):
     def _check_open(self) -> None:
         if self._server is None:
             raise RuntimeError(
-                "this flight is not open: it opens when an `async def` test begins; in a `def` test use"
-                " flight.run(main), in a fixture `async with open_flight()`"
+                "this flight is not open. The plugin opens a flight when an `async def` test begins. In a `def` test use"
+                " flight.run(main), and in a fixture `async with open_flight()`"
             )
 
     def _schedule_with(self, plan: Callable[[FlightScheduler], None]) -> None:

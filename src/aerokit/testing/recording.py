@@ -114,7 +114,7 @@ class RecordedFlight:
         self._discard_unanswered()
 
     def _discard_unanswered(self) -> None:
-        """Discard the commands without an acknowledgement, and those command ids that were never acknowledged."""
+        """Discard the recorded commands that were not acknowledged."""
         acknowledged = {
             command: [answer for answer in answers if answer.acks] for command, answers in self.answers.items()
         }

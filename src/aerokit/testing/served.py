@@ -37,7 +37,7 @@ class ServedFlight:
         self.address: str = server.addresses[0].replace("tcpin:", "tcp:")
         """Address to connect to, such as "tcp:127.0.0.1:5760"."""
         self.simulated: Any = vehicle
-        """The simulated vehicle, which runs on another thread. Only read its attributes, and use ``faults`` for changes."""
+        """The simulated vehicle, which runs on another thread. Only read its attributes; use ``faults`` for changes."""
         self.track: Track = scheduler.tracks[0]
         """True track of the vehicle."""
         self.journal: Journal = scheduler.journals[0]
