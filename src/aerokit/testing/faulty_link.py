@@ -203,9 +203,7 @@ class FaultyLink(Link):
     async def open(self, receiver: Receiver) -> None:
         """See `Link.open`."""
         if self._is_closed:
-            raise ConnectionClosed(
-                f"{self.address} was closed; a closed link cannot be opened again, so make a new link"
-            )
+            raise ConnectionClosed(f"{self.address} was closed and cannot be opened again; make a new link")
         if self._incoming_path is not None:
             raise BusyError(f"{self.address} is already open; a link can be opened only once")
         loop = asyncio.get_running_loop()

@@ -157,7 +157,7 @@ class SimulatedFleet(Sequence[Flight]):
         self._check_open()
         if self._connect:
             raise RuntimeError(
-                "the flight itself uses this link; to connect your program to the link, open the flight with connect=False"
+                "the flight itself uses this link; open the flight with connect=False to connect your program to the link"
             )
         assert self._link is not None
         return self._link
@@ -216,8 +216,8 @@ class SimulatedFleet(Sequence[Flight]):
     def _check_open(self) -> None:
         if self._server is None:
             raise RuntimeError(
-                "this flight is not open. The plugin opens a flight when an `async def` test begins. In a `def` test use"
-                " flight.run(main), and in a fixture `async with open_flight()`"
+                "this flight is not open. The plugin opens a flight when an `async def` test begins. In a `def` test"
+                " use flight.run(main), and in a fixture `async with open_flight()`"
             )
 
     def _schedule_with(self, plan: Callable[[FlightScheduler], None]) -> None:

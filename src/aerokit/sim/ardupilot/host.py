@@ -268,7 +268,7 @@ class ArduPilotBatteryHost(Protocol):
 
 class ArduPilotFailsafesHost(Protocol):
     ground_station_seen_at: float
-    radio: bool
+    is_radio_lost: bool
 
     @property
     def battery(self) -> ArduPilotBatteryHost: ...
