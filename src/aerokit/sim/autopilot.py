@@ -34,10 +34,10 @@ class VehicleSigning:
 
     def __init__(self, vehicle: SimulatedVehicle, key: SigningKey | None, timestamp: int) -> None:
         self.key = key
-        """The stored key; None turns signing off. Call `load` after assigning it."""
+        """The stored key; None turns signing off. Call `load` after an assignment."""
         self.timestamp: int = timestamp if key is not None else 0
         self.trusts_first_port = False
-        """True if the first port accepts unsigned frames, ArduPilot's default. Call `load` after assigning it."""
+        """True if the first port accepts unsigned frames, as ArduPilot does. Call `load` after an assignment."""
         self._vehicle = vehicle
         self._streams: dict[tuple[int, int, int], int] = {}
         vehicle.on(SetupSigning, self._on_setup)
@@ -92,7 +92,7 @@ class VehicleSigning:
 
 
 class _Signing(Signing):
-    """Message signing whose time stamps wrap around after 48 bits, as in the firmwares."""
+    """Message signing in which the 48-bit time stamp overflows to 0, as in the firmwares."""
 
     def sign(self, frame: bytes, now: float = 0.0) -> bytes:
         if self.timestamp > LAST_TIMESTAMP:
@@ -216,7 +216,7 @@ class SimulatedAutopilot(SimulatedVehicle):
         self.on(m.Timesync, self._on_timesync)
 
     def serve_commands(self, handlers: Mapping[int, CommandHandler]) -> CommandServer:
-        """Answer these MAV_CMDs, except those in ``unsupported_commands``."""
+        """Answer the MAV_CMDs with these handlers, except those in ``unsupported_commands``."""
         supported = {number: handler for number, handler in handlers.items() if number not in self.unsupported_commands}
         return CommandServer(self, supported, self.refusal_of_command)
 

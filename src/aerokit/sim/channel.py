@@ -58,7 +58,7 @@ MAX_PEERS = 256
 
 
 class MessageReader:
-    """Decodes the bytes of several peers. ``wanted`` holds the message ids to decode; None decodes all."""
+    """Decodes the bytes of several peers. ``wanted`` contains the message ids to decode; None decodes all."""
 
     def __init__(self, wanted: Container[int] | None) -> None:
         self._wanted = wanted
@@ -108,7 +108,7 @@ class Streams:
         self._token = 0
 
     def set_interval(self, message_id: int, interval_s: float, now: float) -> None:
-        """Send a message every ``interval_s`` seconds, starting now; 0 stops the stream."""
+        """Stream a message every ``interval_s`` seconds from now on. 0 stops the stream."""
         self._token += 1
         if interval_s <= 0.0:
             self._intervals.pop(message_id, None)
@@ -181,7 +181,7 @@ class Channel:
         """Signs and checks frames; see `sign_with`."""
 
     def sign_with(self, signing: Signing | None) -> None:
-        """Sign and check frames with ``signing`` from now on; None turns signing off."""
+        """Sign and check frames with ``signing`` from now on. None turns signing off."""
         self.signing = signing
         for encoder in self._encoders.values():
             encoder.signing = signing
@@ -247,7 +247,7 @@ class Channel:
 
 
 def datagrams(pieces: Iterable[bytes]) -> list[bytes]:
-    """Join pieces into as few datagrams as possible."""
+    """Join the pieces, in their order, into as few datagrams as possible."""
     joined: list[bytes] = []
     datagram = b""
     for piece in pieces:

@@ -23,7 +23,7 @@ from aerokit.sim.vehicle import MessageHost
 
 
 class CommandServer(commands.CommandDispatcher):
-    """Answers commands, modified by the `Faults` of a vehicle or component."""
+    """Answers commands. The `Faults` of the vehicle or component change the answers."""
 
     def __init__(
         self,
@@ -130,7 +130,7 @@ class Setpoint:
 
 
 def rotated(vector: Ned, yaw: float) -> Ned:
-    """Rotate a body vector (forward, right, down) to north, east, down."""
+    """Rotate a vector of the body frame (forward, right, down) by ``yaw`` radians to north, east, down."""
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     forward, right, down = vector
     return (forward * cos_yaw - right * sin_yaw, forward * sin_yaw + right * cos_yaw, down)

@@ -17,15 +17,15 @@ class CommandFault:
 
     times: int | None = None
     refuse_with: int | None = None
-    """MAV_RESULT of the refusal, instead of executing the command."""
+    """MAV_RESULT with which the command is refused instead of being executed; None to execute the command."""
     text: str | None = None
     """Status text sent with the refusal."""
     ignore: bool = False
     """Neither execute nor acknowledge the command."""
     acks: int = 1
-    """Number of acknowledgements sent: 0 loses the acknowledgement, 2 repeats it."""
+    """Number of acknowledgements to send. 0 loses the acknowledgement, 2 repeats it."""
     delay_s: float = 0.0
-    """Delay of the acknowledgement in seconds; the command is executed at once."""
+    """Delay of the acknowledgement in seconds. The command itself is executed at once."""
     progress: tuple[int, ...] = ()
     """Percentages of IN_PROGRESS answers sent before the result."""
     progress_interval_s: float = 0.5
@@ -88,7 +88,7 @@ class Faults:
         *,
         times: int | None = None,
     ) -> None:
-        """Refuse a MAV_CMD with this MAV_RESULT and an optional status text, without executing it."""
+        """Do not execute a MAV_CMD, but answer with this MAV_RESULT and an optional status text."""
         self.commands[command] = CommandFault(times, refuse_with=result, text=text)
 
     def ignore(self, command: int, *, times: int | None = None) -> None:

@@ -45,7 +45,7 @@ def kind_class(name: str) -> type[SimulatedVehicle]:
 
 
 def simulated(name: str, **options: Any) -> SimulatedVehicle:
-    """Create a vehicle of this kind; ``options`` are passed to its class (``system_id``, ``home``, ``seed`` …).
+    """Create a vehicle of this kind. Its class gets the ``options``, such as ``system_id``, ``home`` and ``seed``.
 
     Raises InvalidArgument for an unknown kind, TypeError for an unknown option.
     """

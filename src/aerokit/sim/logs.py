@@ -37,9 +37,9 @@ class SimulatedLog:
 
     size: int
     time_utc: int = 1_790_000_000
-    """Seconds since 1970."""
+    """Time of the log in seconds since 1970."""
     seed: int | None = None
-    """Seed of the content; None derives it from size and time."""
+    """Seed of the pseudo-random content. If None, the content depends on size and time."""
 
     def make(self) -> bytes:
         """Return the content. Of two logs with the same seed, the longer one starts with the shorter one."""
@@ -130,7 +130,7 @@ class LogServer:
         return [lambda start=start: _block(data, log_id, start, end) for start in starts]  # type: ignore[misc]
 
     def transfer(self, messages: Sequence[Callable[[], Message]], channel: Channel) -> None:
-        """Abort the running transfer and send these messages."""
+        """Abort the running transfer, if any, and send these messages."""
         self.restart()
         self._outgoing.extend(messages)
         self._channel = channel
@@ -146,7 +146,7 @@ class LogServer:
 
 
 class ArduPilotLogServer(LogServer):
-    """ArduPilot's log server: log numbers start at 1, and requests are refused while armed.
+    """ArduPilot's log server. Log numbers start at 1, and requests are refused while the vehicle is armed.
 
     Requests during a transfer are ignored. A request for an unknown log aborts the transfer.
     """
@@ -206,7 +206,7 @@ class ArduPilotLogServer(LogServer):
 
 
 class Px4LogServer(LogServer):
-    """PX4's log server: log numbers start at 0, and data is sent only after a list request.
+    """PX4's log server. Log numbers start at 0, and data is sent only after a list request.
 
     The ``end`` of a list request is ignored. A new request replaces the transfer. The last block is not cut to the
     requested size. Without logs, a list request is not answered.

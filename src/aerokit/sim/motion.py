@@ -1,8 +1,8 @@
-"""Local frame and motion of a simulated multicopter: a point mass that leans as its acceleration requires.
+"""Local frame and motion of a simulated multicopter, which is a point mass that leans as its acceleration requires.
 
-Modelled: limits of speed, acceleration and turn rate; braking before a target, by the square-root controller of
-ArduPilot and PX4; drag, against which the copter leans in steady flight; constant wind with gusts; ground. Not
-modelled: propeller dynamics, attitude control loops, ground effect, drift.
+The model has limits of speed, acceleration and turn rate. The copter brakes before a target like the square-root
+controller of ArduPilot and PX4, and leans against its drag in steady flight. There is a constant wind with gusts, and a
+ground. Not modelled: propeller dynamics, attitude control loops, ground effect, drift.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ class Motion:
         self._set_target((north, east, down), is_acceleration=True)
 
     def seek_attitude(self, roll: float, pitch: float, velocity_down: float) -> None:
-        """Hold these angles (rad) and this vertical speed."""
+        """Hold these angles in radians, and this vertical velocity in m/s (positive down)."""
         self._set_target((0.0, 0.0, velocity_down), lean=(roll, pitch))
 
     def _set_target(
@@ -211,7 +211,7 @@ class Motion:
     def seek_position(
         self, north: float, east: float, down: float, *, speed: float, climb: float, descent: float
     ) -> None:
-        """Fly to a point and stop there, with these speed limits in m/s."""
+        """Fly to a point and stop there, with limits of the horizontal speed, climb rate and sink rate in m/s."""
         offset_north, offset_east, offset_down = north - self.north, east - self.east, down - self.down
         distance = math.hypot(offset_north, offset_east)
         scale = 0.0
@@ -259,7 +259,7 @@ class Motion:
         return math.hypot(self.velocity_north, self.velocity_east)
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds; an unpowered copter falls."""
+        """Advance by ``dt`` seconds. A copter without power falls."""
         if self.wind.gusts_m_s > 0.0:
             self._update_gusts(dt)
         if powered:

@@ -19,7 +19,7 @@ from aerokit.sim.vehicle import SimulatedVehicle, sender_of
 
 
 class ParameterServer(servers.ParameterProtocolServer):
-    """Answers parameter requests; each autopilot has a subclass. The `Faults` of the vehicle apply."""
+    """Base of the parameter servers, which answer parameter requests. The `Faults` of the vehicle apply."""
 
     def __init__(
         self,

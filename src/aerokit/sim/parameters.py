@@ -45,7 +45,7 @@ class SimParameter:
     """
 
     def as_parameter(self, index: int | None = None) -> Parameter:
-        """Convert to the client's `Parameter`; integer types become int."""
+        """Convert to a `Parameter`, the client's class. Values of integer types become int."""
         type_ = ParameterType(self.type)
         value, default = (int(x) if type_.is_integer else x for x in (self.value, self.default))
         return Parameter(self.name, value, type_, default, index)
@@ -65,9 +65,9 @@ class SimParameters:
 
     @classmethod
     def from_text(cls, text: str, *, used: Iterable[str] = (), count: int | None = None) -> SimParameters:
-        """Parse lines of ``name,type,value[,default[,switch]]``; the switch ``v`` marks a volatile parameter.
+        """Parse lines of ``name,type,value[,default[,switch]]``. The switch ``v`` marks a volatile parameter.
 
-        ``count`` limits the number of parameters, in the order of the text. Names in ``used`` are always included.
+        ``count`` limits the number of parameters. Those in ``used`` are always included.
         """
         lines = text.split()
         if count is not None:
@@ -89,7 +89,7 @@ class SimParameters:
         return self[name] if name in self else default  # noqa: SIM401 - this is `get`
 
     def __setitem__(self, name: str, value: float) -> None:
-        """Set a value; raises KeyError for an unknown name."""
+        """Set a value. Raises KeyError for an unknown name."""
         row = self.row(name)
         row.value = stored(value, row.type)
         if name in self._switches.values():
@@ -125,7 +125,7 @@ class SimParameters:
         return self._names
 
     def index(self, name: str) -> int:
-        """Return the position in ``names``; raises KeyError for a name that is not listed."""
+        """Return the position of a name in ``names``. Raises KeyError for a name that is not listed."""
         _ = self.names  # Reading the property updates `_indices`.
         return self._indices[name]
 

@@ -299,7 +299,7 @@ class _Port:
         self._server.on_bytes(data, peer, self)
 
     def link_lost(self, error: LinkLost) -> None:
-        """Does nothing: vehicles continue to fly without a client."""
+        """Do nothing, because the vehicles continue to fly without a client."""
 
     async def close(self) -> None:
         self.link.close()
@@ -329,7 +329,7 @@ def _channels(vehicles: Iterable[SimulatedVehicle], connected: set[int]) -> list
 async def simulated_link(
     vehicles: SimulatedVehicle | Iterable[SimulatedVehicle], *, speedup: float = 1.0, latency_s: float = 0.0
 ) -> AsyncIterator[MemoryLink]:
-    """Simulate vehicles in memory and yield the client's end of the link, which the caller opens.
+    """Simulate vehicles in memory, and yield the client's end of the link. The caller opens this end.
 
     ``latency_s`` delays both directions, in seconds of the loop's clock.
     """
@@ -342,7 +342,7 @@ async def simulated_link(
 async def open_simulator(
     vehicles: SimulatedVehicle | Iterable[SimulatedVehicle], *addresses: str, speedup: float = 1.0
 ) -> AsyncIterator[SimulatorServer]:
-    """Serve vehicles on addresses ("tcpin:0.0.0.0:5760", "udpout:127.0.0.1:14550") for other programs.
+    """Serve vehicles on addresses, such as "tcpin:0.0.0.0:5760" or "udpout:127.0.0.1:14550", for other programs.
 
     Raises InvalidArgument for an invalid address, LinkOpenError if an address cannot be opened.
     """

@@ -1,7 +1,7 @@
 """Base of all simulated vehicles: simulated time, channels, timers, status texts, faults.
 
-A vehicle uses no event loop. The caller passes the time, in simulated seconds that never decrease. Times and order
-of events do not depend on the step size: equal calls with an equal seed produce equal bytes.
+A vehicle uses no event loop. The caller passes the time in simulated seconds, which must never decrease. The times and
+the order of events do not depend on the step size. Equal calls with an equal seed produce equal bytes.
 """
 
 from __future__ import annotations
@@ -46,7 +46,10 @@ class MessageHost(ServerHost, Protocol):
 
 
 class VehicleJournal(Protocol):
-    """Records received messages and sent texts, such as `aerokit.testing.Journal`. Times are simulated seconds."""
+    """Interface of an object that records received messages and sent texts, such as `aerokit.testing.Journal`.
+
+    Times are simulated seconds.
+    """
 
     def on_text_sent(self, time_s: float, severity: int, text: str) -> None: ...
 
@@ -123,7 +126,7 @@ class SimulatedVehicle:
             component.join(self)
 
     def open_channel(self, *, version: int = 2) -> Channel:
-        """Open another port, which has its own stream rates; ``version`` is its MAVLink version."""
+        """Open another port, which has its own stream rates. ``version`` is the MAVLink version of the port."""
         channel = Channel(self.system_id, self.component_id, self.handlers, version=version)
         self.channels.append(channel)
         if self._is_on:
@@ -182,7 +185,7 @@ class SimulatedVehicle:
 
     @property
     def uptime(self) -> float:
-        """Seconds since the power-on or last reboot, as ``time_boot_ms`` counts."""
+        """Seconds since the power-on or the last reboot. Messages contain this time as ``time_boot_ms``."""
         return self.now - self.booted_at
 
     @property

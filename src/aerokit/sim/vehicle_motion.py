@@ -64,7 +64,7 @@ class FixedWing(Motion):
         self._wanted_climb = 0.0
 
     def bank_and_climb(self, airspeed: float, bank: float, climb: float) -> None:
-        """Hold airspeed (m/s), bank angle (rad, positive right) and climb rate (m/s)."""
+        """Hold an airspeed in m/s, a bank angle in radians (positive to the right) and a climb rate in m/s."""
         limit = self.wing_limits.bank_rad
         self._wanted_airspeed = airspeed
         self._wanted_bank = max(-limit, min(limit, bank))
@@ -114,7 +114,7 @@ class FixedWing(Motion):
         return self.is_on_ground and self._speed < _STOPPED_M_S
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds; an unpowered plane glides."""
+        """Advance by ``dt`` seconds. A plane without power glides."""
         if self.wind.gusts_m_s > 0.0:
             self._update_gusts(dt)
         was_on_ground = self.is_on_ground
@@ -249,11 +249,11 @@ class GroundMotion(Motion):
         self.drive(0.0, 0.0)
 
     def drive(self, speed: float, turn_rate: float) -> None:
-        """Drive at this speed (m/s, negative backwards) and turn rate (rad/s)."""
+        """Drive at this speed in m/s (negative: backwards), with this turn rate in rad/s."""
         self._wanted_speed, self._wanted_turn_rate, self._wanted_heading = speed, turn_rate, None
 
     def head(self, speed: float, heading: float) -> None:
-        """Drive at this speed towards this heading (rad)."""
+        """Drive at this speed in m/s, and turn to this heading in radians."""
         self._wanted_speed, self._wanted_turn_rate, self._wanted_heading = speed, 0.0, heading
 
     def drive_to(self, north: float, east: float, *, speed: float, stops: bool = True, backwards: bool = False) -> None:
@@ -276,7 +276,7 @@ class GroundMotion(Motion):
         return 0.0
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds; an unpowered rover rolls to a stop."""
+        """Advance by ``dt`` seconds. A rover without power rolls to a stop."""
         rate = self._turn_rate()
         self._accelerate(self._curve_speed(rate) if powered else 0.0, dt)
         mean_yaw = self.yaw + 0.5 * rate * dt
@@ -366,7 +366,7 @@ class UnderwaterMotion(Motion):
         self._is_floating = True
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds; an unpowered submarine rises."""
+        """Advance by ``dt`` seconds. A submarine without power rises."""
         floating_down = -self.buoyancy_m_s2 - _DRAG_PER_S * self.velocity_down
         if powered:
             north, east, commanded_down = self._commanded_acceleration()

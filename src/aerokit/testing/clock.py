@@ -52,11 +52,11 @@ _POLL_EVERY = 64
 _MANY_TIMERS = 100
 
 DEADLOCK_TIMEOUT_S = 10.0
-"""Real seconds to wait for sockets, executor calls and other threads before the loop is considered deadlocked."""
+"""Real seconds without an event from sockets, executor calls and other threads after which the loop is deadlocked."""
 
 
 class DeadlockError(RuntimeError):
-    """Nothing can happen any more: no ready callback, no timer, no socket or thread that could wake the loop."""
+    """Raised if nothing can happen any more: there is no callback, timer, socket or thread that could wake the loop."""
 
 
 class VirtualClockLoop(asyncio.SelectorEventLoop):
@@ -233,7 +233,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 def run_virtual(coroutine: Coroutine[Any, Any, T]) -> T:
     """Run a coroutine on a `VirtualClockLoop`, and cancel its remaining tasks, as asyncio.run does.
 
-    Raises TypeError for a coroutine function, or any other object that is not a coroutine.
+    Raises TypeError for an object that is not a coroutine, such as a coroutine function.
     """
     if not asyncio.iscoroutine(coroutine):
         raise TypeError(f"run_virtual requires a coroutine, such as main(), not {coroutine!r}")

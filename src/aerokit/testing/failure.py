@@ -77,7 +77,7 @@ def _picture(flights: Sequence[Flight | ServedFlight], test: str, directory: Pat
 
 
 def _recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: Path) -> list[str]:
-    """Save a file for each link, and a report for each vehicle."""
+    """Save a recording of each link and a report on each vehicle. Return the lines about these files."""
     by_recording: dict[int, list[Flight | ServedFlight]] = {}
     for flight in flights:
         by_recording.setdefault(id(flight.recording), []).append(flight)

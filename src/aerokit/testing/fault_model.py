@@ -1,4 +1,4 @@
-"""``FaultModel``: faults of a radio link; ``FaultyPath``: applies them to frames in one direction, without I/O."""
+"""Faults of a radio link (``FaultModel``), and their application to frames in one direction (``FaultyPath``), without I/O."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class FaultModel(Snapshot):
     outages: tuple[tuple[float, float], ...] = ()
     """Intervals (begin, end), in seconds since the link was opened, in which all frames are lost."""
     per_frame: bool = True
-    """True applies faults to each MAVLink frame, as a radio does; False applies them to whole writes and datagrams."""
+    """True to apply the faults to each MAVLink frame, as a radio does; False to apply them to whole datagrams."""
 
     def _check(self) -> None:
         for name in _SHARES:

@@ -167,15 +167,15 @@ class FaultyLink(Link):
 
     @property
     def dropped_writes(self) -> int:  # type: ignore[override]
-        """Number of writes that the wrapped link dropped, that overflowed a queue, or that expired during a stall.
+        """Number of writes that the wrapped link dropped, that did not fit into a queue, or that expired in a stall.
 
-        Frames lost in transit do not count.
+        Frames that were lost in transit do not count.
         """
         return self.link.dropped_writes + self.outgoing.overflowed + self._expired
 
     @property
     def unsent_bytes(self) -> int:
-        """See `Link.unsent_bytes`; bytes in transit do not count."""
+        """See `Link.unsent_bytes`. Bytes in transit do not count."""
         return self.link.unsent_bytes + (0 if self._stalled_queue is None else self._stalled_queue.unsent_bytes)
 
     def discard_unsent(self) -> None:
@@ -220,7 +220,7 @@ class FaultyLink(Link):
             raise
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; a frame lost in transit is not a dropped write."""
+        """See `Link.write`. A frame that is lost in transit does not count as a dropped write."""
         if self._in_flight is None or self._is_closed:
             return
         if self._stalled_queue is not None:
@@ -316,7 +316,7 @@ class _IncomingPath:
             self._in_flight.put(due, lambda piece=piece: self._receiver.bytes_received(piece, peer))  # type: ignore[misc]
 
     def link_lost(self, error: LinkLost) -> None:
-        """See `Receiver`; frames in transit are delivered first."""
+        """See `Receiver`. Frames in transit are delivered first."""
         self._when_lost()
         if not self._is_closed:
             self._in_flight.put(self._in_flight.latest_due, lambda: self._receiver.link_lost(error))
@@ -367,7 +367,7 @@ class _DeliveryQueue:
         return bool(self._waiting)
 
     def put(self, due: float, action: Callable[[], None]) -> None:
-        """Queue an action, or run it at once if it is due and the queue is empty.
+        """Queue an action. If the action is due and the queue is empty, run the action at once.
 
         A radio without faults therefore adds no delay.
         """

@@ -87,7 +87,9 @@ class Flight:
 
 
 class SimulatedFleet(Sequence[Flight]):
-    """Simulated vehicles on one link, with system ids 1, 2, 3 …: a sequence of `Flight`. Can be opened once.
+    """Simulated vehicles on one link, with the system ids 1, 2, 3 …
+
+    The fleet is a sequence of `Flight`, and can be opened only once.
 
     The vehicles stand in a row to the east of ``home``, ``spacing_m`` metres apart.
     """
@@ -129,11 +131,11 @@ class SimulatedFleet(Sequence[Flight]):
 
     @property
     def min_distance_m(self) -> float:
-        """Minimum distance of any two vehicles in space; infinity for fewer than two."""
+        """Minimum distance of any two vehicles in space, in metres. It is infinite for fewer than two vehicles."""
         return self._closest_approach()[0]
 
     def assert_stayed_apart(self, distance_m: float) -> None:
-        """Assert that no two vehicles came nearer to each other than this distance, in space."""
+        """Assert that the distance of any two vehicles in space was never below ``distance_m``."""
         __tracebackhide__ = True
         closest_m, time_s, names = self._closest_approach()
         text = f"{names} came nearer than {distance_m:g} m: {closest_m:.1f} m at {time_s:.1f} s"
@@ -157,7 +159,7 @@ class SimulatedFleet(Sequence[Flight]):
         self._check_open()
         if self._connect:
             raise RuntimeError(
-                "the flight itself uses this link; open the flight with connect=False to connect your program to the link"
+                "the flight itself uses this link; open the flight with connect=False to connect your program instead"
             )
         assert self._link is not None
         return self._link
@@ -244,10 +246,10 @@ def _side_by_side(
 
 @asynccontextmanager
 async def open_flight(kind: str = "copter", **options: Any) -> AsyncIterator[Flight]:
-    """Open a connected vehicle of a kind ("copter", "plane", "rover", "sub", "px4", "px4_plane").
+    """Simulate a vehicle of a kind ("copter", "plane", "rover", "sub", "px4", "px4_plane") and connect to it.
 
-    ``connect=False`` lets the program connect to ``flight.link``; ``latency_s`` delays both directions;
-    ``record=True`` records the link for the report of a failed test. Other options are those of the simulated
+    With ``connect=False``, the program connects to ``flight.link`` by itself. ``latency_s`` delays both directions of
+    the link. ``record=True`` records the link for the report of a failed test. Other options are those of the simulated
     vehicle: ``seed``, ``home``, ``parameters``, ``battery_percent`` …
 
     Raises InvalidArgument for an unknown kind.

@@ -1,4 +1,4 @@
-"""Pictures of tracks, from above and as altitude profile: SVG, or PNG with Pillow."""
+"""Pictures of tracks from above, with altitude profiles, as SVG or (with Pillow) as PNG."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Drawable(Protocol):
     def __len__(self) -> int: ...
 
     def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
-        """Return metres north and east of ``origin`` (default: home), and metres above home."""
+        """Return metres north and east of ``origin``, by default home, and metres above home."""
         ...
 
     def snapshot(self) -> Drawable:

@@ -79,7 +79,7 @@ def flight(request: pytest.FixtureRequest) -> Flight:
 
 @pytest.fixture
 def fleet(request: pytest.FixtureRequest) -> SimulatedFleet:
-    """Simulated vehicles on one link, on virtual time; two copters by default."""
+    """Simulated vehicles on one link, on virtual time. By default, these are two copters."""
     from aerokit.testing.flights import SimulatedFleet, expand_kinds
 
     kinds, options = _requested(request)
@@ -114,7 +114,10 @@ def dronekit_address(served_flight: ServedFlight) -> str:
 
 @pytest.fixture
 def dronekit() -> Iterator[ModuleType]:
-    """`aerokit.dronekit`, which ``import dronekit`` imports during the test unless DroneKit was imported before."""
+    """The module `aerokit.dronekit`. During the test, ``import dronekit`` imports this module.
+
+    This does not work if DroneKit itself was imported before.
+    """
     import sys
 
     import aerokit.dronekit as package

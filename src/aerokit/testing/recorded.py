@@ -164,7 +164,7 @@ class RecordedMissions(MissionServer):
         """Do nothing: the recording decides which item is current."""
 
     def _recorded_result(self, request: str, results: list[int], mission_type: int) -> int:
-        """Return the next of the recorded results; the last result is repeated."""
+        """Return the next of the recorded results. After the last result, return that result again."""
         number = self._result_counts.get((request, mission_type), 0)
         self._result_counts[request, mission_type] = number + 1
         return results[min(number, len(results) - 1)]

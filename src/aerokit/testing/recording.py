@@ -57,10 +57,10 @@ class RecordedPlan:
 
 
 class RecordedFlight:
-    """The content of a recording. Times are seconds since the first message of the vehicle, without long gaps.
+    """What a recording tells about one vehicle. Times are seconds since the vehicle's first message, without long gaps.
 
-    ``system_id`` None selects the first autopilot with a HEARTBEAT. Raises InvalidArgument if there is none, OSError
-    if the file cannot be read.
+    If ``system_id`` is None, the vehicle is the first autopilot with a HEARTBEAT. Raises InvalidArgument if the
+    recording contains no such vehicle, and OSError if the file cannot be read.
     """
 
     system_id: int

@@ -119,7 +119,7 @@ class Track(Sequence[TrackPoint]):
 
     @property
     def battery_used_percent(self) -> float:
-        """Battery use in percent of a full battery; negative if the battery was charged."""
+        """Charge that the battery has lost, in percent of a full battery. Negative if the battery was charged."""
         return self[0].battery_percent - self.end.battery_percent if self else 0.0
 
     @property
@@ -128,7 +128,7 @@ class Track(Sequence[TrackPoint]):
         return sum(math.dist(start, end) for start, end in pairwise(self.local()))
 
     def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
-        """Return metres north and east of ``origin`` (default: home), and metres above home."""
+        """Return for each point metres north and east of ``origin``, by default home, and metres above home."""
         offset_of = metres_from(self.home if origin is None else origin)
         return [(*offset_of(point), point.altitude_m) for point in self]
 
@@ -236,7 +236,7 @@ class Track(Sequence[TrackPoint]):
         assert not self.end.armed, f"the vehicle is armed at the end, {self.end}"
 
     def assert_modes(self, *names: str) -> None:
-        """Assert that the vehicle was in these modes in this order; other modes in between are allowed."""
+        """Assert that the vehicle was in these modes in this order. Other modes in between are allowed."""
         __tracebackhide__ = True
         modes = iter(self.modes)
         for name in names:

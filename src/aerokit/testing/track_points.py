@@ -43,7 +43,7 @@ class TrackFailure:
 
     point: TrackPoint
     circle: tuple[Position, float] | None = None
-    """Centre and radius in metres of the allowed area."""
+    """The allowed area of the assertion: its centre, and its radius in metres. None without such an area."""
     polygon: Sequence[Position] | None = None
     altitude_m: float | None = None
     """Altitude above home."""

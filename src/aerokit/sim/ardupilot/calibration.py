@@ -21,10 +21,11 @@ _LAST = AccelcalVehiclePos.BACK
 
 
 class AccelerometerCalibration:
-    """Six-position calibration, which broadcasts the requested position as a COMMAND_LONG every second.
+    """Calibration of the accelerometers in six positions.
 
-    The client confirms each position with the same command. The result is broadcast every second until a reboot.
-    Set ``is_held_wrong`` to let the calibration fail.
+    The vehicle broadcasts the requested position as a COMMAND_LONG every second. The client confirms each position with
+    the same command. The result is broadcast every second until a reboot. Set ``is_held_wrong`` to let the calibration
+    fail.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
@@ -87,10 +88,10 @@ _FITNESS = 5.0
 
 
 class CompassCalibration:
-    """Compass calibration: DO_START_MAG_CAL, DO_ACCEPT_MAG_CAL, DO_CANCEL_MAG_CAL and their reports.
+    """Compass calibration, with the commands DO_START_MAG_CAL, DO_ACCEPT_MAG_CAL and DO_CANCEL_MAG_CAL.
 
-    ``turns_s``: seconds until the vehicle has been turned in all directions. With infinity, as in SITL, the progress
-    stays at 0 % until the calibration is cancelled. The vehicle cannot be armed while a calibration runs.
+    ``turns_s`` is the number of seconds after which the vehicle has been turned in all directions. With infinity, as in
+    SITL, the progress stays at 0 % until the calibration is cancelled. The vehicle cannot be armed meanwhile.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
@@ -107,7 +108,7 @@ class CompassCalibration:
 
     @property
     def is_running(self) -> bool:
-        """True until the progress reaches 100 %; a calibration that waits for acceptance is not running."""
+        """True until the progress reaches 100 %. A calibration that waits for acceptance does not run any more."""
         return bool(self._mask) and self.percent < 100
 
     @property
@@ -127,7 +128,7 @@ class CompassCalibration:
         }
 
     def _start(self, command: ReceivedCommand) -> int:
-        """Start a calibration. Param 1 is a mask of compasses (0: all); param 3 is 1 to save without acceptance."""
+        """Start a calibration of the compasses in the mask param 1 (0: all). Param 3 is 1 to save without acceptance."""
         if self._vehicle.motors.is_armed:
             self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
             return MavResult.FAILED
@@ -189,9 +190,9 @@ _Accelerometers = PreflightCalibrationAccelerometer
 
 
 class Calibrations:
-    """Sensor calibrations. PREFLIGHT_CALIBRATION is acknowledged when it ends or requests the first position.
+    """Sensor calibrations. Those of ``compasses`` and ``accelerometers`` require that the vehicle is turned by hand.
 
-    The calibrations ``compasses`` and ``accelerometers`` require that the vehicle is turned by hand.
+    PREFLIGHT_CALIBRATION is acknowledged at the end of the calibration, or when the first position is requested.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:

@@ -16,10 +16,10 @@ _UNLIMITED = -1
 
 
 class ArduPilotCamera:
-    """Takes images on command, by time or by distance, and sends CAMERA_FEEDBACK for each image on every link.
+    """Takes images on command, by time or by distance. Each image is reported by CAMERA_FEEDBACK on every link.
 
-    The camera belongs to the autopilot component (1). Like the firmware, it sends neither CAMERA_IMAGE_CAPTURED nor
-    heartbeats. CAM1_TYPE 0 disables it.
+    The camera belongs to the autopilot component (1). As in the firmware, there are neither CAMERA_IMAGE_CAPTURED nor
+    heartbeats of the camera. CAM1_TYPE 0 disables the camera.
     """
 
     image_count: int
@@ -46,7 +46,7 @@ class ArduPilotCamera:
         return self._vehicle.parameters.get("CAM1_DURATION", _SHUTTER_S)
 
     def take(self) -> bool:
-        """Take an image; return False if there is no camera or its shutter is still open."""
+        """Take an image and return True. Return False if there is no camera or its shutter is still open."""
         if not self.is_fitted or self._vehicle.now - self._taken_at < self._shutter_s:
             return False
         motion = self._vehicle.motion
@@ -57,7 +57,10 @@ class ArduPilotCamera:
         return True
 
     def take_series(self, interval_s: float, count: int) -> bool:
-        """Take an image every ``interval_s`` seconds, the first at once; ``count`` -1 continues until `stop`."""
+        """Take ``count`` images, one every ``interval_s`` seconds, the first one at once.
+
+        With a ``count`` of -1, the series continues until `stop` is called.
+        """
         if not self.is_fitted:
             return False
         self.interval_s, self.remaining = interval_s, count
@@ -118,7 +121,7 @@ class ArduPilotCamera:
         return self.take_series(interval_s if math.isfinite(interval_s) else 0.0, whole(count) or _UNLIMITED)
 
     def start_capture(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_IMAGE_START_CAPTURE; param1 is the camera, 0 for all."""
+        """Handle MAV_CMD_IMAGE_START_CAPTURE. Param 1 is the number of the camera, or 0 for all cameras."""
         if command.param1 < 0.0:
             return MavResult.UNSUPPORTED
         if command.param1 > 1.0:
@@ -132,13 +135,13 @@ class ArduPilotCamera:
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
     def control(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_DO_DIGICAM_CONTROL: param5 is 1 to take an image; accepted even without a camera."""
+        """Handle MAV_CMD_DO_DIGICAM_CONTROL, which is accepted even without a camera. Param 5 is 1 to take an image."""
         if command.x == 1:
             self.take()
         return MavResult.ACCEPTED
 
     def set_trigger_distance(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_DO_SET_CAM_TRIGG_DIST; param3 is 1 to take an image at once."""
+        """Handle MAV_CMD_DO_SET_CAM_TRIGG_DIST. Param 3 is 1 to take an image at once."""
         self.trigger_by_distance(command.param1)
         if command.param3 == 1.0:
             self.take()

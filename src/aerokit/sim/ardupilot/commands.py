@@ -34,7 +34,7 @@ _FIXED_TEXTS: dict[tuple[int, Kind], tuple[tuple[int, str], ...]] = {
 
 
 def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
-    """Return the handlers by MAV_CMD. Each kind of vehicle adds and replaces handlers."""
+    """Return the common handlers by MAV_CMD. Each kind of vehicle adds handlers and replaces some of these."""
     common, requests = _CommonCommands(vehicle), vehicle.requests
     # Commands of devices that no simulated vehicle has fail.
     handlers: dict[int, CommandHandler] = {
@@ -112,7 +112,7 @@ class _CommonCommands:
         self._vehicle = vehicle
 
     def fixed(self, result: int, texts: tuple[tuple[int, str], ...]) -> CommandHandler:
-        """Return a handler that sends these texts and answers ``result``, whatever the params are."""
+        """Return a handler that always sends these texts and answers ``result``."""
 
         def handle(_: ReceivedCommand) -> int:
             for severity, text in texts:
@@ -245,8 +245,8 @@ _FRAMES = frozenset(
 class HomeAndOrigin:
     """Handlers of DO_SET_HOME, GET_HOME_POSITION and SET_GPS_GLOBAL_ORIGIN.
 
-    SET_GPS_GLOBAL_ORIGIN is accepted only once, and only before GPS has set the origin. Copter and Sub refuse a home
-    before they have an origin; Plane and Rover accept it.
+    SET_GPS_GLOBAL_ORIGIN is accepted only once, and only before GPS has set the origin. Until the origin is set, Copter
+    and Sub refuse DO_SET_HOME, whereas Plane and Rover accept it.
     """
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
@@ -320,7 +320,7 @@ class GimbalCommands:
         vehicle.on(m.GimbalManagerSetPitchyaw, self._on_pitch_and_yaw)
 
     def _gimbal(self, device_id: float = 0) -> ArduPilotGimbal | None:
-        """Return the gimbal if it is fitted and ``device_id`` selects it (1, or 0 for all)."""
+        """Return the gimbal if it is fitted and ``device_id`` is 1, or 0 for all gimbals. Otherwise return None."""
         gimbal = self._vehicle.gimbal
         return gimbal if gimbal.is_fitted and whole(device_id) in (0, 1) else None
 

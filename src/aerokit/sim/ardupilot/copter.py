@@ -92,7 +92,7 @@ class CopterHold(CopterModeBase):
 
 
 class CopterThrow(CopterHold):
-    """THROW: reports once after arming that the copter waits for the throw; the throw itself is not simulated."""
+    """THROW: reports once after arming that the copter waits for the throw. The throw itself is not simulated."""
 
     _reported_at = -math.inf
 
@@ -104,7 +104,7 @@ class CopterThrow(CopterHold):
 
 
 class CopterFollow(CopterHold):
-    """FOLLOW: needs FOLL_ENABLE, and holds the position, like the firmware without a vehicle to follow."""
+    """FOLLOW: holds the position, as the firmware does without a vehicle to follow. FOLL_ENABLE enables the mode."""
 
     def enter(self, *, force: bool) -> bool:
         if self.vehicle.parameters["FOLL_ENABLE"]:

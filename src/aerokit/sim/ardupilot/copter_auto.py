@@ -26,7 +26,7 @@ _RAISED_THROTTLE = 1100  # Pulse in µs above which the throttle stick counts as
 
 
 class _Leg(Protocol):
-    """Manoeuvre of a navigation command; `update` sets the motion targets for the next ``dt`` seconds."""
+    """The manoeuvre of a navigation command. `update` sets the motion targets for the next ``dt`` seconds."""
 
     def update(self, dt: float) -> None: ...
     @property
@@ -34,7 +34,7 @@ class _Leg(Protocol):
 
 
 class _FlyLeg:
-    """Straight flight to a place. It ends within WPNAV_RADIUS of the place; with ``stops``, at the place itself."""
+    """Straight flight to a place. With ``stops``, it ends at the place, otherwise within WPNAV_RADIUS of the place."""
 
     def __init__(self, auto: CopterAuto, destination: Ned, *, stops: bool) -> None:
         self._copter, self._auto = auto.vehicle, auto
@@ -52,7 +52,7 @@ class _FlyLeg:
 
 
 class _CircleLeg:
-    """Flight to the nearest point of a circle, then around it; a negative radius is anticlockwise."""
+    """Flight to the nearest point of a circle, and then around the circle. A negative radius is anticlockwise."""
 
     def __init__(self, auto: CopterAuto, centre: Ned, *, turns: float, radius: float) -> None:
         self._copter, self._turns, self._centre = auto.vehicle, turns, centre
@@ -107,7 +107,7 @@ class _CircleLeg:
 
 
 class _ClimbLeg:
-    """Take-off, which waits on the ground for MISSION_START or a raised throttle; AUTO_OPTIONS can skip the wait."""
+    """Take-off. On the ground, it waits for MISSION_START or a raised throttle, unless AUTO_OPTIONS skips the wait."""
 
     def __init__(self, auto: CopterAuto, altitude_m: float) -> None:
         self._copter, self._auto = auto.vehicle, auto
@@ -161,7 +161,7 @@ _WITHOUT_EFFECT = (
 
 
 class CopterAuto(MissionMode):
-    """AUTO: `MissionRun` selects the commands; the manoeuvre of each navigation command is a leg."""
+    """AUTO: flies the mission. `MissionRun` selects the commands, and each navigation command is flown as a leg."""
 
     number: int = CopterMode.AUTO
     name = "AUTO"

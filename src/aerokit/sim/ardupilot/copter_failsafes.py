@@ -25,7 +25,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
         return ()  # `position_reasons` checks the estimator after GPS.
 
     def position_reasons(self) -> Sequence[str]:
-        """Check GPS and the estimator, and run the mandatory checks."""
+        """Return the failures of the checks of GPS and of the estimator, and of the mandatory checks."""
         if self.vehicle.mode.needs_position and (reasons := self.gps_reasons()):
             return reasons
         return super().ahrs_reasons() or self.mandatory_reasons()
@@ -246,7 +246,10 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return action
 
     def _disarm_if_landed(self, name: str) -> bool:
-        """Disarm a landed vehicle and return True; return False in the air or if a mission is about to take off."""
+        """Disarm a landed vehicle and return True.
+
+        Return False in the air, and on the ground if a mission is about to take off.
+        """
         copter = self.vehicle
         if not copter.is_landed or (copter.mode.needs_mission and not copter.motors.is_idle):
             return False
@@ -319,7 +322,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
         return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"
 
     def on_mode_changed(self) -> None:
-        """Suspend the fence's actions for ten seconds, unless FENCE_ACTION only reports."""
+        """Called after every mode change. Suspend the fence's actions for ten seconds, unless they only report."""
         super().on_mode_changed()
         if self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY:
             self.recover_by_hand()

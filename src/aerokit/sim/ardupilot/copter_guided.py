@@ -30,8 +30,8 @@ class GuidedSubmode(Enum):
 class CopterGuided(CopterModeBase):
     """GUIDED: holds the position until the first target. Targets other than a position expire after GUID_TIMEOUT.
 
-    As in ArduCopter, a change of the submode resets the speed limits to WPNAV_SPEED, WPNAV_SPEED_UP and
-    WPNAV_SPEED_DN: DO_CHANGE_SPEED is valid until the kind of target changes.
+    As in ArduCopter, a change of the submode resets the speed limits to WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN.
+    A speed that DO_CHANGE_SPEED has set is therefore valid until the kind of target changes.
     """
 
     number: int = CopterMode.GUIDED
@@ -89,7 +89,7 @@ class CopterGuided(CopterModeBase):
         self._updated_at = self.vehicle.now
 
     def set_target(self, position: Ned | None, velocity: Ned | None, acceleration: Ned | None) -> bool:
-        """Follow a set-point; return False if the combination of vectors is not supported."""
+        """Follow the vectors of a set-point. Return False if the firmware does not support their combination."""
         if velocity is not None:
             submode = GuidedSubmode.VELOCITY if position is None else GuidedSubmode.POSITION_VELOCITY
             acceleration = acceleration or _ZERO
@@ -103,13 +103,13 @@ class CopterGuided(CopterModeBase):
         return True
 
     def lean(self, roll: float, pitch: float, climb: float) -> None:
-        """Hold roll and pitch (radians) and a climb rate (m/s); on the ground a positive climb rate takes off."""
+        """Hold roll and pitch (radians) and a climb rate (m/s). On the ground, a positive climb rate takes off."""
         self.submode = GuidedSubmode.ATTITUDE
         self._attitude, self._attitude_climb, self._body_rates = (roll, pitch), climb, None
         self._updated_at = self.vehicle.now
 
     def rotate(self, roll_rate: float, pitch_rate: float, climb: float) -> None:
-        """Roll and pitch at rates in radians per second, from the present attitude, and climb (m/s)."""
+        """Change roll and pitch at rates in radians per second, starting at the present attitude, and climb (m/s)."""
         if self.submode is not GuidedSubmode.ATTITUDE or self._body_rates is None:
             self._attitude = (self.vehicle.motion.roll, self.vehicle.motion.pitch)
         self.submode = GuidedSubmode.ATTITUDE
@@ -242,7 +242,7 @@ class CopterSetpoints:
             self._guided.enter(force=False)  # An invalid message stops the vehicle.
 
     def _follow(self, target: PositionTarget, point: Ned, *, rotate: bool) -> bool:
-        """Follow a set-point; return False if it is invalid. With ``rotate``, its vectors are in the body frame."""
+        """Follow a set-point. Return False if it is invalid. With ``rotate``, its vectors are in the body frame."""
         setpoint, motion, yaw = Setpoint.of(target), self._copter.motion, self._copter.yaw
         velocity = setpoint.velocity if setpoint.has_velocity else None
         acceleration = setpoint.acceleration if setpoint.has_acceleration else None

@@ -57,7 +57,7 @@ class AutoYaw:
             self._rate = direction * (rate or motion.limits.turn_rate_rad_s)
 
     def turn_to_last_heading(self, tolerance: float) -> bool:
-        """Turn to the last `turn_to` heading again; return True within ``tolerance`` radians of it."""
+        """Turn to the last heading of `turn_to` again. Return True within ``tolerance`` radians of that heading."""
         self._control = self._go_to_heading
         return abs(wrap_pi(self._heading - self._copter.motion.yaw)) <= tolerance
 
@@ -138,7 +138,7 @@ class CopterHost(ArduPilotVehicle):
         return self.parameters[name] / 100.0
 
     def fly_to(self, target: Ned, speed: float) -> float:
-        """Fly towards a target with the default climb and sink rates; return the distance in metres."""
+        """Fly towards a target with the default climb and sink rates, and return its distance in metres."""
         self.motors.spool_up_requested = True
         climb, descent = self.speed_limit("WPNAV_SPEED_UP"), self.speed_limit("WPNAV_SPEED_DN")
         self.motion.seek_position(*target, speed=speed, climb=climb, descent=descent)
@@ -146,7 +146,7 @@ class CopterHost(ArduPilotVehicle):
         return math.dist(target, self.motion.place)
 
     def hold_position(self) -> None:
-        """Hold the position; on the ground let the motors idle."""
+        """Hold the position. On the ground, let the motors idle."""
         self.motors.spool_up_requested = not self.is_landed
         self.motion.seek_velocity(0.0, 0.0, 0.0)
 
@@ -172,7 +172,7 @@ class CopterModeBase(ArduPilotMode):
 
 
 class CopterTakeOff:
-    """Vertical climb of a commanded take-off; it begins once the motors have spooled up."""
+    """The vertical climb of a commanded take-off, which begins as soon as the motors have spooled up."""
 
     def __init__(self, copter: CopterHost, altitude_m: float) -> None:
         self._copter = copter
@@ -216,7 +216,7 @@ class CopterPilotedMode(CopterModeBase):
         return True
 
     def climb_from_stick(self) -> float:
-        """Return the climb rate of the throttle stick in m/s; the middle holds the altitude."""
+        """Return the climb rate in m/s that the throttle stick commands. The middle holds the altitude."""
         stick = self.vehicle.rc[2] - _MID_STICK
         if abs(stick) <= _THROTTLE_DEADZONE:
             return 0.0
@@ -282,7 +282,7 @@ _SMART_RTL_EXTRA_ALTITUDE_M = 2.0
 
 
 class CopterLand(CopterModeBase):
-    """LAND: descends with WPNAV_SPEED_DN to LAND_ALT_LOW, then with LAND_SPEED; disarms on the ground."""
+    """LAND: descends with WPNAV_SPEED_DN to LAND_ALT_LOW and then with LAND_SPEED, and disarms on the ground."""
 
     needs_position = False
     can_arm = False
@@ -297,7 +297,7 @@ class CopterLand(CopterModeBase):
 
 
 class CopterRtl(CopterModeBase):
-    """RTL: climbs to RTL_ALT (less near home), flies to home or a rally point, waits RTL_LOIT_TIME, lands."""
+    """RTL: climbs to RTL_ALT (less near home), flies to home or a rally point, waits for RTL_LOIT_TIME and lands."""
 
     can_arm = False
     can_change_speed = True

@@ -50,7 +50,7 @@ class ArduPilotDevices:
         return Result.ACCEPTED
 
     def move_gear(self, command: ReceivedCommand) -> int:
-        """Accept every command, like the firmware without a landing gear."""
+        """Accept every command, as the firmware does if no landing gear is fitted."""
         is_retraction = command.param2 == 1
         if self._is_set("LGR_ENABLE") and is_retraction is not self.gear_is_up:
             self.gear_is_up = is_retraction

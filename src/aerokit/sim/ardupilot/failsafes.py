@@ -19,8 +19,8 @@ _PERIOD_S = 0.1
 class BatteryFailsafe:
     """Checks voltage and remaining charge while the vehicle is armed.
 
-    ``priorities`` lists the actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, most severe first. An action is not
-    executed after a more severe one.
+    ``priorities`` lists the actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, from the most to the least severe. An
+    action is not executed if a more severe action was executed before.
     """
 
     def __init__(self, vehicle: ArduPilotHost, priorities: Sequence[int], act: Callable[[int], None]) -> None:
@@ -88,13 +88,13 @@ class BatteryFailsafe:
 
 
 class ArduPilotFailsafes(Generic[HostT]):
-    """Failsafes, checked ten times a second. A failsafe acts once when it triggers, and sends a text.
+    """Base of the failsafes. They are checked ten times a second. When one triggers, it acts once and sends a text.
 
     A subclass overrides `update` with the checks of its firmware and `act_on_battery` with the battery actions.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = ()
-    """Actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, most severe first."""
+    """Actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, from the most to the least severe."""
 
     def __init__(self, vehicle: HostT) -> None:
         self.vehicle = vehicle
@@ -171,8 +171,8 @@ class ArmingCheck(IntFlag):
 class ArduPilotArming(Generic[HostT]):
     """Arms and disarms. Runs the arming checks once a second and reports failures every 30 s while disarmed.
 
-    `common_reasons` has the checks of all firmwares. New failures of these checks are reported at once. A subclass adds
-    its own checks in `own_reasons` and `final_reasons`.
+    `common_reasons` contains the checks of all firmwares. A new failure of these checks is reported at once. A subclass
+    adds its own checks in `own_reasons` and `final_reasons`.
     """
 
     ARMED_TEXT: ClassVar[str] = "Throttle armed"

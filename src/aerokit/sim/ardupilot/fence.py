@@ -47,7 +47,7 @@ class FenceZones:
                     corners = []
 
     def __bool__(self) -> bool:
-        """Return True if there is a zone; a return point does not count."""
+        """Return True if there is at least one zone. A return point is not a zone."""
         return bool(self._inclusions or self._exclusions)
 
     @property
@@ -129,11 +129,10 @@ REPORT_ONLY = 0
 
 
 class ArduPilotFence(Generic[HostT]):
-    """Checks height, distance from home and the uploaded zones; `update` is called 10 times a second.
+    """Checks the height, the distance from home and the uploaded zones. `update` is called ten times a second.
 
-    FENCE_STATUS reports a breach; a subclass adds the reaction of its firmware in `act`. This class itself is the fence
-    of ArduSub, which does nothing but report breaches while armed. Braking before the fence (AVOID_ENABLE) is not
-    simulated.
+    FENCE_STATUS reports a breach. In `act`, a subclass adds the reaction of its firmware. This class itself is the fence
+    of ArduSub, which only reports breaches while armed. Braking before the fence (AVOID_ENABLE) is not simulated.
     """
 
     PERIOD_S: ClassVar[float] = 1.0 / 3.0
@@ -206,7 +205,7 @@ class ArduPilotFence(Generic[HostT]):
         return previous ^ self.enabled
 
     def command(self, command: ReceivedCommand) -> int:
-        """Execute DO_FENCE_ENABLE: param 1 is 0 to disable, 1 to enable, 2 to disable the lower limit only."""
+        """Execute DO_FENCE_ENABLE. Param 1 is 0 to disable, 1 to enable, and 2 to disable only the lower limit."""
         kinds = whole(command.param2) or _ALL
         if command.param1 == 1.0:
             if not self.present & kinds:
@@ -255,7 +254,7 @@ class ArduPilotFence(Generic[HostT]):
             self.act(new_breaches)
 
     def _check(self) -> int:
-        """Compare the position with all active limits; return the kinds with a new breach."""
+        """Compare the position with all active limits, and return the kinds of fences with a new breach."""
         vehicle = self.vehicle
         may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed
         if may_be_low and self._floor_enabled_by_command is not True and self.enabled & _MIN_ALT:
@@ -336,7 +335,7 @@ class ArduPilotFence(Generic[HostT]):
         """Called when the last breach has ended."""
 
     def refusal(self, mode: ArduPilotMode) -> tuple[int, str] | None:
-        """Return severity and text of the refusal if the fence forbids the mode, else None."""
+        """Return the severity and the text of the refusal if the fence forbids the mode, otherwise None."""
         return None
 
     def on_mode_changed(self) -> None:
@@ -413,7 +412,7 @@ class ArduPilotFence(Generic[HostT]):
 
 
 def _joined_names(kinds: int) -> str:
-    """Join names of fences like the firmware: Max Alt, Circle and Polygon fences."""
+    """Join the names of fences as the firmware does, for example "Max Alt, Circle and Polygon fences"."""
     words = [name for kind, name in _NAMES.items() if kinds & kind]
     if len(words) == 1:
         return f"{words[0]} fence"

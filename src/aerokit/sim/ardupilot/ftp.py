@@ -28,12 +28,12 @@ _WITHOUT_DATA = (Op.NONE, Op.CREATEFILE, Op.OPENFILEWO, Op.WRITEFILE)
 class ArduPilotFtp(SessionFtpServer[FileTree]):
     """MAVFTP with the limits of the firmware (GCS_FTP.cpp).
 
-    A worker processes the queue every 2 ms. The queue holds five requests; further requests are lost, also during a
-    burst. A burst cannot be stopped. The answer to a repeated sequence number is the last reply.
+    A worker processes the queue every 2 ms, except during a burst, which cannot be stopped. The queue has space for five
+    requests; further requests are lost. A request that repeats the last sequence number gets the last reply again.
 
-    The client chooses the session number. A session with an open file blocks other sessions until its client closes
-    it, or has sent nothing for 3 s. A close is always acknowledged, even if writing failed. `Faults.no_ftp` turns the
-    server off.
+    The client chooses the session number. A session with an open file blocks other sessions until the file is closed,
+    or until its client has sent nothing for 3 s. A close is always acknowledged, even if writing failed.
+    `Faults.no_ftp` turns the server off.
     """
 
     max_sessions: ClassVar[int] = 1
@@ -58,7 +58,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
 
     @property
     def open_sessions(self) -> int:
-        """1 while an open file blocks other sessions, else 0."""
+        """Number of open sessions: 1 while an open file blocks other sessions, otherwise 0."""
         return 0 if self._is_idle() else super().open_sessions
 
     def _is_idle(self) -> bool:
@@ -180,7 +180,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._send_next(peer, session, request, 0)
 
     def _send_next(self, peer: FtpPeer, session: FtpSession, request: FtpPacket, number: int) -> None:
-        """Send the block with this number and schedule the next. No other request is processed until the burst ends."""
+        """Send a block of a burst, and schedule the next block. Other requests wait until the end of the burst."""
         block_size = request.size or DATA_SIZE
         offset, sequence = request.offset + number * block_size, (request.sequence + 1 + number) & 0xFFFF
         refusal = request.refuse(MavFtpErr.EOF)

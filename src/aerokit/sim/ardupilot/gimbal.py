@@ -149,7 +149,7 @@ class ArduPilotGimbal:
         return (self.setting(f"MNT1_{axis}_MIN") + self.setting(f"MNT1_{axis}_MAX")) / 2.0
 
     def set_mode(self, mode: int) -> None:
-        """Set a MAV_MOUNT_MODE; unknown values are ignored."""
+        """Set a MAV_MOUNT_MODE. Unknown values are ignored."""
         if mode in list(MavMountMode):
             self._target = self.target
             self.mode = mode
@@ -162,7 +162,7 @@ class ArduPilotGimbal:
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def turn(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
-        """Turn at these rates in degrees per second from the current direction."""
+        """Turn at these rates in degrees per second, starting at the current direction."""
         current = self.target
         current_yaw = self._from_nose(current)
         if from_north and current.is_from_north:
@@ -192,7 +192,7 @@ class ArduPilotGimbal:
             self._followed_place = self._followed_place if place is None else place
 
     def set_control(self, sender: tuple[int, int], system: int, component: int) -> bool:
-        """Handle MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE; return False for invalid ids."""
+        """Handle MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Return False for invalid ids."""
         if not (-3 <= system <= 255 and -3 <= component <= 255):
             return False
         previous = self.in_control

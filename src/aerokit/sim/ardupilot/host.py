@@ -65,18 +65,18 @@ class ArduPilotMode:
         """Set the targets of motors and motion for the next ``dt`` seconds."""
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        """Climb to an altitude above home; return False if the mode does not support commanded take-off."""
+        """Climb to an altitude above home. Return False if the mode does not support take-off by command."""
         return False
 
     def pause(self) -> bool:
-        """Stop at the current place; return False if the mode cannot be paused now."""
+        """Stop at the current place. Return False if the mode cannot be paused at present."""
         return False
 
     def resume(self) -> bool:
         return False
 
     def go_to(self, position: Ned) -> None:
-        """Go to a point of the world frame and stay there; only the guided mode implements this method."""
+        """Go to a point of the world frame and stay there. Only the guided mode implements this method."""
         raise NotImplementedError
 
     @property
@@ -301,7 +301,7 @@ _ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 
 
 class ArduPilotHost(SimulatedAutopilot):
-    """Interface of a simulated ArduPilot for its parts; `ArduPilotVehicle` implements it."""
+    """Interface of a simulated ArduPilot for its parts. `ArduPilotVehicle` implements it."""
 
     KIND: ClassVar[Kind]
     """The kind of firmware, which selects the parameter table."""
@@ -383,7 +383,7 @@ class ArduPilotHost(SimulatedAutopilot):
             self.info(self.FRAME)
 
     def world_point(self, latitude_e7: int, longitude_e7: int, altitude: float, frame: int) -> Ned | None:
-        """Convert a global position to the world frame; return None for invalid values or an unknown frame."""
+        """Convert a global position to the world frame. Return None for invalid values or an unknown frame."""
         is_place = abs(latitude_e7) <= 900_000_000 and abs(longitude_e7) <= 1_800_000_000
         if not is_place or not math.isfinite(altitude):
             return None

@@ -59,7 +59,7 @@ class ItemList:
         """Abort an upload."""
 
     def clear(self) -> bool:
-        """Delete all items; return False if that is not allowed now."""
+        """Delete all items. Return False if this is not allowed at present."""
         raise NotImplementedError
 
 

@@ -78,7 +78,7 @@ class MissionMode(ArduPilotMode):
         """Called after the mission has started or resumed in this mode."""
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
-        """Return True once the command is complete; polled at every tick."""
+        """Return True as soon as the command is complete. This is polled at every tick."""
         raise NotImplementedError
 
     def end_mission(self) -> None:
@@ -86,7 +86,7 @@ class MissionMode(ArduPilotMode):
         raise NotImplementedError
 
     def start_command(self, item: MissionItem) -> bool:
-        """Start a mission command; return False to skip it because it is not supported."""
+        """Start a mission command. Return False to skip a command that is not supported."""
         handler = self.handlers.get(item.command)
         if handler is not None:
             handler(item)
@@ -103,7 +103,7 @@ def is_navigation(item: MissionItem) -> bool:
 
 
 class MissionRun:
-    """Progress in the mission. Index 1 is the first command; index 0 (home) means that there is no command."""
+    """Progress in the mission. The first command has the index 1. The index 0 (home) means that there is no command."""
 
     def __init__(self, vehicle: ArduPilotHost, mode: MissionMode) -> None:
         self._vehicle, self._mode = vehicle, mode

@@ -106,7 +106,7 @@ class ArduPilotNavigation:
         self._vehicle.call_later(0.0, self._vehicle.send_home)
 
     def set_origin(self, point: Ned) -> bool:
-        """Set the estimator's origin; return False if it is already set or the vehicle is still booting."""
+        """Set the estimator's origin. Return False if the origin is already set or the vehicle is still booting."""
         if self.origin is not None or not self._vehicle.is_initialised:
             return False
         self.origin = point
@@ -286,7 +286,7 @@ class SmartPath:
             self.is_active = True
 
     def take_way_back(self) -> list[Ned]:
-        """Return the simplified path, last point first, and clear the recorded path."""
+        """Return the simplified path, starting with its last point, and clear the recorded path."""
         accuracy = self._vehicle.parameters["SRTL_ACCURACY"]
         path = prune(simplify(self._points, _BEND * accuracy), _LOOP * accuracy)
         self._points.clear()
@@ -318,7 +318,7 @@ class SmartPath:
             self._deactivate("buffer full")
 
     def _add(self, place: Ned) -> bool:
-        """Record a place if it is far enough from the last point; return False if there is no space for it."""
+        """Record a place if it is far enough from the last point. Return False if there is no space for the place."""
         parameters = self._vehicle.parameters
         accuracy, maximum = parameters["SRTL_ACCURACY"], int(parameters["SRTL_POINTS"])
         if self._points and math.dist(self._points[-1], place) < accuracy:

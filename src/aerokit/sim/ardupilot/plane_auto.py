@@ -28,7 +28,7 @@ _ON_CIRCLE_SHARE = 1.3
 
 
 class PlaneAuto(PlaneNavigatingMode, MissionMode):
-    """AUTO: `MissionRun` selects the commands; after the last command the mode changes to RTL."""
+    """AUTO: flies the mission. `MissionRun` selects the commands. After the last command, the mode changes to RTL."""
 
     number: int = PlaneMode.AUTO
     name = "AUTO"
@@ -78,7 +78,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self.vehicle.mission.start_or_resume()
 
     def on_disarmed(self) -> None:
-        """Does nothing: disarming has already reset the progress."""
+        """Do nothing, because disarming has already reset the progress."""
 
     def update(self, dt: float) -> None:
         plane = self.vehicle
@@ -365,7 +365,7 @@ def _change_speed(plane: PlaneHost, guided: PlaneGuided, command: ReceivedComman
 
 
 def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    """Change the altitude. Param 3 is the climb rate in m/s, 0 for the maximum.
+    """Change the altitude. Param 3 is the climb rate in m/s, or 0 for the maximum rate.
 
     The firmware refuses the altitudes 0 and -1.
     """

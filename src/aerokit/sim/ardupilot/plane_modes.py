@@ -74,9 +74,9 @@ _CORRECTION_LENGTH_M = 80.0
 
 
 class PlaneLanding:
-    """Landing on ``point``: approach, flare, roll-out, disarming.
+    """Landing on ``point``, with the approach, the flare, the roll-out and disarming.
 
-    The approach begins at ``start``; None begins it at the current position.
+    The approach begins at ``start``, or at the current position if ``start`` is None.
     """
 
     def __init__(self, plane: PlaneHost, point: Ned, start: Ned | None = None) -> None:
@@ -169,7 +169,7 @@ class PlaneModeBase(ArduPilotMode):
 
 
 class PlanePilotedMode(PlaneModeBase):
-    """Base of the piloted modes: sticks control bank, climb and speed; with a low throttle the plane glides."""
+    """Base of the piloted modes, in which sticks control bank, climb and speed. With a low throttle the plane glides."""
 
     has_manual_throttle = True
 
@@ -211,7 +211,7 @@ class PlaneAltitudeMode(PlaneModeBase):
         return self.stick(1) * self.vehicle.parameters["FBWB_CLIMB_RATE"]
 
     def steer(self, climb: float) -> None:
-        """Bank as the roll stick commands, with this climb rate."""
+        """Bank as the roll stick commands, and climb at ``climb`` m/s."""
         wing = self.vehicle.wing
         wing.bank_and_climb(self.vehicle.cruise_m_s, self.stick(0) * wing.wing_limits.bank_rad, climb)
 
@@ -302,7 +302,7 @@ class PlaneRtl(PlaneNavigatingMode):
 
 
 class PlaneTakeOff(PlaneNavigatingMode):
-    """TAKEOFF: takes off once armed, climbs to TKOFF_ALT and circles TKOFF_DIST ahead of the start."""
+    """TAKEOFF: takes off after arming, climbs to TKOFF_ALT, and circles TKOFF_DIST metres ahead of the start."""
 
     def enter(self, *, force: bool) -> bool:
         super().enter(force=force)

@@ -147,7 +147,7 @@ class ArduPilotMessageRequests:
             self._store_rate(f"{self._prefix(channel)}ADSB", rate)
 
     def start_channel(self, channel: Channel, first: float) -> None:
-        """Start the streams that the port's parameters select; ``first`` is the time of the first messages."""
+        """Start the streams that the port's parameters select. ``first`` is the time of the first messages."""
         for stream, suffix in _RATE_PARAMETERS.items():
             rate = self._vehicle.parameters.get(f"{self._prefix(channel)}{suffix}", 0.0)
             if rate > 0:

@@ -33,7 +33,7 @@ _NEEDS_LOCATION = 1
 
 
 class RoverArming(ArduPilotArming[RoverHost]):
-    """ArduRover's arming checks: a position only in modes that use it, or in all modes with ARMING_NEED_LOC."""
+    """ArduRover's arming checks. Only modes that use a position require it, unless ARMING_NEED_LOC is set."""
 
     def ahrs_reasons(self) -> Sequence[str]:
         return ()  # `position_reasons` includes these checks, because ArduRover runs them after those of GPS.
@@ -196,7 +196,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self.warn("EKF failsafe", MavSeverity.CRITICAL)
 
     def _check_wheels(self) -> None:
-        """Detect a rover that does not move although its mode drives it (FS_CRASH_CHECK)."""
+        """Detect that the rover does not move although its mode drives (FS_CRASH_CHECK)."""
         rover, action = self.vehicle, int(self.vehicle.parameters["FS_CRASH_CHECK"])
         tries_to_drive = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
         is_stuck = bool(action) and tries_to_drive and rover.motion.ground_speed_m_s < _STUCK_M_S

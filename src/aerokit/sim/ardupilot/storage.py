@@ -73,7 +73,7 @@ class ArduPilotStorage:
             self.parameters.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Drop transfers and sessions because of a reboot; files stay."""
+        """Drop transfers and sessions because of a reboot. Files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()

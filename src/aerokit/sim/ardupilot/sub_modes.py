@@ -39,7 +39,7 @@ class SubHost(RoverSubVehicle):
         return math.dist(self._below_surface(place), self.motion.place)
 
     def travel(self, place: Ned, speed: float, *, looks_ahead: bool = True) -> None:
-        """Move towards a place at a speed in m/s; WPNAV_SPEED_UP and WPNAV_SPEED_DN limit the vertical speed."""
+        """Move towards a place at a speed in m/s. WPNAV_SPEED_UP and WPNAV_SPEED_DN limit the vertical speed."""
         motion, parameters = self.motion, self.parameters
         north, east, down = self._below_surface(place)
         max_climb, max_descent = parameters["WPNAV_SPEED_UP"] / 100.0, parameters["WPNAV_SPEED_DN"] / 100.0
@@ -93,7 +93,7 @@ class _Manual(_Mode):
 
 
 class _AltHold(_Mode):
-    """ALT_HOLD and similar modes: hold the depth, which the throttle stick changes."""
+    """ALT_HOLD and similar modes: the submarine holds its depth, which the throttle stick changes."""
 
     needs_position = False
 

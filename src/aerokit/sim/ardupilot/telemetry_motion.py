@@ -305,4 +305,4 @@ MOTION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.Rangefinder.ID: _rangefinder,
     m.DistanceSensor.ID: _distance_sensor,
 }
-"""Functions that build messages, by message id; a function returns None if there is nothing to send."""
+"""Functions that build messages, by message id. A function returns None if there is nothing to send."""

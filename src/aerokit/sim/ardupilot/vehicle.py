@@ -65,7 +65,7 @@ class ArduPilotVehicle(ArduPilotHost):
 
     MAV_TYPE: ClassVar[int]
     BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]]
-    """Functions that build messages, by message id; a function returns None if there is nothing to send."""
+    """Functions that build messages, by message id. A function returns None if there is nothing to send."""
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]]
     """Factories of the modes, in the order of AVAILABLE_MODES."""
     ARMING: ClassVar[type[ArduPilotArming[Any]]]

@@ -21,7 +21,7 @@ MAX_VIDEO_ISO = 400
 
 
 class CameraParameters(ExtendedParameters):
-    """Camera settings (PARAM_EXT). Setting the mode during a capture or recording fails."""
+    """The settings of the camera (PARAM_EXT). During a capture or a recording, the mode cannot be set."""
 
     def __init__(self, camera: CameraBody) -> None:
         self._camera = camera

@@ -38,7 +38,7 @@ def own_definition() -> bytes:
 
 
 class CameraBody(SimulatedComponent, CameraDevice):
-    """Lens, card, shutter and settings; see `SimulatedCamera` for the arguments."""
+    """Base of `SimulatedCamera`, with lens, card, shutter and settings. See that class for the arguments."""
 
     TYPE: ClassVar[int] = MavType.CAMERA
 
@@ -139,7 +139,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
         return None if pose is None else (pose.roll, pose.pitch, pose.yaw)
 
     async def stop_video(self) -> None:
-        """Store the video."""
+        """Stop the recording and store the video on the card."""
         seconds = self.captures.stop_recording()
         self.card.store(min(self.card.free_mib, seconds * self.video_mib_s))
 

@@ -86,7 +86,7 @@ _AUTO = (SetFocusType.AUTO, SetFocusType.AUTO_SINGLE, SetFocusType.AUTO_CONTINUO
 
 
 class Axis:
-    """A lens setting from 0 to 100 percent, at rest or moving at constant speed."""
+    """A lens setting from 0 to 100 percent, which rests or changes at a constant speed."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
@@ -111,7 +111,7 @@ class Axis:
 
 
 class Lens:
-    """Zoom (up to ten times) and focus of a camera; automatic focus sets 50 percent."""
+    """Zoom (up to ten times) and focus of a camera. Automatic focus sets the focus to 50 percent."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self.zoom: Axis = Axis(now)
@@ -123,7 +123,7 @@ class Lens:
         return FOCAL_LENGTH_MM * (1.0 + (_ZOOM_FACTOR - 1.0) * self.zoom.percent / 100.0)
 
     def set_zoom(self, kind: int, value: float) -> bool:
-        """Apply SET_CAMERA_ZOOM; return False if type or value is not supported."""
+        """Apply SET_CAMERA_ZOOM. Return False if the type or the value is not supported."""
         if kind == CameraZoomType.STEP:
             self.zoom.step(value)
         elif kind == CameraZoomType.CONTINUOUS:
@@ -137,7 +137,7 @@ class Lens:
         return True
 
     def set_focus(self, kind: int, value: float) -> bool:
-        """Apply SET_CAMERA_FOCUS; return False if type or value is not supported."""
+        """Apply SET_CAMERA_FOCUS. Return False if the type or the value is not supported."""
         if kind == SetFocusType.STEP:
             self.focus.step(value)
         elif kind == SetFocusType.CONTINUOUS:

@@ -84,11 +84,11 @@ class SimulatedComponent:
         self._streams: MessageStreams = MessageStreams(self)
 
     def commands(self) -> dict[int, CommandHandler]:
-        """Return handlers by MAV_CMD, in addition to the message requests."""
+        """Return the handlers of the component's commands by MAV_CMD, without the message requests."""
         return {}
 
     def builders(self) -> dict[int, Builder]:
-        """Return builders by message id, for REQUEST_MESSAGE and streams."""
+        """Return the functions that build messages for REQUEST_MESSAGE and for streams, by message id."""
         return {}
 
     def listen(self) -> None:
@@ -108,7 +108,7 @@ class SimulatedComponent:
 
     @property
     def system_id(self) -> int:
-        """The system id passed to the component, or else the vehicle's."""
+        """The system id that was passed to the component or, if none was passed, that of the vehicle."""
         return self.vehicle.system_id if self._system_id is None else self._system_id
 
     @property
@@ -162,11 +162,11 @@ class SimulatedComponent:
         self.send(Statustext(severity, text[:50], 0, 0))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
-        """Call a function after ``delay`` simulated seconds; a reboot cancels the call."""
+        """Call a function after ``delay`` simulated seconds. A reboot cancels the call."""
         self.vehicle.call_later(delay, action)
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Call a function at a simulated time; a reboot cancels the call."""
+        """Call a function at a simulated time. A reboot cancels the call."""
         self.vehicle.call_at(when, action)
 
     def stream(self, message_id: int, interval_s: float, channel: Channel | None = None) -> None:

@@ -162,7 +162,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         self._target, self._is_locked = angles, locked
 
     def turn(self, rates: Angles, flags: int, *, locked: bool) -> None:
-        """Turn at these rates in radians per second, limited to the slew rate."""
+        """Turn at these rates in radians per second. The slew rate limits them."""
         current = self.angles_from_north() if locked else self.angles()
         self._begin(flags)
         limit = self.slew_rad_s

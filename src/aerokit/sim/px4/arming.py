@@ -61,7 +61,7 @@ class Px4Calibration:
         return bool(self._sensor)
 
     def command(self, command: ReceivedCommand) -> int:
-        """Handle PREFLIGHT_CALIBRATION; return the MAV_RESULT."""
+        """Handle PREFLIGHT_CALIBRATION and return the MAV_RESULT."""
         sensor = _sensor_of(command)
         if self._px4.is_armed:
             return MavResult.TEMPORARILY_REJECTED
@@ -150,7 +150,7 @@ _MODES_ENDED_BY_DISARMING = frozenset({modes.TAKEOFF, modes.LAND, modes.PRECISIO
 
 
 class Px4Arming:
-    """Arming and disarming, with the arming checks and the log that each arming starts."""
+    """Arming and disarming, with the arming checks. Each arming starts a log."""
 
     def __init__(self, px4: Px4Host, calibration: Px4Calibration) -> None:
         self._px4, self._calibration = px4, calibration

@@ -55,7 +55,7 @@ _MODES_ENDED_BY_LANDING = frozenset({modes.TAKEOFF, modes.LAND, modes.PRECISION_
 
 
 class Px4Vehicle(Px4Host):
-    """Base of the simulated PX4, without commands and telemetry; see `SimulatedPx4` for the arguments."""
+    """Base of the simulated PX4, without commands and telemetry. See `SimulatedPx4` for the arguments."""
 
     CAPABILITIES: ClassVar[int] = 0xE8FF
     VEHICLE_TYPE: ClassVar[int] = MavType.QUADROTOR

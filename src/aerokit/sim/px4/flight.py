@@ -19,7 +19,7 @@ _BACK_TO_CIRCLE_PER_S = 0.5
 
 
 class Px4Orbit:
-    """Circle of ORBIT; a negative radius is counter-clockwise."""
+    """The circle of the mode ORBIT. A negative radius is counter-clockwise."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -90,7 +90,7 @@ _YAW_FROM_M_S = 0.5
 
 
 class Px4Flight:
-    """Navigator: target, speeds, and the phase of a take-off or return."""
+    """Navigator of a multicopter, with the target, the speeds, and the phase of a take-off or return."""
 
     def __init__(self, vehicle: Px4Host) -> None:
         self._vehicle = vehicle

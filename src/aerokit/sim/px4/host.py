@@ -122,7 +122,7 @@ class Px4ExternalInterface(Protocol):
 
 
 class Px4Host(SimulatedAutopilot):
-    """State and operations of a PX4 that its modules use; `Px4Vehicle` implements them."""
+    """Interface of a simulated PX4 for its modules. `Px4Vehicle` implements it."""
 
     VEHICLE_TYPE: ClassVar[int]
 
@@ -163,7 +163,7 @@ class Px4Host(SimulatedAutopilot):
         raise NotImplementedError
 
     def change_mode(self, mode: Px4Mode) -> bool:
-        """Handle a mode request; return False if it is refused."""
+        """Handle a mode request. Return False if the mode is refused."""
         raise NotImplementedError
 
     def switch_to(self, mode: Px4Mode) -> None:
@@ -183,5 +183,5 @@ class Px4Host(SimulatedAutopilot):
         raise NotImplementedError
 
     def on_sticks_moved(self, size: float) -> None:
-        """Called with the distance by which the sticks moved; 2 is end to end."""
+        """Called with the distance by which a stick has moved. 2 is the distance from end to end."""
         raise NotImplementedError

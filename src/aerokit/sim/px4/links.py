@@ -1,4 +1,4 @@
-"""Output of a simulated PX4 by link: stream rates, status texts, and the events that correspond to texts.
+"""What a simulated PX4 sends on each link: stream rates, status texts, and events with the content of texts.
 
 https://mavlink.io/en/services/events.html. Event ids and log levels are those of a recording of a real PX4. Not
 simulated: events without a text, the health report of the components, REQUEST_EVENT.
@@ -46,7 +46,7 @@ class Px4Events:
         return CurrentEventSequence((self._next_sequence - 1) & 0xFFFF, 0)
 
     def send_for(self, text: str) -> None:
-        """Send the event that corresponds to a status text, if there is one."""
+        """Send the event with the content of a status text, if there is such an event."""
         event = _event_of(text)
         if event is None:
             return

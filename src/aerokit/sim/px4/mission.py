@@ -128,7 +128,7 @@ _ACTIVE_MODES = (MISSION, TAKEOFF, LAND)
 
 
 class Px4Mission:
-    """Mission mode; `update` runs at every tick in flight."""
+    """Mission mode. In flight, `update` is called at every tick."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -181,7 +181,7 @@ class Px4Mission:
         return self._item is not None and not self.is_finished and self._phase != "land"
 
     def on_replaced(self, current: int) -> None:
-        """Handle an uploaded mission. In mission mode, start the new mission."""
+        """Handle the upload of a mission. In mission mode, start the new mission at once."""
         self.current, self.is_finished = max(0, current), False
         self.forget_reached()
         self._jumps.clear()

@@ -1,4 +1,4 @@
-"""Storage of mission items in PX4: a download has 0 for params that the storage has no field for."""
+"""Storage of mission items in PX4. A param without a field in the storage is 0 in a download."""
 
 from __future__ import annotations
 

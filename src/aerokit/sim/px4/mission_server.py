@@ -46,7 +46,7 @@ class TransferState(Enum):
 
 @dataclass(eq=False)
 class _Link(ListUpload):
-    """The latest upload or download of a link. The firmware uses this state even after the transfer has ended."""
+    """State of the latest upload or download of a link, which the firmware also uses after the end of the transfer."""
 
     state: TransferState = TransferState.IDLE
     opaque_id: int = 0

@@ -94,7 +94,7 @@ class Px4Offboard:
         self._vehicle.send_text(MavSeverity.CRITICAL, text)
 
     def _store(self, target: PositionTarget, position: Ned, *, is_body: bool) -> bool:
-        """Store a set-point; return False if position, velocity and acceleration are all missing."""
+        """Store a set-point. Return False if it has no position, velocity or acceleration on any axis."""
         setpoint = Setpoint.of(target)
         position, velocity, acceleration = setpoint.axes(position)
         if all(map(math.isnan, (*position, *velocity, *acceleration))):

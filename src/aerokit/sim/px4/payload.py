@@ -3,8 +3,8 @@
 MNT_MODE_IN 0 or 4 enables a gimbal on the AUX outputs (MNT_MODE_OUT 0) and its gimbal manager.
 
 Servos have no feedback, so telemetry reports the set-point. Only the component in control can command the gimbal, but
-every component can set a region of interest. The gimbal has no secondary control and no retracted position, and
-ignores GIMBAL_MANAGER_SET_PITCHYAW. When a return starts, PX4 takes control briefly and centres the gimbal.
+every component can set a region of interest. There is no secondary control and no retracted position, and
+GIMBAL_MANAGER_SET_PITCHYAW is ignored. When a return starts, PX4 briefly takes control and centres the gimbal.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Px4Gimbal:
         return locks | yaw_flag
 
     def angles(self) -> Angles:
-        """Return roll, pitch and yaw of the set-point in radians."""
+        """Return roll, pitch and yaw (radians) to which the gimbal is set at present."""
         if self._place is not None:
             return self._angles_to(self._place)
         seconds = min(self._px4.now - self._since, _RATE_TIMEOUT_S) * _RATE_FACTOR
@@ -239,7 +239,7 @@ _GEOTAG_DELAY_S = 0.02
 
 
 class Px4CameraTrigger:
-    """Camera trigger, which sends CAMERA_TRIGGER, and with ``sends_image_captured`` also CAMERA_IMAGE_CAPTURED.
+    """Camera trigger. Each image sends CAMERA_TRIGGER and, with ``sends_image_captured``, CAMERA_IMAGE_CAPTURED.
 
     As on the real vehicle, commands to a disabled trigger are not answered.
     """

@@ -176,7 +176,7 @@ class Px4Storage:
             self.parameters.burst = self.ftp.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Drop transfers and sessions because of a reboot; files stay."""
+        """Drop transfers and sessions because of a reboot. Files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()
@@ -208,7 +208,7 @@ _UNSIGNED = frozenset((Heartbeat.ID, AdsbVehicle.ID, Collision.ID))
 
 
 class Px4Signing(VehicleSigning):
-    """Message signing of PX4, which reports a new key by a text and accepts unsigned heartbeats.
+    """Message signing of PX4. A text reports a new key, and unsigned heartbeats are accepted.
 
     The time stamp is stored only when a key is set. Version 1.16 does not support signing.
     """

@@ -337,4 +337,4 @@ BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.GimbalManagerInformation.ID: lambda px4: px4.gimbal.manager_information(),
     m.GimbalManagerStatus.ID: lambda px4: px4.gimbal.manager_status(),
 }
-"""Builders by message id; a builder returns None if there is nothing to send."""
+"""Functions that build messages, by message id. A function returns None if there is nothing to send."""

@@ -48,7 +48,7 @@ class SimulatedPx4(Px4Vehicle):
         return px4_commands(self)
 
     def can_build(self, message_id: int) -> bool:
-        """Return True if the vehicle can send this message; gimbal messages require a gimbal."""
+        """Return True if the vehicle can send this message. Gimbal messages require a gimbal."""
         return message_id in BUILDERS and (message_id not in GIMBAL_MESSAGES or self.gimbal.is_fitted)
 
     def build(self, message_id: int) -> Message | None:
@@ -79,7 +79,7 @@ _HEIGHT_REACHED_M = 10.0
 
 
 class Px4PlaneFlight(Px4Flight):
-    """Navigator of a plane. ``target`` is the centre of a circle, or the end of a straight line."""
+    """Navigator of a plane. ``target`` is the centre of the circle or the end of the straight line that it flies."""
 
     def __init__(self, plane: SimulatedPx4Plane, motion: FixedWing) -> None:
         super().__init__(plane)
@@ -297,7 +297,7 @@ class Px4PlaneMission(Px4Mission):
         return is_near and abs(down - motion.down) <= plane.parameters["NAV_FW_ALT_RAD"]
 
     def _hold(self) -> None:
-        """Change to HOLD after the mission, and keep the target."""
+        """Change to HOLD after the mission, without a change of the target."""
         target = self._plane.flight.target
         super()._hold()
         if self._plane.mode == modes.HOLD:
@@ -310,10 +310,10 @@ _AMPERES_AT_FULL = 20.0
 class SimulatedPx4Plane(SimulatedPx4):
     """PX4 plane (MAV_TYPE 1, airframe 10041). `FixedWing` is the motion model; see `SimulatedPx4` for the arguments.
 
-    The plane takes off from a runway along its heading, and circles at NAV_LOITER_RAD where a multicopter hovers. RTL
-    ends in a circle above home without landing (RTL_LAND_DELAY is -1). LAND descends in circles; a mission ends with a
-    straight glide path, and must contain a landing (MIS_TKO_LAND_REQ). Sticks control bank, climb and speed in every
-    manual mode; OFFBOARD circles a position. The plane is not disarmed automatically before take-off.
+    The plane takes off from a runway along its heading. Where a multicopter hovers, the plane circles at NAV_LOITER_RAD.
+    RTL ends in a circle above home, without a landing (RTL_LAND_DELAY is -1). LAND descends in circles, whereas a
+    mission ends with a straight glide path, and must contain a landing (MIS_TKO_LAND_REQ). OFFBOARD circles a position.
+    Sticks control bank, climb and speed in every manual mode. The plane is not disarmed automatically before take-off.
 
     Not simulated, in addition to `SimulatedPx4`: hand launch, stalls, aborted landings, figures of eight.
     """
