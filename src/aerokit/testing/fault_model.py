@@ -1,4 +1,4 @@
-"""Faults of a radio link (``FaultModel``), and their application to frames in one direction (``FaultyPath``), without I/O."""
+"""Faults of a radio link (``FaultModel``), which ``FaultyPath`` applies to the frames of one direction, without I/O."""
 
 from __future__ import annotations
 

@@ -87,11 +87,9 @@ class Flight:
 
 
 class SimulatedFleet(Sequence[Flight]):
-    """Simulated vehicles on one link, with the system ids 1, 2, 3 …
+    """Simulated vehicles on one link, as a sequence of `Flight`. A fleet can be opened only once.
 
-    The fleet is a sequence of `Flight`, and can be opened only once.
-
-    The vehicles stand in a row to the east of ``home``, ``spacing_m`` metres apart.
+    The vehicles have the system ids 1, 2, 3 … and stand in a row to the east of ``home``, ``spacing_m`` metres apart.
     """
 
     def __init__(

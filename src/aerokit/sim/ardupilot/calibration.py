@@ -128,7 +128,7 @@ class CompassCalibration:
         }
 
     def _start(self, command: ReceivedCommand) -> int:
-        """Start a calibration of the compasses in the mask param 1 (0: all). Param 3 is 1 to save without acceptance."""
+        """Start a calibration. Param 1 is a mask of compasses (0: all). Param 3 is 1 to save without acceptance."""
         if self._vehicle.motors.is_armed:
             self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
             return MavResult.FAILED

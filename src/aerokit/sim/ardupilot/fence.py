@@ -131,8 +131,8 @@ REPORT_ONLY = 0
 class ArduPilotFence(Generic[HostT]):
     """Checks the height, the distance from home and the uploaded zones. `update` is called ten times a second.
 
-    FENCE_STATUS reports a breach. In `act`, a subclass adds the reaction of its firmware. This class itself is the fence
-    of ArduSub, which only reports breaches while armed. Braking before the fence (AVOID_ENABLE) is not simulated.
+    FENCE_STATUS reports a breach. In `act`, a subclass adds the reaction of its firmware. This class itself is the
+    fence of ArduSub, which only reports breaches while armed. Braking before the fence (AVOID_ENABLE) is not simulated.
     """
 
     PERIOD_S: ClassVar[float] = 1.0 / 3.0

@@ -28,8 +28,8 @@ _WITHOUT_DATA = (Op.NONE, Op.CREATEFILE, Op.OPENFILEWO, Op.WRITEFILE)
 class ArduPilotFtp(SessionFtpServer[FileTree]):
     """MAVFTP with the limits of the firmware (GCS_FTP.cpp).
 
-    A worker processes the queue every 2 ms, except during a burst, which cannot be stopped. The queue has space for five
-    requests; further requests are lost. A request that repeats the last sequence number gets the last reply again.
+    A worker processes the queue every 2 ms, except during a burst, which cannot be stopped. The queue has space for
+    five requests. Further requests are lost. A request that repeats the last sequence number gets the last reply again.
 
     The client chooses the session number. A session with an open file blocks other sessions until the file is closed,
     or until its client has sent nothing for 3 s. A close is always acknowledged, even if writing failed.

@@ -169,7 +169,7 @@ class PlaneModeBase(ArduPilotMode):
 
 
 class PlanePilotedMode(PlaneModeBase):
-    """Base of the piloted modes, in which sticks control bank, climb and speed. With a low throttle the plane glides."""
+    """Base of the piloted modes: sticks control bank, climb and speed. With a low throttle, the plane glides."""
 
     has_manual_throttle = True
 
