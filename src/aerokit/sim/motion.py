@@ -99,6 +99,11 @@ def wrap_pi(angle: float) -> float:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
+def centidegrees(angle: float) -> int:
+    """Convert an angle in radians to hundredths of a degree, from 0 to 35999."""
+    return round(math.degrees(angle) % 360.0 * 100) % 36000  # Rounding may give 36000, which is 0.
+
+
 def _clamp(value: float, limit: float) -> float:
     if value > limit:
         return limit

@@ -84,6 +84,7 @@ class ExtraComponent:
 
     def join(self, vehicle: SimulatedVehicle) -> None:
         """Send heartbeats from the next power-on."""
+        # The field mavlink_version is 3.
         heartbeat = Heartbeat(self.type, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3)
         system_id = vehicle.system_id if self.system_id is None else self.system_id
         sender = (system_id, self.component_id)

@@ -52,29 +52,29 @@ class AccelerometerCalibration:
         if not self.is_waiting or command.param1 != self._requested:
             return MavResult.FAILED
         self._requested = None
-        run, position = self._run_number, whole(command.param1)
-        self._vehicle.call_later(_SAMPLE_S, lambda: self._on_sample(run, position))
+        run_number, position = self._run_number, whole(command.param1)
+        self._vehicle.call_later(_SAMPLE_S, lambda: self._on_sample(run_number, position))
         return MavResult.ACCEPTED
 
-    def _on_sample(self, run: int, position: int) -> None:
-        if run != self._run_number:  # The calibration was started again or cancelled.
+    def _on_sample(self, run_number: int, position: int) -> None:
+        if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
         if self.is_held_wrong and position > AccelcalVehiclePos.LEVEL:
             self._end("Calibration FAILED", AccelcalVehiclePos.FAILED)
         elif position == _LAST:
             self._end("Calibration successful", AccelcalVehiclePos.SUCCESS)
         else:
-            self._request(run, position + 1)
+            self._request(run_number, position + 1)
 
     def _end(self, text: str, result: int) -> None:
         self._vehicle.send_text(MavSeverity.CRITICAL, text)
         self._request(self._run_number, result)
 
-    def _request(self, run: int, position: int) -> None:
+    def _request(self, run_number: int, position: int) -> None:
         self._requested = position
 
         def request_until_confirmed() -> None:
-            if run == self._run_number and self._requested == position:
+            if run_number == self._run_number and self._requested == position:
                 params = (float(position), 0, 0, 0, 0, 0, 0)
                 self._vehicle.send(m.CommandLong(0, 0, MavCmd.ACCELCAL_VEHICLE_POS, 0, *params))
                 self._vehicle.call_later(_REPEAT_INTERVAL_S, request_until_confirmed)

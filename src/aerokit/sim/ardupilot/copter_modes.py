@@ -171,6 +171,9 @@ class CopterModeBase(ArduPilotMode):
     vehicle: CopterHost
 
 
+_REACHED_M, _AT_REST_M_S = 0.1, 0.2
+
+
 class CopterTakeOff:
     """The vertical climb of a commanded take-off, which begins as soon as the motors have spooled up."""
 
@@ -187,7 +190,7 @@ class CopterTakeOff:
             copter.is_landed = not copter.motors.can_lift
             return
         motion.seek_position(*self.target, speed=2.0, climb=climb_m_s, descent=1.0)
-        if abs(motion.down - self.target[2]) < 0.1 and abs(motion.velocity_down) < 0.2:
+        if abs(motion.down - self.target[2]) < _REACHED_M and abs(motion.velocity_down) < _AT_REST_M_S:
             self.is_complete = True
 
 

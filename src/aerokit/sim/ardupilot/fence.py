@@ -272,10 +272,12 @@ class ArduPilotFence(Generic[HostT]):
 
         A breach of a circle or an altitude limit that has grown by the backup distance counts as new.
         """
-        if beyond_m < 0.0 or (kind == _POLYGON and beyond_m == 0.0):
+        is_inside = beyond_m < 0.0 or (kind == _POLYGON and beyond_m == 0.0)
+        if is_inside:
             self._clear(kind)
             return False
-        if self.breached & kind and (kind == _POLYGON or beyond_m < self._new_breach_m.get(kind, math.inf)):
+        has_grown = kind != _POLYGON and beyond_m >= self._new_breach_m.get(kind, math.inf)
+        if self.breached & kind and not has_grown:
             return False
         self._record_breach(kind)
         self._new_breach_m[kind] = beyond_m + (self.CIRCLE_BACKUP_M if kind == _CIRCLE else _BACKUP_M)

@@ -124,7 +124,7 @@ class ConditionTimer:
 _ARMING_DELAY_S = 2.0
 _SPOOL_UP_S = 1.3
 _SPOOL_DOWN_S = 1.1
-_HOVER_THROTTLE = 0.36
+_HOVER_THROTTLE, _IDLE_THROTTLE = 0.36, 0.05
 _AMPERES_AT_FULL = 78.0
 _STOPPED_PWM, _IDLE_PWM, _FULL_PWM = 1000, 1100, 2000
 
@@ -182,8 +182,9 @@ class ArduPilotMotors:
         else:
             self.spool = max(0.0, self.spool - dt / _SPOOL_DOWN_S)
         if landed or not self.is_armed:
-            self.throttle = 0.05 * self.spool
+            self.throttle = _IDLE_THROTTLE * self.spool
             return
+        # The throttle compensates a lean of up to 60 degrees, whose cosine is 0.5.
         vertical_share_of_thrust = max(0.5, math.cos(motion.roll) * math.cos(motion.pitch))
         lift = 1.0 - motion.acceleration_down / GRAVITY_M_S2
         self.throttle = max(0.0, min(1.0, _HOVER_THROTTLE * lift / vertical_share_of_thrust))

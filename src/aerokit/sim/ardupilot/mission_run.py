@@ -215,7 +215,8 @@ class MissionRun:
 
     def set_current(self, index: int) -> bool:
         """Continue the mission at the command with this index; return False if there is no such command."""
-        if index >= self._list.count or self._list.count == 1:
+        has_only_home = self._list.count == 1
+        if index >= self._list.count or has_only_home:
             return False
         self._running_do, self._last_do_index, self._running_nav = None, 0, None
         if index == 0 or self._state == MissionState.COMPLETE:
@@ -277,7 +278,7 @@ class MissionRun:
             index = command_index + 1
             if is_navigation(item):
                 self.nav_index = command_index
-                if self._begin(command_index, item):
+                if self._begin(command_index, item):  # An unsupported command is skipped.
                     self._running_nav = item
                     return True
             elif self._running_do is None:

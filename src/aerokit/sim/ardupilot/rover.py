@@ -264,9 +264,10 @@ class RoverSetpoints(GuidedSetpoints):
         velocity = (abs(speed) * math.cos(heading), abs(speed) * math.sin(heading), 0.0)
         backwards = speed < 0
         if message.type_mask & AttitudeMask.BODY_YAW_RATE_IGNORE:
-            self.mode.set_target(GuidedTarget(None, velocity, backwards, yaw=heading))
+            target = GuidedTarget(velocity=velocity, backwards=backwards, yaw=heading)
         else:
-            self.mode.set_target(GuidedTarget(None, velocity, backwards, yaw_rate=message.body_yaw_rate))
+            target = GuidedTarget(velocity=velocity, backwards=backwards, yaw_rate=message.body_yaw_rate)
+        self.mode.set_target(target)
 
 
 _AMPERES_AT_FULL = 16.0

@@ -219,7 +219,7 @@ class SubSetpoints(GuidedSetpoints):
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * self.vehicle.parameters[max_climb_parameter] / 100.0
         _, _, yaw = euler_from_quaternion(*message.q)
-        self.mode.set_target(GuidedTarget(None, (0.0, 0.0, -climb), False, yaw, timeout_s=1.0))
+        self.mode.set_target(GuidedTarget(velocity=(0.0, 0.0, -climb), yaw=yaw, timeout_s=1.0))
 
 
 _HOLDING_THROTTLE, _THROTTLE_PER_CLIMB_M_S = 0.45, 0.44

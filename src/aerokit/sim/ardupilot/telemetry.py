@@ -161,7 +161,7 @@ def heartbeat(vehicle: ArduPilotVehicle) -> m.Heartbeat:
         state = MavState.STANDBY if vehicle.is_landed else MavState.ACTIVE
         if vehicle.failsafes.is_any_active:
             state = MavState.CRITICAL
-    return m.Heartbeat(vehicle.MAV_TYPE, MavAutopilot.ARDUPILOTMEGA, base_mode, mode, state, 3)
+    return m.Heartbeat(vehicle.MAV_TYPE, MavAutopilot.ARDUPILOTMEGA, base_mode, mode, state, mavlink_version=3)
 
 
 def _sys_status(vehicle: ArduPilotVehicle) -> m.SysStatus:
@@ -189,7 +189,7 @@ def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
     if vehicle.failsafes.battery_is_critical:
         charge = MavBatteryChargeState.CRITICAL
     current, consumed = round(battery.current_a * 100), round(battery.consumed_mah)
-    hectojoules, percent = round(battery.consumed_wh * 36), int(battery.percent)
+    hectojoules, percent = round(battery.consumed_wh * 36), int(battery.percent)  # 1 Wh is 36 hJ.
     return m.BatteryStatus(0, 0, 0, _UNKNOWN_TEMPERATURE, voltages, current, consumed, hectojoules, percent, 0, charge)
 
 
@@ -222,7 +222,7 @@ def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
 
     voltages = per_motor(round(vehicle.battery.voltage_v * 100))
     currents = per_motor(round(vehicle.battery.current_a * 25))  # A quarter of the battery current, in 0.01 A.
-    rpms = per_motor(round(vehicle.motors.throttle * 15000))
+    rpms = per_motor(round(vehicle.motors.throttle * 15000))  # Full throttle is 15,000 rpm.
     counts = per_motor(int(vehicle.uptime * 100) & 0xFFFF)
     temperatures = bytes(per_motor(32))
     return m.EscTelemetry1To4(temperatures, voltages, currents, (0,) * 4, rpms, counts)

@@ -245,7 +245,7 @@ class _Flight:
 
         A latitude or longitude that is NaN or INT32_MAX keeps the place, and an altitude that is NaN keeps the height.
         """
-        if whole(command.param2) != 1:
+        if whole(command.param2) != 1:  # The flag CHANGE_MODE is required.
             return MavResult.UNSUPPORTED
         result = self._change(modes.HOLD)
         if result != MavResult.ACCEPTED:

@@ -354,7 +354,8 @@ class Px4Failsafes:
             return
         px4, previous, self.action = self._px4, self.action, action
         px4.is_in_failsafe = action > Action.WARN
-        if max(previous, Action.WARN) < action < Action.TERMINATE:
+        is_escalation = action > max(previous, Action.WARN)
+        if is_escalation and action < Action.TERMINATE:  # A termination sends its own texts.
             self._report(action)
         if action == Action.DISARM:
             px4.arming.disarm("failsafe", force=True)

@@ -12,6 +12,7 @@ from aerokit.mavlink.enums import (
     MavAutopilot,
     MavBatteryFunction,
     MavBatteryType,
+    MavFrame,
     MavLandedState,
     MavModeFlag,
     MavModeProperty,
@@ -20,7 +21,7 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.message import Message
 from aerokit.sim.missions import INVALID_INDEX
-from aerokit.sim.motion import quaternion_from_euler
+from aerokit.sim.motion import centidegrees, quaternion_from_euler
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.telemetry_details import IDENTITY_BUILDERS, SENSOR_BUILDERS
@@ -59,7 +60,8 @@ def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
         base_mode |= MavModeFlag.SAFETY_ARMED
     if mode == modes.OFFBOARD and px4.offboard.is_fresh:
         base_mode |= MavModeFlag.STABILIZE_ENABLED
-    return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base_mode, modes.custom_mode(px4.mode), _state(px4), 3)
+    custom_mode = modes.custom_mode(px4.mode)
+    return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base_mode, custom_mode, _state(px4), mavlink_version=3)
 
 
 def _state(px4: Px4Vehicle) -> MavState:
@@ -85,7 +87,8 @@ def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
     present, enabled = _PRESENT, _ENABLED
     if px4.sticks.are_fresh:
         health |= _RC_BIT
-    return m.SysStatus(present, enabled, health, 120, voltage, -100, percent, 0, 0, 0, 0, 0, 0, 0, 0, 1)
+    load, current = 120, -100  # A load of 12 %, and a current that is not measured (-1 A).
+    return m.SysStatus(present, enabled, health, load, voltage, current, percent, 0, 0, 0, 0, 0, 0, 0, 0, 1)
 
 
 def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
@@ -170,7 +173,7 @@ def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
         round(motion.velocity_north * 100),
         round(motion.velocity_east * 100),
         round(motion.velocity_down * 100),
-        round(math.degrees(motion.yaw) % 360.0 * 100) % 36000,
+        centidegrees(motion.yaw),
     )
 
 
@@ -204,10 +207,12 @@ def _vfr_hud(px4: Px4Vehicle) -> m.VfrHud:
 def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
     motion = px4.motion
     if px4.faults.gps_lost:
-        return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, 9999, 9999, 65535, 65535, 0)
+        return m.GpsRawInt(
+            0, GpsFixType.NO_FIX, 0, 0, 0, eph=9999, epv=9999, vel=65535, cog=65535, satellites_visible=0
+        )
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
     altitude = round(place.altitude_m * 1000)
-    course = round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0 * 100) % 36000
+    course = centidegrees(math.atan2(motion.velocity_east, motion.velocity_north))
     return m.GpsRawInt(
         px4.time_boot_us,
         GpsFixType.RTK_FIXED if px4.corrections.is_recent else GpsFixType.TYPE_3D_FIX,
@@ -246,13 +251,24 @@ def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin | None:
     return m.GpsGlobalOrigin(origin.latitude_e7, origin.longitude_e7, altitude, px4.time_boot_us)
 
 
+_IGNORE_POSITION_AND_VELOCITY = 0b111111
+
+
 def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
     """Build POSITION_TARGET_LOCAL_NED. While disarmed, PX4 sends only a downward acceleration of 100 m/s²."""
     motion = px4.motion
     yaw = motion.yaw
     if not px4.is_armed:
         position_and_velocity, acceleration = (math.nan,) * 6, (0.0, 0.0, 100.0)
-        return m.PositionTargetLocalNed(px4.time_boot_ms, 1, 63, *position_and_velocity, *acceleration, yaw, 0.0)
+        return m.PositionTargetLocalNed(
+            px4.time_boot_ms,
+            MavFrame.LOCAL_NED,
+            _IGNORE_POSITION_AND_VELOCITY,
+            *position_and_velocity,
+            *acceleration,
+            yaw,
+            0.0,
+        )
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     acceleration = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down)
     return m.PositionTargetLocalNed(

@@ -57,6 +57,7 @@ def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
         return None
     motion = px4.motion
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
+    # The course in hundredths of a degree, rounded to whole degrees. Rounding may give 360, which is 0.
     course = round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0) % 360 * 100
     return m.OpenDroneIdLocation(
         target_system=0,
