@@ -82,7 +82,7 @@ class AccelerometerCalibration:
         request_until_confirmed()
 
 
-_COMPASSES, _ALL = 3, 0b111
+_COMPASSES, _ALL_COMPASSES = 3, 0b111
 _SETTLING_S = 1.0
 _FITNESS = 5.0
 
@@ -97,23 +97,23 @@ class CompassCalibration:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.turns_s: float = 30.0
-        self._mask = 0
+        self._compass_mask = 0
         self._started_at = math.inf
         self._saves_at_once = False
         self._progress_compass = 0
         self._reported_compass = 0
 
     def reset(self) -> None:
-        self._mask, self._started_at = 0, math.inf
+        self._compass_mask, self._started_at = 0, math.inf
 
     @property
     def is_running(self) -> bool:
         """True until the progress reaches 100 %. A calibration that waits for acceptance does not run any more."""
-        return bool(self._mask) and self.percent < 100
+        return bool(self._compass_mask) and self.percent < 100
 
     @property
     def percent(self) -> int:
-        if not self._mask:
+        if not self._compass_mask:
             return 0
         seconds = self._vehicle.now - self._started_at - _SETTLING_S
         return max(0, min(100, int(100.0 * seconds / self.turns_s)))
@@ -134,12 +134,12 @@ class CompassCalibration:
             return MavResult.FAILED
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
-        self._mask = whole(command.param1) & _ALL or _ALL
+        self._compass_mask = whole(command.param1) & _ALL_COMPASSES or _ALL_COMPASSES
         self._started_at, self._saves_at_once = self._vehicle.now, command.param3 != 0.0
         return MavResult.ACCEPTED
 
     def _accept(self, command: ReceivedCommand) -> int:
-        if not 0 <= command.param1 <= 255 or not self._mask or self.is_running:
+        if not 0 <= command.param1 <= 255 or not self._compass_mask or self.is_running:
             return MavResult.FAILED
         self.reset()
         return MavResult.ACCEPTED
@@ -147,7 +147,7 @@ class CompassCalibration:
     def _cancel(self, command: ReceivedCommand) -> int:
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
-        self._mask &= ~(whole(command.param1) or _ALL)
+        self._compass_mask &= ~(whole(command.param1) or _ALL_COMPASSES)
         return MavResult.ACCEPTED
 
     def progress(self) -> m.MagCalProgress | None:
@@ -160,26 +160,28 @@ class CompassCalibration:
         # The mask has one bit for each of 80 directions in which the vehicle can point.
         direction_count = percent * 80 // 100
         directions = ((1 << direction_count) - 1).to_bytes(10, "little")
-        return m.MagCalProgress(self._progress_compass, self._mask, status, 1, percent, directions, 0.0, 0.0, 0.0)
+        return m.MagCalProgress(
+            self._progress_compass, self._compass_mask, status, 1, percent, directions, 0.0, 0.0, 0.0
+        )
 
     def report(self) -> m.MagCalReport | None:
         """Return the result of one compass, each compass in turn.
 
         Return None before the end of a calibration, and after its result was accepted or cancelled.
         """
-        if not self._mask or self.is_running:
+        if not self._compass_mask or self.is_running:
             return None
         self._reported_compass = self._next_compass(self._reported_compass)
         offsets, diagonal, off_diagonal = (5.0, 13.0, -18.0), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
         saved = int(self._saves_at_once)
         status = MagCalStatus.SUCCESS
         return m.MagCalReport(
-            self._reported_compass, self._mask, status, saved, _FITNESS, *offsets, *diagonal, *off_diagonal
+            self._reported_compass, self._compass_mask, status, saved, _FITNESS, *offsets, *diagonal, *off_diagonal
         )
 
     def _next_compass(self, compass: int) -> int:
         candidates = ((compass + step) % _COMPASSES for step in range(1, _COMPASSES + 1))
-        return next(number for number in candidates if self._mask & 1 << number)
+        return next(number for number in candidates if self._compass_mask & 1 << number)
 
 
 _GYROS_S, _TRIM_S, _ACCELEROMETERS_S = 0.5, 1.0, 1.0
@@ -199,7 +201,7 @@ class Calibrations:
         self._vehicle = vehicle
         self.compasses: CompassCalibration = CompassCalibration(vehicle)
         self.accelerometers: AccelerometerCalibration = AccelerometerCalibration(vehicle)
-        self._accelerometers_at = -math.inf
+        self._simple_calibration_at = -math.inf
 
     @property
     def is_compass_running(self) -> bool:
@@ -242,9 +244,9 @@ class Calibrations:
             text = "Trim OK: roll=0.00 pitch=0.00 yaw=0.00"
             return CommandProgress((), _TRIM_S, finish=lambda: vehicle.info(text))
         if command.x == _Accelerometers.SIMPLE:
-            if vehicle.now - self._accelerometers_at < _MIN_ACCELEROMETERS_INTERVAL_S:
+            if vehicle.now - self._simple_calibration_at < _MIN_ACCELEROMETERS_INTERVAL_S:
                 return MavResult.TEMPORARILY_REJECTED
-            self._accelerometers_at = vehicle.now
+            self._simple_calibration_at = vehicle.now
             vehicle.info("Initialising ArduPilot")
             return CommandProgress((), _ACCELEROMETERS_S)
         is_forced = _FORCED in (command.x, command.param2)

@@ -61,7 +61,7 @@ class _CircleLeg:
         self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
         north, east = motion.north - centre[0], motion.east - centre[1]
         self._angle = math.atan2(east, north)
-        self._turned = 0.0
+        self._turned_rad = 0.0
         self._reported_turns = -1
         self._approach: _FlyLeg | None = None
         distance_to_circle = abs(math.hypot(north, east) - self._radius)
@@ -70,7 +70,7 @@ class _CircleLeg:
 
     @property
     def is_complete(self) -> bool:
-        return self._approach is None and self._turned / math.tau >= self._turns
+        return self._approach is None and self._turned_rad / math.tau >= self._turns
 
     def update(self, dt: float) -> None:
         if self._approach is not None:
@@ -84,7 +84,7 @@ class _CircleLeg:
         rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)
         self._report_new_turn()
         self._angle += rate * dt
-        self._turned += abs(rate) * dt
+        self._turned_rad += abs(rate) * dt
         self._report_new_turn()
         point, speed = self._point(), rate * self._radius
         # Follow a point that moves along the circle: command the velocity of the point, plus 1 m/s towards the point
@@ -100,7 +100,7 @@ class _CircleLeg:
         return (north, self._centre[1] + self._radius * math.sin(self._angle), self._centre[2])
 
     def _report_new_turn(self) -> None:
-        number = int(self._turned / math.tau)
+        number = int(self._turned_rad / math.tau)
         if number > self._reported_turns:
             self._reported_turns = number
             self._copter.info(f"Mission: starting circle {number + 1}/{int(self._turns)}")
@@ -174,7 +174,7 @@ class CopterAuto(MissionMode):
         self.descent: float = 0.0  # Maximum sink rate in m/s.
         self._leg: _Leg | None = None  # None: hold the position.
         self._last_reached = 0
-        self._reached_at = self._condition_from = self._delay_until = 0.0
+        self._reached_at = self._condition_started_at = self._delay_until = 0.0
         self._list_version = -1
         self._upcoming: tuple[tuple[int, MissionItem], ...] = ()
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
@@ -318,7 +318,7 @@ class CopterAuto(MissionMode):
         if command == Cmd.NAV_DELAY:
             return now > self._delay_until
         if command == Cmd.CONDITION_DELAY:
-            return now - self._condition_from > max(0.0, item.param1)
+            return now - self._condition_started_at > max(0.0, item.param1)
         if command == Cmd.CONDITION_DISTANCE:
             return horizontal_distance(self.vehicle, self.destination) < max(0.0, item.param1)
         if command == Cmd.CONDITION_YAW:
@@ -413,7 +413,7 @@ class CopterAuto(MissionMode):
         self.vehicle.info(f"Delaying {int(seconds)} sec")
 
     def _wait(self, _: MissionItem) -> None:
-        self._condition_from = self.vehicle.now
+        self._condition_started_at = self.vehicle.now
 
     def _turn(self, item: MissionItem) -> None:
         heading, direction = math.radians(item.param1), int(item.param3)

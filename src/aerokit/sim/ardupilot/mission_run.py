@@ -214,7 +214,7 @@ class MissionRun:
         self._state = MissionState.NOT_STARTED
 
     def set_current(self, index: int) -> bool:
-        """Continue the mission at the command with this index; return False if there is no such command."""
+        """Continue the mission at the command with this index. Return False if there is no such command."""
         has_only_home = self._list.count == 1
         if index >= self._list.count or has_only_home:
             return False
@@ -224,7 +224,7 @@ class MissionRun:
         index = max(index, _FIRST)
         if self.is_running:
             is_started = self._start_next_navigation(index)
-            if not is_started:
+            if not is_started:  # No navigation command follows, so the mission is over.
                 self._complete()
             return is_started
         return self._set_resume_index(index)

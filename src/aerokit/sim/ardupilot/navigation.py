@@ -41,7 +41,7 @@ class ArduPilotNavigation:
         self.origin: Ned | None = None
         self.home: Ned | None = None
         self.home_is_locked: bool = False
-        self._lost_at = math.nan
+        self._gps_lost_at = math.nan
 
     def start(self) -> None:
         """Schedule the events of the boot timeline."""
@@ -198,16 +198,16 @@ class ArduPilotNavigation:
         if self.gps_is_lost or not self.is_gps_detected:
             self._follow_gps_loss()
         elif self.fix_type < GpsFixType.TYPE_3D_FIX:
-            self._lost_at, self.fix_type = math.nan, GpsFixType.RTK_FIXED
+            self._gps_lost_at, self.fix_type = math.nan, GpsFixType.RTK_FIXED
             if self.origin is not None and not self.has_position and not self.uses_external:
                 self._use_gps()
 
     def _follow_gps_loss(self) -> None:
         """Report no fix at once, and no position after 7 s. After 15 s, GPS stops aiding the estimator."""
-        if math.isnan(self._lost_at):
-            self._lost_at, self.fix_type = self._vehicle.now, GpsFixType.NO_FIX
+        if math.isnan(self._gps_lost_at):
+            self._gps_lost_at, self.fix_type = self._vehicle.now, GpsFixType.NO_FIX
             return
-        lost_for = self._vehicle.now - self._lost_at
+        lost_for = self._vehicle.now - self._gps_lost_at
         if self.uses_external:
             return
         if self.has_position and lost_for >= _POSITION_TIMEOUT_S:

@@ -38,9 +38,9 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._manoeuvre = _LOITER
         self._landing: PlaneLanding | None = None
         self._on_circle_since = math.nan
-        self._turned = 0.0
+        self._turned_rad = 0.0
         self._last_bearing = 0.0
-        self._condition_from = 0.0
+        self._condition_started_at = 0.0
         self._leg_start: Ned = (0.0, 0.0, 0.0)
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             Cmd.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
@@ -103,7 +103,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             return
         bearing = math.atan2(wing.east - self._place[1], wing.north - self._place[0])
         if not math.isnan(self._on_circle_since):
-            self._turned += abs(wrap_pi(bearing - self._last_bearing))
+            self._turned_rad += abs(wrap_pi(bearing - self._last_bearing))
         elif self._is_on_circle:
             self._on_circle_since = self.vehicle.now
         self._last_bearing = bearing
@@ -140,13 +140,13 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if command == Cmd.NAV_LOITER_TIME:
             return self._report_if(plane.now - self._on_circle_since >= item.param1, "Loiter time complete")
         if command == Cmd.NAV_LOITER_TURNS:
-            return self._report_if(self._turned >= 2 * math.pi * item.param1, "Loiter orbits complete")
+            return self._report_if(self._turned_rad >= 2 * math.pi * item.param1, "Loiter orbits complete")
         if command == Cmd.NAV_LOITER_TO_ALT:
             assert self._place is not None
             is_at_height = abs(plane.wing.down - self._place[2]) < _REACHED_HEIGHT_M
             return self._report_if(is_at_height and self._is_on_circle, "Loiter to alt complete")
         if command == Cmd.CONDITION_DELAY:
-            return plane.now - self._condition_from > max(0.0, item.param1)
+            return plane.now - self._condition_started_at > max(0.0, item.param1)
         if command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH):
             return False
         self.warn_if_unknown(item)
@@ -179,7 +179,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if item.z == 0:
             down = self._leg_start[2] if self._place is None else self._place[2]
         self._place, self._manoeuvre = (north, east, down), manoeuvre
-        self._on_circle_since, self._turned, self.radius = math.nan, 0.0, 0.0
+        self._on_circle_since, self._turned_rad, self.radius = math.nan, 0.0, 0.0
 
     def _loiter(self, item: MissionItem) -> None:
         self._go(item, _LOITER)
@@ -198,7 +198,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self.vehicle.set_mode(PlaneMode.RTL)
 
     def _wait(self, _: MissionItem) -> None:
-        self._condition_from = self.vehicle.now
+        self._condition_started_at = self.vehicle.now
 
     def _change_speed(self, item: MissionItem) -> None:
         if self.vehicle.is_valid_airspeed(item.param2):

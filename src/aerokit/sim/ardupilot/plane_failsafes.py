@@ -53,7 +53,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         self._short_since = math.nan
         self._radio_bad = ConditionTimer()
         self._mode_before = self._mode_after = 0
-        self._is_pending = False
+        self._is_long_pending = False
 
     @property
     def is_any_active(self) -> bool:
@@ -150,7 +150,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self._end_long("RC Long Failsafe Cleared")
 
     def _end_long(self, text: str) -> None:
-        self.state, self._is_pending = _NONE, False
+        self.state, self._is_long_pending = _NONE, False
         self.warn(text)
 
     def _start_long(self, state: int) -> None:
@@ -163,7 +163,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         if mode in _LONG_AS_PILOTED:
             acts_in_take_off = action in (_LONG_GLIDE, _LONG_PARACHUTE)
             if self._is_in_take_off and not acts_in_take_off:
-                self._is_pending = True
+                self._is_long_pending = True
             else:  # In these modes, action 0 returns to launch; only in AUTO and GUIDED it continues.
                 self.change_to(*_LONG_MODES.get(action or _LONG_RTL, ()))
         elif mode == PlaneMode.RTL:
@@ -179,8 +179,8 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def _resume_pending(self) -> None:
         """Start a long failsafe that was postponed until the end of a take-off."""
-        if self._is_pending and not self._is_in_take_off:
-            self._is_pending = False
+        if self._is_long_pending and not self._is_in_take_off:
+            self._is_long_pending = False
             if self.vehicle.mode.number == PlaneMode.TAKEOFF:
                 self._start_long(_LONG)
 
@@ -203,7 +203,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         self.warn(text, MavSeverity.INFO)
 
     def _land_by_mission(self) -> bool:
-        """Fly the landing sequence of the mission; return False if the mission has no DO_LAND_START."""
+        """Start the landing sequence of the mission. Return False if the mission has no DO_LAND_START."""
         plane = self.vehicle
         items = enumerate(plane.missions.commands.items())
         land_start = next((index for index, item in items if item.command == MavCmd.DO_LAND_START), None)

@@ -149,7 +149,7 @@ class Px4Vehicle(Px4Host):
         self.arming: Px4Arming = Px4Arming(self, self.calibration)
         self.throttle: float = 0.0
         # True if a client has set home. Arming does not move such a home.
-        self.home_is_set_by_hand = False
+        self.home_is_set_by_client = False
         self.mode_after_landing: Px4Mode = modes.HOLD
         self.vtol_state: int = 0
         """MAV_VTOL_STATE to report. Assign a value to simulate a VTOL; the motion of the vehicle does not change."""
@@ -258,7 +258,7 @@ class Px4Vehicle(Px4Host):
 
     def on_armed(self) -> None:
         self.is_armed, self._has_flown, self._landed_at = True, False, math.nan
-        if not self.home_is_set_by_hand:
+        if not self.home_is_set_by_client:
             self.home = self.motion.place
         self.failsafes.on_armed()
         if self.mode == modes.MISSION:

@@ -344,7 +344,7 @@ class _Flight:
         else:
             north, east = px4.frame.to_local(*command.place())
             px4.home = (north, east, px4.frame.origin.altitude_m - command.z)
-        px4.home_is_set_by_hand = True
+        px4.home_is_set_by_client = True
         return MavResult.ACCEPTED
 
     def run_prearm_checks(self, _: ReceivedCommand) -> int:

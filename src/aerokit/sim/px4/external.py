@@ -96,15 +96,15 @@ class PrecisionLanding:
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._search_began_at: float | None = None
-        self._searches = 0
+        self._search_count = 0
 
     def enter(self) -> None:
-        self._search_began_at, self._searches = None, 0
+        self._search_began_at, self._search_count = None, 0
 
     def update(self) -> None:
         px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
         target = px4.external.target
-        if target is None or self._searches > limits["PLD_MAX_SRCH"]:
+        if target is None or self._search_count > limits["PLD_MAX_SRCH"]:
             self._search()
             return
         self._search_began_at = None
@@ -116,9 +116,9 @@ class PrecisionLanding:
     def _search(self) -> None:
         px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
         if self._search_began_at is None:
-            self._search_began_at, self._searches = px4.now, self._searches + 1
+            self._search_began_at, self._search_count = px4.now, self._search_count + 1
         is_over = px4.now - self._search_began_at > limits["PLD_SRCH_TOUT"]
-        if is_over or self._searches > limits["PLD_MAX_SRCH"]:
+        if is_over or self._search_count > limits["PLD_MAX_SRCH"]:
             px4.flight.descend()
             return
         search_down = px4.home[2] - limits["PLD_SRCH_ALT"]

@@ -100,7 +100,7 @@ class Px4Flight:
         self.speed_m_s: float = 0.0
         self.radius_m: float = 0.0  # Radius of the circle that a plane flies.
         self.lifts_off: bool = False  # True if the mode wants to leave the ground.
-        self.by_hand: Px4ManualFlight = Px4ManualFlight(vehicle)
+        self.manual_flight: Px4ManualFlight = Px4ManualFlight(vehicle)
         self.precision_landing: PrecisionLanding = PrecisionLanding(vehicle)
         self.orbit: Px4Orbit = Px4Orbit(vehicle)
         self._phase = ""
@@ -122,7 +122,7 @@ class Px4Flight:
         self.heading = None
         self._phase = "climb"
         self.stay_here()
-        self.by_hand.enter()
+        self.manual_flight.enter()
         self.precision_landing.enter()
         if mode == modes.RTL and self._vehicle.is_armed:
             self._plan_return()
@@ -138,7 +138,7 @@ class Px4Flight:
         mode = vehicle.mode
         self.lifts_off = (
             mode == modes.TAKEOFF
-            or self.by_hand.wants_up
+            or self.manual_flight.wants_up
             or (mode == modes.OFFBOARD and vehicle.offboard.wants_up)
             or (mode == modes.MISSION and vehicle.mission.wants_up)
         )
@@ -158,7 +158,7 @@ class Px4Flight:
         elif mode == modes.MISSION:
             vehicle.mission.update()
         elif mode in modes.STICK_MODES:
-            self.by_hand.update()
+            self.manual_flight.update()
         elif mode == modes.ORBIT:
             self.orbit.update()
         elif mode == modes.TERMINATION:

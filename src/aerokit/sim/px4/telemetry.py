@@ -236,7 +236,7 @@ def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
         return None
     place = px4.frame.to_global(*px4.home)
     altitude = round(place.altitude_m * 1000)
-    quaternion = (math.nan,) * 4 if px4.home_is_set_by_hand else (1.0, 0.0, 0.0, 0.0)
+    quaternion = (math.nan,) * 4 if px4.home_is_set_by_client else (1.0, 0.0, 0.0, 0.0)
     return m.HomePosition(
         place.latitude_e7, place.longitude_e7, altitude, *px4.home, quaternion, 0.0, 0.0, 0.0, px4.time_boot_us
     )

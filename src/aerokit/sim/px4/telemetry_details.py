@@ -148,7 +148,7 @@ def _distance_sensor(px4: Px4Vehicle) -> m.DistanceSensor:
 
 
 def _measured_acceleration(px4: Px4Vehicle) -> tuple[float, float, float]:
-    """Return the measured acceleration in m/s² forward, right, down."""
+    """Return the acceleration that the accelerometers measure, in m/s² forward, right and down."""
     motion = px4.motion
     north, east, down = (
         motion.acceleration_north,
@@ -157,6 +157,7 @@ def _measured_acceleration(px4: Px4Vehicle) -> tuple[float, float, float]:
     )
     cos_yaw, sin_yaw = math.cos(motion.yaw), math.sin(motion.yaw)
     forward, right = north * cos_yaw + east * sin_yaw, east * cos_yaw - north * sin_yaw
+    # The products of roll and pitch are small, and are left out.
     return (
         forward * math.cos(motion.pitch) - down * math.sin(motion.pitch),
         right * math.cos(motion.roll) + down * math.sin(motion.roll),
