@@ -130,7 +130,8 @@ class ReceivedCorrections:
         # short fragment.
         has_short = any(len(fragment) < FRAGMENT_SIZE for fragment in self._fragments.values())
         has_last = has_short or len(self._fragments) == MAX_FRAGMENTS
-        if has_last and len(self._fragments) == max(self._fragments) + 1:
+        has_all = len(self._fragments) == max(self._fragments) + 1  # The ids of the fragments count from 0.
+        if has_last and has_all:
             self._add(b"".join(self._fragments[index] for index in range(len(self._fragments))))
             self._fragments.clear()
 

@@ -107,7 +107,7 @@ class ArduPilotParameterServer(ParameterServer):
             names = self._parameters.names
             name = names[index] if 0 <= index < len(names) else ""
         if name in self._parameters:
-            self.send(name, index & 0xFFFF, channel)
+            self.send(name, index & 0xFFFF, channel)  # The index -1 of a read by name becomes 65535.
         elif self.errors:
             self.send_error(sender_of(request), name, index, MavParamError.DOES_NOT_EXIST, channel)
 

@@ -103,7 +103,7 @@ class SimParameters:
         for name, value in values.items():
             if name not in self:
                 similar = ", ".join(get_close_matches(name, self._rows)) or "none"
-                raise InvalidArgument(f"the simulated vehicle has no parameter {name!r}; similar: {similar}")
+                raise InvalidArgument(f"the simulated vehicle has no parameter {name!r}; similar names: {similar}")
             self[name] = value
 
     def __contains__(self, name: object) -> bool:

@@ -342,7 +342,7 @@ class CopterAuto(MissionMode):
         Otherwise return False, and disarm the landed copter.
         """
         copter = self.vehicle
-        if isinstance(self._leg, _FlyLeg):
+        if isinstance(self._leg, _FlyLeg):  # The copter first flies to the place of the landing.
             if self._leg.is_complete:
                 copter.yaw.hold()
                 self._leg = _DescendLeg(copter)

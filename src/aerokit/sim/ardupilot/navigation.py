@@ -187,7 +187,7 @@ class ArduPilotNavigation:
 
     def _use_gps(self) -> None:
         if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX or self.uses_external:
-            self._vehicle.call_later(1.0, self._use_gps)
+            self._vehicle.call_later(1.0, self._use_gps)  # Check again in a second.
             return
         self.flags = _WITH_POSITION
         self._report_cores("is using GPS")
@@ -208,7 +208,7 @@ class ArduPilotNavigation:
             self._gps_lost_at, self.fix_type = self._vehicle.now, GpsFixType.NO_FIX
             return
         lost_for = self._vehicle.now - self._gps_lost_at
-        if self.uses_external:
+        if self.uses_external:  # External navigation provides the position, even without GPS.
             return
         if self.has_position and lost_for >= _POSITION_TIMEOUT_S:
             self.flags = _DEAD_RECKONING | (Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0)

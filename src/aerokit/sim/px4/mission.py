@@ -94,6 +94,7 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
             approach = index - 1
         elif item.command == Cmd.NAV_RETURN_TO_LAUNCH and land_start >= 0:
             return "land start item before RTL item not possible."
+    # DO_LAND_START must not be after the item before the landing.
     return "invalid land start." if land_start > approach else None
 
 
