@@ -180,10 +180,11 @@ def test_fly_prints_four_words_for_each_item(capsys: pytest.CaptureFixture[str])
 
 def test_fly_records_and_names_next_command(capsys: pytest.CaptureFixture[str]) -> None:
     copter = SimulatedCopter(boot_time_s=0.0, home=HOME)
+    Path("my flight.tlog").write_text("earlier")
     assert run_with(copter, ["fly", "m.waypoints", "--yes", "--record", "my flight.tlog"]) == [0]
+    assert Path("my flight.1.tlog").read_text() == "earlier"
     assert capsys.readouterr().out.endswith("\nnext: aerokit report 'my flight.tlog'\n")
     assert sum(1 for _ in read_tlog("my flight.tlog")) > 100
-    assert run_with(copter, ["fly", "m.waypoints", "--yes", "--record", "my flight.tlog"]) == [6]
     assert run_with(SimulatedCopter(boot_time_s=0.0, home=HOME), ["fly", "m.waypoints", "--yes"]) == [0]
     assert "next time: --record FILE.tlog" in capsys.readouterr().out.splitlines()[-1]
 

@@ -184,11 +184,18 @@ def test_record_interrupted_writes_all_frames(capsys: pytest.CaptureFixture[str]
     assert f"flight.tlog: {received} frames received from system 1 in" in capsys.readouterr().out
 
 
-def test_record_to_existing_file_fails(capsys: pytest.CaptureFixture[str]) -> None:
+def test_record_without_frames_keeps_existing_file(capsys: pytest.CaptureFixture[str]) -> None:
     Path("flight.tlog").write_text("mine")
-    assert main(["record", "udpin:127.0.0.1:0", "flight.tlog", "--seconds", "1"]) == 6
+    assert main(["record", "udpin:127.0.0.1:0", "flight.tlog", "--seconds", "0.1"]) == 1
     assert Path("flight.tlog").read_text() == "mine"
-    assert capsys.readouterr().err == "aerokit: flight.tlog: file exists; nothing was recorded\n"
+    assert "0 bytes: nothing was received" in capsys.readouterr().out
+
+
+def test_record_to_existing_file_keeps_it_numbered(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("flight.tlog").write_text("mine")
+    assert run_on_messages([(1, 1, m.Heartbeat(2, 3, 81, 0, 3))], "record", "flight.tlog", "--seconds", "2") == 0
+    assert Path("flight.1.tlog").read_text() == "mine"
+    assert len(list(read_tlog("flight.tlog"))) >= 1
 
 
 def test_record_connection_failure_leaves_no_file() -> None:

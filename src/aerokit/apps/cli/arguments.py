@@ -230,5 +230,8 @@ def add_baud(command: argparse._ActionsContainer) -> None:
 def add_record(command: argparse._ActionsContainer) -> None:
     """Add ``--record FILE``; see `aerokit.apps.cli.output.new_recording`."""
     command.add_argument(
-        "--record", type=log_file, metavar="FILE", help="record all messages to a new file: flight.tlog"
+        "--record",
+        type=log_file,
+        metavar="FILE",
+        help="record all messages: flight.tlog (an existing file is kept as flight.1.tlog)",
     )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.apps.cli.arguments import add_baud, add_vehicle_kind, address, number, system_id, writable_file
 from aerokit.apps.cli.completion import addresses, offer
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_signing_key, connect_to, signing_of
-from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, add_force, add_json, check_not_existing, emit
+from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, add_json, emit, new_recording
 from aerokit.apps.cli.sim import simulated_vehicle
 from aerokit.apps.cli.supervised_flight import FlightReport, SupervisedFlight
 from aerokit.apps.cli.terminal import InterruptStack, on_interrupt
@@ -50,10 +50,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--record",
         type=writable_file,
+        default=_DEFAULT_LOG,
         metavar="FILE",
-        help=f"telemetry log to write ({_DEFAULT_LOG}, which is replaced each time)",
+        help=f"record all messages ({_DEFAULT_LOG}); an existing file is kept as demo.1.tlog",
     )
-    add_force(command)
     command.add_argument(
         "--speedup", type=number(0.1, 100), default=5.0, metavar="X", help="simulation speed factor (5)"
     )
@@ -65,10 +65,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 async def run_demo(options: argparse.Namespace) -> int:
     """Fly the demonstration. Return 0 when the vehicle is back on the ground."""
-    if options.record is None:
-        options.record = _DEFAULT_LOG
-    else:
-        check_not_existing(options.record, options)
     interrupts = InterruptStack()
     with on_interrupt(interrupts.interrupt):
         code = await interrupts.run(lambda: _connect_and_fly(options, interrupts))
@@ -81,6 +77,7 @@ async def run_demo(options: argparse.Namespace) -> int:
 async def _connect_and_fly(options: argparse.Namespace, interrupts: InterruptStack) -> int:
     async with _address(options) as address, AsyncExitStack() as stack:
         emit(options, "connecting", {"address": address}, f"connecting to {address}")
+        stack.enter_context(new_recording(options.record))
         signing = signing_of(options) if options.connect else None
         is_real = options.connect is not None
         vehicle = await stack.enter_async_context(

@@ -27,11 +27,9 @@ from aerokit.apps.cli.output import (
     DONE,
     FAILED,
     INTERRUPTED,
-    create_recording,
     emit,
     import_extra,
     new_recording,
-    remove_if_empty,
 )
 from aerokit.apps.cli.terminal import on_interrupt, waiting
 from aerokit.apps.event_text import event_details
@@ -57,7 +55,7 @@ EXIT_TIMEOUT_S = 3.0
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_record)
     add_link(command)
-    command.add_argument("file", type=log_file, metavar="FILE", help="new file, flight.tlog; directly after ADDRESS")
+    command.add_argument("file", type=log_file, metavar="FILE", help="flight.tlog; directly after ADDRESS")
     add_seconds(command, "stop after S seconds (at Ctrl-C)")
     command.add_argument(
         "--as-is",
@@ -68,28 +66,28 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 async def run_record(options: argparse.Namespace) -> int:
     """Record until Ctrl-C or for ``--seconds``; a lost link is reopened."""
+    with new_recording(options.file):
+        return await _record_link(options)
+
+
+async def _record_link(options: argparse.Namespace) -> int:
     counts: Counter[tuple[int, int]] = Counter()
 
     def count(frame: Frame, peer: Peer) -> None:
         counts[frame.system_id, frame.message_id] += 1
 
-    create_recording(options.file)
     error: AerokitError | None = None
-    try:
-        async with opened(options, reconnect=True) as connection:
-            started = connection.now()
-            connection.record(options.file)
-            connection.observe_frames(count)
-            text = f"recording {connection.link.address} to {options.file} until Ctrl-C"
-            emit(options, "recording", {"address": connection.link.address, "file": options.file}, text)
-            try:
-                is_interrupted = await _record(connection, options)
-            except AerokitError as ended:  # report the counts before the error
-                error, is_interrupted = ended, False
-            seconds = connection.now() - started
-    except BaseException:
-        remove_if_empty(options.file)
-        raise
+    async with opened(options, reconnect=True) as connection:
+        started = connection.now()
+        connection.record(options.file)
+        connection.observe_frames(count)
+        text = f"recording {connection.link.address} to {options.file} until Ctrl-C"
+        emit(options, "recording", {"address": connection.link.address, "file": options.file}, text)
+        try:
+            is_interrupted = await _record(connection, options)
+        except AerokitError as ended:  # report the counts before the error
+            error, is_interrupted = ended, False
+        seconds = connection.now() - started
     _emit_counts(options, counts, seconds)
     if error is not None:
         raise error
@@ -115,7 +113,7 @@ def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], 
         known = STANDARD.get(message_id)
         messages[str(message_id) if known is None else known.NAME] += number
     systems = sorted({system_id for system_id, _ in counts})
-    size = os.path.getsize(options.file)
+    size = os.path.getsize(options.file) if counts else 0  # without a frame, an earlier recording keeps its name
     record = {
         "file": options.file,
         "seconds": seconds,
