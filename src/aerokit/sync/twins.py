@@ -4390,11 +4390,19 @@ class Vehicle(VehicleTwin):
         return self.aio.taken_over
 
     def missing_for_flight(self) -> list[str]:
-        """Return what is still missing before the vehicle can fly, from the state received so far. Sends nothing."""
+        """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
+
+        If its arming checks fail, includes the vehicle's texts about them of the last 35 seconds;
+        :meth:`why_not_armable` requests them. A vehicle may arm all the same: ArduCopter arms in STABILIZE without a
+        position.
+        """
         return self._loop.call(self.aio.missing_for_flight)
 
     def why_not_armable(self) -> list[str]:
-        """Return the reasons why arming would be refused now; an empty list means that none is known.
+        """Return the reasons why arming would be refused now, in the present mode; an empty list means that none is
+        known.
+
+        What only a flight needs is not listed, see :meth:`missing_for_flight`.
 
         Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) if it supports that, and collects its status
         texts. Also reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).

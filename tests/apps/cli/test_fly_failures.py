@@ -10,12 +10,12 @@ from pathlib import Path
 
 import anyio
 import pytest
-from cli_harness import HOME, MISSION, ctrl_c, run_on, wait_until
+from cli_harness import HOME, MISSION, ctrl_c, run_on, run_with, wait_until
 
 import aerokit
 from aerokit.apps.cli import fly
 from aerokit.apps.cli import fly as flown_plan
-from aerokit.apps.cli.output import emit, emit_error
+from aerokit.apps.cli.output import TIMED_OUT, emit, emit_error
 from aerokit.errors import OperationRejected
 from aerokit.mavlink.enums import CopterMode
 from aerokit.missions import read_waypoint_file
@@ -212,6 +212,16 @@ def test_demo_repeats_reasons_of_vehicle_while_not_ready(capsys: pytest.CaptureF
 
     assert run_virtual(scenario()) == 1
     after_text = capsys.readouterr().out.partition("! PreArm: Compass not healthy\n")[2]
-    lines = [line for line in after_text.splitlines() if "    still missing: " in line]
+    lines = [line for line in after_text.splitlines() if "    cannot arm yet: " in line]
     assert len(lines) > 5
-    assert all(line.endswith("; PreArm: Compass not healthy") for line in lines)
+    assert all(line.endswith("  cannot arm yet: Compass not healthy") for line in lines)
+
+
+def test_fly_not_ready_prints_no_empty_list(capsys: pytest.CaptureFixture[str]) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0, home=HOME)
+    copter.faults.prearm_failures = ["Compass not healthy"]
+    Path("m.waypoints").write_text(MISSION)
+    assert run_with(copter, ["fly", "m.waypoints", "--yes", "--ready", "10"]) == [TIMED_OUT]
+    out, err = capsys.readouterr()
+    assert "still missing" not in out
+    assert err.endswith("; still missing:\n  - PreArm: Compass not healthy\n")

@@ -79,7 +79,9 @@ def test_status_prints_all_vehicles(
 
 def test_status_prints_what_is_missing_for_flight(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_with(SimulatedCopter(boot_time_s=600.0), ["status"]) == [0]
-    assert "missing  " in (out := capsys.readouterr().out)
+    out = capsys.readouterr().out
+    assert "  arming   cannot arm: " in out
+    assert "position unknown" in out
     assert "ready  " not in out
 
 
@@ -99,7 +101,9 @@ def test_status_without_gps_names_mode_that_allows_arming(
 
     run_virtual(scenario())
     out = capsys.readouterr().out
-    assert ("missing  for autonomous flight; STABILIZE allows arming:\n" in out) is is_for_flight_only
+    words = "  arming   arms in STABILIZE, but cannot take off by itself or fly GUIDED, AUTO, RTL:\n"
+    assert (words in out) is is_for_flight_only
+    assert ("cannot arm: " in out) is not is_for_flight_only
     assert "the estimator has no absolute horizontal position" in out
 
 
@@ -109,6 +113,16 @@ def test_status_of_ready_vehicle_says_so(capsys: pytest.CaptureFixture[str]) -> 
     out = capsys.readouterr().out
     assert "ready    no reason against arming is reported\n" in out
     assert "missing" not in out
+    assert "position -35.3632610, 149.1652300, height above home 0.0 m\n" in out
+
+
+def test_status_gives_real_reason_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.faults.prearm_failures = ["Compass not healthy"]
+    assert run_with(copter, ["status", "--seconds", "8"]) == [0]
+    out = capsys.readouterr().out
+    assert "  arming   cannot arm: PreArm: Compass not healthy\n" in out
+    assert "SYS_STATUS" not in out
 
 
 def test_status_sends_only_requests_and_restores_rates() -> None:

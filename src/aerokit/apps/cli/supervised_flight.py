@@ -16,6 +16,7 @@ import anyio
 
 from aerokit import events
 from aerokit.apps.cli.output import DONE, INTERRUPTED, MISSION_TEXT, emit, plain_text
+from aerokit.apps.readiness import Readiness, arms_but, readiness
 from aerokit.errors import (
     AerokitError,
     CommandRejected,
@@ -25,7 +26,6 @@ from aerokit.errors import (
 )
 from aerokit.events import SILENT_AFTER_S
 from aerokit.mavlink.enums import MavLandedState
-from aerokit.vehicle.commanding.arming import PREARM_REPORT_INTERVAL_S
 from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
 
 if TYPE_CHECKING:
@@ -76,7 +76,10 @@ class SupervisedFlight(ABC):
         except Exception as error:
             # After any error, a vehicle that this program has armed must not stay armed on the ground.
             cause, _, reasons = plain_text(error).partition("\n")
-            self._print(f"failed: {cause}" + (f"\n{reasons}" if reasons and self._prints_reasons else ""))
+            if self._prints_reasons and reasons:
+                self._print(f"failed: {cause}\n{reasons}")
+            else:
+                self._print(f"failed: {cause.removesuffix('; still missing:')}")
             if self.armed_by_us:
                 await self._make_safe(partial(self._after_failure, error))
             raise
@@ -214,7 +217,6 @@ class FlightReport:
     def __init__(self, vehicle: Vehicle, options: argparse.Namespace, speedup: float) -> None:
         self._vehicle, self._options, self._speedup = vehicle, options, speedup
         self._armed_at: float | None = None
-        self._arming_texts: dict[str, float] = {}  # the vehicle's reasons against arming, with their times
         self._armed_s = 0.0
         self._started = self._last_line = vehicle.connection.now()
         self._highest_m = self._fastest_m_s = self._flown_m = 0.0
@@ -310,8 +312,6 @@ class FlightReport:
                 if isinstance(event, events.ModeChanged):
                     self.print_line(f"  mode {event.after}")
                 elif isinstance(event, events.StatusTextReceived) and not MISSION_TEXT.match(event.text):
-                    if self._vehicle.autopilot.arming_reason(event.text) is not None:
-                        self._arming_texts[event.text] = self._vehicle.connection.now()
                     self.print_line(f"  {'! ' if event.severity <= _WARNING else ''}{event.text}")
 
     async def _print_status(self) -> None:
@@ -320,11 +320,11 @@ class FlightReport:
             await anyio.sleep(_STATUS_INTERVAL_S / 5)
             if not self.prints_status or vehicle.connection.now() - self._last_line < _STATUS_INTERVAL_S:
                 continue
-            missing = [] if vehicle.is_armed else vehicle.missing_for_flight()
-            if missing:
-                since = vehicle.connection.now() - PREARM_REPORT_INTERVAL_S
-                texts = [text for text, at in self._arming_texts.items() if at >= since]
-                self.print_line(f"  still missing: {'; '.join([*missing, *texts])}")
+            found = Readiness((), ()) if vehicle.is_armed else readiness(vehicle)
+            if found.against_arming:
+                self.print_line(f"  cannot arm yet: {'; '.join([*found.against_arming, *found.against_flight])}")
+            elif found.against_flight:
+                self.print_line(f"  {arms_but(vehicle)}: {'; '.join(found.against_flight)}")
             else:
                 self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
 
