@@ -110,8 +110,23 @@ def test_params_set_and_get_round_trip(run: Run) -> None:
 def test_params_set_with_unknown_name_sets_the_others(run: Run) -> None:
     code, out, _ = run("params", "set", "WPNAV_ACCEL=210", "NO_SUCH=1")
     assert code == 5
-    assert "WPNAV_ACCEL      210          set range not checked (--metadata FILE checks it)" in out
+    assert "WPNAV_ACCEL      250 → 210    set range not checked (--metadata FILE checks it)" in out
     assert "NO_SUCH          not set: " in out
+
+
+def test_params_load_with_invalid_values_names_all_and_sets_nothing(run: Run, tmp_path: Path) -> None:
+    file = tmp_path / "bad.param"
+    file.write_text("RTL_ALT,1800\nNOSUCH,4\nFLTMODE1,3.5\nFLTMODE2,300\n")
+    before = run("params", "get", "RTL_ALT")[1]
+    code, out, err = run("params", "load", str(file))
+    assert (code, out) == (2, "")
+    assert err.splitlines() == [
+        f"aerokit: {file}, line 3: FLTMODE1 = 3.5 must be a whole number (it is an INT8)",
+        f"{file}, line 4: FLTMODE2 = 300 must be in -128..127 (it is an INT8)",
+        f"{file}, line 2: the vehicle has no parameter NOSUCH",
+        "nothing was set",
+    ]
+    assert run("params", "get", "RTL_ALT")[1] == before
 
 
 def test_params_list_filters_by_pattern_and_changed(run: Run) -> None:

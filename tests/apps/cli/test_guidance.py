@@ -72,7 +72,8 @@ def test_unknown_option_gets_no_far_suggestion(capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("assignment", "hint"),
     [
-        ("RTL_AL=1", "(did you mean 'RTL_ALT' or 'RTL_ALTITUDE' or 'RTL_ALT_TYPE'?)"),
+        ("RTL_AL=1", "(did you mean 'RTL_ALT' or 'RTL_ALT_TYPE' or 'RTL_ALT_FINAL'?)"),
+        ("RTL_ALTITUDE=1", "(did you mean 'RTL_ALT' or 'RTL_ALT_TYPE'?)"),  # a plane's name
         ("BOGUS=1", "; `aerokit params list` shows all names"),
     ],
 )

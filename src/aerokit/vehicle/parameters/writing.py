@@ -169,7 +169,7 @@ class ParameterWrite(Snapshot):
     - ``"failed"``: see ``error``; ``value`` is the last known value, or NaN.
 
     ``note`` has further information: another name on this vehicle, a value outside its documented range, a reboot that
-    is needed.
+    is needed. ``before`` is the value that the vehicle had, None if unknown.
     """
 
     name: str
@@ -179,6 +179,7 @@ class ParameterWrite(Snapshot):
     outcome: Outcome
     note: str = ""
     error: AerokitError | None = None
+    before: int | float | None = None
 
 
 def failed(name: str, requested: float, known: Parameter | None, error: AerokitError) -> ParameterWrite:
@@ -303,7 +304,8 @@ class ParameterWriter:
         written = plan.found.as_requested(answer)
         notes = (plan.found.note, self._note_of(plan.wanted.name, answer.value))
         note = "; ".join(filter(None, notes))
-        return ParameterWrite(name, requested, written.value, written.type, outcome, note)
+        before = plan.found.as_requested(plan.before).value
+        return ParameterWrite(name, requested, written.value, written.type, outcome, note, before=before)
 
 
 def _plan_write(found: ResolvedParameter, value: int | float) -> _PlannedWrite:
