@@ -193,6 +193,21 @@ def test_mission_check_warns_of_unknown_command_and_missing_take_off(capsys: pyt
     assert out.endswith("m.waypoints has no errors, but 2 warnings\n")
 
 
+@pytest.mark.parametrize("text", ["", "[1]", '{"a":', "hello"])
+def test_broken_plan_file_gives_error_about_plan(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("bad.plan").write_text(text)
+    assert main(["mission", "check", "bad.plan"]) == 6
+    err = capsys.readouterr().err
+    assert "QGC WPL" not in err
+    assert err.startswith("aerokit: bad.plan")
+
+
+def test_mission_upload_gives_the_warnings_of_check(run: Run) -> None:
+    Path("m.waypoints").write_text(WAYPOINTS.replace("\t3\t22\t", "\t3\t16\t"))
+    out = run("mission", "upload", "m.waypoints")[1]
+    assert "warning: the mission does not begin with a take-off" in out
+
+
 def test_mission_check_of_plan_without_problems_has_no_warnings(capsys: pytest.CaptureFixture[str]) -> None:
     Path("m.waypoints").write_text(WAYPOINTS)
     assert main(["mission", "check", "m.waypoints"]) == 0
