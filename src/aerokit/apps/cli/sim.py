@@ -5,17 +5,16 @@ from __future__ import annotations
 import asyncio
 import inspect
 import shlex
-from contextlib import suppress
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from aerokit.apps.cli.arguments import (
     DEFAULT_SIM_ADDRESS,
-    FAULTS,
+    add_faults,
     add_vehicle_kind,
     address_or_template,
     count,
     expand_address,
-    fault,
     home,
     is_address_template,
     number,
@@ -45,7 +44,7 @@ from aerokit.transport.address import parse_address
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 
     from aerokit.sim import AttachableComponent
     from aerokit.testing.track import Track
@@ -239,17 +238,7 @@ def _add_conditions(command: argparse.ArgumentParser) -> None:
         metavar="S",
         help="simulated seconds until the vehicle is ready to arm",
     )
-    faults = command.add_argument(
-        "--fault",
-        action="append",
-        type=fault,
-        default=[],
-        dest="faults",
-        metavar="NAME[@S]",
-        help="fault of every vehicle, from the start or after S simulated seconds (repeatable):"
-        f" {', '.join(FAULTS)}; loss=0.2 loses a share, 'prearm_failures=TEXT' refuses to arm",
-    )
-    offer(faults, lambda: FAULTS)
+    add_faults(command)
     add_signing_key(command, "signing key of the vehicles; ArduPilot's first port accepts unsigned messages too")
     command.add_argument(
         "--duration", type=number(0.1, 1e6), metavar="S", help="stop after S simulated seconds (at Ctrl-C)"
@@ -271,12 +260,10 @@ async def run_sim(options: argparse.Namespace) -> int:
     server = _server(vehicles, options.addresses, options.speedup)
     stop = asyncio.Event()
     with on_interrupt(stop.set):
-        async with server:
-            injecting = asyncio.create_task(_inject(vehicles, options))
+        async with server, faults_begin(vehicles, options):
             _emit(server, options)
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(stop.wait(), options.duration and options.duration / options.speedup)
-            injecting.cancel()
     emit(options, "stopped", {}, "stopped")
     if options.picture is not None:
         from aerokit.testing.picture import save_picture
@@ -285,6 +272,16 @@ async def run_sim(options: argparse.Namespace) -> int:
         record = {"file": options.picture, "what": "track", "count": len(tracks)}
         emit(options, "saved", record, f"track written to {options.picture}")
     return 0
+
+
+@asynccontextmanager
+async def faults_begin(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> AsyncIterator[None]:
+    """Within the block, begin the faults of ``--fault`` at their times."""
+    injecting = asyncio.create_task(_inject(vehicles, options))
+    try:
+        yield
+    finally:
+        injecting.cancel()
 
 
 async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> None:

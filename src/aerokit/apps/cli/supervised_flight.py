@@ -226,7 +226,7 @@ class FlightReport:
 
     def print_line(self, text: str) -> None:
         """Print a line with time and altitude. A closed pipe or a full disk does not end the flight."""
-        here = self._vehicle.position.latest
+        here = None if self._vehicle.heartbeat_age > SILENT_AFTER_S else self._vehicle.position.latest
         altitude = None if here is None else here.altitude_relative_m
         height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"
         self._last_line = self._vehicle.connection.now()
@@ -319,6 +319,12 @@ class FlightReport:
         while vehicle.connection.is_open:
             await anyio.sleep(_STATUS_INTERVAL_S / 5)
             if not self.prints_status or vehicle.connection.now() - self._last_line < _STATUS_INTERVAL_S:
+                continue
+            if vehicle.heartbeat_age > SILENT_AFTER_S:
+                height = vehicle.position.latest and vehicle.position.latest.altitude_relative_m
+                last = "" if height is None else f" at {height:.1f} m"
+                seconds = self._speedup * vehicle.heartbeat_age
+                self.print_line(f"  silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}")
                 continue
             found = Readiness((), ()) if vehicle.is_armed else readiness(vehicle)
             if found.against_arming:
