@@ -121,7 +121,8 @@ def test_sim_after_duration_writes_picture(tmp_path: Path, capsys: pytest.Captur
     assert printed[1].startswith("system 2 on udpout:127.0.0.1:45551")
     assert printed[2].startswith("systems 1 to 2 on tcpin:127.0.0.1:")
     assert printed[3] == "try: aerokit demo --connect udpin:127.0.0.1:45550"
-    assert printed[4:] == ["stopped", f"track written to {picture}"]
+    assert printed[4].startswith("or:  aerokit status udpin:127.0.0.1:45550, ")
+    assert printed[5:] == ["stopped", f"track written to {picture}"]
     assert picture.read_text().count("<polyline") == 4
 
 

@@ -153,6 +153,15 @@ def test_sim_hint_chooses_one_of_several_vehicles(address: str, hint: str, capsy
     assert hint in capsys.readouterr().out.splitlines()
 
 
+def test_sim_on_two_ports_prints_vehicle_once_and_programs(capsys: pytest.CaptureFixture[str]) -> None:
+    one, other = "udpout:127.0.0.1:45575", "udpout:127.0.0.1:45576"
+    assert main(["sim", one, other, "--duration", "1", "--speedup", "100"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    place = "udpin:127.0.0.1:45575"
+    assert lines[0] == f"system 1 on {one} and {other}, speed 100x"
+    assert lines[2] == f"or:  aerokit status {place}, aerokit monitor {place}, aerokit serve {place}"
+
+
 # -------------------------------------------------------------------------------------------- flying
 
 

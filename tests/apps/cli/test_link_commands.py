@@ -141,6 +141,11 @@ def test_status_sends_only_requests_and_restores_rates() -> None:
     assert others == set()
 
 
+def test_status_without_vehicle_names_simulator(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["status", "udpin:127.0.0.1:45561", "--patience", "0.1"]) == 3
+    assert "in another terminal: aerokit sim udpout:127.0.0.1:45561)" in capsys.readouterr().err
+
+
 def test_status_without_vehicle_lists_ground_stations(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_on_messages([(255, 190, GROUND_STATION)], "status", "--patience", "3") == 3
     printed = capsys.readouterr()

@@ -58,6 +58,8 @@ _CLIENT_SCHEMES = {
     "zenohin": "zenoh",
 }
 
+_SERIAL_END = "the other end of the serial line"
+
 
 def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
     """Create a vehicle of a kind of `aerokit.sim.kinds`. ``options`` are arguments of its class.
@@ -348,13 +350,16 @@ def _emit(server: SimulatorServer, options: argparse.Namespace) -> None:
             "address": address,
             "speedup": options.speedup,
         }
-        text = f"{_systems(vehicles)} on {address}, speed {options.speedup:g}x"
-        emit(options, "simulated", record, text)
+        same = [place for place, others in zip(server.addresses, server.vehicles_on, strict=True) if others == vehicles]
+        text = f"{_systems(vehicles)} on {' and '.join(same)}, speed {options.speedup:g}x"
+        emit(options, "simulated", record, text if address == same[0] else None)
     if not options.json:
         vehicles = server.vehicles_on[0]
         place = _client_address(server.addresses[0], options.addresses[0])
         choice = f" --system-id {vehicles[0].system_id}" if len(vehicles) > 1 else ""
         print(f"try: aerokit demo --connect {place}{choice}", flush=True)
+        if place != _SERIAL_END:
+            print(f"or:  aerokit status {place}, aerokit monitor {place}, aerokit serve {place}", flush=True)
 
 
 def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
@@ -370,7 +375,7 @@ def _client_address(address: str, as_given: str) -> str:
     if scheme == "pty":
         return place
     if scheme not in _CLIENT_SCHEMES:
-        return "the other end of the serial line"
+        return _SERIAL_END
     return f"{_CLIENT_SCHEMES[scheme]}:{place.replace('0.0.0.0', '127.0.0.1')}"
 
 
