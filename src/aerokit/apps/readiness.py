@@ -18,7 +18,7 @@ class Readiness(NamedTuple):
     against_arming: tuple[str, ...]
     """Why arming is refused in the present mode."""
     against_flight: tuple[str, ...]
-    """What else is missing for take-off and for flight in the modes that need a position."""
+    """The rest that is missing for take-off and for flight in the modes that need a position."""
 
 
 def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None) -> Readiness:

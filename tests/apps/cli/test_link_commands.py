@@ -13,7 +13,9 @@ from flight_harness import Wire
 import aerokit
 from aerokit import messages as m
 from aerokit.apps.cli import main
+from aerokit.apps.cli.listening import _kept_is_printed
 from aerokit.apps.cli.output import TIMED_OUT
+from aerokit.connection.frame_observers import keep_existing
 from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.mavlink.signing import SigningKey
 from aerokit.mavlink.tlog import read_tlog
@@ -208,6 +210,13 @@ def test_record_without_frames_keeps_existing_file(capsys: pytest.CaptureFixture
     assert main(["record", "udpin:127.0.0.1:0", "flight.tlog", "--seconds", "0.1"]) == 1
     assert Path("flight.tlog").read_text() == "mine"
     assert "0 bytes: nothing was received" in capsys.readouterr().out
+
+
+def test_monitor_names_kept_recording_at_its_end(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("flight.tlog").write_text("mine")
+    with _kept_is_printed("flight.tlog"):
+        keep_existing("flight.tlog")
+    assert capsys.readouterr().err == "flight.tlog existed and was kept as flight.1.tlog\n"
 
 
 def test_record_to_existing_file_keeps_it_numbered(capsys: pytest.CaptureFixture[str]) -> None:

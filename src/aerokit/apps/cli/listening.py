@@ -8,8 +8,9 @@ import signal
 import sys
 import threading
 from collections import Counter
-from contextlib import AsyncExitStack, ExitStack, suppress
+from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit.apps.cli.arguments import add_record, log_file
@@ -38,6 +39,7 @@ from aerokit.events import Event, LinkReport, StatusTextReceived
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Iterator
 
     from aerokit.connection.connection import Connection
     from aerokit.mavlink.frame import Frame
@@ -224,6 +226,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
             stack.callback(end.cancel)
 
         stack.enter_context(new_recording(options.record))
+        stack.enter_context(_kept_is_printed(options.record))
         return await run(
             options.address,
             baud=options.baud,
@@ -231,6 +234,19 @@ async def run_monitor(options: argparse.Namespace) -> int:
             record=options.record,
             on_start=lambda app: stack.enter_context(on_interrupt(app.exit, end_soon)),
         )
+
+
+@contextmanager
+def _kept_is_printed(path: str | None) -> Iterator[None]:
+    """After the block, print where an earlier recording of this name is now, because Textual hides the log meanwhile."""
+    if path is None or not os.path.isfile(path):
+        yield
+        return
+    earlier = os.stat(path)
+    yield
+    for kept in Path(path).resolve().parent.iterdir():
+        if kept.name != Path(path).name and os.path.samestat(kept.lstat(), earlier):
+            print(f"{path} existed and was kept as {kept.name}", file=sys.stderr)
 
 
 def _detach_terminal() -> None:
