@@ -238,7 +238,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _kept_is_printed(path: str | None) -> Iterator[None]:
-    """After the block, print where an earlier recording of this name is now, because Textual hides the log meanwhile."""
+    """After the block, print where an earlier recording is now, because Textual hides the log meanwhile."""
     if path is None or not os.path.isfile(path):
         yield
         return
