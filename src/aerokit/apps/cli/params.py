@@ -16,13 +16,13 @@ from aerokit.apps.cli.completion import assignments, offer, parameter_names
 from aerokit.apps.cli.connecting import add_action
 from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, exit_code, near_names, suggestion
 from aerokit.apps.cli.params_metadata import (
-    about,
-    about_text,
     add_metadata,
-    check_given,
-    load_given,
+    check_allowed,
+    load_metadata_option,
+    metadata_facts,
     metadata_for_check,
     metadata_source,
+    metadata_text,
     reboot_note,
 )
 from aerokit.apps.cli.terminal import progress_bar
@@ -87,16 +87,17 @@ def connected(options: argparse.Namespace, *, changes: bool = False) -> Abstract
 
 
 async def _list(options: argparse.Namespace) -> int:
-    metadata = load_given(options)
+    metadata = load_metadata_option(options)
     async with connected(options) as vehicle:
         table = await _download(vehicle, options)
     if options.changed:
         table = table.changed_from_default()
     pattern = options.pattern.upper()
-    pattern = pattern if any(mark in pattern for mark in "*?[") else f"*{pattern}*"
-    found = [value for name, value in table.items() if fnmatch.fnmatch(name, pattern)]
-    _emit_parameters(options, found, metadata)
-    if not found and options.pattern != "*":
+    if not any(wildcard in pattern for wildcard in "*?["):
+        pattern = f"*{pattern}*"
+    matching = [parameter for name, parameter in table.items() if fnmatch.fnmatch(name, pattern)]
+    _emit_parameters(options, matching, metadata)
+    if not matching and options.pattern != "*":
         hint = suggestion(options.pattern.strip("*"), table, 3)
         print(f"aerokit: none of {len(table)} parameters matches {options.pattern!r}{hint}", file=sys.stderr)
         return FAILED
@@ -104,7 +105,7 @@ async def _list(options: argparse.Namespace) -> int:
 
 
 async def _get(options: argparse.Namespace) -> int:
-    metadata = load_given(options)
+    metadata = load_metadata_option(options)
     async with connected(options) as vehicle:
         for name in options.names:
             _emit_parameters(options, [await _read(vehicle, name, options)], metadata)
@@ -126,33 +127,33 @@ async def _save(options: argparse.Namespace) -> int:
 async def _diff(options: argparse.Namespace) -> int:
     from aerokit.parameters import read_parameter_file
 
-    wanted = read_parameter_file(options.file)
+    file_values = read_parameter_file(options.file)
     async with connected(options) as vehicle:
         await _download(vehicle, options)
-        differences = await vehicle.parameters.diff(wanted, idle_timeout_s=options.patience)
+        differences = await vehicle.parameters.diff(file_values, idle_timeout_s=options.patience)
     for difference in differences:
-        sides = f"vehicle {_side(difference.before)}, file {_side(difference.after)}"
-        emit(options, "parameter_difference", difference.to_dict(), f"{difference.name:16} {sides}")
-    record = {"file": options.file, "parameters": len(wanted), "different": len(differences)}
-    emit(options, "comparison", record, f"{len(differences)} of {len(wanted)} parameters differ")
+        values = f"vehicle {_value_or_missing(difference.before)}, file {_value_or_missing(difference.after)}"
+        emit(options, "parameter_difference", difference.to_dict(), f"{difference.name:16} {values}")
+    record = {"file": options.file, "parameters": len(file_values), "different": len(differences)}
+    emit(options, "comparison", record, f"{len(differences)} of {len(file_values)} parameters differ")
     return DONE if not differences else FAILED
 
 
 async def _set(options: argparse.Namespace) -> int:
-    given = load_given(options)
+    metadata = load_metadata_option(options)
     if not options.force:
-        check_given(given, dict(options.values))
+        check_allowed(metadata, dict(options.values))  # before the vehicle is connected
     async with connected(options, changes=True) as vehicle:
-        if given is None:
-            given = await metadata_for_check(vehicle, None, options)
-            check_given(given, dict(options.values))
+        if metadata is None:
+            metadata = await metadata_for_check(vehicle, None, options)
+            check_allowed(metadata, dict(options.values))
         results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
         known = await _names_for_hints(vehicle, results.values())
     if not options.force:
-        results = {name: with_range_note(given, each, "--metadata FILE") for name, each in results.items()}
-    code = _emit_results(options, results.values(), known, given)
+        results = {name: with_range_note(metadata, result, "--metadata FILE") for name, result in results.items()}
+    code = _emit_results(options, results.values(), known, metadata)
     was_set = any(result.error is None and result.outcome != "unchanged" for result in results.values())
-    if was_set and given is None and not options.force and not options.json:
+    if was_set and metadata is None and not options.force and not options.json:
         print(metadata_source(vehicle))
     return code
 
@@ -160,16 +161,19 @@ async def _set(options: argparse.Namespace) -> int:
 async def _load(options: argparse.Namespace) -> int:
     from aerokit.parameters import read_parameter_file
 
-    wanted, given = read_parameter_file(options.file), load_given(options)
+    file_values, file_metadata = read_parameter_file(options.file), load_metadata_option(options)
     async with connected(options, changes=True) as vehicle:
-        _check_file(wanted, await _download(vehicle, options), vehicle)
-        metadata = await metadata_for_check(vehicle, given, options)
+        _check_file(file_values, await _download(vehicle, options), vehicle)
+        metadata = await metadata_for_check(vehicle, file_metadata, options)
         if metadata is not None:
             # Only changes are checked, because a backup may have unusual values that the vehicle has already.
-            differences = await vehicle.parameters.diff(wanted, idle_timeout_s=options.patience)
-            check_given(metadata, {one.name: one.after for one in differences if one.after is not None})
-        with progress_bar("parameters", "parameter") as show:
-            results = await vehicle.parameters.upload(wanted, idle_timeout_s=options.patience, on_progress=show)
+            differences = await vehicle.parameters.diff(file_values, idle_timeout_s=options.patience)
+            new_values = {change.name: change.after for change in differences if change.after is not None}
+            check_allowed(metadata, new_values)
+        with progress_bar("parameters", "parameter") as on_progress:
+            results = await vehicle.parameters.upload(
+                file_values, idle_timeout_s=options.patience, on_progress=on_progress
+            )
         table = vehicle.parameters.table
     if options.json:
         return _emit_results(options, results.values(), table, metadata)
@@ -204,8 +208,8 @@ def _check_file(wanted: ParameterFile, table: ParameterTable, vehicle: Vehicle) 
 
 
 async def _download(vehicle: Vehicle, options: argparse.Namespace) -> ParameterTable:
-    with progress_bar("parameters", "parameter") as show:
-        return await vehicle.parameters.download(idle_timeout_s=options.patience, on_progress=show)
+    with progress_bar("parameters", "parameter") as on_progress:
+        return await vehicle.parameters.download(idle_timeout_s=options.patience, on_progress=on_progress)
 
 
 async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Parameter:
@@ -248,9 +252,9 @@ def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter
     for parameter in parameters:
         is_changed = parameter.default is not None and parameter.default != parameter.value
         default = f"  (default {_text(parameter.default)})" if is_changed else ""
-        facts = about(metadata, parameter)
-        described = f"  {about_text(facts)}".rstrip()
-        text = f"{parameter.name:16} {_text(parameter.value):<12}{default}{described}".rstrip()
+        facts = metadata_facts(metadata, parameter)
+        description = f"  {metadata_text(facts)}".rstrip()
+        text = f"{parameter.name:16} {_text(parameter.value):<12}{default}{description}".rstrip()
         emit(options, "parameter", {**_record(parameter), **facts}, text)
 
 
@@ -265,8 +269,8 @@ def _emit_results(
     code = DONE
     for result in results:
         if result.error is None and result.outcome != "unchanged":
-            due = reboot_note(metadata, result.name, result.value)
-            result = result.replace(note="; ".join(filter(None, (result.note, due))))
+            reboot = reboot_note(metadata, result.name, result.value)
+            result = result.replace(note="; ".join(filter(None, (result.note, reboot))))
         if result.error is None:
             is_same = result.before is None or result.outcome == "unchanged"
             value = _text(result.value) if is_same else f"{_text(result.before)} → {_text(result.value)}"
@@ -282,12 +286,12 @@ def _emit_results(
 
 
 def _record(parameter: Parameter | ParameterWrite) -> dict[str, object]:
-    # the key "type" is reserved for the type of the record
+    # The key "type" is reserved for the type of the record.
     fields = parameter.to_dict()
     return {("value_type" if name == "type" else name): value for name, value in fields.items()}
 
 
-def _side(value: float | None) -> str:
+def _value_or_missing(value: float | None) -> str:
     return "does not have it" if value is None else _text(value)
 
 
