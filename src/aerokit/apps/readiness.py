@@ -19,6 +19,13 @@ class Readiness(NamedTuple):
     """Why arming is refused in the present mode."""
     against_flight: tuple[str, ...]
     """The rest that is missing for take-off and for flight in the modes that need a position."""
+    is_known: bool = True
+    """False if the vehicle does not report whether it arms. ``against_arming`` then has the missing reports."""
+
+    @property
+    def prefix(self) -> str:
+        """Words before the reasons against arming."""
+        return "cannot arm" if self.is_known else "not known whether it arms"
 
 
 def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None) -> Readiness:
@@ -34,8 +41,9 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None) -> Readine
     if passes and only_estimates:  # ArduCopter arms in STABILIZE without a position, for example
         return Readiness((), tuple(dict.fromkeys([*(reasons or ()), *missing])))
     against = tuple(missing if reasons is None else reasons)
+    is_known = not any(text.startswith(("heartbeats (", "sensors (")) for text in against)
     bare = {vehicle.autopilot.arming_reason(text) for text in against}
-    return Readiness(against, tuple(text for text in missing if text not in against and text not in bare))
+    return Readiness(against, tuple(text for text in missing if text not in against and text not in bare), is_known)
 
 
 def _is_about_estimates(text: str) -> bool:
@@ -56,7 +64,7 @@ def arms_but(vehicle: Vehicle) -> str:
 
 def readiness_lines(vehicle: Vehicle, found: Readiness) -> list[str]:
     """Return lines of text. Empty if nothing is missing."""
-    lines = [f"{'cannot arm: ' if place == 0 else '  '}{text}" for place, text in enumerate(found.against_arming)]
+    lines = [f"{f'{found.prefix}: ' if place == 0 else '  '}{text}" for place, text in enumerate(found.against_arming)]
     if found.against_flight:
         words = "also missing for flight" if lines else arms_but(vehicle)
         lines += [f"{words}:", *(f"  {text}" for text in found.against_flight)]

@@ -42,6 +42,7 @@ def test_status_of_signing_vehicle_names_missing_key(
     assert run_with(copter, ["status"], ["params", "get", "RTL_ALT"]) == [0, TIMED_OUT]
     out, err = capsys.readouterr()
     assert "it signs its frames, and without its key" in out.splitlines()[1]
+    assert "  arming   not known whether it arms: no COMMAND_ACK" in out
     assert "frames are signed" in err.splitlines()[0]
     assert copter.now < 25.0, "both commands must finish soon"
 
@@ -80,7 +81,7 @@ def test_status_prints_all_vehicles(
 
 
 def test_status_prints_what_is_missing_for_flight(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_with(SimulatedCopter(boot_time_s=600.0), ["status"]) == [0]
+    assert run_with(SimulatedCopter(boot_time_s=600.0), ["status"]) == [1]
     out = capsys.readouterr().out
     assert "  arming   cannot arm: " in out
     assert "position unknown" in out
@@ -99,7 +100,7 @@ def test_status_without_gps_names_mode_that_allows_arming(
             copter.set_mode(mode)
             copter.faults.gps_lost = True
             await anyio.sleep(20)
-            assert await run_on(link, "status", "--seconds", "8") == 0
+            assert await run_on(link, "status", "--seconds", "8") == (0 if is_for_flight_only else 1)
 
     run_virtual(scenario())
     out = capsys.readouterr().out
@@ -121,7 +122,7 @@ def test_status_of_ready_vehicle_says_so(capsys: pytest.CaptureFixture[str]) -> 
 def test_status_gives_real_reason_alone(capsys: pytest.CaptureFixture[str]) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.faults.prearm_failures = ["Compass not healthy"]
-    assert run_with(copter, ["status", "--seconds", "8"]) == [0]
+    assert run_with(copter, ["status", "--seconds", "8"]) == [1]
     out = capsys.readouterr().out
     assert "  arming   cannot arm: PreArm: Compass not healthy\n" in out
     assert "SYS_STATUS" not in out

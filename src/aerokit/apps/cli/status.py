@@ -9,7 +9,7 @@ import anyio
 
 from aerokit.apps.cli.arguments import number
 from aerokit.apps.cli.connecting import add_link, add_seconds, await_vehicle, opened
-from aerokit.apps.cli.output import DONE, emit
+from aerokit.apps.cli.output import DONE, FAILED, emit
 from aerokit.apps.readiness import Readiness, readiness, readiness_lines
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout
 from aerokit.events import SILENT_AFTER_S
@@ -204,7 +204,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_status(options: argparse.Namespace) -> int:
-    """Listen, request what is missing, and print the status."""
+    """Listen, request what is missing, and print the status. Return 1 if a vehicle cannot arm."""
     from aerokit.vehicle.connect import vehicles_on
 
     async with opened(options) as connection, vehicles_on(connection, rates={}) as vehicles:
@@ -223,7 +223,11 @@ async def run_status(options: argparse.Namespace) -> int:
             emit(options, "status", record, "\n".join(_vehicle_lines(vehicle, found)))
         _emit_components(connection, options, vehicles_found)
         await anyio.sleep(_RELEASE_TIME_S)
-    return DONE
+    cannot_arm = any(
+        found.against_arming and found.is_known and not vehicle.is_armed
+        for vehicle, found in zip(vehicles_found.values(), reasons, strict=True)
+    )
+    return FAILED if cannot_arm else DONE
 
 
 async def _readiness_of(vehicle: Vehicle) -> Readiness:
@@ -234,7 +238,7 @@ async def _readiness_of(vehicle: Vehicle) -> Readiness:
                 await _request(vehicle, message, cell)
             except CommandTimeout as error:
                 # A vehicle that does not answer this request would not answer the other requests either.
-                return Readiness((str(error), *vehicle.missing_for_flight()), ())
+                return Readiness((str(error), *vehicle.missing_for_flight()), (), is_known=False)
     return readiness(vehicle, await vehicle.why_not_armable())
 
 

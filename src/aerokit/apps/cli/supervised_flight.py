@@ -330,7 +330,8 @@ class FlightReport:
                 continue
             found = Readiness((), ()) if vehicle.is_armed else readiness(vehicle)
             if found.against_arming:
-                self.print_line(f"  cannot arm yet: {'; '.join([*found.against_arming, *found.against_flight])}")
+                yet = " yet" if found.is_known else ""
+                self.print_line(f"  {found.prefix}{yet}: {'; '.join([*found.against_arming, *found.against_flight])}")
             elif found.against_flight:
                 self.print_line(f"  {arms_but(vehicle)}: {'; '.join(found.against_flight)}")
             else:

@@ -175,7 +175,7 @@ class VehicleText:
         if not missing:
             return Text("nothing")
         if not self._vehicle.armed.latest:
-            missing[0] = f"{'cannot arm' if found.against_arming else 'arms, cannot fly by itself'}: {missing[0]}"
+            missing[0] = f"{found.prefix if found.against_arming else 'arms, cannot fly by itself'}: {missing[0]}"
         shown, used_lines = 1, 0
         for count, reason in enumerate(missing, 1):
             used_lines += math.ceil((len(reason) + _MORE_WIDTH) / max(1, width))
