@@ -300,7 +300,7 @@ class ManeuverActions(VehicleBase):
         Raises:
             InvalidArgument: there is no such state. Nothing was sent.
             NotSupported: the vehicle is not a VTOL. Nothing was sent.
-            OperationRejected: the mode changed, or the vehicle disarmed, during the transition.
+            OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the transition.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ten seconds.
@@ -312,12 +312,13 @@ class ManeuverActions(VehicleBase):
         with self._arbiter.auxiliary_order() as order:
             started = self.connection.now()
             await self._sender.send_long(order, MavCmd.DO_VTOL_TRANSITION, float(wanted))
+            hits_ground = self._sender.hits_ground(order)
             with self._session.streaming("vtol_state"):
                 await await_progress(
                     self._session,
                     f"transition_to({state})",
                     is_done=lambda: cell.latest == wanted and cell.updated_at > started,
-                    trouble=lambda: order.takeover_reason,
+                    trouble=lambda: hits_ground() or order.takeover_reason,
                     describe=lambda: f"MAV_VTOL_STATE is {cell.latest}",
                     timeout=timeout,
                 )

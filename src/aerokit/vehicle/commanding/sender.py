@@ -11,6 +11,7 @@ from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, Operat
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, MAX_ATTEMPTS, rejection
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S
+from aerokit.vehicle.commanding.ground import ImpactDetector
 from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, REQUEST_COMMANDS
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
 
@@ -210,15 +211,16 @@ class OrderSender:
     def stays_in(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
         """Return a function that reports why the order cannot succeed, as a clause.
 
-        The reasons are: the order was superseded, or the vehicle is disarmed or in another mode.
+        The reasons are: the order was superseded, or the vehicle has hit the ground, is disarmed or in another mode.
         """
+        hits_ground = self.hits_ground(order)
         grace_until, settles_at = self._session.connection.now() + MODE_GRACE_S, self._arbiter.mode_settles_at
         arrived = False
 
         def trouble() -> str | None:
             nonlocal arrived
-            if order.end:
-                return order.end
+            if reason := hits_ground() or order.end:
+                return reason
             if self._session.telemetry.is_confirmed_disarmed:
                 return "the vehicle disarmed"
             if self._session.connection.now() < settles_at:
@@ -228,6 +230,17 @@ class OrderSender:
             if mode not in modes and (arrived or self._session.connection.now() > grace_until):
                 return f"the mode changed to {mode}" if arrived else f"the vehicle stayed in {mode}"
             return None
+
+        return trouble
+
+    def hits_ground(self, order: Order) -> Callable[[], str]:
+        """Return a function that returns a clause once the vehicle has hit the ground during the newest order."""
+        impact = ImpactDetector(self._session)
+
+        def trouble() -> str:
+            impact.update()
+            order.impact = impact.text() if order.is_newest else ""
+            return order.impact
 
         return trouble
 

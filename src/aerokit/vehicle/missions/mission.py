@@ -93,7 +93,7 @@ class MissionEndDetector:
         session, now = self._session, self._session.connection.now()
         if self._vehicle_context.arbiter.newest not in (self._order, order):
             return "another order was given"
-        if self._is_on_ground and (fall := self._ground.fall()):
+        if fall := self._ground.fall():
             return f"{fall}, {self.describe()}"
         if self._ground.is_pending:
             return None
