@@ -145,7 +145,7 @@ def test_fly_disarmed_in_air_prints_reasons_once(copter: SimulatedCopter, capsys
         async with simulated_link(copter) as link:
             flight = asyncio.create_task(run_on(link, "fly", "m.waypoints", "--yes"))
             await wait_until(lambda: copter.altitude_m > 8)
-            copter.info("Crash: Disarming: AngErr=121>30, Accel=0.9<3.0")
+            copter.send_text(0, "Crash: Disarming: AngErr=121>30, Accel=0.9<3.0")  # MAV_SEVERITY_EMERGENCY
             copter.arming.disarm()
             with anyio.fail_after(60):
                 return await flight

@@ -12,7 +12,7 @@ from flight_harness import Flight, in_the_air, now, open_flight, open_px4
 import aerokit
 from aerokit.connection.cells import Source
 from aerokit.errors import OperationRejected, SetpointStreamStopped
-from aerokit.mavlink.enums import CopterMode
+from aerokit.mavlink.enums import CopterMode, MavSeverity
 from aerokit.missions import Mission, waypoint
 from aerokit.position import Position
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
@@ -153,6 +153,22 @@ async def test_disarming_in_the_air_ends_flight_call_at_once(name: str, opened: 
             await CALLS[name](flight)
         assert now() - disarmed_at[0] < 1.5
         assert (place_of(flight).altitude_relative_m or 0.0) > 30.0
+
+
+async def test_texts_about_progress_are_no_reasons_of_impact() -> None:
+    async with open_px4() as flight, anyio.create_task_group() as group:
+        await flight.take_off(20.0)
+        group.start_soon(fall_later, flight, [])
+
+        async def send_texts() -> None:
+            await anyio.sleep(8.0)
+            flight.px4.send_text(MavSeverity.INFO, "Mission finished, loitering")
+            flight.px4.send_text(MavSeverity.CRITICAL, "Motor failure detected")
+
+        group.start_soon(send_texts)
+        with pytest.raises(OperationRejected, match=IMPACT) as caught:
+            await go_to(flight)
+        assert caught.value.reasons == ("Motor failure detected",)
 
 
 # ------------------------------------------------------------------------------- false alarms

@@ -105,6 +105,7 @@ _TEXTS: tuple[tuple[re.Pattern[str], str], ...] = tuple(
 )  # fmt: skip
 _ACTION = re.compile(r"failsafe activated|changed to|switch|fail-?safe.*[-:] *(rtl|land|hold|brake|disarm)", re.I)
 
+_PX4_PREFIXES = ("BAT_", "COM_", "FD_", "GF_", "NAV_")
 # Parameters that define when a failsafe triggers, and its action.
 _LIMITS: dict[str, tuple[str, ...]] = {
     "battery": (
@@ -348,9 +349,18 @@ def _max_before(columns: TimeSeries, name: str, time_s: float) -> float | None:
 
 
 def _limits(flight: FlightLog, kind: str, time_s: float) -> list[str]:
-    values = ((name, flight.parameter_at(name, time_s)) for name in _LIMITS.get(kind, ()))
+    names = configured_by(flight, kind)
+    values = ((name, flight.parameter_at(name, time_s)) for name in names)
     known = [f"{name} = {value:g}" for name, value in values if value == value]
-    return [f"parameters: {', '.join(known)}"] if known else []
+    if known:
+        return [f"parameters: {', '.join(known)}"]
+    return [f"parameters to look at, which the log does not contain: {', '.join(names)}"] if names else []
+
+
+def configured_by(flight: FlightLog, kind: str) -> list[str]:
+    """Return the names of the autopilot's parameters that configure this kind of failsafe; empty if none are known."""
+    is_px4 = {"PX4": True, "ArduPilot": False}.get(flight.autopilot)
+    return [name for name in _LIMITS.get(kind, ()) if is_px4 in (None, name.startswith(_PX4_PREFIXES))]
 
 
 def _texts_before(flight: FlightLog, time_s: float) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.vehicle.commanding.progress import FALL_SINK_M_S, POSITION_MAX_AGE_S
+from aerokit.vehicle.commanding.progress import FALL_SINK_M_S, HIT_GROUND, POSITION_MAX_AGE_S
 from aerokit.vehicle.state.telemetry import height_above_home
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class ImpactDetector:
         """Return the impact as a clause; empty if there was none, or the vehicle has left the place of the impact."""
         if self._impact_m_s is None or not self._has_stopped:
             return ""
-        return f"the vehicle hit the ground at {self._impact_m_s:.1f} m/s"
+        return f"{HIT_GROUND} at {self._impact_m_s:.1f} m/s"
 
     def _current_height(self) -> float | None:
         telemetry = self._session.telemetry

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal import geo
 from aerokit._internal.arguments import check_range
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavFrame, MavLandedState
+from aerokit.mavlink.enums import MavFrame, MavLandedState, MavSeverity
 from aerokit.position import Position
 from aerokit.vehicle.state.telemetry import height_above_home
 
@@ -35,6 +35,9 @@ FALL_SINK_M_S = 3.0
 
 FALL_EVIDENT_S = 0.5
 """After falling for this time, a vehicle sinks faster than ``FALL_SINK_M_S``, even with air resistance."""
+
+HIT_GROUND = "the vehicle hit the ground"
+"""Beginning of the clause about an impact."""
 
 FALL_STOP_S = 1.5
 """Maximum seconds from a fast descent to a standstill on the ground that together count as a fall."""
@@ -76,7 +79,7 @@ async def await_progress(
                 return
             if done_since is None and (reason := trouble()):
                 reason += _height_when_disarmed(session)
-                raise OperationRejected(f"{what}: {reason}", reasons=session.texts_since(reasons_from))
+                raise OperationRejected(f"{what}: {reason}", reasons=_reasons(session, reason, reasons_from))
             if max_silence_s is not None and session.watch.silent_for_s > max_silence_s:
                 raise HeartbeatTimeout(f"{what}: {session.describe_link()}")
             if timeout is not None and now - started >= timeout:
@@ -86,6 +89,13 @@ async def await_progress(
             if stillness is not None and (still := stillness()):
                 raise OperationTimeout(f"{what}: {still}; {describe()}; {session.describe_link()}")
             await changes.next(POLL_INTERVAL_S)
+
+
+def _reasons(session: VehicleSession, reason: str, since: float) -> tuple[str, ...]:
+    """Return the status texts that may explain the trouble. Texts about normal progress do not explain an impact."""
+    texts = session.telemetry.texts_since(since)
+    is_impact = reason.startswith(HIT_GROUND)
+    return tuple(text.text for text in texts if not is_impact or text.severity < MavSeverity.INFO)
 
 
 def _height_when_disarmed(session: VehicleSession) -> str:
