@@ -163,7 +163,7 @@ def test_measurements_of_px4_fall_name_the_motors(tmp_path: Path) -> None:
 
     run_virtual(crash())
     first, second, *_ = findings(read_flight(log))
-    assert first.startswith("Fall: from 28.")
+    assert first.startswith("Fall: from 30.0 m, 17.0 m/s")
     assert ", so look at what stopped the motors: ESCs, their supply, a command; tilt up to " in second
     assert re.search(r"motor outputs 1\d\d\d to 1\d\d\d µs \(before: 1\d\d\d µs\)", second)
 

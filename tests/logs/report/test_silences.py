@@ -17,6 +17,7 @@ from aerokit.logs.report.sections import failsafe_section
 from aerokit.logs.report.silences import ground_station_failsafe
 from aerokit.logs.report.statistics import statistics_of, summary
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.message import Message
 from aerokit.mavlink.tlog import TlogWriter
 from aerokit.testing import open_flight, run_virtual
 
@@ -157,7 +158,7 @@ def test_sped_up_recording_has_simulated_times(tmp_path: Path) -> None:
             height_m = 40.0 if seconds < 30 else max(0.0, 40.0 - 4.9 * (seconds - 30) ** 2)
             sink_m_s = 9.8 * (seconds - 30) if 0.0 < height_m < 40.0 else 0.0
             place = (int(seconds * 1000), 470000000, 80000000, 0, int(height_m * 1000), 0, 0, int(sink_m_s * 100), 0)
-            messages = [m.GlobalPositionInt(*place)]
+            messages: list[Message] = [m.GlobalPositionInt(*place)]
             messages += [m.Heartbeat(2, 3, 217, 4, 4, 3)] if step % 10 == 0 else []
             for message in messages:
                 writer.write(encoder.encode(message), 1_700_000_000 + seconds / 20)

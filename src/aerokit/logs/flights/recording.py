@@ -1,4 +1,4 @@
-"""What a recording shows about itself: its lost messages, the vehicle's silences, and the speed of a simulation."""
+"""Lost messages, silences of the vehicle and the speed of a simulation, from a recording itself."""
 
 from __future__ import annotations
 
