@@ -129,8 +129,8 @@ class RouteChanged(Event):
 class RouteChangeRefused(Event):
     """Frames of a silent component arrive from ``peer``, but are ignored: their sequence numbers do not continue.
 
-    The sender may be another vehicle, or the same vehicle with a new IP address after a reboot. ``may_move=True``
-    accepts both.
+    The sender may be another vehicle, or the same vehicle with a new IP address after a reboot.
+    ``aerokit.connect(…, may_move=True)`` accepts frames from either.
     """
 
     component_id: int

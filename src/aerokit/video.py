@@ -69,8 +69,8 @@ async def open_video(
         uri: anything that FFmpeg reads: ``rtsp://…``, ``udp://0.0.0.0:5600``, the path of a file.
             ``vehicle.camera.streams`` lists the addresses of a camera's streams.
         vehicle: adds its position and attitude to the frames.
-        timeout: seconds until the stream must be open, above 0 to 3600.
-        idle_timeout_s: seconds without data after which the stream counts as lost, above 0 to 3600.
+        timeout: seconds until the stream must be open, above 0 and at most 3600.
+        idle_timeout_s: seconds without data after which the stream counts as lost, above 0 and at most 3600.
         options: further FFmpeg options.
 
     Raises:
@@ -85,7 +85,9 @@ async def open_video(
     stream = VideoStream(uri, vehicle)
     for name, value in (options or {}).items():
         if not isinstance(name, str) or not isinstance(value, str):
-            raise InvalidArgument(f"options: {name!r} = {value!r} is not allowed: texts")
+            raise InvalidArgument(
+                f"options: {name!r} = {value!r} is not allowed: names and values of FFmpeg options are strings"
+            )
     defaults = LIVE_OPTIONS if "://" in uri else {}
     thread = _Reader(uri, {**defaults, **(options or {})}, (timeout, idle_timeout_s), stream)
     try:
@@ -122,7 +124,7 @@ class VideoStream:
 
     async def __anext__(self) -> VideoFrame:
         if self._has_reader:
-            raise BusyError("a video stream has one reader; open it twice for a second one")
+            raise BusyError("another task already reads this video stream; call open_video() again for a second reader")
         self._has_reader = True
         try:
             await self._wait(lambda: self._latest is not None)
@@ -131,6 +133,7 @@ class VideoStream:
         frame, self._latest = self._latest, None
         if frame is None:
             if isinstance(self._end, LinkLost):
+                # A new exception each time: one that is raised again would collect the tracebacks of all reads.
                 raise LinkLost(*self._end.args)
             raise StopAsyncIteration
         return frame
@@ -166,10 +169,12 @@ class VideoStream:
 
 
 class _Reader(threading.Thread):
-    def __init__(self, uri: str, options: dict[str, str], limits_s: tuple[float, float], stream: VideoStream) -> None:
+    """Decodes a stream in a thread, because PyAV blocks. ``timeouts_s`` are those of FFmpeg for opening and reading."""
+
+    def __init__(self, uri: str, options: dict[str, str], timeouts_s: tuple[float, float], stream: VideoStream) -> None:
         super().__init__(name=f"aerokit video {uri}", daemon=True)
         self.ended = asyncio.Event()
-        self._uri, self._options, self._limits_s, self._stream = uri, options, limits_s, stream
+        self._uri, self._options, self._timeouts_s, self._stream = uri, options, timeouts_s, stream
         self._loop = asyncio.get_running_loop()
         self._is_stopped = False
 
@@ -186,12 +191,15 @@ class _Reader(threading.Thread):
         self._is_stopped = True
 
     def run(self) -> None:
+        # Reported if something other than an Exception, such as SystemExit, ends the thread.
         error: Exception = LinkLost(f"the video of {self._uri} ended")
         try:
             self._read()
-            error = EOFError()
-        except Exception as caught:
+            error = EOFError()  # ends the iteration over the frames without an error
+        except (LinkOpenError, LinkLost) as caught:
             error = caught
+        except Exception as caught:
+            error = LinkLost(f"the decoder of {self._uri} failed: {caught!r}")
         finally:
             self._call_on_loop(self._stream._on_end, error)
             self._call_on_loop(self.ended.set)
@@ -199,7 +207,7 @@ class _Reader(threading.Thread):
     def _read(self) -> None:
         errors = (self._av.error.FFmpegError, OSError, ValueError, IndexError)
         try:
-            container = self._av.open(self._uri, options=self._options, timeout=self._limits_s)
+            container = self._av.open(self._uri, options=self._options, timeout=self._timeouts_s)
         except errors as error:
             raise LinkOpenError(f"the video of {self._uri} cannot be opened: {error}") from None
         with container:

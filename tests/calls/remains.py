@@ -54,7 +54,7 @@ def _all(stage: Stage) -> Iterator[str]:
     for stream in streams:
         yield from _times(f"wish for {stream.message_type.NAME}", stream.requests)
     yield from _times(
-        "answer under way", [key for key in vehicle._session.commands._under_way if _is_awaited(vehicle, key)]
+        "answer under way", [key for key in vehicle._session.commands._pending_acks if _is_awaited(vehicle, key)]
     )
     yield from _times("command that waits", vehicle._session.commands._runs)
     yield from _times("order", vehicle._arbiter._orders[1:])
@@ -70,7 +70,7 @@ def _all(stage: Stage) -> Iterator[str]:
 
 def _is_awaited(vehicle: Any, key: tuple[int, int]) -> bool:
     oldest = vehicle.connection.now() - PENDING_ACK_TIMEOUT_S
-    expected = vehicle._session.commands._under_way.get((vehicle.component_id, key[1]), ())
+    expected = vehicle._session.commands._pending_acks.get((vehicle.component_id, key[1]), ())
     return any(at >= oldest for at in expected)
 
 

@@ -213,7 +213,7 @@ async def test_values_are_older_after_the_computer_slept(grounded: Flight, caplo
         ages += [vehicle.armed.age, vehicle.position.age, vehicle.heartbeat_age]
         assert events.get_nowait() is not None
     assert min(ages) > 600.0
-    assert not vehicle._arbiter.is_known
+    assert not vehicle._arbiter.is_state_recent
     assert "the computer slept for 600 s" in caplog.text
     grounded.copter.faults.silent = False
     await anyio.sleep(1.5)

@@ -166,7 +166,7 @@ def test_next_is_read_and_set(three: Pair) -> None:
 
 
 def test_next_unconfirmed_message_is_followed_by_command(three: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("aerokit.dronekit.flight_orders.CONFIRM_TIMEOUT_S", 0.3)
+    monkeypatch.setattr("aerokit.dronekit.flight_orders.MISSION_CURRENT_TIMEOUT_S", 0.3)
     controller, cmds = three
     controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
     cmds.next = 2
@@ -176,13 +176,13 @@ def test_next_unconfirmed_message_is_followed_by_command(three: Pair, monkeypatc
 def test_next_is_not_repeated_while_vehicle_is_silent(
     three: Pair, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("aerokit.dronekit.flight_orders.CONFIRM_TIMEOUT_S", 0.3)
+    monkeypatch.setattr("aerokit.dronekit.flight_orders.MISSION_CURRENT_TIMEOUT_S", 0.3)
     monkeypatch.setattr("aerokit.dronekit.flight_orders.MODE_MAX_AGE_S", 0.2)
     controller, cmds = three
     controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
     controller.heartbeat_s = None
     cmds.next = 2
-    assert becomes(lambda: "next = 2 was not confirmed" in caplog.text)
+    assert becomes(lambda: "did not confirm next = 2" in caplog.text)
     assert not controller.commands(224)
 
 
@@ -306,7 +306,7 @@ def test_rejected_home_location_is_restored() -> None:
 
 def test_next_without_confirmation_is_sent_once(three: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """A message that is not answered could be repeated against a pilot: the order that follows has an answer."""
-    monkeypatch.setattr("aerokit.dronekit.flight_orders.CONFIRM_TIMEOUT_S", 2.5)
+    monkeypatch.setattr("aerokit.dronekit.flight_orders.MISSION_CURRENT_TIMEOUT_S", 2.5)
     controller, cmds = three
     controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
     cmds.next = 2

@@ -32,6 +32,7 @@ ClassT = TypeVar("ClassT")
 Check = Callable[[Any], bool]
 Rule = tuple[Check, str]
 
+# Rules by the name in the annotation.
 _SIMPLE: dict[str, Rule] = {
     "float": (lambda value: isinstance(value, Real), "a number"),
     "int": (lambda value: isinstance(value, Integral), "a whole number"),
@@ -57,6 +58,7 @@ def _is_above_zero(value: Any) -> bool:
         return False
 
 
+# Rules for parameters that denote a time, by the annotation.
 _SECONDS: dict[str, Rule] = {
     "float": (_is_above_zero, "seconds above 0"),
     "float | None": (lambda value: value is None or _is_above_zero(value), "seconds above 0, or None"),
@@ -105,21 +107,24 @@ class _Rules:
 
     def check(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
         rules = self._read() if self._by_name is None else self._by_name
-        rest = args[len(self._positional) :]
-        given = [
+        arguments = [
             *zip(self._positional, args),  # noqa: B905 - Python rejects surplus arguments itself
-            *((self._var_positional, value) for value in rest),
+            *((self._var_positional, value) for value in args[len(self._positional) :]),
             *kwargs.items(),
         ]
-        for name, value in given:
-            if name in rules and not rules[name][0](value):
-                raise _error(rules[name], name, value, dict(given).get("name"))
+        for name, value in arguments:
+            if name not in rules:
+                continue
+            is_allowed, _ = rules[name]
+            if not is_allowed(value):
+                raise _error(rules[name], name, value, vehicle_parameter=dict(arguments).get("name"))
 
     def _read(self) -> dict[str, Rule]:
+        """Compute the rules from the signature of the function."""
         parameters = inspect.signature(self._function).parameters.values()
-        rules = {p.name: self._rule(p) for p in parameters if p.annotation is not p.empty}
-        self._positional = tuple(p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD)
-        self._var_positional = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
+        rules = {param.name: self._rule(param) for param in parameters if param.annotation is not param.empty}
+        self._positional = tuple(param.name for param in parameters if param.kind is param.POSITIONAL_OR_KEYWORD)
+        self._var_positional = next((param.name for param in parameters if param.kind is param.VAR_POSITIONAL), "")
         self._by_name = rules
         return rules
 
@@ -135,13 +140,17 @@ def _is_time(parameter: inspect.Parameter) -> bool:
     return str(parameter.annotation) in _SECONDS and name.endswith(("timeout", "_s")) and not is_speed
 
 
-def _error(rule: Rule, name: str, value: object, parameter: object) -> InvalidArgument:
-    """Describe an invalid argument. ``parameter`` is the argument called ``name``, which a ``value`` belongs to."""
+def _error(rule: Rule, name: str, value: object, vehicle_parameter: object) -> InvalidArgument:
+    """Create the error for an invalid argument.
+
+    ``vehicle_parameter`` is the argument called ``name`` of the same call, if there is one, as in
+    ``set(name="RTL_ALT", value="abc")``.
+    """
     check, allowed = rule
     hint = _hint(check, value)
-    if name == "value" and isinstance(parameter, str):  # set("RTL_ALT", "abc")
+    if name == "value" and isinstance(vehicle_parameter, str):
         return InvalidArgument(
-            f"value = {short_repr(value)} of {parameter[:40]} is not allowed: it must be {allowed}{hint}"
+            f"value = {short_repr(value)} of {vehicle_parameter[:40]} is not allowed: it must be {allowed}{hint}"
         )
     return InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}{hint}")
 
@@ -156,10 +165,11 @@ def _hint(check: Check, value: object) -> str:
 
 
 def _rule(node: ast.expr, names: Mapping[str, Any]) -> Rule:
+    """Return the rule of an annotation. ``names`` are the globals of the module that has the annotation."""
     if isinstance(node, ast.BinOp):
-        (is_left, left), (is_right, right) = _rule(node.left, names), _rule(node.right, names)
-        return (lambda value: is_left(value) or is_right(value)), f"{left} or {right}"
-    if isinstance(node, ast.Constant):
+        (is_left, left_text), (is_right, right_text) = _rule(node.left, names), _rule(node.right, names)
+        return (lambda value: is_left(value) or is_right(value)), f"{left_text} or {right_text}"
+    if isinstance(node, ast.Constant):  # None is the only constant in our annotations.
         return _SIMPLE["None"]
     if isinstance(node, ast.Subscript):
         return _generic_rule(_name_of(node.value), node.slice, names)
@@ -167,34 +177,39 @@ def _rule(node: ast.expr, names: Mapping[str, Any]) -> Rule:
 
 
 def _name_of(node: ast.expr) -> str:
-    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+    """Return the last part of a name: ``Path`` for ``Path`` and ``pathlib.Path``; empty for other expressions."""
+    if isinstance(node, ast.Attribute):
+        return node.attr
+    return node.id if isinstance(node, ast.Name) else ""
 
 
 def _named_rule(name: str, names: Mapping[str, Any]) -> Rule:
+    """Return the rule of an annotation that is a single name."""
     if name in _SIMPLE:
         return _SIMPLE[name]
-    found = names.get(name)
-    if isinstance(found, type):
-        return (lambda value: isinstance(value, found)), with_article(name)
-    if get_origin(found) is Literal:
-        choices = get_args(found)
+    annotated = names.get(name)
+    if isinstance(annotated, type):
+        return (lambda value: isinstance(value, annotated)), with_article(name)
+    if get_origin(annotated) is Literal:
+        choices = get_args(annotated)
         return partial(_is_one_of, choices), f"one of {', '.join(map(str, choices))}"
-    if isinstance(found, UnionType):
-        kinds = tuple(get_origin(kind) or kind for kind in get_args(found))
-        return (lambda value: isinstance(value, kinds)), " or ".join(kind.__name__ for kind in kinds)
-    if name in ("Any", "object") or isinstance(found, TypeVar):
+    if isinstance(annotated, UnionType):
+        types = tuple(get_origin(member) or member for member in get_args(annotated))
+        return (lambda value: isinstance(value, types)), " or ".join(allowed.__name__ for allowed in types)
+    if name in ("Any", "object") or isinstance(annotated, TypeVar):
         return (lambda _: True), "anything"
     return partial(_has_class_name, name), with_article(name)
 
 
 def _generic_rule(name: str, inner: ast.expr, names: Mapping[str, Any]) -> Rule:
+    """Return the rule of the annotation ``name[inner]``."""
     if name in _SIMPLE:  # e.g. Callable[[int], None] or PathLike[str]
         return _SIMPLE[name]
     parts = inner.elts if isinstance(inner, ast.Tuple) else [inner]
     rules = [_rule(part, names) for part in parts]
     if name == "type":
-        kinds = _class_names(_name_of(parts[0]), names)
-        return partial(_is_class, kinds), f"a class{' of ' if kinds else ''}{' or '.join(kinds)}"
+        class_names = _class_names(_name_of(parts[0]), names)
+        return partial(_is_class, class_names), f"a class{' of ' if class_names else ''}{' or '.join(class_names)}"
     if name == "Mapping":
         (is_key, _), (is_value, description) = rules
         return partial(_is_mapping, is_key, is_value), f"a mapping whose values are each {description}"
@@ -205,13 +220,15 @@ def _generic_rule(name: str, inner: ast.expr, names: Mapping[str, Any]) -> Rule:
 
 def _class_names(name: str, names: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the names of the classes that ``type[name]`` allows; empty if it allows any class."""
-    found = names.get(name)
-    if not isinstance(found, TypeVar):
+    annotated = names.get(name)
+    if not isinstance(annotated, TypeVar):
         return () if name == "Any" else (name,)
-    bound = found.__bound__
-    if bound is None or isinstance(bound, type):
-        return () if bound is None else (bound.__name__,)
-    return tuple(bound.__forward_arg__.split(" | "))
+    bound = annotated.__bound__
+    if bound is None:
+        return ()
+    if isinstance(bound, type):
+        return (bound.__name__,)
+    return tuple(bound.__forward_arg__.split(" | "))  # a bound given as text: TypeVar(…, bound="Event | Message")
 
 
 def _is_one_of(choices: tuple[object, ...], value: object) -> bool:
@@ -237,10 +254,10 @@ def _are_items(is_item: Check, value: object) -> bool:
     return not isinstance(value, (list, tuple, set, frozenset)) or all(map(is_item, value))
 
 
-def check_kind(name: str, value: object, kind: type) -> None:
-    """Raise InvalidArgument unless ``value`` is an instance of ``kind``. Used if the annotation is a type variable."""
-    if not isinstance(value, kind):
-        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {with_article(kind.__name__)}")
+def check_kind(name: str, value: object, expected_type: type) -> None:
+    """Raise InvalidArgument unless ``value`` is an instance of this type. Used if the annotation is a type variable."""
+    if not isinstance(value, expected_type):
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {with_article(expected_type.__name__)}")
 
 
 def check_range(name: str, value: float, minimum: float, maximum: float, *, above: bool = False) -> None:
@@ -250,8 +267,8 @@ def check_range(name: str, value: float, minimum: float, maximum: float, *, abov
     except TypeError:
         is_allowed = False
     if not is_allowed:
-        low = f"above {minimum:g}" if above else f"{minimum:g}"
-        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {low} to {maximum:g}")
+        allowed = f"above {minimum:g} and at most {maximum:g}" if above else f"{minimum:g} to {maximum:g}"
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}")
 
 
 def check_finite(name: str, *values: float) -> None:

@@ -47,16 +47,14 @@ class _Block(AbstractAsyncContextManager[T]):
             ) from None
         try:
             return await self._block.__aenter__()
-        except (
-            LinkOpenError,
-            InvalidArgument,
-        ) as error:  # the traceback inside this library does not help a user
+        except (LinkOpenError, InvalidArgument) as error:
+            # The traceback inside this library does not help a user.
             raise error.with_traceback(None) from error.__cause__
 
     async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+        self, error_type: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> bool | None:
-        return await self._block.__aexit__(kind, error, traceback)
+        return await self._block.__aexit__(error_type, error, traceback)
 
     def __await__(self) -> None:
         raise self._misused("await")
@@ -81,7 +79,7 @@ class _Block(AbstractAsyncContextManager[T]):
         )
 
 
-# Maps an attribute to the call that changes the reported value.
+# For error texts: maps a read-only attribute to the method call that changes the value on the vehicle.
 _SETTER_CALLS = {
     "mode": "set_mode({value})",
     "mode_name": "set_mode({value})",
@@ -103,12 +101,12 @@ class ReadOnly:
     """
 
     def __setattr__(self, name: str, value: object) -> None:
-        found = inspect.getattr_static(type(self), name, None)
-        is_setter = isinstance(found, property) and found.fset is not None
-        is_descriptor = hasattr(type(found), "__get__")
-        # A callable is a method that a mock replaces. Attributes without a descriptor are set in the constructor or by
-        # programs.
-        if name.startswith("_") or is_setter or callable(found) or not is_descriptor:
+        attribute = inspect.getattr_static(type(self), name, None)
+        is_setter = isinstance(attribute, property) and attribute.fset is not None
+        is_descriptor = hasattr(type(attribute), "__get__")
+        # Allowed are: replacing a method, e.g. by a mock, and attributes without a descriptor, which the constructor or
+        # the program sets.
+        if name.startswith("_") or is_setter or callable(attribute) or not is_descriptor:
             object.__setattr__(self, name, value)
             return
         text = f"{type(self).__name__}.{name} = {short_repr(value)} is not allowed"

@@ -22,17 +22,17 @@ _XZ_MEMORY_LIMIT = 128 << 20  # xz -9 needs 65 MB
 def write_atomically(path: str | os.PathLike[str], text: str) -> None:
     """Write a UTF-8 file with Unix line ends. If writing fails (OSError), the previous content is kept."""
     target = Path(path)
-    part = target.with_name(target.name + ".part")
+    part_file = target.with_name(target.name + ".part")
     # Remove the file of an earlier attempt, or a symbolic link that would redirect the writing.
-    part.unlink(missing_ok=True)
+    part_file.unlink(missing_ok=True)
     try:
-        with part.open("x", encoding="utf-8", newline="\n") as file:
+        with part_file.open("x", encoding="utf-8", newline="\n") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())  # without fsync, a power failure may leave an empty file under the new name
-        part.replace(target)
+        part_file.replace(target)
     finally:
-        part.unlink(missing_ok=True)
+        part_file.unlink(missing_ok=True)
 
 
 def read_bounded(path: str | os.PathLike[str]) -> bytes:
@@ -67,14 +67,14 @@ def decompress(data: bytes, name: str) -> bytes:
 
     decompressor = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY_LIMIT)
     try:
-        found = decompressor.decompress(data, MAX_FILE_SIZE + 1)
+        content = decompressor.decompress(data, MAX_FILE_SIZE + 1)
     except lzma.LZMAError as error:
         raise FileFormatError(f"{name} is damaged: {error}") from None
-    if len(found) > MAX_FILE_SIZE:
+    if len(content) > MAX_FILE_SIZE:
         raise file_too_large(name)
     if not decompressor.eof:
         raise FileFormatError(f"{name} is damaged: it is truncated")
-    return found
+    return content
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
@@ -93,14 +93,14 @@ def read_text(path: str | os.PathLike[str]) -> str:
 
 
 class PartFile:
-    """A download in progress: ``<to>.part`` always holds the beginning of the complete file, until :meth:`finish`.
+    """A download in progress: until :meth:`finish`, ``<destination>.part`` holds the beginning of the complete file.
 
-    ``mark`` is inserted before ``.part``, so that a partial download of another file is not continued.
+    ``mark`` is inserted before ``.part``, so that a download continues only the partial file that has the same mark.
     """
 
-    def __init__(self, to: str | os.PathLike[str], mark: str = "") -> None:
-        self._to = os.fspath(to)
-        self.path: Path = Path(f"{self._to}{mark}.part")
+    def __init__(self, destination: str | os.PathLike[str], mark: str = "") -> None:
+        self._destination = os.fspath(destination)
+        self.path: Path = Path(f"{self._destination}{mark}.part")
         """Path of the partial file."""
 
     @property
@@ -127,4 +127,4 @@ class PartFile:
 
     def finish(self) -> None:
         """Rename the partial file to its final name, replacing any existing file."""
-        os.replace(self.path, self._to)
+        os.replace(self.path, self._destination)

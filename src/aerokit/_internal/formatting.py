@@ -51,6 +51,7 @@ def to_jsonable(value: object) -> Any:
 
 
 def _names(member: Enum) -> Any:
+    # A combination of flags is not among the members of its class.
     if isinstance(member, Flag) and member not in tuple(type(member)):
         return [flag.name for flag in type(member) if flag in member]
     return member.name

@@ -7,10 +7,10 @@ import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 
-# Packages of the other project only: ``aerokit.aero`` and so on.
+# Packages that only the other project called aerokit has: ``aerokit.aero`` and so on.
 _OTHER_PACKAGES = ("aero", "engine", "stability")
 
-# Modules whose names are looked for in the package itself.
+# Modules whose names users often expect in the package itself: aerokit.LinkLost instead of aerokit.errors.LinkLost.
 _NAMED_MODULES = ("aerokit.errors", "aerokit.events")
 
 
@@ -20,12 +20,12 @@ def installation_problem(folder: str, *, is_ours: bool = True) -> str | None:
     PyPI has another project called aerokit, for compressible flow. Both projects install into the same folder, so
     neither may work if both are installed. ``is_ours`` is True if the ``__init__.py`` there is this library's.
     """
-    others = [name for name in _OTHER_PACKAGES if os.path.isfile(os.path.join(folder, name, "__init__.py"))]
-    if is_ours and not others:
+    other_packages = [name for name in _OTHER_PACKAGES if os.path.isfile(os.path.join(folder, name, "__init__.py"))]
+    if is_ours and not other_packages:
         return None
-    found = f"aerokit.{others[0]}" if others else "its __init__.py"
+    mixed_in = f"aerokit.{other_packages[0]}" if other_packages else "its __init__.py"
     return (
-        f"files of another project called aerokit ({found}) are mixed into this one in {folder}:"
+        f"files of another project called aerokit ({mixed_in}) are mixed into this one in {folder}:"
         " run pip uninstall aerokit aerokit-mavlink, then pip install aerokit-mavlink, the one for drones"
     )
 

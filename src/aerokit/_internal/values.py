@@ -26,14 +26,15 @@ class _SnapshotType(type):
 
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> _SnapshotType:
         annotations: dict[str, str] = namespace.get("__annotations__", {})
-        own = tuple(field for field, kind in annotations.items() if not kind.startswith("ClassVar"))
+        own_fields = tuple(field for field, annotation in annotations.items() if not annotation.startswith("ClassVar"))
         defaults = {field: value for base in bases for field, value in getattr(base, "_defaults", {}).items()}
-        defaults.update({field: namespace.pop(field) for field in own if field in namespace})
-        fields = (*(field for base in bases for field in getattr(base, "__match_args__", ())), *own)
-        cls = super().__new__(mcs, name, bases, {**namespace, "__slots__": own, "__match_args__": fields})
-        if own:
+        defaults.update({field: namespace.pop(field) for field in own_fields if field in namespace})
+        fields = (*(field for base in bases for field in getattr(base, "__match_args__", ())), *own_fields)
+        cls = super().__new__(mcs, name, bases, {**namespace, "__slots__": own_fields, "__match_args__": fields})
+        if own_fields:
             type.__setattr__(cls, "__init__", _lazy_init(cls))
         type.__setattr__(cls, "_defaults", defaults)
+        # attrgetter needs a name. Values without fields are all equal, as their class is.
         type.__setattr__(cls, "_values", attrgetter(*(fields or ("__class__",))))
         return cls
 
@@ -45,8 +46,10 @@ class _SnapshotType(type):
         init: Any = getattr(cls, "__init__")  # noqa: B009 - mypy calls the plain access unsound
         if init is object.__init__:
             return Signature()
-        pending = getattr(init, "of", None)
-        return signature((init if pending is None else _generate_init(pending)).__get__(object()))
+        defining_class = getattr(init, "defining_class", None)
+        if defining_class is not None:
+            init = _generate_init(defining_class)
+        return signature(init.__get__(object()))  # bound to any object, because a signature has no self
 
 
 def _lazy_init(cls: Any) -> Callable[..., None]:
@@ -56,7 +59,7 @@ def _lazy_init(cls: Any) -> Callable[..., None]:
         type.__setattr__(cls, "__init__", init)
         init(self, *args, **kwargs)
 
-    setattr(generate_and_call, "of", cls)  # noqa: B010 - a plain assignment looks wrong to the type checker
+    setattr(generate_and_call, "defining_class", cls)  # noqa: B010 - a plain assignment looks wrong to the type checker
     return generate_and_call
 
 
@@ -66,7 +69,7 @@ def _generate_init(cls: Any) -> Any:
     scope: dict[str, Any] = {f"_set_{field}": getattr(cls, field).__set__ for field in fields}
     scope.update({f"_default_{field}": value for field, value in defaults.items()})
     arguments = [f"{field}=_default_{field}" if field in defaults else field for field in fields]
-    lines = [f"def __init__(self, {', '.join(arguments)}):", *(f" _set_{f}(self, {f})" for f in fields)]
+    lines = [f"def __init__(self, {', '.join(arguments)}):", *(f" _set_{field}(self, {field})" for field in fields)]
     if hasattr(cls, "_check"):
         lines.append(" self._check()")
     exec("\n".join(lines), scope)

@@ -31,6 +31,7 @@ wire_implementation: str = "python" if wire is None else "c"
 """``"c"`` if frames and messages are processed by the compiled extension, ``"python"`` if by Python code."""
 
 
+# Without the compiled extension, frames, their sources and counters have these slots.
 class _FrameFields:
     __slots__ = ("_raw", "body", "checksum", "component_id", "message_id", "received_at", "system_id")
 
@@ -58,7 +59,7 @@ class Copyable:
         return None, {name: getattr(self, name) for name in names}
 
 
-# Base classes with the fields that compiled code accesses.
+# Base classes of frames, sources and counters, with the fields that compiled code accesses directly.
 if TYPE_CHECKING:
 
     class FrameFields: ...

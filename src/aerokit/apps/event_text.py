@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from aerokit.events import Event
 
 _NOTES = {"DuplicateSender": "a second sender has the same ids, and is ignored"}
-_UNLABELLED = frozenset(("name", "message", "link", "peer", "text", "error"))
-_ENUMS: dict[str, type[MavType] | type[MavAutopilot]] = {
+_UNLABELLED_FIELDS = frozenset(("name", "message", "link", "peer", "text", "error"))
+_ENUM_FIELDS: dict[str, type[MavType] | type[MavAutopilot]] = {
     "vehicle_type": MavType,
     "type": MavType,
     "autopilot": MavAutopilot,
@@ -33,13 +33,15 @@ def event_details(event: Event) -> str:
         elif isinstance(value, bool):
             label = name.removeprefix("is_").replace("_", " ")
             parts.append(label if value else f"not {label}")
-        elif name in _ENUMS and value in (known := _ENUMS[name]).__members__.values():
-            parts.append(known(value).name)
-        elif name in _UNLABELLED:
+        elif name in _ENUM_FIELDS and value in _ENUM_FIELDS[name].__members__.values():
+            parts.append(_ENUM_FIELDS[name](value).name)
+        elif name in _UNLABELLED_FIELDS:
             parts.append(format_value(value))
         else:
             suffix = next((suffix for suffix in _UNITS if name.endswith(suffix)), "")
             label = name.removesuffix(suffix).removesuffix("_id").replace("_", " ")
             parts.append(f"{label} {format_value(value)}{_UNITS.get(suffix, '')}")
     note = _NOTES.get(type(event).__name__)
-    return ", ".join(parts if note is None else [*parts, note])
+    if note is not None:
+        parts.append(note)
+    return ", ".join(parts)

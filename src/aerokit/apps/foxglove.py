@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 from fnmatch import fnmatchcase
+from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -95,10 +96,10 @@ async def foxglove_bridge(
         raise InvalidArgument(f"rate_hz = {rate_hz} is not allowed: above 0, at most {MAX_RATE_HZ:g}")
     if not 0 <= port <= 65535:
         raise InvalidArgument(f"port = {port} is not allowed: 0 to 65535")
-    kinds = _message_types(connection, messages)
+    message_types = _message_types(connection, messages)
     channels = _TopicChannels(connection)
     server = _serve(channels, host, port)
-    tasks, detachers = BackgroundTasks(connection.fail), connection.attach(kinds, channels.on_message)
+    tasks, detachers = BackgroundTasks(connection.fail), connection.attach(message_types, channels.on_message)
     try:
         async with vehicles_on(connection, rates=rates, on_found=on_found) as vehicles:
             tasks.start(lambda: _repeat(lambda: channels.publish(vehicles), 1 / rate_hz))
@@ -114,13 +115,13 @@ async def foxglove_bridge(
 
 
 def _message_types(connection: Connection, patterns: Iterable[str]) -> list[type[Message]]:
-    found: dict[int, type[Message]] = {}
+    by_id: dict[int, type[Message]] = {}
     for pattern in patterns:
         matching = [message for message in connection.bus.dialect if fnmatchcase(message.NAME, pattern.upper())]
         if not matching:
             raise InvalidArgument(f"messages: no message of the connection's dialect matches {pattern!r}")
-        found.update({message.ID: message for message in matching})
-    return list(found.values())
+        by_id.update({message.ID: message for message in matching})
+    return list(by_id.values())
 
 
 def _serve(channels: _TopicChannels, host: str, port: int) -> Any:
@@ -146,10 +147,10 @@ async def _stop(server: Any, host: str) -> None:
             await anyio.sleep(0.005)
 
 
-async def _repeat(action: Callable[[], None], every_s: float) -> None:
+async def _repeat(action: Callable[[], None], interval_s: float) -> None:
     while True:
         action()
-        await asyncio.sleep(every_s)
+        await asyncio.sleep(interval_s)
 
 
 class _Listener:
@@ -174,16 +175,16 @@ class _TopicChannels:
         self._sdk = import_module("foxglove")
         self.context = self._sdk.Context()
         self._connection = connection
-        self._wall_at_0 = connection.unix_time() - connection.now()
+        self._unix_time_at_0 = connection.unix_time() - connection.now()
         self._channels: dict[str, Any] = {}
         self._sent_at: dict[str, float] = {}
-        self._map = topics.MapFrame()
+        self._map_frame = topics.MapFrame()
         self._messages: dict[tuple[int, int, int], Message] = {}
 
     def send_again(self, topic: str) -> None:
         """Send the current value of a topic again, for a new viewer. Texts are sent from the buffer."""
         if not topic.endswith("/log"):
-            self._sent_at.pop(topic, None)
+            self._sent_at.pop(topic, None)  # so that `publish` sends the current value
 
     def on_message(self, message: Message) -> None:
         frame = message.received_frame
@@ -194,14 +195,15 @@ class _TopicChannels:
         """Send all values that are newer than the last values sent."""
         for system_id, vehicle in vehicles.items():
             self._publish_states(system_id, vehicle)
-            self._publish_place(system_id, vehicle)
+            self._publish_pose(system_id, vehicle)
             self._publish_texts(system_id, vehicle)
         for (system_id, component_id, _), message in self._messages.items():
             assert message.received_frame is not None
-            at, kind = message.received_frame.received_at, type(message)
-            name = topics.raw_topic_name(system_id, component_id, kind)
-            if self._needs_sending(name, at, lambda: topics.raw_topic(system_id, component_id, kind)):  # noqa: B023
-                self._send(name, at, topics.raw_fields(message))
+            received_at, message_type = message.received_frame.received_at, type(message)
+            name = topics.raw_topic_name(system_id, component_id, message_type)
+            make_topic = partial(topics.raw_topic, system_id, component_id, message_type)
+            if self._needs_sending(name, received_at, make_topic):
+                self._send(name, received_at, topics.raw_fields(message))
 
     def close(self) -> None:
         """Remove all topics."""
@@ -211,44 +213,44 @@ class _TopicChannels:
 
     def _publish_states(self, system_id: int, vehicle: Vehicle) -> None:
         for state, cell in vehicle.telemetry.cells.items():
-            at, value, name = cell.updated_at, cell.latest, topics.vehicle_topic(system_id, state)
+            value, name = cell.latest, topics.vehicle_topic(system_id, state)
             if value is None:
                 continue
-            if self._needs_sending(name, at, lambda: topics.state_topic(system_id, state, value)):  # noqa: B023
-                self._send(name, at, topics.state_fields(value))
+            if self._needs_sending(name, cell.updated_at, partial(topics.state_topic, system_id, state, value)):
+                self._send(name, cell.updated_at, topics.state_fields(value))
         name, now = topics.vehicle_topic(system_id, "link"), self._connection.now()
         if now - self._sent_at.get(name, -_LINK_INTERVAL_S) >= _LINK_INTERVAL_S:
             link = overview(vehicle)["link"]
             if self._needs_sending(name, now, lambda: topics.state_topic(system_id, "link", link)):
                 self._send(name, now, link)
 
-    def _publish_place(self, system_id: int, vehicle: Vehicle) -> None:
-        place, attitude = vehicle.position.latest, vehicle.attitude.latest
-        if place is None:
+    def _publish_pose(self, system_id: int, vehicle: Vehicle) -> None:
+        position, attitude = vehicle.position.latest, vehicle.attitude.latest
+        if position is None:
             return
-        at = vehicle.position.updated_at
-        moved_at = max(at, vehicle.attitude.updated_at)
+        position_at = vehicle.position.updated_at
+        pose_at = max(position_at, vehicle.attitude.updated_at)
         location, transform, pose = (
-            topics.vehicle_topic(system_id, what) for what in ("location", "transform", "pose")
+            topics.vehicle_topic(system_id, name) for name in ("location", "transform", "pose")
         )
-        if self._needs_sending(location, at, lambda: Topic(location, topics.LOCATION_FIX)):
+        if self._needs_sending(location, position_at, lambda: Topic(location, topics.LOCATION_FIX)):
             heading, velocity = vehicle.heading_deg.latest, vehicle.velocity.latest
-            self._send(location, at, topics.location_fix(self._unix(at), system_id, place, heading, velocity))
-        metres = self._map.east_north_up_m(place)
-        if self._needs_sending(transform, moved_at, lambda: Topic(transform, topics.FRAME_TRANSFORM)):
-            fields = topics.frame_transform(self._unix(moved_at), system_id, metres, attitude)
-            self._send(transform, moved_at, fields)
-        if self._needs_sending(pose, moved_at, lambda: Topic(pose, topics.POSE_IN_FRAME)):
-            self._send(pose, moved_at, topics.pose_in_frame(self._unix(moved_at), metres, attitude))
+            unix_s = self._to_unix_time(position_at)
+            self._send(location, position_at, topics.location_fix(unix_s, system_id, position, heading, velocity))
+        metres, unix_s = self._map_frame.east_north_up_m(position), self._to_unix_time(pose_at)
+        if self._needs_sending(transform, pose_at, lambda: Topic(transform, topics.FRAME_TRANSFORM)):
+            self._send(transform, pose_at, topics.frame_transform(unix_s, system_id, metres, attitude))
+        if self._needs_sending(pose, pose_at, lambda: Topic(pose, topics.POSE_IN_FRAME)):
+            self._send(pose, pose_at, topics.pose_in_frame(unix_s, metres, attitude))
 
     def _publish_texts(self, system_id: int, vehicle: Vehicle) -> None:
         name = topics.vehicle_topic(system_id, "log")
         sent_at = self._sent_at.get(name, -math.inf)
         for text in vehicle.telemetry.texts_since(sent_at):
             if text.at > sent_at and self._needs_sending(name, text.at, lambda: Topic(name, topics.LOG)):
-                self._send(name, text.at, topics.log_entry(self._unix(text.at), system_id, text))
+                self._send(name, text.at, topics.log_entry(self._to_unix_time(text.at), system_id, text))
 
-    def _needs_sending(self, name: str, at: float, topic: Callable[[], Topic]) -> bool:
+    def _needs_sending(self, name: str, updated_at: float, make_topic: Callable[[], Topic]) -> bool:
         """Return True if a viewer subscribes to the topic, and the value is newer than the last value sent.
 
         Creates the channel of the topic with its first value.
@@ -256,17 +258,17 @@ class _TopicChannels:
         channel = self._channels.get(name)
         if channel is None:
             channel = self._channels[name] = self._sdk.Channel(
-                name, schema=dict(topic().schema), message_encoding="json", context=self.context
+                name, schema=dict(make_topic().schema), message_encoding="json", context=self.context
             )
         if not channel.has_sinks():
             self._sent_at.pop(name, None)
             return False
-        return at > self._sent_at.get(name, -math.inf)
+        return updated_at > self._sent_at.get(name, -math.inf)
 
-    def _send(self, name: str, at: float, fields: Mapping[str, Any]) -> None:
-        self._sent_at[name] = at
-        self._channels[name].log(topics.encoded(fields), log_time=topics.nanoseconds(self._unix(at)))
+    def _send(self, name: str, updated_at: float, fields: Mapping[str, Any]) -> None:
+        self._sent_at[name] = updated_at
+        self._channels[name].log(topics.encoded(fields), log_time=topics.nanoseconds(self._to_unix_time(updated_at)))
 
-    def _unix(self, at: float) -> float:
+    def _to_unix_time(self, loop_time: float) -> float:
         """Convert the loop's time to UTC, in seconds since 1970."""
-        return self._wall_at_0 + at
+        return self._unix_time_at_0 + loop_time

@@ -21,7 +21,7 @@ def check_values(metadata: Metadata | None, values: Mapping[str, float], force: 
     """
     if metadata is None:
         return
-    problems = [problem for name, value in values.items() if (problem := _problem(metadata, name, value))]
+    problems = list(filter(None, (_problem(metadata, name, value) for name, value in values.items())))
     if problems:
         raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; {force} sets such values too")
 
@@ -31,13 +31,15 @@ def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: s
 
     ``option`` is the option that gives the metadata; it appears in the note.
     """
-    text = ""
+    if result.error is not None or result.outcome == "unchanged":
+        return result
     if metadata is None:
         text = f"range not checked ({option} checks it)"
     elif metadata_entry(metadata, result.name)[0] is None:
         text = "range not checked (the metadata does not have this parameter)"
-    is_set = result.error is None and result.outcome != "unchanged"
-    return result.replace(note="; ".join(filter(None, (result.note, text if is_set else ""))))
+    else:
+        return result
+    return result.replace(note=f"{result.note}; {text}" if result.note else text)
 
 
 def _problem(metadata: Metadata, name: str, value: float) -> str | None:
@@ -53,8 +55,10 @@ def metadata_entry(metadata: Metadata, name: str) -> tuple[ParameterMetadata | N
     """Return the metadata of a parameter under any of its names, and the conversion to its unit."""
     from aerokit.parameters.renames import resolve_rename
 
-    for spelled in (name, name.upper()):
-        if spelled in metadata:
-            return metadata[spelled], lambda value: value
+    for spelling in (name, name.upper()):
+        if spelling in metadata:
+            return metadata[spelling], lambda value: value
     renamed = resolve_rename(name.upper(), metadata)
-    return (None, lambda value: value) if renamed is None else (metadata[renamed.name], renamed.to_vehicle)
+    if renamed is None:
+        return None, lambda value: value
+    return metadata[renamed.name], renamed.to_vehicle

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def parse_plan_text(text: str, name: str) -> Plan:
-    """Parse a text in either format, and check the parts of the plan.
+    """Parse the text of a .plan or QGC WPL 110 file, and check the parts of the plan.
 
     Raises:
         FileFormatError: the text has neither format. The error begins with ``name`` and the position.

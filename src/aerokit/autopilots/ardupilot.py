@@ -27,13 +27,18 @@ from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavSta
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
 
-_C = MavCmd
 NOT_ON_ARDUPILOT = frozenset(
-    (_C.DO_SET_ACTUATOR, _C.ACTUATOR_TEST, _C.INJECT_FAILURE, _C.ILLUMINATOR_ON_OFF, _C.LOGGING_START)
+    {
+        MavCmd.DO_SET_ACTUATOR,
+        MavCmd.ACTUATOR_TEST,
+        MavCmd.INJECT_FAILURE,
+        MavCmd.ILLUMINATOR_ON_OFF,
+        MavCmd.LOGGING_START,
+    }
 )
-NOT_ON_PLANE = NOT_ON_ARDUPILOT | {_C.DO_WINCH}
-NOT_ON_COPTER = NOT_ON_ARDUPILOT | {_C.DO_VTOL_TRANSITION}
-NOT_ON_GROUND_OR_WATER = NOT_ON_PLANE | NOT_ON_COPTER | {_C.DO_PARACHUTE, _C.AIRFRAME_CONFIGURATION}
+NOT_ON_PLANE = NOT_ON_ARDUPILOT | {MavCmd.DO_WINCH}
+NOT_ON_COPTER = NOT_ON_ARDUPILOT | {MavCmd.DO_VTOL_TRANSITION}
+NOT_ON_GROUND_OR_WATER = NOT_ON_PLANE | NOT_ON_COPTER | {MavCmd.DO_PARACHUTE, MavCmd.AIRFRAME_CONFIGURATION}
 
 COPTER = ModeTable(
     {
@@ -196,10 +201,15 @@ class ArduPilot(Autopilot):
     stream_groups = ARDUPILOT_GROUPS
     # ATTITUDE_QUATERNION is not listed, because it is sent on request.
     unsupported_messages: frozenset[str] = frozenset(
-        (
-            *("ESTIMATOR_STATUS", "WIND_COV", "ALTITUDE", "CURRENT_MODE"),
-            *("ODOMETRY", "HIL_STATE_QUATERNION", "ACTUATOR_CONTROL_TARGET"),
-        )
+        {
+            "ESTIMATOR_STATUS",
+            "WIND_COV",
+            "ALTITUDE",
+            "CURRENT_MODE",
+            "ODOMETRY",
+            "HIL_STATE_QUATERNION",
+            "ACTUATOR_CONTROL_TARGET",
+        }
     )
     highres_imu_field_ut: float = 1e-4
     unsupported_commands: frozenset[int] = NOT_ON_ARDUPILOT
@@ -217,11 +227,11 @@ class ArduPilot(Autopilot):
         )
 
     def arming_reason(self, text: str) -> str | None:
-        return _after(text, "PreArm: ", "Arm: ")
+        return _text_after(text, "PreArm: ", "Arm: ")
 
     def is_refusal(self, text: str) -> bool:
-        lower = text.lower()
-        return super().is_refusal(text) or ("mode change" in lower and "failed" in lower)
+        lower_text = text.lower()
+        return super().is_refusal(text) or ("mode change" in lower_text and "failed" in lower_text)
 
     def _git_hash(self, custom_version: bytes) -> str:
         return custom_version.split(b"\0")[0].decode("ascii", "replace")
@@ -256,20 +266,20 @@ class ArduCopter(ArduPilot):
     circles_by: Literal["orbit", "reposition", "setpoints"] | None = "setpoints"
     arming_mode: ClassVar[str | None] = "GUIDED"
     unarmable_modes: frozenset[str] = frozenset(
-        (
-            *(
-                "AUTOROTATE",
-                "AUTOTUNE",
-                "AUTO_RTL",
-                "AVOID_ADSB",
-                "BRAKE",
-                "CIRCLE",
-                "FLIP",
-                "FOLLOW",
-                "LAND",
-            ),
-            *("RTL", "SMART_RTL", "SYSTEMID"),
-        )
+        {
+            "AUTOROTATE",
+            "AUTOTUNE",
+            "AUTO_RTL",
+            "AVOID_ADSB",
+            "BRAKE",
+            "CIRCLE",
+            "FLIP",
+            "FOLLOW",
+            "LAND",
+            "RTL",
+            "SMART_RTL",
+            "SYSTEMID",
+        }
     )
     armable_by_option: Mapping[str, str] = {"AUTO": "AUTO_OPTIONS"}
     modes_without_position: frozenset[str] = frozenset(
@@ -278,8 +288,9 @@ class ArduCopter(ArduPilot):
 
     def take_off(self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool) -> TakeOff:
         # The vehicle stays in GUIDED after the take-off.
+        params = (0, 0, 0, 0, 0, 0, altitude_relative_m)
         guided = self.modes.find("GUIDED")
-        return TakeOff(guided, MavCmd.NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, altitude_relative_m), None)
+        return TakeOff(mode=guided, command=MavCmd.NAV_TAKEOFF, params=params, mode_after=None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
         # STANDBY means on the ground, ACTIVE in the air. During a failsafe, CRITICAL replaces both.
@@ -324,8 +335,9 @@ class ArduPlane(ArduPilot):
         # A QuadPlane climbs in GUIDED. A plane armed in TAKEOFF climbs to its parameter TKOFF_ALT.
         if self._can_hover(is_vtol):
             params = (0, 0, 0, 0, 0, 0, altitude_relative_m)
-            return TakeOff(self.modes.find("GUIDED"), MavCmd.NAV_TAKEOFF, params, None)
-        return TakeOff(self.modes.find("TAKEOFF"), None, (), None)
+            guided = self.modes.find("GUIDED")
+            return TakeOff(mode=guided, command=MavCmd.NAV_TAKEOFF, params=params, mode_after=None)
+        return TakeOff(mode=self.modes.find("TAKEOFF"), command=None, params=(), mode_after=None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
         return _landed_state(heartbeat)
@@ -423,10 +435,12 @@ def ardupilot_for(vehicle_type: int) -> ArduPilot:
 
 
 def _landed_state(heartbeat: Heartbeat) -> int | None:
+    """Return the landed state according to MAV_STATE: STANDBY on the ground, ACTIVE in the air, else None."""
     if heartbeat.system_status == MavState.STANDBY:
         return MavLandedState.ON_GROUND
     return MavLandedState.IN_AIR if heartbeat.system_status == MavState.ACTIVE else None
 
 
-def _after(text: str, *prefixes: str) -> str | None:
+def _text_after(text: str, *prefixes: str) -> str | None:
+    """Return the text without the prefix that it begins with; None if it begins with none of them."""
     return next((text[len(prefix) :].strip() for prefix in prefixes if text.startswith(prefix)), None)

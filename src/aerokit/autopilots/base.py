@@ -34,9 +34,7 @@ _C_CAST = MavProtocolCapability.PARAM_ENCODE_C_CAST.value
 Purpose = Literal["hold", "land", "precision_land", "return", "setpoint", "sticks", "take_off", "mission"]
 """Purpose for which a program uses a mode."""
 
-# Maps a MAV_CMD to the purposes of the modes that it may lead to. An autopilot may use several modes for one purpose.
-
-
+# Maps a MAV_CMD to the purposes of the modes that it may lead to, on any autopilot.
 PURPOSES_OF_COMMANDS: Mapping[int, tuple[Purpose, ...]] = {
     MavCmd.NAV_RETURN_TO_LAUNCH: ("return",),
     MavCmd.NAV_LAND: ("land",),
@@ -188,7 +186,9 @@ class Autopilot:
     """True if users also refer to modes by number."""
     purposes: ClassVar[Mapping[str, str]] = {}
     """Maps purposes to names of modes."""
-    setpoints: SetpointRules = SetpointRules(*[False] * 5)
+    setpoints: SetpointRules = SetpointRules(
+        local_position=False, global_position=False, velocity=False, acceleration=False, attitude=False
+    )
     external: ExternalRules = ExternalRules()
     """External measurements that the autopilot accepts by MAVLink."""
     sticks: StickRules | None = None
@@ -345,8 +345,8 @@ class Autopilot:
         return tuple(self.modes.find(name) for name in sorted(filter(None, names)))
 
     def _modes_of_order(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
-        base, custom = mode_numbers((*params, 0.0, 0.0)[:2])
-        return (self.mode(custom, base, extra),) if base & CUSTOM_MODE_ENABLED else ()
+        base_mode, custom_mode = mode_numbers((*params, 0.0, 0.0)[:2])  # Missing parameters are 0.
+        return (self.mode(custom_mode, base_mode, extra),) if base_mode & CUSTOM_MODE_ENABLED else ()
 
     def mode_to_arm_in(self) -> Mode | None:
         """Return a mode in which to arm if the current mode does not allow arming; None if no such mode is known."""
@@ -415,6 +415,7 @@ class Autopilot:
 
     @staticmethod
     def _missing_estimates(flags: int, *, required: int, horizontal: int) -> tuple[str, ...]:
+        """Return the missing estimates: all of ``required``, and one of those in ``horizontal``."""
         missing = bit_names(required & ~flags, ESTIMATES)
         return missing if flags & horizontal else (*missing, ESTIMATES[POS_HORIZ_ABS])
 

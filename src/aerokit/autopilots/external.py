@@ -60,10 +60,17 @@ class ExternalRules(Snapshot):
     origin_is_final: bool = False
 
 
-def _external_navigation(what: str) -> ExternalRule:
-    """Return the rule for AP_VisualOdom: VISO_TYPE, and source 6 (ExternalNav) in each set of EK3_SRC parameters."""
-    sources = [(f"EK3_SRC1_{what}", (6.0,)), *((f"EK3_SRC{n}_{what}", (0.0, 6.0)) for n in (2, 3))]
-    return ExternalRule(((("VISO_TYPE",), (1.0, 2.0, 3.0)),), tuple(sources))
+def _external_navigation(quantity: str) -> ExternalRule:
+    """Return the rule for AP_VisualOdom: VISO_TYPE, and source 6 (ExternalNav) in each set of EK3_SRC parameters.
+
+    Sets 2 and 3 may also have source 0 (none).
+    """
+    sole_source = (
+        (f"EK3_SRC1_{quantity}", (6.0,)),
+        (f"EK3_SRC2_{quantity}", (0.0, 6.0)),
+        (f"EK3_SRC3_{quantity}", (0.0, 6.0)),
+    )
+    return ExternalRule(required=((("VISO_TYPE",), (1.0, 2.0, 3.0)),), sole_source=sole_source)
 
 
 _GPS_ALONE = (("EK3_SRC1_POSXY", (3.0,)), ("EK3_SRC2_POSXY", (0.0, 3.0)), ("GPS2_TYPE", (0.0,)))

@@ -13,7 +13,7 @@ CUSTOM_MODE_ENABLED = MavModeFlag.CUSTOM_MODE_ENABLED.value
 SAFETY_ARMED = MavModeFlag.SAFETY_ARMED.value
 
 NO_MODES: Mapping[int, str] = {}
-_UNKNOWN = "MODE"
+_PREFIX_OF_NUMBER = "MODE"  # "MODE 42" is the name of a mode that is not in the table.
 _MAX_CUSTOM_MODE = 0xFFFF_FFFF
 
 
@@ -64,7 +64,7 @@ class ModeTable:
         """Return the name of the mode with this number. ``extra`` has the modes that the vehicle reported by
         AVAILABLE_MODES.
         """
-        return self._names.get(custom_mode) or extra.get(custom_mode) or f"{_UNKNOWN} {custom_mode}"
+        return self._names.get(custom_mode) or extra.get(custom_mode) or f"{_PREFIX_OF_NUMBER} {custom_mode}"
 
     def find(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:
         """Find a mode by name or number.
@@ -84,20 +84,21 @@ class ModeTable:
         for number, extra_name in extra.items():
             if _key(extra_name) == key:
                 return number
-        digits = key[len(_UNKNOWN) :] if key.startswith(_UNKNOWN) else key
+        # The mode number is in "MODE 42", or is the whole text.
+        digits = key[len(_PREFIX_OF_NUMBER) :] if key.startswith(_PREFIX_OF_NUMBER) else key
         if digits.isdecimal():
             return self._check(int(digits))
-        raise InvalidArgument(self._unknown(name, extra))
+        raise InvalidArgument(self._unknown_name_text(name, extra))
 
     def _check(self, number: int) -> int:
         if not 0 <= number <= _MAX_CUSTOM_MODE:
             raise InvalidArgument(f"mode = {number} is not allowed: a custom_mode from 0 to {_MAX_CUSTOM_MODE}")
         return int(number)
 
-    def _unknown(self, name: str, extra: Mapping[int, str]) -> str:
-        known = [*self.names, *(extra[n] for n in sorted(extra) if n not in self._names)]
-        hint = did_you_mean(name, known)
-        return f"mode = {short_repr(name)} is not known{hint}; this vehicle's modes are " + ", ".join(known)
+    def _unknown_name_text(self, name: str, extra: Mapping[int, str]) -> str:
+        known_names = [*self.names, *(extra[number] for number in sorted(extra) if number not in self._names)]
+        hint = did_you_mean(name, known_names)
+        return f"mode = {short_repr(name)} is not known{hint}; this vehicle's modes are {', '.join(known_names)}"
 
 
 def is_armed(base_mode: int) -> bool:
@@ -114,4 +115,5 @@ def base_mode_name(base_mode: int) -> str:
 
 
 def _key(name: str) -> str:
+    """Return the name in the form in which names are compared: ``"auto_rtl"`` becomes ``"AUTORTL"``."""
     return "".join(char for char in name.upper() if char.isalnum())

@@ -25,11 +25,12 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType, SpeedType
 
 MAIN_POSCTL, MAIN_AUTO, SUB_MISSION = 3, 4, 4
-_E, _C = EstimatorStatusFlags, MavCmd
-ESTIMATES_REQUIRED = ATTITUDE_AND_HEIGHT | _E.VELOCITY_HORIZ.value | _E.VELOCITY_VERT.value
+ESTIMATES_REQUIRED = (
+    ATTITUDE_AND_HEIGHT | EstimatorStatusFlags.VELOCITY_HORIZ.value | EstimatorStatusFlags.VELOCITY_VERT.value
+)
 ESTIMATOR_PROBLEMS: Mapping[int, str] = {
-    _E.GPS_GLITCH.value: "GPS without glitches",
-    _E.ACCEL_ERROR.value: "accelerometer without errors",
+    EstimatorStatusFlags.GPS_GLITCH.value: "GPS without glitches",
+    EstimatorStatusFlags.ACCEL_ERROR.value: "accelerometer without errors",
 }
 
 
@@ -39,6 +40,7 @@ def px4_custom_mode(main: int, sub: int = 0) -> int:
 
 
 def _auto(sub: int) -> int:
+    """Return the custom_mode of a sub mode of AUTO."""
     return px4_custom_mode(MAIN_AUTO, sub)
 
 
@@ -83,7 +85,7 @@ MODES = ModeTable(
     },
 )
 
-_EXTERNAL = range(_auto(11), _auto(19))
+_EXTERNAL_MODES = range(_auto(11), _auto(19))
 
 
 class Px4(Autopilot):
@@ -101,7 +103,14 @@ class Px4(Autopilot):
     external: ExternalRules = PX4_EXTERNAL
     actuators_until: tuple[int, int] | None = (1, 14)  # removed on 2023-03-06 by commit 27658354 (MavlinkReceiver.cpp)
     reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
-    gimbals: GimbalRules = GimbalRules(*[False] * 6)
+    gimbals: GimbalRules = GimbalRules(
+        has_secondary=False,
+        supports_retract=False,
+        supports_pitchyaw=False,
+        supports_roi_sysid=False,
+        roi_per_gimbal=False,
+        roi_needs_control=False,
+    )
     log_suffix = ".ulg"
     log_directories: ClassVar[tuple[str, str]] = ("/fs/microsd/log", "/log")
     silent_without_logs = True
@@ -144,10 +153,17 @@ class Px4(Autopilot):
     has_shell = True
     # PX4's MAVLink module passes DO_WINCH on, but no other module handles it.
     unsupported_commands: frozenset[int] = frozenset(
-        (
-            *(_C.DO_SET_SERVO, _C.DO_REPEAT_SERVO, _C.DO_SET_RELAY, _C.DO_REPEAT_RELAY, _C.DO_MOTOR_TEST),
-            *(_C.DO_PARACHUTE, _C.AIRFRAME_CONFIGURATION, _C.DO_WINCH, _C.ILLUMINATOR_ON_OFF),
-        )
+        {
+            MavCmd.DO_SET_SERVO,
+            MavCmd.DO_REPEAT_SERVO,
+            MavCmd.DO_SET_RELAY,
+            MavCmd.DO_REPEAT_RELAY,
+            MavCmd.DO_MOTOR_TEST,
+            MavCmd.DO_PARACHUTE,
+            MavCmd.AIRFRAME_CONFIGURATION,
+            MavCmd.DO_WINCH,
+            MavCmd.ILLUMINATOR_ON_OFF,
+        }
     )
 
     def __init__(self, vehicle_type: int) -> None:
@@ -164,14 +180,14 @@ class Px4(Autopilot):
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
         """Return the mode of these numbers. An external mode's registered name takes precedence over EXTERNAL1 etc."""
-        if custom_mode in _EXTERNAL and custom_mode in extra:
+        if custom_mode in _EXTERNAL_MODES and custom_mode in extra:
             return Mode(extra[custom_mode], custom_mode, base_mode)
         return super().mode(custom_mode, base_mode, extra)
 
     def find_mode(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:
         """Find a mode by name or number. External modes are also found by their registered names."""
-        found = super().find_mode(mode, extra)
-        return Mode(extra.get(found.custom_mode, found.name), found.custom_mode)
+        numbered = super().find_mode(mode, extra)
+        return Mode(extra.get(numbered.custom_mode, numbered.name), numbered.custom_mode)
 
     def mode_order(self, mode: Mode) -> ModeOrder:
         # param2 is the main mode, param3 the sub mode.
@@ -179,12 +195,12 @@ class Px4(Autopilot):
         return ModeOrder((CUSTOM_MODE_ENABLED, main, sub), CUSTOM_MODE_ENABLED, mode.custom_mode)
 
     def _modes_of_order(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
-        base, main, sub = mode_numbers((*params, 0.0, 0.0, 0.0)[:3])
-        if not base & CUSTOM_MODE_ENABLED:
+        base_mode, main, sub = mode_numbers((*params, 0.0, 0.0, 0.0)[:3])  # Missing parameters are 0.
+        if not base_mode & CUSTOM_MODE_ENABLED:
             return ()
         if main == MAIN_AUTO and not sub:
             sub = SUB_MISSION  # PX4's default
-        return (self.mode((main & 0xFF) << 16 | (sub & 0xFF) << 24, CUSTOM_MODE_ENABLED, extra),)
+        return (self.mode(px4_custom_mode(main & 0xFF, sub & 0xFF), CUSTOM_MODE_ENABLED, extra),)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
         """Return the name if it belongs to an external mode.
@@ -193,7 +209,7 @@ class Px4(Autopilot):
         """
         if name.startswith("("):
             return None
-        if custom_mode in _EXTERNAL:
+        if custom_mode in _EXTERNAL_MODES:
             return name or None
         return super().learn_mode_name(custom_mode, name)
 
@@ -210,7 +226,8 @@ class Px4(Autopilot):
         if home_altitude_amsl_m is None:
             raise InvalidArgument("take-off on PX4 needs the altitude of home: NAV_TAKEOFF is above mean sea level")
         params = (NAN, 0, 0, NAN, NAN, NAN, home_altitude_amsl_m + altitude_relative_m)
-        return TakeOff(None, MavCmd.NAV_TAKEOFF, params, self.modes.find("LOITER"))
+        loiter = self.modes.find("LOITER")
+        return TakeOff(mode=None, command=MavCmd.NAV_TAKEOFF, params=params, mode_after=loiter)
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
         return () if self._cannot_fly else (("RTL_RETURN_ALT", 1.0),)

@@ -5,66 +5,66 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from aerokit._internal.values import Snapshot
-from aerokit.mavlink.enums import EstimatorStatusFlags, MavDataStream, MavSysStatusSensor
+from aerokit.mavlink.enums import EstimatorStatusFlags as Estimate
+from aerokit.mavlink.enums import MavDataStream
+from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 from aerokit.mavlink.messages import INDEX
 
-_E, _S = EstimatorStatusFlags, MavSysStatusSensor
-
 # The summary of all checks, not a sensor.
-PREARM_CHECK = _S.MAV_SYS_STATUS_PREARM_CHECK.value
+PREARM_CHECK = Sensor.MAV_SYS_STATUS_PREARM_CHECK.value
 
-POS_HORIZ_ABS = _E.POS_HORIZ_ABS.value
+POS_HORIZ_ABS = Estimate.POS_HORIZ_ABS.value
 
 # Besides the position itself, these are required to arm in a mode that needs a position.
-ATTITUDE_AND_HEIGHT = _E.ATTITUDE.value | _E.POS_VERT_ABS.value
+ATTITUDE_AND_HEIGHT = Estimate.ATTITUDE.value | Estimate.POS_VERT_ABS.value
 
 # MAV_SYS_STATUS_SENSOR (https://mavlink.io/en/messages/common.html#MAV_SYS_STATUS_SENSOR)
 SENSORS: Mapping[int, str] = {
-    _S.SENSOR_3D_GYRO.value: "gyroscope",
-    _S.SENSOR_3D_ACCEL.value: "accelerometer",
-    _S.SENSOR_3D_MAG.value: "compass",
-    _S.ABSOLUTE_PRESSURE.value: "barometer",
-    _S.DIFFERENTIAL_PRESSURE.value: "airspeed sensor",
-    _S.GPS.value: "GPS",
-    _S.OPTICAL_FLOW.value: "optical flow",
-    _S.VISION_POSITION.value: "vision position",
-    _S.LASER_POSITION.value: "range finder",
-    _S.EXTERNAL_GROUND_TRUTH.value: "external ground truth",
-    _S.ANGULAR_RATE_CONTROL.value: "rate control",
-    _S.ATTITUDE_STABILIZATION.value: "attitude stabilisation",
-    _S.YAW_POSITION.value: "yaw control",
-    _S.Z_ALTITUDE_CONTROL.value: "altitude control",
-    _S.XY_POSITION_CONTROL.value: "horizontal position control",
-    _S.MOTOR_OUTPUTS.value: "motor outputs",
-    _S.RC_RECEIVER.value: "RC receiver",
-    _S.SENSOR_3D_GYRO2.value: "second gyroscope",
-    _S.SENSOR_3D_ACCEL2.value: "second accelerometer",
-    _S.SENSOR_3D_MAG2.value: "second compass",
-    _S.MAV_SYS_STATUS_GEOFENCE.value: "geofence",
-    _S.MAV_SYS_STATUS_AHRS.value: "attitude and heading estimate",
-    _S.MAV_SYS_STATUS_TERRAIN.value: "terrain data",
-    _S.MAV_SYS_STATUS_REVERSE_MOTOR.value: "reversed motors",
-    _S.MAV_SYS_STATUS_LOGGING.value: "logging",
-    _S.BATTERY.value: "battery",
-    _S.PROXIMITY.value: "proximity sensor",
-    _S.SATCOM.value: "satellite link",
-    _S.MAV_SYS_STATUS_PREARM_CHECK.value: "pre-arm checks",
-    _S.MAV_SYS_STATUS_OBSTACLE_AVOIDANCE.value: "obstacle avoidance",
-    _S.PROPULSION.value: "propulsion",
+    Sensor.SENSOR_3D_GYRO.value: "gyroscope",
+    Sensor.SENSOR_3D_ACCEL.value: "accelerometer",
+    Sensor.SENSOR_3D_MAG.value: "compass",
+    Sensor.ABSOLUTE_PRESSURE.value: "barometer",
+    Sensor.DIFFERENTIAL_PRESSURE.value: "airspeed sensor",
+    Sensor.GPS.value: "GPS",
+    Sensor.OPTICAL_FLOW.value: "optical flow",
+    Sensor.VISION_POSITION.value: "vision position",
+    Sensor.LASER_POSITION.value: "range finder",
+    Sensor.EXTERNAL_GROUND_TRUTH.value: "external ground truth",
+    Sensor.ANGULAR_RATE_CONTROL.value: "rate control",
+    Sensor.ATTITUDE_STABILIZATION.value: "attitude stabilisation",
+    Sensor.YAW_POSITION.value: "yaw control",
+    Sensor.Z_ALTITUDE_CONTROL.value: "altitude control",
+    Sensor.XY_POSITION_CONTROL.value: "horizontal position control",
+    Sensor.MOTOR_OUTPUTS.value: "motor outputs",
+    Sensor.RC_RECEIVER.value: "RC receiver",
+    Sensor.SENSOR_3D_GYRO2.value: "second gyroscope",
+    Sensor.SENSOR_3D_ACCEL2.value: "second accelerometer",
+    Sensor.SENSOR_3D_MAG2.value: "second compass",
+    Sensor.MAV_SYS_STATUS_GEOFENCE.value: "geofence",
+    Sensor.MAV_SYS_STATUS_AHRS.value: "attitude and heading estimate",
+    Sensor.MAV_SYS_STATUS_TERRAIN.value: "terrain data",
+    Sensor.MAV_SYS_STATUS_REVERSE_MOTOR.value: "reversed motors",
+    Sensor.MAV_SYS_STATUS_LOGGING.value: "logging",
+    Sensor.BATTERY.value: "battery",
+    Sensor.PROXIMITY.value: "proximity sensor",
+    Sensor.SATCOM.value: "satellite link",
+    Sensor.MAV_SYS_STATUS_PREARM_CHECK.value: "pre-arm checks",
+    Sensor.MAV_SYS_STATUS_OBSTACLE_AVOIDANCE.value: "obstacle avoidance",
+    Sensor.PROPULSION.value: "propulsion",
 }
 
 # The bits that EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS have in common.
 ESTIMATES: Mapping[int, str] = {
-    _E.ATTITUDE.value: "attitude",
-    _E.VELOCITY_HORIZ.value: "horizontal velocity",
-    _E.VELOCITY_VERT.value: "vertical velocity",
-    _E.POS_HORIZ_REL.value: "relative horizontal position",
-    _E.POS_HORIZ_ABS.value: "absolute horizontal position",
-    _E.POS_VERT_ABS.value: "absolute altitude",
-    _E.POS_VERT_AGL.value: "altitude above ground",
-    _E.CONST_POS_MODE.value: "constant position mode",
-    _E.PRED_POS_HORIZ_REL.value: "predicted relative horizontal position",
-    _E.PRED_POS_HORIZ_ABS.value: "predicted absolute horizontal position",
+    Estimate.ATTITUDE.value: "attitude",
+    Estimate.VELOCITY_HORIZ.value: "horizontal velocity",
+    Estimate.VELOCITY_VERT.value: "vertical velocity",
+    Estimate.POS_HORIZ_REL.value: "relative horizontal position",
+    Estimate.POS_HORIZ_ABS.value: "absolute horizontal position",
+    Estimate.POS_VERT_ABS.value: "absolute altitude",
+    Estimate.POS_VERT_AGL.value: "altitude above ground",
+    Estimate.CONST_POS_MODE.value: "constant position mode",
+    Estimate.PRED_POS_HORIZ_REL.value: "predicted relative horizontal position",
+    Estimate.PRED_POS_HORIZ_ABS.value: "predicted absolute horizontal position",
 }
 
 
@@ -124,14 +124,14 @@ _IDS: Mapping[str, int] = {row[0]: message_id for message_id, row in INDEX.items
 ARDUPILOT_GROUPS: Mapping[int, int] = {_IDS[name]: group for group, names in _GROUPS.items() for name in names}
 
 _ALSO_STREAMED = (
-    *("ActuatorControlTarget", "ActuatorOutputStatus", "Ahrs2", "Ahrs3", "Altitude", "AttitudeQuaternion"),
-    *("AttitudeTarget", "Battery2", "EfiStatus"),
-    *("GimbalDeviceAttitudeStatus", "GimbalManagerStatus", "GlobalPositionIntCov", "GpsStatus", "Gps2Raw"),
-    *("HighLatency2", "HighresImu", "HilActuatorControls", "HygrometerSensor", "LocalPositionNedCov"),
-    *("LocalPositionNedSystemGlobalOffset", "ManualControl", "NavControllerOutput", "ObstacleDistance"),
-    *("Odometry", "OpticalFlowRad", "OrbitExecutionStatus", "PositionTargetGlobalInt"),
-    *("PositionTargetLocalNed", "RawRpm", "ScaledImu", "UtmGlobalPosition", "WaterDepth", "WheelDistance"),
-)
+    "ActuatorControlTarget", "ActuatorOutputStatus", "Ahrs2", "Ahrs3", "Altitude", "AttitudeQuaternion",
+    "AttitudeTarget", "Battery2", "EfiStatus", "GimbalDeviceAttitudeStatus", "GimbalManagerStatus",
+    "GlobalPositionIntCov", "GpsStatus", "Gps2Raw", "HighLatency2", "HighresImu", "HilActuatorControls",
+    "HygrometerSensor", "LocalPositionNedCov", "LocalPositionNedSystemGlobalOffset", "ManualControl",
+    "NavControllerOutput", "ObstacleDistance", "Odometry", "OpticalFlowRad", "OrbitExecutionStatus",
+    "PositionTargetGlobalInt", "PositionTargetLocalNed", "RawRpm", "ScaledImu", "UtmGlobalPosition", "WaterDepth",
+    "WheelDistance",
+)  # fmt: skip
 
 # Class names of messages that any autopilot sends as a stream. Other messages are sent when needed.
 STREAMED_MESSAGES = frozenset((*(name for names in _GROUPS.values() for name in names), *_ALSO_STREAMED))
@@ -163,6 +163,6 @@ class AutopilotVersion(Snapshot):
 
 def version_text(flight_sw_version: int) -> tuple[str, tuple[int, int, int]]:
     """Convert ``flight_sw_version`` to text and (major, minor, patch): ``("4.6.1-rc", (4, 6, 1))``."""
-    major, minor, patch, kind = flight_sw_version.to_bytes(4, "big")
-    suffix = next(text for first, text in _VERSION_TYPES if kind >= first)
+    major, minor, patch, release_type = flight_sw_version.to_bytes(4, "big")
+    suffix = next(text for first, text in _VERSION_TYPES if release_type >= first)
     return f"{major}.{minor}.{patch}{suffix}", (major, minor, patch)

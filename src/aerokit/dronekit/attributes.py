@@ -27,11 +27,12 @@ from aerokit.dronekit.values import (
 )
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import EkfStatusFlags, MavProtocolCapability
-from aerokit.vehicle.state.movement import place
+from aerokit.vehicle.state.movement import valid_coordinates
 
 if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
 
+# Names of MAV_STATE by value.
 STATES = ("UNINIT", "BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL", "EMERGENCY", "POWEROFF")
 # Flags of EKF_STATUS_REPORT, which are also those of ESTIMATOR_STATUS.
 POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
@@ -39,8 +40,8 @@ POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
     EkfStatusFlags.CONST_POS_MODE.value,
     EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
 )
-FACING_DOWN = 25
-NO_MODE = (None, "INITIALISING", "MAV")  # while booting
+FACING_DOWN = 25  # MAV_SENSOR_ROTATION_PITCH_270
+NO_MODE = (None, "INITIALISING", "MAV")  # names that stand for no mode, while the vehicle boots
 GLOBAL_FRAMES = ("location.global_relative_frame", "location.global_frame")
 LOCAL_FRAME = "location.local_frame"
 
@@ -54,10 +55,10 @@ class Locations(HasObservers, LocationPrivates):
     def __init__(self, vehicle: VehicleCore) -> None:
         self._core = core = core_of(vehicle)
         super().__init__(core.handler.listener_thread)
-        self._has_altitude = False
-        here, on_global, on_local = self._dk_listeners, self._on_global_position, self._on_local_position
-        self._global = core.on(m.GlobalPositionInt, on_global, "location", *GLOBAL_FRAMES, listeners=here)
-        self._local = core.on(m.LocalPositionNed, on_local, "location", LOCAL_FRAME, listeners=here)
+        self._has_altitude = False  # True after the first altitude other than 0
+        own_listeners, on_global, on_local = self._dk_listeners, self._on_global_position, self._on_local_position
+        self._global = core.on(m.GlobalPositionInt, on_global, "location", *GLOBAL_FRAMES, listeners=own_listeners)
+        self._local = core.on(m.LocalPositionNed, on_local, "location", LOCAL_FRAME, listeners=own_listeners)
 
     @property
     def global_frame(self) -> LocationGlobal:
@@ -68,8 +69,10 @@ class Locations(HasObservers, LocationPrivates):
         message = self._global.message
         if message is None:
             return LocationGlobal(None, None, None)
-        altitude = message.alt / 1000.0
-        return LocationGlobal(*_place_of(message), altitude if altitude or self._has_altitude else None)
+        latitude, longitude = _position_of(message)
+        if message.alt == 0 and not self._has_altitude:  # 0 may stand for an unknown altitude
+            return LocationGlobal(latitude, longitude, None)
+        return LocationGlobal(latitude, longitude, message.alt / 1000.0)
 
     @property
     def global_relative_frame(self) -> LocationGlobalRelative:
@@ -77,7 +80,7 @@ class Locations(HasObservers, LocationPrivates):
         message = self._global.message
         if message is None:
             return LocationGlobalRelative(None, None, None)
-        return LocationGlobalRelative(*_place_of(message), message.relative_alt / 1000.0)
+        return LocationGlobalRelative(*_position_of(message), message.relative_alt / 1000.0)
 
     @property
     def local_frame(self) -> LocationLocal:
@@ -101,9 +104,9 @@ class Locations(HasObservers, LocationPrivates):
         self._core.listeners.announce(f"location.{frame}")
 
 
-def _place_of(message: m.GlobalPositionInt) -> tuple[float | None, float | None]:
+def _position_of(message: m.GlobalPositionInt) -> tuple[float | None, float | None]:
     """Return latitude and longitude in degrees, or None without a fix."""
-    return place(message.lat, message.lon) or (None, None)
+    return valid_coordinates(message.lat, message.lon) or (None, None)
 
 
 class VehicleAttributes(VehicleCore):
@@ -212,7 +215,8 @@ class VehicleAttributes(VehicleCore):
         """
         if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False
-        if self._dk.aio_or_none is not None and self._dk.aio_or_none.autopilot.prearm_depends_on_mode:
+        aio = self._dk.aio_or_none
+        if aio is not None and aio.autopilot.prearm_depends_on_mode:  # PX4
             status = self._dk_sys_status.message
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         gps = self._dk_gps.message
@@ -221,8 +225,8 @@ class VehicleAttributes(VehicleCore):
     @property
     def version(self) -> Version:
         """Firmware version and type (AUTOPILOT_VERSION, HEARTBEAT)."""
-        (raw,) = self._dk_version.values("flight_sw_version")
-        return Version(raw, self._autopilot_type, self._vehicle_type)
+        (raw_version,) = self._dk_version.values("flight_sw_version")
+        return Version(raw_version, self._autopilot_type, self._vehicle_type)
 
     @property
     def capabilities(self) -> Capabilities:
@@ -253,7 +257,8 @@ class VehicleAttributes(VehicleCore):
         self._dk.ready.mark("last_heartbeat")
 
     def _dk_on_distance_sensor(self, message: m.DistanceSensor) -> None:
-        if message.orientation == FACING_DOWN and self._dk_rangefinder.message is None:
+        is_needed = self._dk_rangefinder.message is None  # RANGEFINDER takes precedence
+        if message.orientation == FACING_DOWN and is_needed:
             self._dk_distance_down = message.current_distance / 100.0
             self._dk.listeners.announce("rangefinder")
 

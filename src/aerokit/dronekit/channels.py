@@ -27,7 +27,10 @@ MISSING: Any = object()
 
 
 class _ChannelDict(dict[Any, Any], Python2Mapping[Any]):
-    """A dict of channels, whose keys are numbers as strings or integers."""
+    """A dict of channels, whose keys are numbers as strings or integers.
+
+    Its views are those of a copy, because values are received while programs iterate.
+    """
 
     def __getitem__(self, channel: str | int) -> Any:
         return super().__getitem__(str(channel))
@@ -49,7 +52,7 @@ class _ChannelDict(dict[Any, Any], Python2Mapping[Any]):
 
     @classmethod
     def fromkeys(cls, channels: Iterable[Any], value: Any = None) -> dict[Any, Any]:
-        return dict.fromkeys(channels, value)
+        return dict.fromkeys(channels, value)  # a plain dict, because this class belongs to a vehicle
 
 
 def _unsupported(name: str) -> Any:
@@ -76,7 +79,7 @@ class Channels(_ChannelDict):
         self._count = 0
         self._changing = threading.Lock()
         self._overrides = ChannelsOverride(vehicle)
-        self._grow(count)
+        self._set_count(count)
         core.on(RcChannels, self._on_channels)
         core.on(RcChannelsRaw, self._on_raw)
 
@@ -90,7 +93,7 @@ class Channels(_ChannelDict):
         if not MIN_CHANNELS <= count <= MAX_CHANNELS:
             raise InvalidArgument(f"count = {count!r} is not allowed: {MIN_CHANNELS} to {MAX_CHANNELS}")
         with self._changing:
-            self._grow(count)
+            self._set_count(count)
             for number in NUMBERS[count:]:
                 dict.pop(self, number, None)
 
@@ -111,24 +114,24 @@ class Channels(_ChannelDict):
         setdefault, update = map(_unsupported, ("setdefault", "update"))
 
     def _on_channels(self, message: RcChannels) -> None:
-        self._take(0, ALL_VALUES(message))
+        self._store(0, ALL_VALUES(message))
 
     def _on_raw(self, message: RcChannelsRaw) -> None:
-        first = message.port * MIN_CHANNELS
-        if self._count < first + MIN_CHANNELS <= MAX_CHANNELS:
+        first_index = message.port * 8  # each message has the eight channels of one port
+        if self._count < first_index + 8 <= MAX_CHANNELS:
             with self._changing:
-                self._grow(first + MIN_CHANNELS)
-        self._take(first, FIRST_VALUES(message))
+                self._set_count(first_index + 8)
+        self._store(first_index, FIRST_VALUES(message))
 
-    def _take(self, first: int, received: tuple[int, ...]) -> None:
-        """Set channels from ``first + 1`` on, up to the number of channels."""
+    def _store(self, first_index: int, received: tuple[int, ...]) -> None:
+        """Set channels from number ``first_index + 1`` on, up to the number of channels."""
         with self._changing:
-            numbers = NUMBERS[first : self._count]
+            numbers = NUMBERS[first_index : self._count]
             values = (None if value == UNUSED else value for value in received)
-            dict.update(self, dict(zip(numbers, values, strict=False)))  # atomic for readers
+            dict.update(self, dict(zip(numbers, values, strict=False)))  # one update, so that readers see all or none
         self._core.listeners.notify("channels", self)
 
-    def _grow(self, count: int) -> None:
+    def _set_count(self, count: int) -> None:
         self._count = self._overrides.count = count
         dict.update(self, {number: self.get(number) for number in NUMBERS[:count]})
 
@@ -151,7 +154,7 @@ class ChannelsOverride(_ChannelDict):
         self._core = core_of(vehicle)
         self.count = MIN_CHANNELS
         """Number of channels that can be overridden."""
-        self._released: set[str] = set()
+        self._released: set[str] = set()  # those above 8 are released again with every message
         self._changing = threading.RLock()
 
     def __setitem__(self, channel: str | int, value: float | None) -> None:
@@ -188,8 +191,8 @@ class ChannelsOverride(_ChannelDict):
         with self._changing:
             if not self:
                 raise KeyError("no channel is overridden")
-            channel = list(self)[-1]
-            return channel, self.pop(channel)
+            last_channel = list(self)[-1]
+            return last_channel, self.pop(last_channel)
 
     def setdefault(self, channel: str | int, default: Any = None) -> Any:
         """Override a channel unless it is overridden; return its value."""
@@ -202,22 +205,22 @@ class ChannelsOverride(_ChannelDict):
         with self._changing:
             self._apply(self._checked(overrides))
 
-    def _change(self, changes: Mapping[Any, float | None]) -> None:
+    def _change(self, overrides: Mapping[Any, float | None]) -> None:
         with self._changing:
-            self._apply({**self.copy(), **self._checked(changes)})
+            self._apply({**self.copy(), **self._checked(overrides)})
 
-    def _apply(self, wanted: dict[str, int]) -> None:
-        # Send first: if sending fails, nothing changes.
-        active = {channel: value for channel, value in wanted.items() if value}
+    def _apply(self, overrides: dict[str, int]) -> None:
+        """Make these the only overrides; a value of 0 releases its channel."""
+        active = {channel: value for channel, value in overrides.items() if value}
         released = (self._released | self.keys()) - active.keys()
-        self._send(active, released)
+        self._send(active, released)  # before anything changes here, because sending may fail
         for channel in self.keys() - active.keys():
             dict.pop(self, channel)
         dict.update(self, active)
         self._released = released
 
     def _checked(self, overrides: Mapping[Any, float | None]) -> dict[str, int]:
-        """Return values by number as a string; 0 releases a channel."""
+        """Return the values by channel number (a string); 0 releases the channel."""
         checked: dict[str, int] = {}
         for channel, value in overrides.items():
             number = int(channel)
@@ -230,6 +233,7 @@ class ChannelsOverride(_ChannelDict):
         aio = self._core.check_link()
         if aio.connection.mavlink_version == 1 and any(int(channel) > MIN_CHANNELS for channel in active):
             raise APIException("channels above 8 need MAVLink 2, and this vehicle uses MAVLink 1")
+        # 0 releases a channel up to 8, and leaves a channel above 8 unchanged.
         values = [active.get(number, 0) for number in NUMBERS]
         for channel in released:
             if int(channel) > MIN_CHANNELS:

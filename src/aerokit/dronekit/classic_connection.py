@@ -28,11 +28,11 @@ logger: logging.Logger = logging.getLogger("dronekit.mavlink")
 
 vehicle_logger: logging.Logger = logging.getLogger("dronekit")
 
-ORDERS_TIMEOUT_S = 2.0  # close() waits for the answers to recent orders
+CLOSE_TIMEOUT_S = 2.0  # maximum time for which close() waits for the answers to recent orders
 
-SAME_KIND = {"disarm": "arm"}  # arming and disarming orders replace each other
+SHARED_KINDS = {"disarm": "arm"}  # an order replaces the previous one of its kind; disarming also replaces arming
 
-Work = Callable[..., Awaitable[object]]
+CoroutineFunction = Callable[..., Awaitable[object]]
 
 
 class ClassicConnection:
@@ -42,7 +42,7 @@ class ClassicConnection:
         self,
         address: str,
         loop: LoopThread,
-        held: OpenContext[Connection],
+        context: OpenContext[Connection],
         target_system: int,
         overrides: OverrideRelease,
     ) -> None:
@@ -51,8 +51,8 @@ class ClassicConnection:
         self.listener_thread: ListenerThread = ListenerThread()
         self.listener_thread.on_called = loop.activity.feed
         self.loop = loop
-        self._held = held
-        self.connection: Connection = held.value
+        self._context = context
+        self.connection: Connection = context.value
         """The asynchronous connection, for code that runs on its loop."""
         self.calls: BackgroundCalls = BackgroundCalls(loop)
         self.overrides = overrides
@@ -63,10 +63,12 @@ class ClassicConnection:
         self.vehicle: Any = None
         self._is_closed = threading.Event()
         self._closing = threading.Lock()
-        self._at_close: list[Callable[[], object]] = []
-        self._at_exit = weak_callback(self.close)
-        atexit.register(self._at_exit)
-        loop.when_dropped(functools.partial(_on_dropped, address, self._at_exit, self.listener_thread, self._at_close))
+        self._close_callbacks: list[Callable[[], object]] = []
+        self._exit_callback = weak_callback(self.close)
+        atexit.register(self._exit_callback)
+        loop.when_dropped(
+            functools.partial(_on_dropped, address, self._exit_callback, self.listener_thread, self._close_callbacks)
+        )
 
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Send a message, in the order of the calls, from any thread, without blocking.
@@ -95,21 +97,21 @@ class ClassicConnection:
             if self._is_closed.is_set():
                 return
             self._is_closed.set()
-        atexit.unregister(self._at_exit)
+        atexit.unregister(self._exit_callback)
         try:
-            self.calls.wait(ORDERS_TIMEOUT_S)
+            self.calls.wait(CLOSE_TIMEOUT_S)
         finally:
             self.listener_thread.stop()
             try:
-                self._held.close()
+                self._context.close()
             finally:
                 self.loop.close()
             self.listener_thread.join()
-            for function in self._at_close:
+            for function in self._close_callbacks:
                 function()
 
     def on_close(self, function: Callable[[], object]) -> None:
-        self._at_close.append(function)
+        self._close_callbacks.append(function)
 
     def wait_closed(self, timeout: float) -> bool:
         """Wait at most ``timeout`` seconds until :meth:`close` is called; return True if it was."""
@@ -137,15 +139,15 @@ class ClassicConnection:
 
 def _on_dropped(
     address: str,
-    at_exit: Callable[[], None],
+    exit_callback: Callable[[], None],
     listener_thread: ListenerThread,
-    at_close: list[Callable[[], object]],
+    close_callbacks: list[Callable[[], object]],
 ) -> None:
     """Clean up after a connection was garbage collected. Runs on the loop, which ends afterwards."""
     vehicle_logger.warning("the connection to %s was closed: the program dropped it without close()", address)
-    atexit.unregister(at_exit)
+    atexit.unregister(exit_callback)
     listener_thread.stop()
-    for function in at_close:
+    for function in close_callbacks:
         function()
 
 
@@ -172,7 +174,7 @@ class BackgroundCalls:
         self.describe: Callable[[], str] | None = None
         """Describes the vehicle's state in the warning about a rejected command."""
 
-    def start(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> BackgroundCall:
+    def start(self, kind: str, function: CoroutineFunction, *args: Any, **kwargs: Any) -> BackgroundCall:
         """Start a call, from any thread, without blocking. First messages are sent in the order of these calls.
 
         Raises ConnectionClosed if the connection was closed.
@@ -205,13 +207,13 @@ class BackgroundCalls:
         if pending and not self._loop.is_current:
             concurrent.futures.wait(pending, timeout)
 
-    def _begin(self, order: BackgroundCall, work: Work) -> None:
-        kind = SAME_KIND.get(order.kind, order.kind)
+    def _begin(self, order: BackgroundCall, function: CoroutineFunction) -> None:
+        kind = SHARED_KINDS.get(order.kind, order.kind)
         if kind in self._newest:
             self._cancel(self._newest[kind])
         if order.set_running_or_notify_cancel():
             name = f"dronekit {order.kind}"
-            order.task = asyncio.get_running_loop().create_task(self._run(order, work), name=name)
+            order.task = asyncio.get_running_loop().create_task(self._run(order, function), name=name)
             order.task.add_done_callback(lambda _: self._end(kind, order))
             self._newest[kind] = order
 
@@ -226,9 +228,9 @@ class BackgroundCalls:
             reason = "a newer order replaced it, it was cancelled, or the connection was closed"
             order.set_exception(ConnectionClosed(f"{order.kind}: {reason}"))
 
-    async def _run(self, order: BackgroundCall, work: Work) -> None:
+    async def _run(self, order: BackgroundCall, function: CoroutineFunction) -> None:
         try:
-            await work()
+            await function()
         except Exception as error:
             if not isinstance(error, ConnectionClosed):
                 text = str(error)  # the exception itself would keep stack frames, and thus the vehicle, alive
@@ -241,19 +243,19 @@ class BackgroundCalls:
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
-    # The next loop iteration is late enough for earlier calls to have sent their first messages.
+    # Tasks that earlier calls have just created send their first messages before `function` is called.
     asyncio.get_running_loop().call_soon(function, *args)
 
 
 def weak_callback(method: Callable[..., object]) -> Callable[..., None]:
     """Return a function that calls a bound method without keeping its object alive."""
-    bound: Any = method
-    owner, function = weakref.ref(bound.__self__), bound.__func__
+    bound_method: Any = method
+    owner_reference, function = weakref.ref(bound_method.__self__), bound_method.__func__
 
     def call(*args: object) -> None:
-        present = owner()
-        if present is not None:
-            function(present, *args)
+        owner = owner_reference()
+        if owner is not None:
+            function(owner, *args)
 
     return call
 
@@ -265,7 +267,7 @@ RELEASE_UPPER = 0xFFFE  # releases a channel above 8, for which 0 means "ignore"
 CHANNELS_OF_MAVLINK_1 = 8
 CHANNELS = 18
 
-RELEASE_COPIES = 3  # the message is not acknowledged, and frames get lost
+RELEASE_COPIES = 3  # because the message is not acknowledged, and a frame may be lost
 
 
 class OverrideRelease:
@@ -291,21 +293,21 @@ class OverrideRelease:
             is_upper = channel > CHANNELS_OF_MAVLINK_1
             if value == (RELEASE_UPPER if is_upper else RELEASE):
                 overridden.discard(channel)
-            elif value not in (IGNORE, RELEASE):
+            elif value not in (IGNORE, RELEASE):  # above channel 8, 0 means "ignore", too
                 overridden.add(channel)
 
     def send(self, connection: Connection) -> None:
         """Release overridden channels, unless ``is_enabled`` is False (loop thread). Never raises."""
         for (system, component), channels in self._overridden.items():
             if self.is_enabled and channels:
-                values = [_released(channel, channel in channels) for channel in range(1, CHANNELS + 1)]
+                values = [_release_value(channel, channel in channels) for channel in range(1, CHANNELS + 1)]
                 message = RcChannelsOverride(system, component, *values)
                 with contextlib.suppress(AerokitError):  # the link may be closed
                     for _ in range(RELEASE_COPIES):
                         connection.send(message)
 
 
-def _released(channel: int, is_overridden: bool) -> int:
+def _release_value(channel: int, is_overridden: bool) -> int:
     if channel > CHANNELS_OF_MAVLINK_1:
         return RELEASE_UPPER if is_overridden else 0
     return RELEASE if is_overridden else IGNORE

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 # Fields of MAVLink 1; the later `mission_type` is not part of a command's text.
 FIELDS: list[str] = MAVLink_mission_item_message.fieldnames[:14]
-PARAMS: list[str] = FIELDS[7:11]
+PARAM_FIELDS: list[str] = FIELDS[7:11]
 # Fields that are compared to detect a changed mission.
-CONTENT: tuple[str, ...] = ("frame", "command", "autocontinue", *FIELDS[7:])
+CONTENT_FIELDS: tuple[str, ...] = ("frame", "command", "autocontinue", *FIELDS[7:])
 AMSL_FRAMES = (0, 5)  # MAV_FRAME_GLOBAL and MAV_FRAME_GLOBAL_INT
 # How far the first row of a waypoint file may be from home to count as home: about ten metres, two in altitude.
 HOME_TOLERANCE_DEG, HOME_TOLERANCE_M = 1e-4, 2.0
@@ -128,9 +128,9 @@ class CommandSequence:
     def __init__(self, vehicle: VehicleAttributes) -> None:
         self._vehicle, self._core = vehicle, core_of(vehicle)
         self._lock = threading.Lock()
-        self._held = SequenceState()
-        self._uploaded: tuple[tuple[Any, ...], ...] = ()  # content of the vehicle's mission, as last known
-        self._downloads = 0
+        self._state = SequenceState()
+        self._vehicle_content: tuple[tuple[Any, ...], ...] = ()  # of the vehicle's mission, as last known
+        self._download_number = 0  # of the latest download; an earlier download must not replace its result
         self._download: BackgroundCall | None = None
         self._current = vehicle._dk_current_command
 
@@ -145,9 +145,9 @@ class CommandSequence:
         """
         self._core.check_link()
         with self._lock:
-            self._downloads += 1
+            self._download_number += 1
             self._core.ready.unmark("commands")
-            self._download = self._core.order("commands.download", self._read, self._downloads)
+            self._download = self._core.order("commands.download", self._run_download, self._download_number)
 
     def wait_ready(self, **kwargs: Any) -> bool:
         """Wait for the download; arguments, result and errors are those of :meth:`Vehicle.wait_ready`.
@@ -172,18 +172,18 @@ class CommandSequence:
         """
         self._require_downloaded()
         with self._lock:
-            values = _values_of(self._held.items)
-            if not self._held.is_changed and values == self._uploaded:
+            content = _content_of(self._state.items)
+            if not self._state.is_changed and content == self._vehicle_content:
                 return
-            held = self._held = self._held.replace(is_changed=True)  # until the vehicle has confirmed
+            uploaded = self._state = self._state.replace(is_changed=True)  # until the vehicle has confirmed
         aio = self._core.check_link()
-        # DroneKit has no such limit, and its programs must run unchanged.
+        # No limit of distances, because DroneKit has none and its programs must run unchanged.
         options = {"timeout": timeout, "max_distance_m": math.inf}
-        self._core.run(aio.mission.upload, _mission_of(held.items, aio), **options)
+        self._core.run(aio.mission.upload, _mission_of(uploaded.items, aio), **options)
         with self._lock:
-            self._uploaded = values
-            if self._held is held:
-                self._held = held.replace(is_changed=False)
+            self._vehicle_content = content
+            if self._state is uploaded:  # not changed during the upload
+                self._state = uploaded.replace(is_changed=False)
 
     @property
     def next(self) -> int:
@@ -203,9 +203,9 @@ class CommandSequence:
         """Remove all commands from the sequence; :meth:`upload` sends the change. Waits for a running download."""
         self._wait_for_download()
         with self._lock:
-            if self._core.ready.failure_of({"commands"}) is not None:
+            if self._core.ready.failure_of({"commands"}) is not None:  # an empty sequence replaces the failed download
                 self._core.ready.mark("commands")
-            self._held = SequenceState((), self._held.home, is_changed=True)
+            self._state = SequenceState((), self._state.home, is_changed=True)
 
     def add(self, cmd: Any) -> None:
         """Append a copy of a command; :meth:`upload` sends the change. Waits for a running download.
@@ -222,81 +222,84 @@ class CommandSequence:
 
     @property
     def count(self) -> int:
-        return len(self._held.items)
+        return len(self._state.items)
 
     def __len__(self) -> int:
         return self.count
 
     def __iter__(self) -> Iterator[Any]:
-        return iter(self._held.items)
+        return iter(self._state.items)
 
     @overload
     def __getitem__(self, index: int) -> Any: ...
     @overload
     def __getitem__(self, index: slice) -> list[Any]: ...
     def __getitem__(self, index: int | slice) -> Any:
-        items = self._held.items
+        items = self._state.items
         if isinstance(index, slice):
             return list(items[index])
-        return items[_checked(index, len(items))]
+        return items[_checked_index(index, len(items))]
 
     def __setitem__(self, index: int, value: Any) -> None:
         self._require_downloaded()
         command = value if isinstance(value, Command) else _command_from(value)
         with self._lock:
-            items = list(self._held.items)
-            at = len(items) if index == len(items) else _checked(index, len(items))
-            command.seq = at + 1
-            items[at : at + 1] = [command]
-            self._held = self._held.replace(items=tuple(items), is_changed=True)
+            items = list(self._state.items)
+            position = len(items) if index == len(items) else _checked_index(index, len(items))
+            command.seq = position + 1
+            items[position : position + 1] = [command]  # appends if `position` is the end
+            self._state = self._state.replace(items=tuple(items), is_changed=True)
 
     def rows(self) -> tuple[Command, ...]:
         """Return the rows of a waypoint file: home (zeros if unknown) and the commands; empty if neither is known."""
-        held = self._held
-        if not held.items and held.home is None:
+        state = self._state
+        if state.home is not None:
+            return (state.home, *state.items)
+        if not state.items:
             return ()
-        return (*(_commands_of(Mission(), (0, 0)) if held.home is None else (held.home,)), *held.items)
+        unknown_home = _commands_of(Mission(), (0, 0))
+        return (*unknown_home, *state.items)
 
     def _append(self, cmd: Command) -> int:
         """Append a command, or store it as home; return its number."""
         with self._lock:
-            held = self._held
-            if not held.items and _is_home_row(cmd, self._vehicle._home_location):
+            state = self._state
+            if not state.items and _is_home_row(cmd, self._vehicle._home_location):
                 cmd.seq = seq = 0
-                self._held = held.replace(home=cmd, is_changed=True)
+                self._state = state.replace(home=cmd, is_changed=True)
             else:
-                cmd.seq = seq = len(held.items) + 1
-                self._held = held.replace(items=(*held.items, cmd), is_changed=True)
+                cmd.seq = seq = len(state.items) + 1
+                self._state = state.replace(items=(*state.items, cmd), is_changed=True)
             return seq
 
-    async def _read(self, number: int) -> None:
+    async def _run_download(self, number: int) -> None:
         try:
             mission = await self._core.aio.mission.download()
         except AerokitError as error:
             self._on_download_failed(number, error)
             raise
-        self._take(number, mission)
+        self._store_download(number, mission)
 
-    def _take(self, number: int, mission: Mission) -> None:
+    def _store_download(self, number: int, mission: Mission) -> None:
         """Store a downloaded mission (loop thread)."""
         home, connection = mission.home, self._core.aio.connection
         own_ids = connection.source_system, connection.source_component
-        at_home, *items = _commands_of(mission, own_ids)
+        home_command, *items = _commands_of(mission, own_ids)
         with self._lock:
-            if number != self._downloads:
+            if number != self._download_number:
                 return
-            self._held = SequenceState(tuple(items), at_home)
-            self._uploaded = _values_of(items)
+            self._state = SequenceState(tuple(items), home_command)
+            self._vehicle_content = _content_of(items)
         if home is not None and home.altitude_amsl_m is not None:
             self._vehicle._dk_set_home(home.latitude_deg, home.longitude_deg, home.altitude_amsl_m)
         self._core.listeners.notify("commands", self)
 
     def _on_download_failed(self, number: int, error: AerokitError) -> None:
-        kind = TimeoutError if isinstance(error, OperationTimeout) else APIException
-        failure = kind(f"the mission could not be downloaded: {error}")
+        error_class = TimeoutError if isinstance(error, OperationTimeout) else APIException
+        failure = error_class(f"the mission could not be downloaded: {error}")
         failure.__cause__ = error
         with self._lock:
-            if number == self._downloads:
+            if number == self._download_number:
                 self._core.ready.fail("commands", failure)
 
     def _require_downloaded(self) -> None:
@@ -325,14 +328,14 @@ class WaypointLoader:
         return self._commands.rows()[i]
 
 
-def _checked(index: Any, count: int) -> int:
+def _checked_index(index: Any, count: int) -> int:
     try:
-        at = operator.index(index)
+        position = operator.index(index)
     except TypeError:
         raise TypeError("Invalid argument type.") from None
-    if not -count <= at < count:
-        raise IndexError(f"Index {at} out of range.")
-    return at % count
+    if not -count <= position < count:
+        raise IndexError(f"Index {position} out of range.")
+    return position % count
 
 
 def _command_from(cmd: Any) -> Command:
@@ -348,12 +351,13 @@ def _command_from(cmd: Any) -> Command:
     return Command(**fields)
 
 
-def _values_of(commands: Iterable[Command]) -> tuple[tuple[Any, ...], ...]:
+def _content_of(commands: Iterable[Command]) -> tuple[tuple[Any, ...], ...]:
     """Return the content of commands for comparison; NaN equals NaN."""
-    return tuple(
-        tuple("NaN" if value != value else value for value in (getattr(command, name) for name in CONTENT))
-        for command in commands
-    )
+    return tuple(tuple(_comparable(getattr(command, name)) for name in CONTENT_FIELDS) for command in commands)
+
+
+def _comparable(value: Any) -> Any:
+    return "NaN" if value != value else value
 
 
 def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
@@ -366,23 +370,24 @@ def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
         return False
     if any((cmd.param1, cmd.param2, cmd.param3, cmd.param4)):
         return False
-    return cmd.current == 1 or not any((cmd.x, cmd.y, cmd.z)) or _is_at(cmd, home)
+    return cmd.current == 1 or not any((cmd.x, cmd.y, cmd.z)) or _is_at_home(cmd, home)
 
 
-def _is_at(cmd: Command, home: LocationGlobal | None) -> bool:
+def _is_at_home(cmd: Command, home: LocationGlobal | None) -> bool:
     if home is None or home.lat is None or home.lon is None or home.alt is None:
         return False
     try:
-        away = max(abs(cmd.x - home.lat), abs(cmd.y - home.lon) * math.cos(math.radians(home.lat)))
-        return bool(away <= HOME_TOLERANCE_DEG and abs(cmd.z - home.alt) <= HOME_TOLERANCE_M)
+        distance_deg = max(abs(cmd.x - home.lat), abs(cmd.y - home.lon) * math.cos(math.radians(home.lat)))
+        return bool(distance_deg <= HOME_TOLERANCE_DEG and abs(cmd.z - home.alt) <= HOME_TOLERANCE_M)
     except TypeError:  # upload() reports values that are not numbers
         return False
 
 
 def _mission_of(commands: Sequence[Command], vehicle: AsyncVehicle) -> Mission:
     """Convert commands to a mission for this vehicle; InvalidArgument names a field that is not a number."""
-    items: Iterable[MissionItem] = [_item(command, index) for index, command in enumerate(commands)]
+    items: Iterable[MissionItem] = [_item_of(command, index) for index, command in enumerate(commands)]
     if not vehicle.autopilot.home_is_item_0:
+        # ArduPilot takes coordinates 0, 0 for the current position; other autopilots need the actual coordinates.
         here = vehicle.telemetry.position.latest or vehicle.telemetry.home.latest
         items = convert_from_ardupilot(items, None if here is None else (here.latitude_deg, here.longitude_deg))
     return Mission(shift_jumps(items, -1))
@@ -391,16 +396,16 @@ def _mission_of(commands: Sequence[Command], vehicle: AsyncVehicle) -> Mission:
 def _commands_of(mission: Mission, own_ids: tuple[int, int]) -> tuple[Command, ...]:
     """Convert a mission to home (zeros if unknown) and commands; ``own_ids`` are the target system and component."""
     items = mission.to_items(home_is_item_0=True)
-    return tuple(_command(item, seq, own_ids) for seq, item in enumerate(items))
+    return tuple(_command_of(item, seq, own_ids) for seq, item in enumerate(items))
 
 
-def _item(cmd: Command, index: int) -> MissionItem:
+def _item_of(cmd: Command, index: int) -> MissionItem:
     try:
         command, frame = int(cmd.command), int(cmd.frame)
-        one, two, three, four = (float(getattr(cmd, name)) for name in PARAMS)
+        param1, param2, param3, param4 = (float(getattr(cmd, name)) for name in PARAM_FIELDS)
         x, y = (_wire_number(value, command, frame) for value in (cmd.x, cmd.y))
         z, autocontinue = float(cmd.z), bool(cmd.autocontinue)
-        return MissionItem(command, frame, one, two, three, four, x, y, z, autocontinue)
+        return MissionItem(command, frame, param1, param2, param3, param4, x, y, z, autocontinue)
     except (TypeError, ValueError, OverflowError) as error:
         raise InvalidArgument(f"commands[{index}] is not allowed: {error}, in {cmd}") from None
 
@@ -411,7 +416,7 @@ def _wire_number(value: Any, command: int, frame: int) -> int | float:
     return int(number) if isinstance(number, float) and abs(number) < 1e9 else number
 
 
-def _command(item: MissionItem, seq: int, own_ids: tuple[int, int]) -> Command:
+def _command_of(item: MissionItem, seq: int, own_ids: tuple[int, int]) -> Command:
     # A command is a MISSION_ITEM, which has other frames than MISSION_ITEM_INT.
     item = item.replace(frame=int(canonical_frame(item.frame)))
     message = to_wire_float(item, seq, target_system=own_ids[0], target_component=own_ids[1])

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from aerokit.connection.tasks import BackgroundTasks
-    from aerokit.dronekit.classic_connection import BackgroundCall, Work
+    from aerokit.dronekit.classic_connection import BackgroundCall, CoroutineFunction
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 # Attributes that `wait_ready(True)` waits for.
 DEFAULT_ATTRIBUTES = ("parameters", "gps_0", "armed", "mode", "attitude")
 
-MAX_WAIT_S = 0.2  # longer waits are split, so that Ctrl-C and a lost link are noticed
+WAIT_STEP_S = 0.2  # longer waits are split, so that Ctrl-C and a lost link are noticed
 SILENCE_WARNING_S = 5
 TICK_INTERVAL_S = 0.05
 IDLE_TICK_INTERVAL_S = 1.0
@@ -71,12 +71,12 @@ class Readiness:
         """Return the error that leaves one of these attributes without a value, or None."""
         return next(filter(None, map(self._failures.get, names)), None)
 
-    def wait_for_change(self, wanted: set[str], at_most_s: float) -> None:
-        """Wait for a change if one of these attributes is missing: at most ``at_most_s``, and never more than 0.2 s."""
+    def wait_for_change(self, names: set[str], max_wait_s: float) -> None:
+        """Wait for a change while one of these attributes is missing, for the smaller of ``max_wait_s`` and 0.2 s."""
         with self._changed:
-            missing = wanted - self.names
+            missing = names - self.names
             if missing and self.failure_of(missing) is None:
-                self._changed.wait(min(MAX_WAIT_S, at_most_s))
+                self._changed.wait(min(WAIT_STEP_S, max_wait_s))
 
 
 class LatestMessage(Generic[MessageT]):
@@ -84,27 +84,28 @@ class LatestMessage(Generic[MessageT]):
 
     def __init__(self, message_type: type[MessageT], ready: set[str], listeners: Listeners) -> None:
         self._decode: Callable[[bytes, Frame], MessageT] = decoder_of(message_type)
-        self._ready = ready
+        self._ready_names = ready
         self._listeners = [listeners]
-        self._names: set[str] = set()
+        self._announced_names: set[str] = set()
         self._handlers: list[Callable[[MessageT], object]] = []
-        self._held: Frame | MessageT | None = None
-        self._decoded: MessageT | None = None
+        self._latest: Frame | MessageT | None = None  # a frame until it is decoded
+        self._decoded: MessageT | None = None  # from the latest frame, or from an earlier one
         self.component_id = 0
         """Component id of the autopilot; messages of other components are ignored."""
 
     @property
     def message(self) -> MessageT | None:
         """The message, or None before the first. Decoded on first access, on any thread."""
-        held = self._held
-        if not isinstance(held, Frame):
-            return held
+        latest = self._latest
+        if not isinstance(latest, Frame):
+            return latest
         decoded = self._decoded
-        if decoded is None or decoded.received_frame is not held:
-            decoded = self._decoded = self._decode(held.body, held)
+        if decoded is None or decoded.received_frame is not latest:
+            decoded = self._decoded = self._decode(latest.body, latest)
         return decoded
 
     def values(self, *fields: str) -> tuple[Any, ...]:
+        """Return these fields of the message; None for each before the first message."""
         message = self.message
         return tuple([None if message is None else getattr(message, field) for field in fields])
 
@@ -115,32 +116,33 @@ class LatestMessage(Generic[MessageT]):
         the vehicle or in ``listeners``.
         """
         self._handlers.append(handler)
-        self._names.update(names)
+        self._announced_names.update(names)
         if listeners is not None:
             self._listeners.append(listeners)
 
-    def take(self, frame: Frame, message: MessageT | None = None) -> None:
+    def on_frame(self, frame: Frame, message: MessageT | None = None) -> None:
         """Receive a frame of the vehicle's system, with the message if the frame is decoded already (loop thread)."""
         if frame.component_id != self.component_id:
             return
-        if self._needs_message():
+        if self._must_decode():
             self.receive(self._decode(frame.body, frame) if message is None else message)
         else:
-            self._held = frame
+            self._latest = frame
 
     def receive(self, message: MessageT) -> None:
         """Store a message and call the handlers."""
-        self._held = message
+        self._latest = message
         for handler in self._handlers:
             handler(message)
 
-    def _needs_message(self) -> bool:
-        names = self._names
-        if not names or not names <= self._ready:
+    def _must_decode(self) -> bool:
+        """Return True unless the handlers only announce attributes that have a value and no listeners."""
+        names = self._announced_names
+        if not names or not names <= self._ready_names:
             return True
         for listeners in self._listeners:
-            listened = listeners.by_name
-            if listened and (EVERY_NAME in listened or not names.isdisjoint(listened)):
+            by_name = listeners.by_name
+            if by_name and (EVERY_NAME in by_name or not names.isdisjoint(by_name)):
                 return True
         return False
 
@@ -223,10 +225,10 @@ class Core:
         """Start receiving once the vehicle is connected (loop thread). The loop gets weak references only."""
         self.aio_or_none, self._tasks = aio, tasks
         self.handler.target_system = aio.system_id
-        _ = aio.parameters  # created first, so that the parameter table has a value before our handlers are called
+        _ = aio.parameters  # created first, so that it receives each PARAM_VALUE before our handlers do
         for message_type, latest in self._latest.items():
             latest.component_id = aio.component_id
-            aio.connection.bus.attach_lazily(message_type, weak_callback(latest.take), system_id=aio.system_id)
+            aio.connection.bus.attach_lazily(message_type, weak_callback(latest.on_frame), system_id=aio.system_id)
 
     def watch_link(self) -> None:
         """Report the age of the last heartbeat to listeners 20 times a second; log when silence begins and ends."""
@@ -242,11 +244,10 @@ class Core:
                 post(self.logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENCE_WARNING_S)
             else:
                 post(self.logger.info, "...link restored.")
-        # Each tick wakes the process, which costs as much as a few messages.
-        is_urgent = self._is_silent or self.listeners.has_listener("last_heartbeat")
-        wait_s = (
-            TICK_INTERVAL_S if is_urgent else max(TICK_INTERVAL_S, min(IDLE_TICK_INTERVAL_S, SILENCE_WARNING_S - age))
-        )
+        wait_s = TICK_INTERVAL_S
+        # Ticks are rare if possible, because each wakes the process, which costs as much as a few messages.
+        if not self._is_silent and not self.listeners.has_listener("last_heartbeat"):
+            wait_s = max(wait_s, min(IDLE_TICK_INTERVAL_S, SILENCE_WARNING_S - age))
         asyncio.get_running_loop().call_later(wait_s, weak_callback(self.watch_link))
 
     def background(self, function: Callable[[], Awaitable[None]]) -> None:
@@ -261,7 +262,7 @@ class Core:
         with classic_errors():
             return self.handler.loop.run(function, *args, **kwargs)
 
-    def order(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> BackgroundCall:
+    def order(self, kind: str, function: CoroutineFunction, *args: Any, **kwargs: Any) -> BackgroundCall:
         """Start an order without waiting; a newer order of the same kind replaces it."""
         self.check_link()
         with classic_errors():
@@ -277,17 +278,17 @@ class Core:
         self.handler.send(message)
 
 
-def _feeding(read: property) -> property:
-    """Return a property that also records that the program is running."""
-    getter = read.fget
+def _recording_activity(original: property) -> property:
+    """Return a property that also records that the program is running, so that our heartbeat continues."""
+    getter = original.fget
     assert getter is not None
 
     @functools.wraps(getter)
-    def fed(vehicle: VehicleCore) -> Any:
+    def recording_getter(vehicle: VehicleCore) -> Any:
         vehicle._dk.handler.loop.feed()
         return getter(vehicle)
 
-    return property(fed, read.fset, read.fdel, read.__doc__)
+    return property(recording_getter, original.fset, original.fdel, original.__doc__)
 
 
 class VehicleCore(HasObservers):
@@ -295,10 +296,11 @@ class VehicleCore(HasObservers):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
+        # Only properties of our own classes are wrapped; those of a program's subclass stay as they are.
         if cls.__module__.startswith("aerokit."):
             for name, member in list(vars(cls).items()):
                 if isinstance(member, property) and not name.startswith("_"):
-                    setattr(cls, name, _feeding(member))
+                    setattr(cls, name, _recording_activity(member))
 
     def __init__(self, handler: MAVConnection) -> None:
         self._handler = handler
@@ -338,20 +340,21 @@ class VehicleCore(HasObservers):
         names = DEFAULT_ATTRIBUTES if not types or types == (True,) else types
         if not all(isinstance(name, str) for name in names):
             raise ValueError("wait_ready expects one or more string arguments.")
-        wanted = {str(name) for name in names}
+        required = {str(name) for name in names}
         ready = self._dk.ready
-        started = reported_at = time.monotonic()
-        deadline = math.inf if timeout is None else started + timeout
-        while missing := wanted - ready.names:
+        started_at = reported_at = time.monotonic()
+        deadline = math.inf if timeout is None else started_at + timeout
+        while missing := required - ready.names:
             now = time.monotonic()
             if now >= deadline:
                 if raise_exception:
+                    # The text is DroneKit's; the cause names what is missing.
                     error = TimeoutError(f"wait_ready experienced a timeout after {timeout} seconds.")
                     raise error from LookupError(f"not received: {', '.join(sorted(missing))}")
                 return False
             self._dk.check_link()
             if (failure := ready.failure_of(missing)) is not None:
-                if raise_exception:
+                if raise_exception:  # a new exception, because several threads may wait and raise
                     raise type(failure)(str(failure)) from failure.__cause__
                 return False
             for name in ready.fetchers.keys() & missing:
@@ -359,7 +362,7 @@ class VehicleCore(HasObservers):
             if still_waiting_callback is not None and now >= reported_at + still_waiting_interval:
                 reported_at = now
                 still_waiting_callback(missing)
-            ready.wait_for_change(wanted, deadline - now)
+            ready.wait_for_change(required, deadline - now)
         return True
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 HOME_TIMEOUT_S = 10.0
 ORDER_POLL_INTERVAL_S = 0.02
-ARMING = ("disarm", "arm")
+ARMED_ORDER_KINDS = ("disarm", "arm")  # by the wanted value of `armed`
 
 
 class FlightMethods(VehicleAttributes):
@@ -55,16 +55,16 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_set_mode(self, value: VehicleMode | str | int) -> tuple[str, BackgroundCall]:
         aio = self._dk.check_link()
-        wanted = flight_orders.find_mode(aio, value.name if isinstance(value, VehicleMode) else value)
-        return wanted.name, self._dk.order("mode", flight_orders.change_mode, aio, wanted)
+        mode = flight_orders.find_mode(aio, value.name if isinstance(value, VehicleMode) else value)
+        return mode.name, self._dk.order("mode", flight_orders.change_mode, aio, mode)
 
     def wait_for_mode(self, mode: VehicleMode | str | int, timeout: float | None = None) -> None:
         """Set the mode and wait until HEARTBEAT confirms it.
 
         Raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle rejects the mode.
         """
-        name, done = self._dk_set_mode(mode)
-        self._dk_wait_for_order(done, lambda: self._flightmode == name, timeout, "failed to set flight mode")
+        name, order = self._dk_set_mode(mode)
+        self._dk_wait_for_order(order, lambda: self._flightmode == name, timeout, "failed to set flight mode")
 
     # -------------------------------------------------------------------------------- arming
 
@@ -86,13 +86,13 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_set_armed(self, value: bool) -> BackgroundCall:
         aio = self._dk.check_link()
-        self._dk_arming = order = self._dk.order(ARMING[value], flight_orders.change_armed, aio, value)
+        self._dk_arming = order = self._dk.order(ARMED_ORDER_KINDS[value], flight_orders.change_armed, aio, value)
         return order
 
     def _dk_is_changing_to(self, value: bool) -> bool:
         """Return True while an order to change to ``value`` is pending."""
         order = self._dk_arming
-        return order is not None and order.kind == ARMING[value] and not order.done()
+        return order is not None and order.kind == ARMED_ORDER_KINDS[value] and not order.done()
 
     def arm(self, wait: bool = True, timeout: float | None = None) -> None:
         """Arm the motors: **propellers may start to turn**. With ``wait``, wait until HEARTBEAT reports that.
@@ -105,7 +105,7 @@ class FlightMethods(VehicleAttributes):
         """Stop the motors, like :meth:`arm`. The vehicle refuses in the air."""
         self._dk_change_armed(False, wait, timeout, "failed to disarm vehicle")
 
-    def _dk_change_armed(self, value: bool, wait: bool, timeout: float | None, text: str) -> None:
+    def _dk_change_armed(self, value: bool, wait: bool, timeout: float | None, failure_text: str) -> None:
         is_overruling = self._dk_is_changing_to(not value)
         if self._armed == value and not is_overruling:
             self._dk.check_link()
@@ -114,9 +114,10 @@ class FlightMethods(VehicleAttributes):
         if wait:
 
             def is_done() -> bool:
+                # While the opposite order is pending, the value may be reported although it is about to change.
                 return self._armed == value and (order.done() or not is_overruling)
 
-            self._dk_wait_for_order(order, is_done, timeout, text)
+            self._dk_wait_for_order(order, is_done, timeout, failure_text)
 
     # -------------------------------------------------------------------------------- flying
 
@@ -134,7 +135,7 @@ class FlightMethods(VehicleAttributes):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()
         send = functools.partial(self._dk.order, "takeoff", flight_orders.take_off, aio)
-        if not aio.autopilot.repositions_amsl:
+        if not aio.autopilot.repositions_amsl:  # the altitude is above home, and the command changes no mode
             return send((), MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
         plan = aio.autopilot.take_off(altitude, self._dk_known_home().alt, is_vtol=aio.is_vtol)
         mode = aio.autopilot.mode_for("take_off")
@@ -170,21 +171,21 @@ class FlightMethods(VehicleAttributes):
         """
         aio = self._dk.check_link()
         modes = flight_orders.reposition_modes(aio)
-        place = self._dk_place(location, is_relative=not modes)
+        target = self._dk_target(location, is_relative=not modes)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
             flight_orders.check_speed(name, speed)
         if modes and self._flightmode not in map(str, modes):
             reason = f"not sent in mode {self._flightmode}: set mode {modes[0]} first"
             self._dk.order("goto", flight_orders.reject, reason)
         else:
-            self._dk.order("goto", flight_orders.go_to, aio, *place)
+            self._dk.order("goto", flight_orders.go_to, aio, *target)
         if airspeed is not None:
             self.airspeed = airspeed
         if groundspeed is not None:
             self.groundspeed = groundspeed
 
-    def _dk_place(self, location: object, *, is_relative: bool) -> tuple[int, int, float]:
-        """Return latitude and longitude in 1e-7 degrees, and altitude above home or sea level."""
+    def _dk_target(self, location: object, *, is_relative: bool) -> tuple[int, int, float]:
+        """Return latitude and longitude in 1e-7 degrees, and the altitude above home (``is_relative``) or sea level."""
         if not isinstance(location, (LocationGlobal, LocationGlobalRelative)):
             raise ValueError("Expecting location to be LocationGlobal or LocationGlobalRelative.")
         latitude, longitude, altitude = flight_orders.checked_location(location)
@@ -237,12 +238,12 @@ class FlightMethods(VehicleAttributes):
             raise ValueError("Expecting home_location to be set to a LocationGlobal.")
         latitude, longitude, altitude = flight_orders.checked_location(pos)
         aio = self._dk.check_link()
-        place = {"frame": MavFrame.GLOBAL, "x": latitude, "y": longitude, "z": altitude}
-        order = self._dk.order("home", aio.command_int, MavCmd.DO_SET_HOME, 0, **place, component_id=0, or_long=True)
+        home = {"frame": MavFrame.GLOBAL, "x": latitude, "y": longitude, "z": altitude}
+        order = self._dk.order("home", aio.command_int, MavCmd.DO_SET_HOME, 0, **home, component_id=0, or_long=True)
         self._home_location = LocationGlobal(pos.lat, pos.lon, altitude)
-        order.add_done_callback(self._dk_home_is_set)
+        order.add_done_callback(self._dk_on_home_answer)
 
-    def _dk_home_is_set(self, order: Future[None]) -> None:
+    def _dk_on_home_answer(self, order: Future[None]) -> None:
         """Restore the reported home if the vehicle has rejected the new home."""
         if not order.cancelled() and isinstance(order.exception(), (CommandRejected, OperationTimeout)):
             self._home_location = self._dk_reported_home
@@ -294,17 +295,18 @@ class FlightMethods(VehicleAttributes):
         self.wait_for(has_reached, timeout, errmsg="failed to reach specified altitude")
 
     def _dk_altitude_condition(self, alt: float, epsilon: float, *, is_relative: bool) -> Callable[[], bool]:
+        """Return a function that is true once the altitude is near ``alt``, or has passed it since the first call."""
         start: float | None = None
 
         def has_reached() -> bool:
             nonlocal start
             location = self.location
             frame = location.global_relative_frame if is_relative else location.global_frame
-            now: float | None = frame.alt
-            if now is None:
+            altitude: float | None = frame.alt
+            if altitude is None:
                 return False
-            start = now if start is None else start
-            return abs(now - alt) <= epsilon or (start < alt <= now) or (now <= alt < start)
+            start = altitude if start is None else start
+            return abs(altitude - alt) <= epsilon or (start < alt <= altitude) or (altitude <= alt < start)
 
         return has_reached
 
@@ -313,7 +315,7 @@ class FlightMethods(VehicleAttributes):
         order: BackgroundCall,
         is_done: Callable[[], bool],
         timeout: float | None,
-        text: str,
+        failure_text: str,
     ) -> None:
         """Wait for the effect of an order, or raise TimeoutError as soon as the order fails.
 
@@ -323,13 +325,14 @@ class FlightMethods(VehicleAttributes):
         def is_over() -> bool:
             if is_done():
                 return True
+            # Asks is_done again, because the effect may have arrived together with the failure.
             if order.done() and order.exception() is not None and not is_done():
-                self._dk.check_link()
-                raise TimeoutError(f"{text}: {order.exception()}") from order.exception()
+                self._dk.check_link()  # raises if the link is lost, which is the more useful error
+                raise TimeoutError(f"{failure_text}: {order.exception()}") from order.exception()
             return False
 
         try:
-            self.wait_for(is_over, timeout, ORDER_POLL_INTERVAL_S, text)
+            self.wait_for(is_over, timeout, ORDER_POLL_INTERVAL_S, failure_text)
         except BaseException:
             self._handler.calls.cancel(order)
             raise

@@ -36,30 +36,33 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Subject
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-POSITION_ONLY = 0x0DF8
+POSITION_ONLY = 0x0DF8  # type_mask that ignores velocity, acceleration, yaw and yaw rate
 
 ARMED_TIMEOUT_S = 10.0
 
-CONFIRM_TIMEOUT_S = 1.5  # time to wait for MISSION_CURRENT after MISSION_SET_CURRENT
+MISSION_CURRENT_TIMEOUT_S = 1.5  # time to wait for MISSION_CURRENT after MISSION_SET_CURRENT
 
 MAX_SEQ = 0xFFFF
 
-NO_MISSION = 0xFFFF
+NO_MISSION = 0xFFFF  # MISSION_CURRENT.total of a vehicle without a mission
 
 
 def mode_name(vehicle: AsyncVehicle, custom_mode: int) -> str:
-    return _as_known(vehicle).mode(custom_mode, CUSTOM_MODE_ENABLED, vehicle.telemetry.mode_names).name
+    autopilot = _autopilot_with_mode_numbers(vehicle)
+    return autopilot.mode(custom_mode, CUSTOM_MODE_ENABLED, vehicle.telemetry.mode_names).name
 
 
 def find_mode(vehicle: AsyncVehicle, mode: str | int) -> Mode:
     """Return a mode by its name (in capitals, or as reported) or, on ArduPilot, its number; KeyError if unknown."""
-    autopilot = _as_known(vehicle)
+    autopilot = _autopilot_with_mode_numbers(vehicle)
     if isinstance(mode, int) and autopilot.modes_are_numbered:
         return Mode(mode_name(vehicle, mode), mode)
     try:
         found = autopilot.find_mode(mode, vehicle.telemetry.mode_names)
-    except (InvalidArgument, AttributeError, TypeError) as error:  # InvalidArgument lists the available modes
-        raise KeyError(mode) from (error if isinstance(error, InvalidArgument) else None)
+    except InvalidArgument as error:
+        raise KeyError(mode) from error  # its text lists the available modes
+    except (AttributeError, TypeError):  # not a string
+        raise KeyError(mode) from None
     if not isinstance(mode, str) or not (mode.isupper() or mode == found.name):
         raise KeyError(mode)
     return found if autopilot.modes_are_numbered else found.replace(base_mode=_px4_flags(found.name))
@@ -72,23 +75,23 @@ def _px4_flags(name: str) -> int:
     return int(px4_map.get(name, (CUSTOM_MODE_ENABLED,))[0])
 
 
-def _as_known(vehicle: AsyncVehicle) -> Autopilot:
+def _autopilot_with_mode_numbers(vehicle: AsyncVehicle) -> Autopilot:
     # Like pymavlink, use ArduPilot's mode numbers for unknown autopilots such as iNav.
     if vehicle.autopilot.modes.numbers:
         return vehicle.autopilot
     return autopilot_for(m.Heartbeat(vehicle.vehicle_type, MavAutopilot.ARDUPILOTMEGA, 0, 0, 0, 0))
 
 
-async def change_mode(vehicle: AsyncVehicle, wanted: Mode) -> None:
-    with vehicle.posted("mode", "motion", modes=(wanted,)) as order:
-        await order.set_mode(wanted, component_id=0)
+async def change_mode(vehicle: AsyncVehicle, mode: Mode) -> None:
+    with vehicle.posted("mode", "motion", modes=(mode,)) as order:
+        await order.set_mode(mode, component_id=0)
 
 
 async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
     """Arm or disarm, and wait until HEARTBEAT reports the change. Disarming ends orders that move the vehicle."""
-    subjects: tuple[Subject, ...] = ("arm",) if value else ("arm", "motion")
+    topics: tuple[Subject, ...] = ("arm",) if value else ("arm", "motion")
     try:
-        with vehicle.posted(*subjects, armed=value) as order:
+        with vehicle.posted(*topics, armed=value) as order:
             await order.command(MavCmd.COMPONENT_ARM_DISARM, float(value), component_id=0)
             await order.wait_confirmed(ARMED_TIMEOUT_S)
     except CommandRejected:
@@ -106,14 +109,16 @@ async def take_off(vehicle: AsyncVehicle, modes: tuple[Mode, ...], command: int,
 async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
     """Send DO_REPOSITION; if it is unsupported, send SET_POSITION_TARGET_GLOBAL_INT.
 
-    The altitude is above home, or above sea level if the autopilot's reposition command uses that (PX4).
+    Latitude and longitude are in 1e-7 degrees; the altitude is above home, or above sea level if the autopilot's
+    reposition command uses that (PX4).
     """
     is_amsl = vehicle.autopilot.repositions_amsl
+    flags = MavDoRepositionFlags.CHANGE_MODE if is_amsl else 0
     with vehicle.posted("motion", modes=reposition_modes(vehicle)[:1]) as order:
         try:
             await order.command_int(
                 MavCmd.DO_REPOSITION,
-                *(-1, MavDoRepositionFlags.CHANGE_MODE if is_amsl else 0, 0, math.nan),
+                *(-1, flags, 0, math.nan),  # default speed, flags, default radius, unchanged yaw
                 frame=MavFrame.GLOBAL_INT if is_amsl else MavFrame.GLOBAL_RELATIVE_ALT_INT,
                 x=latitude,
                 y=longitude,
@@ -121,7 +126,9 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
                 component_id=0,
             )
         except CommandRejected as error:
-            if is_amsl or error.result != MavResult.UNSUPPORTED or order.end or vehicle.heartbeat_age > MODE_MAX_AGE_S:
+            is_unsupported = error.result == MavResult.UNSUPPORTED and not is_amsl
+            may_still_order = not order.end and vehicle.heartbeat_age <= MODE_MAX_AGE_S
+            if not is_unsupported or not may_still_order:
                 raise
             target = (vehicle.system_id, 0, MavFrame.GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
             vehicle.send(m.SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
@@ -130,8 +137,8 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
     """Return the modes in which a reposition command may be sent.
 
-    The command itself sets the first of these modes (PX4). Empty if the command does not change the mode. The vehicle
-    then refuses the command in wrong modes.
+    The command itself sets the first of these modes (PX4). Empty if the command does not change the mode: such a
+    vehicle refuses the command in wrong modes.
     """
     if not aio.autopilot.repositions_amsl:
         return ()
@@ -184,7 +191,8 @@ class CurrentCommand:
             return 0
         if self._core.aio.autopilot.home_is_item_0:
             return int(message.seq)
-        if message.total == NO_MISSION or (self._is_over(message) and message.seq != self._chosen):
+        is_chosen = message.seq == self._chosen
+        if message.total == NO_MISSION or (self._is_no_mission_active(message) and not is_chosen):
             return 0
         return int(message.seq) + 1
 
@@ -198,9 +206,9 @@ class CurrentCommand:
         if message.seq != self._chosen:
             self._chosen = None
 
-    def _is_over(self, message: m.MissionCurrent) -> bool:
-        has_ended = message.seq == 0 or message.mission_state == MissionState.COMPLETE
-        return has_ended and not self._core.aio.is_armed
+    def _is_no_mission_active(self, message: m.MissionCurrent) -> bool:
+        is_at_start_or_end = message.seq == 0 or message.mission_state == MissionState.COMPLETE
+        return is_at_start_or_end and not self._core.aio.is_armed
 
     async def _choose(self, seq: int) -> None:
         """Send MISSION_SET_CURRENT once, like DroneKit. Without confirmation, send a command with retries."""
@@ -210,11 +218,11 @@ class CurrentCommand:
             self._chosen = seq - 1
             return
         aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))
-        with anyio.move_on_after(CONFIRM_TIMEOUT_S):
+        with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):
             await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
             return
         if aio.heartbeat_age > MODE_MAX_AGE_S:
-            raise APIException(f"next = {seq} was not confirmed, and the vehicle is silent: it may have been set")
+            raise APIException(f"the vehicle is silent and did not confirm next = {seq}, which may or may not be set")
         if seq == 0:
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:
@@ -226,7 +234,7 @@ CALIBRATION_TIMEOUT_S = 35.0
 
 REBOOT_TIMEOUT_S = 3.0
 
-TUNE_SIZES = (30, 200)
+TUNE_SIZES = (30, 200)  # characters in the fields `tune` and `tune2` of PLAY_TUNE
 
 
 class Maintenance(VehicleCore):
@@ -266,7 +274,7 @@ class Maintenance(VehicleCore):
             progress_timeout=CALIBRATION_TIMEOUT_S,
         )
 
-    # --------------------------------------------------------------------------------- rest
+    # ------------------------------------------------------------------ tunes and rebooting
 
     def play_tune(self, tune: str | bytes) -> None:
         """Play a tune on the vehicle's buzzer, such as ``"AAAA"``, in the format of the autopilot (PLAY_TUNE).
@@ -277,8 +285,8 @@ class Maintenance(VehicleCore):
         text = _tune_text(tune)
         if self._dk.check_link().connection.mavlink_version == 1:
             raise APIException("play_tune needs MAVLink 2, and this vehicle uses MAVLink 1")
-        first = TUNE_SIZES[0]
-        self._dk.send(PlayTune(self._dk.target_system, 0, text[:first], text[first:]))
+        first_size = TUNE_SIZES[0]
+        self._dk.send(PlayTune(self._dk.target_system, 0, text[:first_size], text[first_size:]))
 
     def reboot(self) -> None:
         """Reboot the autopilot, which then does not answer for some seconds. It refuses while armed.

@@ -34,7 +34,7 @@ class Gimbal(GimbalPrivates):
     def __init__(self, vehicle: VehicleCore) -> None:
         self._core = core_of(vehicle)
         self._attitude = UNKNOWN_ATTITUDE
-        self._core.on_connected.append(self._begin)
+        self._core.on_connected.append(self._observe_attitude)
 
     @property
     def pitch(self) -> float | None:
@@ -75,29 +75,29 @@ class Gimbal(GimbalPrivates):
                 the camera points at ``yaw`` at first, but then turns with the vehicle.
             yaw: degrees clockwise from north.
         """
-        angles = [_checked(name, value) for name, value in (("pitch", pitch), ("yaw", yaw), ("roll", roll))]
+        pitch, yaw, roll = _checked("pitch", pitch), _checked("yaw", yaw), _checked("roll", roll)
         gimbal = self._core.check_link().gimbal
-        self._core.order("gimbal", gimbal.point, *angles[:2], roll_deg=angles[2], wait=False)
+        self._core.order("gimbal", gimbal.point, pitch, yaw, roll_deg=roll, wait=False)
 
     def target_location(self, roi: LocationGlobalRelative | LocationGlobal) -> None:
         """Point the camera at a location; a copter without a gimbal turns itself. Zeros as location end the order."""
         if not isinstance(roi, (LocationGlobal, LocationGlobalRelative)):
             raise InvalidArgument("Expecting roi to be LocationGlobal or LocationGlobalRelative.")
-        is_location = any(checked_location(roi))
+        is_all_zeros = not any(checked_location(roi))
         aio = self._core.check_link()
-        if not is_location:
+        if is_all_zeros:
             self._core.order("gimbal", aio.stop_looking)
         elif isinstance(roi, LocationGlobal):
             self._core.order("gimbal", aio.look_at, Position(roi.lat, roi.lon, altitude_amsl_m=roi.alt))
         else:
-            place = Position(roi.lat, roi.lon, altitude_relative_m=roi.alt)
-            self._core.order("gimbal", _point_above_home, aio, place)
+            target = Position(roi.lat, roi.lon, altitude_relative_m=roi.alt)
+            self._core.order("gimbal", _point_above_home, aio, target)
 
     def release(self) -> None:
         """Return control of the gimbal to the pilot's sticks."""
         self._core.order("gimbal", self._core.check_link().gimbal.release)
 
-    def _begin(self) -> None:
+    def _observe_attitude(self) -> None:
         self._core.aio.gimbal.attitude.observe(weak_callback(self._on_attitude), every_arrival=True)
 
     def _on_attitude(self, _: GimbalAttitude | None, attitude: GimbalAttitude) -> None:
@@ -110,11 +110,12 @@ class Gimbal(GimbalPrivates):
         core.listeners.notify("gimbal", self)
 
 
-async def _point_above_home(aio: AsyncVehicle, place: Position) -> None:
-    # Programs call this right after connecting, before home is known.
+async def _point_above_home(aio: AsyncVehicle, target: Position) -> None:
+    # An autopilot that takes altitudes above sea level needs home for the conversion. Programs point the camera right
+    # after connecting, when home may still be unknown.
     if aio.autopilot.repositions_amsl:
         await aio.home.wait_until(lambda _: True, timeout=HOME_TIMEOUT_S, description="home")
-    await aio.look_at(place)
+    await aio.look_at(target)
 
 
 def _checked(name: str, value: float) -> float:

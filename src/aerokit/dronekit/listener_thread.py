@@ -37,7 +37,7 @@ class ListenerThread:
         """Called after each callback."""
         self.dropped = 0
         """Number of calls that were dropped because a callback blocked."""
-        self._kept: dict[int, object] = {}
+        self._kept_alive: dict[int, object] = {}
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
         """Queue a call, from any thread, without blocking. Ignored once stopped."""
@@ -76,16 +76,17 @@ class ListenerThread:
                 called.finish()
 
         self.post(call_and_finish)
-        end = time.monotonic() + CALL_TIMEOUT_S  # waits in short steps, so that Ctrl-C works on every system
-        while not called.wait(0.2) and not self.is_stopped and time.monotonic() <= end:
+        deadline = time.monotonic() + CALL_TIMEOUT_S
+        # Waits in short steps, so that Ctrl-C works on every system.
+        while not called.wait(0.2) and not self.is_stopped and time.monotonic() <= deadline:
             pass
 
     def keep(self, owner: object, *, has_listeners: bool) -> None:
         """Keep an object alive while it has listeners, even if the program has dropped the vehicle."""
         if has_listeners and not self.is_stopped:
-            self._kept[id(owner)] = owner
+            self._kept_alive[id(owner)] = owner
         else:
-            self._kept.pop(id(owner), None)
+            self._kept_alive.pop(id(owner), None)
 
     @property
     def is_current(self) -> bool:
@@ -95,8 +96,8 @@ class ListenerThread:
         """Make no further calls. Idempotent; does not block."""
         with self._lock:
             self.is_stopped = True
-        self._kept.clear()
-        self._calls.put((_nothing, ()))
+        self._kept_alive.clear()
+        self._calls.put((_nothing, ()))  # wakes the thread, which then sees that it is stopped
 
     def join(self) -> None:
         """Wait at most two seconds until the thread has ended; a callback may block."""
@@ -124,7 +125,7 @@ class ListenerThread:
             except BaseException:  # including SystemExit, which would end this thread only
                 logger.exception("Exception in a callback")
             self.on_called()
-            del function, args  # not kept alive until the next call
+            del function, args  # otherwise they stay alive until the next call
 
 
 class _Thread(threading.Thread):

@@ -41,11 +41,11 @@ class Master:
 
     def __init__(self, connection: ClassicConnection) -> None:
         self._connection = connection
-        ours = connection.connection
-        self.source_system: int = ours.source_system
-        self.source_component: int = ours.source_component
+        own_ids = connection.connection
+        self.source_system: int = own_ids.source_system
+        self.source_component: int = own_ids.source_component
         """Own component id."""
-        self.mav: MessageFactory = MessageFactory(self._send, ours.source_system, ours.source_component)
+        self.mav: MessageFactory = MessageFactory(self._send, self.source_system, self.source_component)
         """Creates and sends messages."""
         self.messages: Inbox = Inbox(connection)
         """The last message of every type by name, from the first access on."""
@@ -58,7 +58,8 @@ class Master:
     @property
     def target_component(self) -> int:
         """Component id of the vehicle's autopilot, 0 until it is found."""
-        return self._autopilot()[0]
+        component_id, _ = self._autopilot()
+        return component_id
 
     @property
     def address(self) -> str:
@@ -72,7 +73,7 @@ class Master:
     @property
     def flightmode(self) -> str:
         """Name of the flight mode, ``UNKNOWN`` before the first HEARTBEAT."""
-        heartbeat = self._autopilot()[1]
+        _, heartbeat = self._autopilot()
         if heartbeat is None or heartbeat.received_frame is None:
             return "UNKNOWN"
         return str(mavutil.mode_string_v10(message_of(heartbeat.received_frame)))
@@ -84,27 +85,31 @@ class Master:
 
     def mode_mapping(self) -> dict[str, Any] | None:
         """Return mode names and numbers (PX4: three numbers each), or None if the modes are unknown."""
-        heartbeat = self._autopilot()[1]
+        _, heartbeat = self._autopilot()
         if heartbeat is None:
             return None
-        modes = (
-            mavutil.px4_map if heartbeat.autopilot == MavAutopilot.PX4 else mavutil.mode_mapping_byname(heartbeat.type)
-        )
+        if heartbeat.autopilot == MavAutopilot.PX4:
+            return dict(mavutil.px4_map)
+        modes = mavutil.mode_mapping_byname(heartbeat.type)
         return dict(modes) if modes is not None else None
 
     def set_mode(self, mode: str | int, custom_mode: int | None = 0, custom_sub_mode: int | None = 0) -> None:
         """Set a mode by name (KeyError if unknown), by number, or on PX4 by the numbers of :meth:`mode_mapping`."""
-        heartbeat = self._autopilot()[1]
+        _, heartbeat = self._autopilot()
         is_px4 = heartbeat is not None and heartbeat.autopilot == MavAutopilot.PX4
         vehicle = self._connection.vehicle
         if vehicle is not None and (isinstance(mode, str) or not is_px4):
             vehicle.mode = mode
             return
-        order = (self.mode_mapping() or {})[mode] if isinstance(mode, str) else mode
-        if is_px4 and not isinstance(mode, str):
-            order = (mode, custom_mode or 0, custom_sub_mode or 0)
-        numbers = order if isinstance(order, tuple) else (MavModeFlag.CUSTOM_MODE_ENABLED.value, order, 0)
-        self._command(MavCmd.DO_SET_MODE, *numbers)
+        number: Any
+        if isinstance(mode, str):
+            number = (self.mode_mapping() or {})[mode]
+        elif is_px4:
+            number = (mode, custom_mode or 0, custom_sub_mode or 0)
+        else:
+            number = mode
+        params = number if isinstance(number, tuple) else (MavModeFlag.CUSTOM_MODE_ENABLED.value, number, 0)
+        self._command(MavCmd.DO_SET_MODE, *params)
 
     set_mode_apm: Callable[..., None] = set_mode
     set_mode_px4: Callable[..., None] = set_mode
@@ -119,7 +124,7 @@ class Master:
         self._command(MavCmd.COMPONENT_ARM_DISARM, 0)
 
     def motors_armed(self) -> bool:
-        heartbeat = self._autopilot()[1]
+        _, heartbeat = self._autopilot()
         return heartbeat is not None and is_armed(heartbeat.base_mode)
 
     def motors_armed_wait(self) -> None:
@@ -136,8 +141,8 @@ class Master:
         self._command(MavCmd.DO_SET_SERVO, channel, pwm)
 
     def _command(self, command: int, *params: float) -> None:
-        filled = (*params, *(0,) * (7 - len(params)))
-        self.mav.command_long_send(self.target_system, self.target_component, command, 0, *filled)
+        seven_params = (*params, *(0,) * (7 - len(params)))
+        self.mav.command_long_send(self.target_system, self.target_component, command, 0, *seven_params)
 
     # ------------------------------------------------------------ raw parameter and mission messages
 
@@ -146,8 +151,8 @@ class Master:
 
     def param_set_send(self, parm_name: str | bytes, parm_value: float, parm_type: int | None = None) -> None:
         """Send PARAM_SET without checking the answer; ``vehicle.parameters`` checks it."""
-        kind = MavParamType.REAL32 if parm_type is None else parm_type
-        self.mav.param_set_send(self.target_system, self.target_component, parm_name, parm_value, kind)
+        param_type = MavParamType.REAL32 if parm_type is None else parm_type
+        self.mav.param_set_send(self.target_system, self.target_component, parm_name, parm_value, param_type)
 
     def waypoint_clear_all_send(self) -> None:
         self.mav.mission_clear_all_send(self.target_system, self.target_component)
@@ -181,12 +186,13 @@ class Master:
         at once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). Raises APIException if
         the connection is closed.
         """
-        names = {type} if isinstance(type, str) else None if type is None else set(type)
+        types = (type,) if isinstance(type, str) else type
+        names = None if types is None else set(types)
 
         def matches(message: Any) -> bool:
             return bool(mavutil.evaluate_condition(condition, {message.get_type(): message}))
 
-        may_wait = blocking and not self._connection.loop.is_current
+        may_wait = blocking and not self._connection.loop.is_current  # the loop's thread receives, and must not wait
         return self.messages.next_match(names, matches, timeout if may_wait else 0.0)
 
     def wait_heartbeat(self, blocking: bool = True, timeout: float | None = None) -> Any:
@@ -248,14 +254,14 @@ class Inbox(Mapping[str, Any]):
         self._connection = connection
         self._latest: dict[int, Frame] = {}
         self._frames: deque[Frame] = deque(maxlen=MAX_MESSAGES)
-        self._came = threading.Condition()
-        self._started: float | None = None
+        self._frame_arrived = threading.Condition()
+        self._started_at: float | None = None
 
     def next_match(self, names: Collection[str] | None, condition: Any, timeout: float | None) -> Any:
         """Return the next message of these types that satisfies ``condition``; see :meth:`Master.recv_match`."""
         self._start()
-        end = None if timeout is None else time.monotonic() + timeout
-        while (frame := self._pop(end)) is not None:
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while (frame := self._pop(deadline)) is not None:
             message = message_of(frame)
             if (names is None or message.get_type() in names) and condition(message):
                 return message
@@ -266,15 +272,15 @@ class Inbox(Mapping[str, Any]):
         self._start()
         frame = self._latest.get(_id_of(name))
         if frame is None:
-            return time.monotonic() - (self._started or 0.0)
+            return time.monotonic() - (self._started_at or 0.0)
         return self._connection.connection.now() - frame.received_at
 
     def __getitem__(self, name: str) -> Any:
         self._start()
         message_id = _id_of(name)
-        while (frame := self._latest.get(message_id)) is None and self._waits():
-            with self._came:
-                self._came.wait(SIGNAL_CHECK_INTERVAL_S / 10)
+        while (frame := self._latest.get(message_id)) is None and self._may_wait():
+            with self._frame_arrived:
+                self._frame_arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)
         if frame is None:
             raise KeyError(name)
         return message_of(frame)
@@ -288,45 +294,48 @@ class Inbox(Mapping[str, Any]):
         return len(self._latest)
 
     def _start(self) -> None:
-        with self._came:
-            is_first, self._started = self._started is None, self._started or time.monotonic()
-        if is_first:
-            loop, tap = self._connection.loop, self._connection.connection.observe_frames
-            if loop.is_current:
-                tap(weak_callback(self._take))
-            else:
-                loop.call(tap, weak_callback(self._take))  # blocks until attached, so that no later message is missed
+        with self._frame_arrived:
+            if self._started_at is not None:
+                return
+            self._started_at = time.monotonic()
+        loop, observe_frames = self._connection.loop, self._connection.connection.observe_frames
+        if loop.is_current:
+            observe_frames(weak_callback(self._on_frame))
+        else:
+            loop.call(observe_frames, weak_callback(self._on_frame))  # blocks, so that no later message is missed
 
-    def _waits(self) -> bool:
-        is_young = self._started is not None and time.monotonic() < self._started + FIRST_LOOKUP_TIMEOUT_S
+    def _may_wait(self) -> bool:
+        is_young = self._started_at is not None and time.monotonic() < self._started_at + FIRST_LOOKUP_TIMEOUT_S
         return is_young and self._connection.connection.is_open and not self._connection.loop.is_current
 
-    def _take(self, frame: Frame, peer: Peer) -> None:
+    def _on_frame(self, frame: Frame, peer: Peer) -> None:
         # Runs on the loop's thread.
         if self._connection.is_of_another_vehicle(frame.system_id):
             return
-        with self._came:
+        with self._frame_arrived:
             self._latest[frame.message_id] = frame
             self._frames.append(frame)
-            self._came.notify_all()
+            self._frame_arrived.notify_all()
 
-    def _pop(self, end: float | None) -> Frame | None:
-        """Return the oldest frame that is recent enough; None when the time is over."""
+    def _pop(self, deadline: float | None) -> Frame | None:
+        """Return the oldest frame that is recent enough; None if there is none before the deadline."""
         now = self._connection.connection.now
         while True:
-            with self._came:
+            with self._frame_arrived:
                 while self._frames:
                     frame = self._frames.popleft()
                     if now() - frame.received_at < MESSAGE_MAX_AGE_S:
                         return frame
-                left = SIGNAL_CHECK_INTERVAL_S if end is None else min(end - time.monotonic(), SIGNAL_CHECK_INTERVAL_S)
-                if left > 0:
-                    self._check()
-                    self._came.wait(left)
+                wait_s = SIGNAL_CHECK_INTERVAL_S
+                if deadline is not None:
+                    wait_s = min(wait_s, deadline - time.monotonic())
+                if wait_s > 0:
+                    self._raise_if_closed()
+                    self._frame_arrived.wait(wait_s)
                 elif not self._frames:
                     return None
 
-    def _check(self) -> None:
+    def _raise_if_closed(self) -> None:
         if self._connection.is_closed or not self._connection.connection.is_open:
             raise APIException("the connection was closed")
 

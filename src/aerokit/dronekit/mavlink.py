@@ -39,7 +39,7 @@ logger: logging.Logger = logging.getLogger("dronekit.mavlink")
 FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
 
 TICK_INTERVAL_S = 0.05
-ATTEMPTS, RETRY_INTERVAL_S = 3, 1.0
+MAX_OPEN_ATTEMPTS, RETRY_INTERVAL_S = 3, 1.0
 
 
 class MAVConnection(ClassicConnection):
@@ -64,15 +64,15 @@ class MAVConnection(ClassicConnection):
         heartbeat: OwnHeartbeat | None = OwnHeartbeat(),  # noqa: B008 - it is immutable
     ) -> None:
         loop, overrides = LoopThread(), OverrideRelease()
-        held = _open(loop, ip, baud, source_system, source_component, overrides, heartbeat)
-        super().__init__(ip, loop, held, target_system, overrides)
+        context = _open(loop, ip, baud, source_system, source_component, overrides, heartbeat)
+        super().__init__(ip, loop, context, target_system, overrides)
         self.loop_listeners: list[Callable[[MAVConnection], object]] = []
         """Functions called about 20 times a second; see :meth:`forward_loop`."""
         self.message_listeners: list[Callable[[MAVConnection, Any], object]] = []
         """Functions called with every message; see :meth:`forward_message`."""
-        created = _created.get()
-        if created is not None:
-            created.add(self)
+        collected = _collected_connections.get()
+        if collected is not None:
+            collected.add(self)
 
     def fix_targets(self, message: Any) -> None:
         """Set ``message.target_system`` to the vehicle's system id, if the message has this field."""
@@ -135,6 +135,7 @@ class MAVConnection(ClassicConnection):
     @_accept_input.setter
     def _accept_input(self, value: bool) -> None:
         """Discard received bytes if False, so that programs can test a silent link."""
+        # An attribute of the instance hides the method that the link calls.
         if value:
             vars(self.connection).pop("bytes_received", None)
         else:
@@ -168,7 +169,7 @@ class MAVConnection(ClassicConnection):
         for listener in tuple(listeners):
             try:
                 listener(self, *args)
-            except BaseException:
+            except BaseException:  # including SystemExit, which would end the listener thread only
                 logger.exception("Exception in a listener of the connection")
 
     def write_frame(self, frame: Frame) -> None:
@@ -181,18 +182,20 @@ class MAVConnection(ClassicConnection):
             self.connection.write_raw(frame.raw)
 
 
-_created: ContextVar[weakref.WeakSet[MAVConnection] | None] = ContextVar("created_connections", default=None)
+_collected_connections: ContextVar[weakref.WeakSet[MAVConnection] | None] = ContextVar(
+    "created_connections", default=None
+)
 
 
 @contextlib.contextmanager
 def created_connections() -> Iterator[weakref.WeakSet[MAVConnection]]:
     """Collect the connections that this thread creates in the block, by weak reference."""
     connections: weakref.WeakSet[MAVConnection] = weakref.WeakSet()
-    token = _created.set(connections)
+    token = _collected_connections.set(connections)
     try:
         yield connections
     finally:
-        _created.reset(token)
+        _collected_connections.reset(token)
 
 
 def _open(
@@ -205,20 +208,20 @@ def _open(
     heartbeat: OwnHeartbeat | None,
 ) -> OpenContext[Connection]:
     """Open the link. A refused connection is retried, because a program may have just started a simulator."""
-    ids: dict[str, Any] = {"source_system": source_system, "source_component": source_component}
+    own_ids: dict[str, Any] = {"source_system": source_system, "source_component": source_component}
     try:
         _check_address(ip)
-        for attempt in range(ATTEMPTS):
+        for attempt in range(MAX_OPEN_ATTEMPTS):
             try:
-                opened = open_connection(ip, baud=baud, reconnect=True, heartbeat=heartbeat, **ids)
-                held = loop.open_context(_with_override_release(opened, overrides))
-                held.value._use_activity_monitor(loop.activity)
-                return held
+                opened = open_connection(ip, baud=baud, reconnect=True, heartbeat=heartbeat, **own_ids)
+                context = loop.open_context(_with_override_release(opened, overrides))
+                context.value._use_activity_monitor(loop.activity)
+                return context
             except LinkOpenError as error:
-                if attempt == ATTEMPTS - 1 or not isinstance(error.__context__, ConnectionRefusedError):
+                if attempt == MAX_OPEN_ATTEMPTS - 1 or not isinstance(error.__context__, ConnectionRefusedError):
                     _raise_classic(error)
                 time.sleep(RETRY_INTERVAL_S)
-        raise AssertionError
+        raise AssertionError("the last attempt returns or raises")
     except BaseException:
         loop.close()
         raise
@@ -242,7 +245,7 @@ def _check_address(ip: object) -> None:
     try:
         parse_address(ip)
     except InvalidArgument as error:
-        from aerokit.transport.serial import AddressError
+        from aerokit.transport.serial import AddressError  # also the SerialException that pymavlink raises
 
         raise AddressError(str(error)) from None
 

@@ -30,7 +30,7 @@ ListenerT = TypeVar("ListenerT", bound=AttributeListener)
 # Name under which listeners get all attributes or messages.
 EVERY_NAME = "*"
 
-_changing = threading.Lock()  # acquired while listeners are added and removed
+_registration_lock = threading.Lock()  # for adding and removing listeners of any object
 
 
 class Listeners:
@@ -53,7 +53,7 @@ class Listeners:
 
     def add(self, name: str, listener: AttributeListener) -> None:
         """Add a listener, unless it is already registered."""
-        with _changing:
+        with _registration_lock:
             present = self.by_name.get(name, ())
             if listener in present:
                 return
@@ -62,15 +62,15 @@ class Listeners:
 
     def remove(self, name: str, listener: AttributeListener) -> None:
         """Remove a listener; ValueError if the name has listeners, but not this one."""
-        with _changing:
+        with _registration_lock:
             present = self.by_name.get(name)
             if present is None:
                 return
             if listener not in present:
                 raise ValueError(f"{listener!r} does not listen to {name!r}")
-            left = tuple(other for other in present if other != listener)
-            if left:
-                self.by_name[name] = left
+            remaining = tuple(registered for registered in present if registered != listener)
+            if remaining:
+                self.by_name[name] = remaining
             else:
                 del self.by_name[name]
                 self._keep_owner()
@@ -91,12 +91,14 @@ class Listeners:
             self._on_value(name)
         if not self.has_listener(name):
             return
-        thread = self._thread
-        if thread is None:
+        if self._thread is None:
             self.deliver(name, value)
+        elif waits:
+            self._thread.call(self.deliver, name, value)
+        elif cache:  # a change must not be lost
+            self._thread.post(self.deliver, name, value)
         else:
-            enqueue = thread.call if waits else thread.post if cache else thread.offer
-            enqueue(self.deliver, name, value)
+            self._thread.offer(self.deliver, name, value)
 
     def announce(self, name: str) -> None:
         """Call :meth:`notify` with the value of the owner's attribute, which is read only if there are listeners."""
@@ -106,16 +108,16 @@ class Listeners:
             self._on_value(name)
 
     def deliver(self, attr_name: str, value: Any) -> None:
+        """Call the listeners of this name, then those of every name."""
         for name in (attr_name, EVERY_NAME):
             for listener in self.by_name.get(name, ()):
                 try:
                     listener(self._owner, attr_name, value)
-                except BaseException:
-                    # This includes SystemExit, which would end the listener thread only.
+                except BaseException:  # including SystemExit, which would end the listener thread only
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
     def _keep_owner(self) -> None:
-        # The owner stays alive while it has listeners, even if the program has dropped it.
+        # These listeners refer to their owner, so it stays alive while it has any, even if the program has dropped it.
         if self._thread is not None:
             self._thread.keep(self, has_listeners=bool(self.by_name))
 
@@ -145,6 +147,7 @@ class HasObservers:
 
     @staticmethod
     def _dk_normalized(attr_name: str) -> str:
+        """Return the name under which listeners of an attribute are stored; parameters override it."""
         return attr_name
 
     def add_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
@@ -184,7 +187,7 @@ class MessageListeners(Listeners):
     def __init__(self, owner: object, handler: ClassicConnection) -> None:
         super().__init__(owner, handler.listener_thread)
         self._handler = handler
-        self._detach: dict[str, Detach] = {}
+        self._detach_by_name: dict[str, Detach] = {}
         self._is_started = False
 
     def add(self, name: str, listener: AttributeListener) -> None:
@@ -205,37 +208,39 @@ class MessageListeners(Listeners):
         self._attach()
 
     def _attach_now(self) -> None:
-        # This call blocks, so that no message is missed after add() has returned.
         if not self._is_started:
             return
         if self._handler.loop.is_current:
             self._attach()
         else:
             with contextlib.suppress(AerokitError):  # the connection is closed
+                # Blocks until attached, so that no message is missed after add() has returned.
                 self._handler.loop.call(self._attach)
 
     def _attach(self) -> None:
         """Subscribe to all messages, or to those that have listeners."""
-        names = self.by_name.copy()
-        wanted = [EVERY_NAME] if EVERY_NAME in names else list(names)
-        for name in set(self._detach).difference(wanted):
-            self._detach.pop(name)()
-        for name in wanted:
-            if name not in self._detach:
-                self._detach[name] = self._listen(name)
+        names = list(self.by_name.copy())
+        if EVERY_NAME in names:
+            names = [EVERY_NAME]
+        for name in set(self._detach_by_name).difference(names):
+            detach = self._detach_by_name.pop(name)
+            detach()
+        for name in names:
+            if name not in self._detach_by_name:
+                self._detach_by_name[name] = self._listen(name)
 
     def _listen(self, name: str) -> Detach:
         connection = self._handler.connection
         if name == EVERY_NAME:
-            return connection.observe_frames(self._take)
+            return connection.observe_frames(self._on_frame)
         try:
             message_type = connection.bus.dialect.by_name(name)
         except AerokitError:
             logger.warning("unknown message %s: its listener will never be called", name)
             return lambda: None
-        return connection.bus.attach_frames(message_type, self._take)
+        return connection.bus.attach_frames(message_type, self._on_frame)
 
-    def _take(self, frame: Frame, peer: Peer = None) -> None:
+    def _on_frame(self, frame: Frame, peer: Peer = None) -> None:
         if not self._handler.is_of_another_vehicle(frame.system_id):
             self._handler.listener_thread.offer(self._deliver, frame)
 
@@ -256,7 +261,7 @@ def message_of(frame: Frame) -> Any:
 
 @cache
 def _pymavlink() -> tuple[Any, Callable[..., Any]]:
-    # Imported for the first message listener.
+    """Import pymavlink's ``mavutil`` and our conversion to its messages, once the first of them is needed."""
     from pymavlink import mavutil
 
     from aerokit.mavlink.pymavlink import to_pymavlink

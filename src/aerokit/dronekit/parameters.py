@@ -38,8 +38,8 @@ VERSION_TIMEOUT_S = 1.0  # time to wait for AUTOPILOT_VERSION, which shows wheth
 READ_TIMEOUT_S = 30.0
 RETRY_DELAY_S = 1.0
 
-MIN_ATTEMPT_S = 1.0  # longer on slow links
-LAST_ATTEMPT_SHARE = 0.5
+MIN_ATTEMPT_S = 1.0  # on slow links ROUND_TRIPS round trips, if longer
+LAST_WAIT_SHARE = 0.5  # the answer to the last attempt is awaited for this share of an attempt's time
 ROUND_TRIPS = 3
 
 ROUNDING = 0.01  # ArduPilot adds this value before it truncates a number to an integer
@@ -51,8 +51,8 @@ class ParameterDownload:
     A failed download is repeated only while a program waits for parameters.
     """
 
-    def __init__(self, core: Core, take_all: Callable[[ParameterTable], None]) -> None:
-        self._core, self._take_all = core, take_all
+    def __init__(self, core: Core, store_all: Callable[[ParameterTable], None]) -> None:
+        self._core, self._store_all = core, store_all
         self.is_complete = False
         """True once the whole list was received; a reboot of the vehicle does not reset it."""
         self._ended: asyncio.Event | None = None
@@ -61,9 +61,9 @@ class ParameterDownload:
     def begin(self) -> None:
         if self._ended is None and not self.is_complete:
             self._ended = asyncio.Event()
-            aio, take = self._core.aio, weak_callback(self._take_all)
-            fail, end = weak_callback(self._warn), weak_callback(self._end)
-            self._core.background(lambda: _download(aio, take, fail, end))
+            aio, on_success = self._core.aio, weak_callback(self._store_all)
+            on_failure, on_ended = weak_callback(self._log_failure_once), weak_callback(self._on_ended)
+            self._core.background(lambda: _download(aio, on_success, on_failure, on_ended))
 
     def request(self) -> None:
         """Like :meth:`begin`, from any thread; ignored once the connection is closed."""
@@ -73,12 +73,12 @@ class ParameterDownload:
     async def wait_for(self, name: str) -> None:
         """Wait until the parameter is received, alone or with the list, or is known not to exist."""
         if self.is_complete:
-            await self._read(name)
+            await self._request(name)
             return
         async with anyio.create_task_group() as group:
 
             async def read() -> None:
-                if await self._read(name):
+                if await self._request(name):
                     group.cancel_scope.cancel()
 
             group.start_soon(read)
@@ -91,17 +91,17 @@ class ParameterDownload:
             if self._ended is not None:
                 await self._ended.wait()
 
-    def _end(self) -> None:
+    def _on_ended(self) -> None:
         ended, self._ended = self._ended, None
         if ended is not None:
             ended.set()
 
-    def _warn(self, error: AerokitError) -> None:
+    def _log_failure_once(self, error: AerokitError) -> None:
         if not self._has_warned:
             self._has_warned = True
             self._core.logger.warning("the parameters could not be downloaded: %s", error)
 
-    async def _read(self, name: str) -> bool:
+    async def _request(self, name: str) -> bool:
         """Request a parameter under all its names; return True if it was received or the vehicle reported it missing.
 
         While the list is being sent, a missing answer does not show that the parameter is missing.
@@ -113,27 +113,28 @@ class ParameterDownload:
             answers = (await self._core.aio.parameters.probe(*names, idle_timeout_s=READ_TIMEOUT_S)).values()
         except AerokitError:
             return False
-        return any(isinstance(answer, Parameter) for answer in answers) or all(
-            isinstance(answer, ParameterRejected) and answer.code is not None for answer in answers
-        )
+        if any(isinstance(answer, Parameter) for answer in answers):
+            return True
+        # With a code, the vehicle itself has reported the parameter missing; without one, it did not answer.
+        return all(isinstance(answer, ParameterRejected) and answer.code is not None for answer in answers)
 
 
 async def _download(
     vehicle: AsyncVehicle,
-    take: Callable[[ParameterTable], None],
-    fail: Callable[[AerokitError], None],
-    end: Callable[[], None],
+    on_success: Callable[[ParameterTable], None],
+    on_failure: Callable[[AerokitError], None],
+    on_ended: Callable[[], None],
 ) -> None:
     """Download all parameters on the loop, without a reference that keeps the classic vehicle alive."""
     try:
-        take(await vehicle.parameters.download(method=await _method(vehicle)))
+        on_success(await vehicle.parameters.download(method=await _method(vehicle)))
     except ConnectionClosed:
         return
     except AerokitError as error:
-        fail(error)
-        await anyio.sleep(RETRY_DELAY_S)
+        on_failure(error)
+        await anyio.sleep(RETRY_DELAY_S)  # a program that waits starts the next download as soon as this one has ended
     finally:
-        end()
+        on_ended()
 
 
 async def _method(vehicle: AsyncVehicle) -> DownloadMethod:
@@ -148,35 +149,36 @@ class ParameterValues:
     """Parameters as reported, kept through reboots. One thread writes, any thread reads."""
 
     def __init__(self) -> None:
-        self._known: dict[str, Parameter] = {}
-        self._spelled: dict[str, str] = {}
+        self._parameters: dict[str, Parameter] = {}
+        self._spelling_of_upper: dict[str, str] = {}
 
     def __len__(self) -> int:
-        return len(self._known)
+        return len(self._parameters)
 
     def copy(self) -> dict[str, float]:
         """Return a new dict of values by name, in the vehicle's spelling and units."""
-        return {name: float(parameter.value) for name, parameter in self._known.copy().items()}
+        return {name: float(parameter.value) for name, parameter in self._parameters.copy().items()}
 
     def find(self, name: str) -> ResolvedParameter | None:
         """Look up a parameter by an upper-case name, old or new."""
-        known = self._known
-        return resolve_known(name if name in known else self._spelled.get(name, name), known)
+        if name not in self._parameters:
+            name = self._spelling_of_upper.get(name, name)
+        return resolve_known(name, self._parameters)
 
     def get(self, name: str) -> float | None:
         """Return the value of exactly this upper-case name, or None."""
-        known = self._known.get(name)
-        return None if known is None else float(known.value)
+        parameter = self._parameters.get(name)
+        return None if parameter is None else float(parameter.value)
 
-    def take(self, parameter: Parameter) -> bool:
+    def store(self, parameter: Parameter) -> bool:
         """Store a parameter; return True if it is new or changed."""
-        name, before = parameter.name, self._known.get(parameter.name)
-        if before is None and len(self._known) >= MAX_PARAMETERS:
+        name, previous = parameter.name, self._parameters.get(parameter.name)
+        if previous is None and len(self._parameters) >= MAX_PARAMETERS:
             return False
-        if before is None and name != name.upper():
-            self._spelled[name.upper()] = name
-        self._known[name] = parameter
-        return before is None or not same_value(before.value, parameter.value)
+        if previous is None and name != name.upper():
+            self._spelling_of_upper[name.upper()] = name
+        self._parameters[name] = parameter
+        return previous is None or not same_value(previous.value, parameter.value)
 
 
 async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int) -> AerokitError | None:
@@ -185,15 +187,15 @@ async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int
     Fractions for integer parameters are cut off, as in ArduPilot. PARAM_SET is sent once; without an answer the value
     is requested, for ``retries`` + 1 attempts in total.
     """
-    idle_timeout_s = (retries + LAST_ATTEMPT_SHARE) * _try_s(aio)
+    idle_timeout_s = (retries + LAST_WAIT_SHARE) * _attempt_s(aio)
     try:
-        known = aio.parameters.known(name) or await aio.parameters.read(name, idle_timeout_s=idle_timeout_s)
-        wanted = convert_to_type(name, value, known.type)
-        done = await aio.parameters.set(name, wanted, idle_timeout_s=idle_timeout_s)
+        parameter = aio.parameters.known(name) or await aio.parameters.read(name, idle_timeout_s=idle_timeout_s)
+        converted = convert_to_type(name, value, parameter.type)
+        result = await aio.parameters.set(name, converted, idle_timeout_s=idle_timeout_s)
     except (InvalidArgument, ParameterRejected, ParameterTimeout) as error:
         return error
-    if done.outcome == "clamped":
-        return ParameterRejected(f"the vehicle set {done.value:g} instead", name=name)
+    if result.outcome == "clamped":
+        return ParameterRejected(f"the vehicle set {result.value:g} instead", name=name)
     return None
 
 
@@ -204,9 +206,12 @@ def convert_to_type(name: str, value: float, type: ParameterType) -> int | float
     return checked_value(name, value, type)
 
 
-def _try_s(aio: AsyncVehicle) -> float:
+def _attempt_s(aio: AsyncVehicle) -> float:
+    """Return the seconds for one attempt on this link."""
     report = aio.link_quality.latest
-    return max(MIN_ATTEMPT_S, ROUND_TRIPS * ((report and report.round_trip_s) or 0.0))
+    if report is None or report.round_trip_s is None:
+        return MIN_ATTEMPT_S
+    return max(MIN_ATTEMPT_S, ROUND_TRIPS * report.round_trip_s)
 
 
 WAIT_TIMEOUT_S = 30.0
@@ -230,17 +235,17 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         HasObservers.__init__(self, core.handler.listener_thread)
         self._values = ParameterValues()
         self._count = 0  # number of parameters according to the last PARAM_VALUE
-        self._reading = ParameterDownload(core, self._take_all)
+        self._download = ParameterDownload(core, self._store_all)
         core.on(ParamValue, self._on_value)
         core.on_connected.append(self._start)
-        core.ready.fetchers["parameters"] = self._reading.request
+        core.ready.fetchers["parameters"] = self._download.request
 
     # ------------------------------------------------------------------------------- reading
 
     def __getitem__(self, name: str) -> float:
         value = self.get(name)
         if value is None:
-            raise KeyError(_described(name.upper()) if isinstance(name, str) else name)
+            raise KeyError(_with_replacement(name.upper()) if isinstance(name, str) else name)
         return value
 
     def get(  # type: ignore[override]
@@ -252,12 +257,12 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         """
         if isinstance(name, str) and (value := self._values.get(name.upper())) is not None:
             return value
-        found = self._find(name, waits=bool(wait_ready))
-        if found is None:
+        resolved = self._find(name, waits=bool(wait_ready))
+        if resolved is None:
             return default
-        if found.renamed is not None:
-            warn_of_rename(found.renamed)
-        return float(found.as_requested(found.parameter).value)
+        if resolved.renamed is not None:
+            warn_of_rename(resolved.renamed)
+        return float(resolved.as_requested(resolved.parameter).value)
 
     def __contains__(self, name: object) -> bool:
         return self._find(name) is not None
@@ -266,7 +271,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         return len(self._values)
 
     def __iter__(self) -> Iterator[str]:
-        if not self._reading.is_complete:
+        if not self._download.is_complete:
             self.wait_ready()
         return iter(self._values.copy())
 
@@ -300,19 +305,21 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
 
         InvalidArgument, a ValueError: the name is not a string, or the value not a number.
         """
-        name, number = _upper(name), number_of(name, value)
+        name, number = _upper_name(name), number_of(name, value)
         if wait_ready:
             self.wait_ready()
-        found = self._values.find(name)
-        own, converted = name if found is None else found.name, number
-        if found is not None and found.renamed is not None:
-            converted = found.renamed.to_vehicle(number)  # not rounded here, because set_parameter converts to integers
-            warn_of_rename(found.renamed)
+        vehicle_name, converted = name, number
+        resolved = self._values.find(name)
+        if resolved is not None:
+            vehicle_name = resolved.name
+            if resolved.renamed is not None:
+                converted = resolved.renamed.to_vehicle(number)  # not rounded: set_parameter converts to integers
+                warn_of_rename(resolved.renamed)
         core = self._core
         if retries <= 0:
-            core.order(f"parameter {own}", set_parameter, core.aio, own, converted, 0)
+            core.order(f"parameter {vehicle_name}", set_parameter, core.aio, vehicle_name, converted, 0)
             return False
-        failure = core.run(set_parameter, core.aio, own, converted, retries)
+        failure = core.run(set_parameter, core.aio, vehicle_name, converted, retries)
         if isinstance(failure, ParameterTimeout):
             core.logger.error("timeout setting parameter %s to %f", name, number)
         elif failure is not None:
@@ -333,21 +340,21 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         if not isinstance(name, str):
             return None
         name = name.upper()
-        is_settled = self._is_settled  # evaluated first, because the list may complete in between
-        known = self._values.find(name)
-        if known is None and waits and not is_settled and _is_possible(name):
+        is_settled = self._is_settled  # read before find(), because the last values may arrive between both
+        resolved = self._values.find(name)
+        if resolved is None and waits and not is_settled and _is_valid_name(name):
             self._core.run(self._wait_for, name)
-            known = self._values.find(name)
-        return known
+            resolved = self._values.find(name)
+        return resolved
 
     @property
     def _is_settled(self) -> bool:
         """True if no unknown parameters can exist: the list is complete and has the reported length."""
-        return self._reading.is_complete and self._count <= len(self._values)
+        return self._download.is_complete and self._count <= len(self._values)
 
     async def _wait_for(self, name: str) -> None:
         with anyio.move_on_after(WAIT_TIMEOUT_S) as waiting:
-            await self._reading.wait_for(name)
+            await self._download.wait_for(name)
         if waiting.cancelled_caught:
             raise TimeoutError(f"wait_ready experienced a timeout after {WAIT_TIMEOUT_S:.0f} seconds.")
 
@@ -357,44 +364,44 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
 
     def _start(self) -> None:
         self._core.aio.connection.bus.attach_event(ParameterChanged, weak_callback(self._on_changed))
-        self._reading.begin()
+        self._download.begin()
 
     def _on_value(self, message: ParamValue) -> None:
-        # The parameter table of aerokit, which stores integers as int, has processed this message before.
+        # The table of vehicle.aio.parameters has processed this message before; its values have the right types.
         self._count = message.param_count
-        self._take(message.param_id)
+        self._store(message.param_id)
 
     def _on_changed(self, event: ParameterChanged) -> None:
         # This includes downloads that the program started with vehicle.aio.
         if event.system_id == self._core.target_system:
-            self._take(event.name)
+            self._store(event.name)
 
-    def _take(self, name: str) -> None:
+    def _store(self, name: str) -> None:
         parameter = self._core.aio.parameters.known(name)
-        if parameter is not None and self._values.take(parameter):
+        if parameter is not None and self._values.store(parameter):
             self._dk_listeners.notify(parameter.name.upper(), float(parameter.value), cache=True)
 
-    def _take_all(self, table: ParameterTable) -> None:
+    def _store_all(self, table: ParameterTable) -> None:
         for name in table:
-            self._take(name)
-        self._reading.is_complete = True
+            self._store(name)
+        self._download.is_complete = True
         self._core.listeners.notify("parameters", self)
 
 
-def _upper(name: str) -> str:
+def _upper_name(name: str) -> str:
     if not isinstance(name, str):
         raise InvalidArgument(f"parameter name = {name!r} is not a string")
     return name.upper()
 
 
-def _described(name: str) -> str:
+def _with_replacement(name: str) -> str:
     from aerokit.parameters.renames import replacement_of
 
-    replaced = replacement_of(name)
-    return f"{name}: replaced by {replaced}" if replaced else name
+    replacement = replacement_of(name)
+    return f"{name}: replaced by {replacement}" if replacement else name
 
 
-def _is_possible(name: str) -> bool:
+def _is_valid_name(name: str) -> bool:
     try:
         check_name(name)
     except InvalidArgument:

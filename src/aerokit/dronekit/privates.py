@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-SILENCE_S = 5.0  # DroneKit's limit
+HEARTBEAT_TIMEOUT_S = 5.0  # as in DroneKit, which reports a link time-out after this silence
 
 
 class OverridableProperty(Generic[T]):
@@ -49,12 +49,12 @@ def _velocity(index: int) -> OverridableProperty[Any]:
     return OverridableProperty(lambda vehicle: vehicle.velocity[index])
 
 
-def _message_of(latest: str, *fields: str) -> tuple[OverridableProperty[Any], ...]:
-    """Return properties for fields of a message."""
-    return tuple(attribute_path(f"{latest}.message.{field}") for field in fields)
+def _message_fields(latest_message: str, *fields: str) -> tuple[OverridableProperty[Any], ...]:
+    """Return a property for each field of the message in this ``LatestMessage`` attribute of the vehicle."""
+    return tuple(attribute_path(f"{latest_message}.message.{field}") for field in fields)
 
 
-def _last_heartbeat_at(vehicle: Any) -> float:
+def _last_heartbeat_time(vehicle: Any) -> float:
     age = vehicle.last_heartbeat
     return 0.0 if age is None else time.monotonic() - age
 
@@ -62,17 +62,19 @@ def _last_heartbeat_at(vehicle: Any) -> float:
 class VehiclePrivates:
     """Private attributes of DroneKit's Vehicle. Reading works; assigning sets an instance attribute."""
 
-    _pitch, _yaw, _roll, _pitchspeed, _yawspeed, _rollspeed = _message_of(
+    _pitch, _yaw, _roll, _pitchspeed, _yawspeed, _rollspeed = _message_fields(
         "_dk_attitude", "pitch", "yaw", "roll", "pitchspeed", "yawspeed", "rollspeed"
     )
     _vx, _vy, _vz = map(_velocity, range(3))
-    _heading, _airspeed, _groundspeed = _message_of("_dk_vfr_hud", "heading", "airspeed", "groundspeed")
-    _eph, _epv, _fix_type, _satellites_visible = _message_of("_dk_gps", "eph", "epv", "fix_type", "satellites_visible")
-    _voltage, _current, _level = _message_of(
+    _heading, _airspeed, _groundspeed = _message_fields("_dk_vfr_hud", "heading", "airspeed", "groundspeed")
+    _eph, _epv, _fix_type, _satellites_visible = _message_fields(
+        "_dk_gps", "eph", "epv", "fix_type", "satellites_visible"
+    )
+    _voltage, _current, _level = _message_fields(
         "_dk_sys_status", "voltage_battery", "current_battery", "battery_remaining"
     )
     _system_status = attribute_path("_dk_heartbeat.system_status")
-    _raw_version, _capabilities = _message_of("_dk_version", "flight_sw_version", "capabilities")
+    _raw_version, _capabilities = _message_fields("_dk_version", "flight_sw_version", "capabilities")
     _rngfnd_distance, _rngfnd_voltage = (
         attribute_path("rangefinder.distance"),
         attribute_path("rangefinder.voltage"),
@@ -86,9 +88,9 @@ class VehiclePrivates:
     _last_heartbeat = attribute_path("last_heartbeat")
     _heartbeat_started = OverridableProperty(lambda vehicle: vehicle.last_heartbeat is not None)
     _heartbeat_system = attribute_path("_handler.target_system")
-    # True while the link is silent. Despite its name, the attribute is a flag.
-    _heartbeat_timeout = OverridableProperty(lambda vehicle: (vehicle.last_heartbeat or 0.0) >= SILENCE_S)
-    _heartbeat_lastreceived = OverridableProperty(_last_heartbeat_at)
+    # Despite its name, the attribute is a flag: true while the link is silent.
+    _heartbeat_timeout = OverridableProperty(lambda vehicle: (vehicle.last_heartbeat or 0.0) >= HEARTBEAT_TIMEOUT_S)
+    _heartbeat_lastreceived = OverridableProperty(_last_heartbeat_time)
     _params_loaded = OverridableProperty(lambda vehicle: "parameters" in vehicle._ready_attrs)
     _params_count = OverridableProperty(
         lambda vehicle: len(vehicle.parameters) if "parameters" in vehicle._ready_attrs else -1

@@ -66,7 +66,9 @@ def uninstall() -> None:
         return
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _SubmoduleFinder)]
     for name in list(sys.modules):
-        if name == ALIAS or (_own_name(name) and sys.modules[name] is sys.modules.get(_own_name(name) or "")):
+        own_name = _own_name(name)
+        is_alias = own_name is not None and sys.modules[name] is sys.modules.get(own_name)
+        if name == ALIAS or is_alias:
             del sys.modules[name]
 
 
@@ -102,7 +104,7 @@ class _SubmoduleLoader(Loader):
 
 FAILED, CANNOT_OPEN = 1, 2
 
-WITH_VALUE = ("--vehicle", "--speedup", "--home")
+OPTIONS_WITH_VALUE = ("--vehicle", "--speedup", "--home")
 
 RUNPY_FILES = (runpy.__file__, "<frozen runpy>")
 
@@ -145,8 +147,8 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
     Returns:
         Exit code: 0, 1 if the simulated vehicle cannot be served, or 2 if the program cannot be opened.
     """
-    own, rest = _split(arguments)
-    options = parser(prog).parse_args(own)
+    own_arguments, program_arguments = _split_at_program(arguments)
+    options = parser(prog).parse_args(own_arguments)
     if not options.module and (error := _file_error(options.program)):
         errprinter(f"{prog}: can't open file {options.program!r}: {error}")
         return CANNOT_OPEN
@@ -165,7 +167,7 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
         del sys.path[:1]  # remove the folder of this command
     run = _run_module if options.module else _run_file
     try:
-        run(options.program, rest)
+        run(options.program, program_arguments)
     finally:
         if served is not None:
             served.stop()
@@ -195,18 +197,20 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        label, _, rest = message.partition("unrecognized arguments: ")
-        if rest and not label:
-            message += did_you_mean(rest.split()[0].partition("=")[0], self._option_string_actions)
+        prefix = "unrecognized arguments: "
+        if message.startswith(prefix) and message != prefix:
+            unknown_option = message.removeprefix(prefix).split()[0].partition("=")[0]
+            message += did_you_mean(unknown_option, self._option_string_actions)
         super().error(message)
 
 
-def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
+def _split_at_program(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
+    """Return the arguments up to the program, and the arguments of the program."""
     is_value = False
-    for place, argument in enumerate(arguments, 1):
+    for count, argument in enumerate(arguments, 1):
         if not is_value and not argument.startswith("-"):
-            return arguments[:place], arguments[place:]
-        is_value = not is_value and argument in WITH_VALUE
+            return arguments[:count], arguments[count:]
+        is_value = not is_value and argument in OPTIONS_WITH_VALUE
     return arguments, []
 
 
@@ -218,7 +222,7 @@ def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
         raise InvalidArgument(f"speedup = {options.speedup:g} is not allowed: 0.1 to 100")
     home = HOME if options.home is None else parse_home(options.home)
     served = serve_for_program(options.vehicle, home, options.speedup)
-    tcp, udp = (place.replace("tcpin:", "tcp:").replace("udpout:", "udp:") for place in served.addresses)
+    tcp, udp = (address.replace("tcpin:", "tcp:").replace("udpout:", "udp:") for address in served.addresses)
     errprinter(f"{prog}: a simulated {options.vehicle} is on {tcp} and {udp}")
     return served
 
@@ -254,7 +258,7 @@ def _lacks_main(path: str) -> bool:
 def _file_error(path: str) -> str | None:
     try:
         io.open_code(os.path.abspath(path)).close()
-    except IsADirectoryError:
+    except IsADirectoryError:  # a folder with a __main__.py is a program
         return None
     except OSError as error:
         return error.strerror
@@ -272,6 +276,7 @@ def _run_file(path: str, arguments: Sequence[str]) -> None:
     if os.path.isdir(path) or path.endswith(".pyc") or zipfile.is_zipfile(path):
         runpy.run_path(path, run_name="__main__")
         return
+    # Not by runpy, which removes the module `__main__` when the main program ends, while threads may still need it.
     path = os.path.abspath(path)
     with io.open_code(path) as file:
         source = file.read()
@@ -304,12 +309,12 @@ def _print_program_traceback(kind: type[BaseException], error: BaseException, tr
 
 
 def _without_our_frames(traceback: TracebackType | None) -> TracebackType | None:
-    rest = traceback
-    while rest is not None and rest.tb_frame.f_code not in (_run_file.__code__, _run_module.__code__):
-        rest = rest.tb_next
-    if rest is None:
+    entry = traceback
+    while entry is not None and entry.tb_frame.f_code not in (_run_file.__code__, _run_module.__code__):
+        entry = entry.tb_next
+    if entry is None:  # the error is ours
         return traceback
-    rest = rest.tb_next
-    while rest is not None and rest.tb_frame.f_code.co_filename in RUNPY_FILES:
-        rest = rest.tb_next
-    return rest
+    entry = entry.tb_next
+    while entry is not None and entry.tb_frame.f_code.co_filename in RUNPY_FILES:
+        entry = entry.tb_next
+    return entry

@@ -26,8 +26,8 @@ KINDS = {"copter": "copter", "solo": "copter", "plane": "plane", "rover": "rover
 START_TIMEOUT_S = 30.0
 USUAL_ADDRESSES = ("tcpin:127.0.0.1:5760", "udpout:127.0.0.1:14550")
 
-_instances = 0
-_for_program: ServedVehicle | None = None
+_next_instance = 0  # number of the next SITL object created without a number
+_vehicle_for_program: ServedVehicle | None = None  # started by the runner before the program (--sim)
 
 
 class ServedVehicle:
@@ -46,14 +46,14 @@ class ServedVehicle:
         self.addresses: tuple[str, ...] = ()
         """Addresses in the simulator's spelling."""
         self._vehicle = simulated(kind, home=home)
-        self._requested = tuple(addresses)
+        self._requested_addresses = tuple(addresses)
         self._error: Exception | None = None
-        self._is_up = threading.Event()
+        self._startup_ended = threading.Event()  # set when the vehicle is served, or could not be
         self._loop = asyncio.new_event_loop()
-        self._over = asyncio.Event()
+        self._stop_requested = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="aerokit simulated vehicle", daemon=True)
         self._thread.start()
-        if not self._is_up.wait(START_TIMEOUT_S):
+        if not self._startup_ended.wait(START_TIMEOUT_S):
             raise LinkOpenError(f"the simulated vehicle has not started within {START_TIMEOUT_S:g} s")
         self._raise_error()
 
@@ -69,7 +69,7 @@ class ServedVehicle:
     def stop(self) -> None:
         if self._thread.is_alive():
             with suppress(RuntimeError):  # the loop ends at this moment
-                self._loop.call_soon_threadsafe(self._over.set)
+                self._loop.call_soon_threadsafe(self._stop_requested.set)
             self._thread.join()
 
     def wait(self) -> None:
@@ -79,19 +79,19 @@ class ServedVehicle:
         try:
             self._loop.run_until_complete(self._serve())
         except Exception as error:
-            if self._is_up.is_set():
+            if self._startup_ended.is_set():
                 errprinter(f"the simulated vehicle failed: {error!r}")
             self._error = error
         finally:
             self._loop.close()
-            self._is_up.set()
+            self._startup_ended.set()
 
     async def _serve(self) -> None:
         scale_timeouts([self._vehicle], self.speedup)
-        async with open_simulator([self._vehicle], *self._requested, speedup=self.speedup) as simulator:
+        async with open_simulator([self._vehicle], *self._requested_addresses, speedup=self.speedup) as simulator:
             self.addresses = tuple(simulator.addresses)
-            self._is_up.set()
-            await self._over.wait()
+            self._startup_ended.set()
+            await self._stop_requested.wait()
 
 
 def serve_for_program(kind: str, home: tuple[float, float, float], speedup: float) -> ServedVehicle:
@@ -101,24 +101,24 @@ def serve_for_program(kind: str, home: tuple[float, float, float], speedup: floa
         InvalidArgument: the kind is unknown.
         LinkOpenError: no address could be opened.
     """
-    global _for_program
+    global _vehicle_for_program
     try:
-        _for_program = ServedVehicle(kind, USUAL_ADDRESSES, home=home, speedup=speedup)
+        _vehicle_for_program = ServedVehicle(kind, USUAL_ADDRESSES, home=home, speedup=speedup)
     except LinkOpenError as error:
         errprinter(f"{error}; using another port")
-        free = ("tcpin:127.0.0.1:0", *USUAL_ADDRESSES[1:])
-        _for_program = ServedVehicle(kind, free, home=home, speedup=speedup)
-    return _for_program
+        any_port = ("tcpin:127.0.0.1:0", *USUAL_ADDRESSES[1:])
+        _vehicle_for_program = ServedVehicle(kind, any_port, home=home, speedup=speedup)
+    return _vehicle_for_program
 
 
 class SITL:
     """A simulated ArduPilot vehicle with the interface of dronekit-sitl. Ignores ``path`` and options for debuggers."""
 
     def __init__(self, path: str | None = None, instance: int | None = None, *_: Any, **__: Any) -> None:
-        global _instances
+        global _next_instance
         self.path = path
         if instance is None:
-            instance, _instances = _instances, _instances + 1
+            instance, _next_instance = _next_instance, _next_instance + 1
         self.instance: int = instance
         self._kind: str | None = None
         self._served: ServedVehicle | None = None
@@ -145,23 +145,24 @@ class SITL:
             ChildProcessError: the vehicle is running, and ``restart`` is not set.
             LinkOpenError: the port is in use.
         """
-        global _for_program
+        global _vehicle_for_program
         if self._served is not None and self._served.is_up:
             if not restart:
                 raise ChildProcessError("SITL is already running in this process, please use .stop() to kill it")
             self.stop()
-        options = _arguments().parse_known_args(list(initial_args))[0]
+        options = _sitl_options().parse_known_args(list(initial_args))[0]
         if options.instance is not None:
             self.instance = options.instance
-        kind, addresses = self._kind or KINDS.get(options.model or "", "copter"), [self._port()]
-        if _for_program is not None:
-            kind = (self._kind and kind) or _for_program.kind
-            speedup = speedup or options.speedup or _for_program.speedup
+        kind, speedup, addresses = self._kind, speedup or options.speedup, [self._address()]
+        if _vehicle_for_program is not None:  # the new vehicle replaces it; by default with its kind and speed
+            kind = kind or _vehicle_for_program.kind
+            speedup = speedup or _vehicle_for_program.speedup
             addresses += USUAL_ADDRESSES[1:]
-            _for_program.stop()
-            _for_program = None
+            _vehicle_for_program.stop()
+            _vehicle_for_program = None
+        kind = kind or KINDS.get(options.model or "", "copter")
         home = parse_home(options.home) if options.home else HOME
-        self._served = ServedVehicle(kind, addresses, home=home, speedup=speedup or options.speedup or 1.0)
+        self._served = ServedVehicle(kind, addresses, home=home, speedup=speedup or 1.0)
 
     def poll(self) -> int | None:
         """Return None while the vehicle runs, 0 otherwise."""
@@ -181,9 +182,9 @@ class SITL:
 
     def connection_string(self) -> str:
         """Return the address for ``dronekit.connect``."""
-        return self._port().replace("tcpin:", "tcp:")
+        return self._address().replace("tcpin:", "tcp:")
 
-    def _port(self) -> str:
+    def _address(self) -> str:
         return f"tcpin:127.0.0.1:{5760 + 10 * self.instance}"
 
 
@@ -192,7 +193,8 @@ def start_default(lat: float | None = None, lon: float | None = None) -> SITL:
     if (lat is None) != (lon is None):
         raise InvalidArgument("dronekit_sitl.start_default: give both lat and lon, or neither")
     sitl = SITL()
-    sitl.launch([] if lat is None else [f"--home={lat:f},{lon:f},{HOME[2]},353"])
+    heading_deg = 353  # ignored, but SITL's --home has a fourth part
+    sitl.launch([] if lat is None else [f"--home={lat:f},{lon:f},{HOME[2]},{heading_deg}"])
     return sitl
 
 
@@ -209,7 +211,7 @@ def parse_home(text: str) -> tuple[float, float, float]:
     return latitude, longitude, altitude
 
 
-def _arguments() -> argparse.ArgumentParser:
+def _sitl_options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--home", "-O")
     parser.add_argument("--speedup", "-s", type=float)

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+# FIRMWARE_VERSION_TYPE: 255 for a release, otherwise 64 times the index of the release type plus its number.
 STABLE = 255
 RELEASE_TYPES = ("dev", "alpha", "beta", "rc")
-# MAV_AUTOPILOT and MAV_TYPE with a name in DroneKit; for others the text has the number.
+# The values of MAV_AUTOPILOT and MAV_TYPE for which DroneKit has a name.
 AUTOPILOTS = {3: "APM:", 12: "PX4"}
 VEHICLES = {1: "Plane", 2: "Copter", 10: "Rover"}
 
@@ -38,6 +39,7 @@ class Attitude(_Value):
 
 
 class _Place(_Value):
+    # Always None. DroneKit's locations have these attributes for old programs.
     local_frame: Any = None
     global_frame: Any = None
 
@@ -140,20 +142,21 @@ class Wind(_Value):
 class _Named(_Value):
     """A value that equals its name and is hashable."""
 
-    _named_by: str
+    _name_attribute: str
 
     def __eq__(self, other: object) -> bool:
-        name = getattr(self, self._named_by)
-        return bool(name == (getattr(other, self._named_by) if isinstance(other, type(self)) else other))
+        if isinstance(other, type(self)):
+            other = getattr(other, self._name_attribute)
+        return bool(getattr(self, self._name_attribute) == other)
 
     def __hash__(self) -> int:
-        return hash(getattr(self, self._named_by))
+        return hash(getattr(self, self._name_attribute))
 
 
 class VehicleMode(_Named):
     """A flight mode by its ``name``: ``VehicleMode("GUIDED")``. It equals its name, and can be a dict key."""
 
-    _text, _named_by = "VehicleMode:{0.name}", "name"
+    _text, _name_attribute = "VehicleMode:{0.name}", "name"
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -165,7 +168,7 @@ class SystemStatus(_Named):
     It equals its state as a string, and can be a dict key.
     """
 
-    _text, _named_by = "SystemStatus:{0.state}", "state"
+    _text, _name_attribute = "SystemStatus:{0.state}", "state"
 
     def __init__(self, state: str) -> None:
         self.state = state
@@ -239,5 +242,5 @@ class Capabilities:
         self.compass_calibration: bool = bool(bits & 1 << 12)
 
     def __repr__(self) -> str:
-        known = [name for name, value in vars(self).items() if value]
-        return f"Capabilities({', '.join(known)})"
+        supported = [name for name, is_supported in vars(self).items() if is_supported]
+        return f"Capabilities({', '.join(supported)})"

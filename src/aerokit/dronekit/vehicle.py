@@ -73,7 +73,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
     def __init__(self, handler: MAVConnection) -> None:
         super().__init__(handler)
-        self._dk_held: OpenContext[AsyncVehicle] | None = None
+        self._dk_context: OpenContext[AsyncVehicle] | None = None
         self._dk_sync: sync.Vehicle | None = None
         self._dk_initializing = threading.Lock()
         self._message_listeners = MessageListeners(self, handler)
@@ -109,8 +109,9 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         # Imports pymavlink, which programs without missions do not need.
         from aerokit.dronekit.commands import CommandSequence
 
-        made: CommandSequence = self.__dict__.setdefault("_commands", CommandSequence(self))
-        return made
+        # Two threads may get here at once; setdefault gives them the same object.
+        commands: CommandSequence = self.__dict__.setdefault("_commands", CommandSequence(self))
+        return commands
 
     @property
     def commands(self) -> CommandSequence:
@@ -147,12 +148,12 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         Programs can move to this API function by function: ``vehicle.sync.take_off(10)`` returns at altitude. Raises
         APIException before the vehicle is connected.
         """
-        if self._dk_held is None:
+        if self._dk_context is None:
             raise APIException("the vehicle is not connected yet: call initialize()")
         if self._dk_sync is None:
             from aerokit.sync import Vehicle
 
-            self._dk_sync = Vehicle(self._handler.loop, self._dk_held, owns_loop=False)
+            self._dk_sync = Vehicle(self._handler.loop, self._dk_context, owns_loop=False)
         return self._dk_sync
 
     def run(self, function: Callable[..., Awaitable[Any]], /, *args: Any, **kwargs: Any) -> Any:
@@ -220,8 +221,8 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
             self._dk.heartbeat_limit_s = max(heartbeat_timeout or 0.0, 0.0)
             timeout = self._dk.heartbeat_limit_s or CONNECT_TIMEOUT_S
             try:
-                found = _found(self._handler.connection, timeout, weak_callback(self._dk_begin), rate)
-                self._dk_held = self._handler.loop.open_context(found)
+                connected = _connected(self._handler.connection, timeout, weak_callback(self._dk_begin), rate)
+                self._dk_context = self._handler.loop.open_context(connected)
                 self._dk_wait_until_booted(timeout)
                 if rate is not None:
                     self._dk_wait_for_first_values()
@@ -250,6 +251,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return self._handler.master
 
     def _is_mode_available(self, mode_code: int, base_mode: int = 0) -> bool:
+        # The name of an unknown mode ends with its number.
         return not mode_name(self._dk.aio, mode_code).endswith(f" {mode_code}")
 
     def _dk_begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
@@ -259,16 +261,17 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         self._handler.vehicle, self._handler.note_sent = self, aio.note_sent
         self._handler.calls.describe = self._dk_describe
         aio.telemetry.status_text.observe(weak_callback(self._dk_on_status_text), every_arrival=True)
-        first = aio.connection.heartbeats.get((aio.system_id, aio.component_id))
-        if first is not None:
-            self._dk_on_heartbeat(first)
+        # The first heartbeat, by which the vehicle was found, arrived before the handlers were attached.
+        first_heartbeat = aio.connection.heartbeats.get((aio.system_id, aio.component_id))
+        if first_heartbeat is not None:
+            self._dk_on_heartbeat(first_heartbeat)
         self._message_listeners.start()
         core.background(lambda: _request_capabilities(aio))
         core.watch_link()
         for function in core.on_connected:
             function()
 
-    def _dk_on_status_text(self, before: StatusText | None, text: StatusText) -> None:
+    def _dk_on_status_text(self, _: StatusText | None, text: StatusText) -> None:
         level = LEVELS[min(text.severity, len(LEVELS) - 1)]
         if self._autopilot_logger.isEnabledFor(level):
             self._handler.listener_thread.post(self._autopilot_logger.log, level, "%s", text.text.strip())
@@ -277,14 +280,14 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return f"the vehicle is {'armed' if self._armed else 'disarmed'}, in {self._flightmode}"
 
     def _dk_wait_for_first_values(self) -> None:
-        wanted, ready = set[str](FIRST_VALUES), self._dk.ready
+        names, ready = set[str](FIRST_VALUES), self._dk.ready
         now = time.monotonic()
-        end = no_more_at = now + FIRST_VALUES_TIMEOUT_S
-        missing = wanted
-        while (still := wanted - ready.names) and now < min(end, no_more_at):
-            if still < missing:  # also true for values that arrived before this loop
-                missing, no_more_at = still, now + NEXT_VALUE_TIMEOUT_S
-            ready.wait_for_change(wanted, min(end, no_more_at) - now)
+        deadline = next_value_deadline = now + FIRST_VALUES_TIMEOUT_S
+        missing_before = names
+        while (missing := names - ready.names) and now < min(deadline, next_value_deadline):
+            if missing < missing_before:  # another value has arrived, perhaps before this loop
+                missing_before, next_value_deadline = missing, now + NEXT_VALUE_TIMEOUT_S
+            ready.wait_for_change(names, min(deadline, next_value_deadline) - now)
             now = time.monotonic()
 
     def _dk_wait_until_booted(self, timeout: float) -> None:
@@ -297,16 +300,15 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
 
 @asynccontextmanager
-async def _found(
+async def _connected(
     connection: Connection, timeout: float, begin: Callable[..., None], rate: float | None
 ) -> AsyncIterator[AsyncVehicle]:
     """Connect and request streams. Runs on the loop and does not refer to the classic vehicle."""
     async with connect_async(connection, timeout=timeout, rates={}) as aio:
         tasks = BackgroundTasks(connection.fail)
-        hz = None if rate is None else min(rate, MAX_STREAM_RATE_HZ) if rate > 0 else 1.0
         try:
             begin(aio, tasks)
-            with nullcontext() if hz is None else aio.streams(hz):
+            with nullcontext() if rate is None else aio.streams(min(rate, MAX_STREAM_RATE_HZ) if rate > 0 else 1.0):
                 yield aio
         finally:
             await tasks.aclose()

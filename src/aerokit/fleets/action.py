@@ -75,13 +75,13 @@ class FleetAction:
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._orders: dict[str, PolicyOrder] = {}
-        # System id and name of the member that failed first.
-        self._cause: tuple[int, str] | None = None
+        # System id and name of the member to whose failure the policy reacted; None while the others continue.
+        self._failed_first: tuple[int, str] | None = None
         self._order_errors: dict[str, str] = {}
         self._pending_orders = 0
-        self._is_deciding = False
+        self._is_applying_policy = False
         self._finished = asyncio.Event()
-        # Raised by the program's function or by its policy function; `run` raises it at the end.
+        # Error in the program's own function or policy function, which `run` raises at the end.
         self.program_error: Exception | None = None
 
     async def run(self) -> FleetResult:
@@ -91,9 +91,9 @@ class FleetAction:
         tasks = BackgroundTasks(self._on_program_error)
         self._context.actions.append(self)
         try:
-            for number, member in enumerate(self._members):
+            for index, member in enumerate(self._members):
                 tasks.start(
-                    partial(self._run_member, member, number * self._stagger_s),
+                    partial(self._run_member, member, index * self._stagger_s),
                     f"aerokit {self.name} {member.name}",
                 )
             await self._finished.wait()
@@ -126,14 +126,15 @@ class FleetAction:
     def result_so_far(self) -> FleetResult:
         """Return the result of the members that have finished."""
         names = [member.name for member in self._members]
-        in_order = {name: self._outcomes[name] for name in names if name in self._outcomes}
-        return FleetResult(self.name, in_order, failed=self._failed, stopped=self._stopped, skipped=self._skipped)
+        outcomes = {name: self._outcomes[name] for name in names if name in self._outcomes}  # in the members' order
+        return FleetResult(self.name, outcomes, failed=self._failed, stopped=self._stopped, skipped=self._skipped)
 
     def on_member_unavailable(self, member: Member) -> None:
+        """Record that the member has failed because it was lost or taken over."""
         if member not in self._members or member.name in (*self._failed, *self._stopped):
             return
-        kind = HeartbeatTimeout if member.state is MemberState.LOST else OperationRejected
-        self._fail(member, kind(f"{self.name}: {member.name} is {member.status}"))
+        error_class = HeartbeatTimeout if member.state is MemberState.LOST else OperationRejected
+        self._fail(member, error_class(f"{self.name}: {member.name} is {member.status}"))
 
     # --------------------------------------------------------------------------------- one member
 
@@ -153,6 +154,7 @@ class FleetAction:
             if member.name not in self._stopped:
                 self._fail(member, error)
         except asyncio.CancelledError:
+            # This class cancels members that have failed or were stopped; any other cancellation is the caller's.
             if member.name not in self._stopped and member.name not in self._failed:
                 raise
         else:
@@ -175,14 +177,14 @@ class FleetAction:
             return
         self._failed[member.name] = self._outcomes[member.name] = error
         member.record_failure(self.name, error)
-        if self._is_safe or self._cause is not None or self._is_deciding or self._context.is_closed:
+        if self._is_safe or self._failed_first is not None or self._is_applying_policy or self._context.is_closed:
             return
         # Refreshing the other members below may make them fail, too; only the first failure applies the policy.
-        self._is_deciding = True
+        self._is_applying_policy = True
         try:
             self._apply_policy(member, error)
         finally:
-            self._is_deciding = False
+            self._is_applying_policy = False
 
     # ------------------------------------------------------------------------------ other members
 
@@ -200,7 +202,7 @@ class FleetAction:
             orders = dict.fromkeys(failure.others, "hold")
         if not orders:
             return
-        self._cause = (failed.vehicle.system_id, failed.name)
+        self._failed_first = (failed.vehicle.system_id, failed.name)
         self._cancel([failed])
         skipped = {member.name: member.reason for member in others if not member.is_available}
         for member in available:
@@ -212,9 +214,12 @@ class FleetAction:
                 skipped[member.name] = "it is disarmed" if is_disarmed else "this program does not fly it"
             else:
                 self._orders[member.name] = order
+            # A member that has finished and gets no order keeps its outcome.
             if member.name in self._orders or member.name not in self._outcomes:
                 self._set_stopped(member, failed, self._orders.get(member.name))
-        self._context.publish(PolicyApplied(self._context.now(), *self._cause, self.name, dict(self._orders), skipped))
+        self._context.publish(
+            PolicyApplied(self._context.now(), *self._failed_first, self.name, dict(self._orders), skipped)
+        )
         self._pending_orders = len(self._orders)
         for member in available:
             if member.name in self._orders:
@@ -222,15 +227,15 @@ class FleetAction:
                     partial(self._send_order, member, self._orders[member.name]),
                     f"aerokit policy {member.name}",
                 )
-        # The policy's orders come first. They supersede the orders of the running actions, so a cancelled action sends
-        # no hold.
+        # Cancelled after the policy's orders have begun: they supersede the orders of the running actions, and a
+        # cancelled action whose order is superseded sends no hold.
         asyncio.get_running_loop().call_soon(self._cancel, [member for member in available if member.name in orders])
         if not self._orders:
             self._publish_completed()
 
     def _set_stopped(self, member: Member, failed: Member, order: PolicyOrder | None) -> None:
-        ordered = f"; the policy ordered {member.name} to {order}" if order else ""
-        error = OperationRejected(f"{self.name}: stopped because {failed.name} failed{ordered}")
+        order_text = f"; the policy ordered {member.name} to {order}" if order else ""
+        error = OperationRejected(f"{self.name}: stopped because {failed.name} failed{order_text}")
         self._stopped[member.name] = self._outcomes[member.name] = error
 
     def _cancel(self, members: Iterable[Member]) -> None:
@@ -257,9 +262,11 @@ class FleetAction:
                 self._check_finished()
 
     def _publish_completed(self) -> None:
-        assert self._cause is not None
+        assert self._failed_first is not None
         self._context.publish(
-            PolicyCompleted(self._context.now(), *self._cause, self.name, dict(self._orders), dict(self._order_errors))
+            PolicyCompleted(
+                self._context.now(), *self._failed_first, self.name, dict(self._orders), dict(self._order_errors)
+            )
         )
 
     def _hold_finished_members(self) -> None:
@@ -334,15 +341,15 @@ class FleetContext:
         Raises:
             InvalidArgument: a pattern matches no member.
         """
-        found: dict[str, None] = {}
+        matching: dict[str, None] = {}  # an ordered set
         for pattern in patterns:
             names = [name for name in self.members if name == pattern or fnmatchcase(name, pattern)]
             if not names:
                 raise InvalidArgument(
                     f"no fleet member matches {short_repr(pattern)}; members: {', '.join(self.members) or 'none'}"
                 )
-            found.update(dict.fromkeys(names))
-        return list(found)
+            matching.update(dict.fromkeys(names))
+        return list(matching)
 
     def _on_member_unavailable(self, member: Member) -> None:
         for action in tuple(self.actions):

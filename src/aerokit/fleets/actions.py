@@ -5,6 +5,7 @@ https://mavlink.io/en/messages/common.html#GPS_RTCM_DATA
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Awaitable, Callable
 from operator import attrgetter
 from typing import Any
@@ -48,15 +49,16 @@ class Actions(SelectionBase):
         if isinstance(action, str):
             for member in self:
                 _method(member, action)  # an unknown name fails before any member has started
-            name = method = action
+            name = method_name = action
 
             async def execute(member: Member) -> Any:
-                return await _method(member, method)(*arguments, **options)
+                return await _method(member, method_name)(*arguments, **options)
 
         else:
             if arguments or options:
                 raise InvalidArgument("do: arguments and options are allowed only for an action given by name")
-            execute, name = action, getattr(action, "__name__", "action")  # type: ignore[assignment]
+            execute = action  # type: ignore[assignment]
+            name = getattr(action, "__name__", "action")
         return await self._run(name, execute, timeout=timeout, stagger_s=stagger_s)
 
     async def wait_ready(self, *, timeout: float = 90.0) -> FleetResult:
@@ -161,10 +163,10 @@ class Actions(SelectionBase):
             FleetError: the condition did not become true for a member, which counts as failed in this action.
         """
 
-        async def until(member: Member) -> None:
+        async def wait_for_condition(member: Member) -> None:
             vehicle = member.vehicle
             cells = (vehicle.mode, vehicle.armed, vehicle.position, vehicle.landed_state)
-            with vehicle._session.streaming("position"), ChangeSignal(vehicle._session, *cells) as changes:
+            with vehicle._session.streaming("position"), ChangeSignal(vehicle._session, *cells) as change_signal:
                 while not condition(member):
                     vehicle.connection.raise_if_ended()
                     if vehicle.connection.now() >= deadline:
@@ -172,10 +174,10 @@ class Actions(SelectionBase):
                         raise OperationTimeout(
                             f"{description}: not reached within {timeout:g} s by {', '.join(missing)}"
                         )
-                    await changes.next(POLL_INTERVAL_S)
+                    await change_signal.next(POLL_INTERVAL_S)
 
         deadline = self._context.now() + timeout
-        result = await self._run(description, until)
+        result = await self._run(description, wait_for_condition)
         result.raise_for_errors()
         return result
 
@@ -194,20 +196,21 @@ class Actions(SelectionBase):
         """
 
         def is_at_altitude(member: Member) -> bool:
-            here = member.vehicle.position.latest
-            above = None if here is None else here.altitude_relative_m
-            return above is not None and abs(above - altitude_m) <= tolerance_m
+            position = member.vehicle.position.latest
+            if position is None or position.altitude_relative_m is None:
+                return False
+            return abs(position.altitude_relative_m - altitude_m) <= tolerance_m
 
         return await self.barrier(is_at_altitude, timeout=timeout, description="wait_at_altitude")
 
 
 def _method(member: Member, name: str) -> Callable[..., Awaitable[Any]]:
-    found: Any = None
-    if not any(part.startswith("_") for part in name.split(".")):
-        try:
-            found = attrgetter(name)(member.vehicle)
-        except AttributeError:
-            found = None
-    if not callable(found):
+    """Return a public method of the vehicle or of a part of it (``"mission.resume"``)."""
+    method: Any = None
+    is_public = not any(part.startswith("_") for part in name.split("."))
+    if is_public:
+        with contextlib.suppress(AttributeError):
+            method = attrgetter(name)(member.vehicle)
+    if not callable(method):
         raise InvalidArgument(f"action = {short_repr(name)} is not allowed: a method of Vehicle, such as 'land'")
-    return found  # type: ignore[no-any-return]
+    return method  # type: ignore[no-any-return]

@@ -48,14 +48,15 @@ def altitude_amsl(member: Member, target: Position) -> float:
     """
     if target.altitude_amsl_m is not None:
         return target.altitude_amsl_m
-    here = position_of(member)
-    if here.altitude_amsl_m is None:
+    position = position_of(member)
+    if position.altitude_amsl_m is None:
         raise ValueUnknownError(f"{member.name} does not report its altitude above sea level")
     if target.altitude_relative_m is None:
-        return here.altitude_amsl_m
-    if here.altitude_relative_m is None:
+        return position.altitude_amsl_m
+    if position.altitude_relative_m is None:
         raise ValueUnknownError(f"{member.name} does not report its altitude above home")
-    return here.altitude_amsl_m - here.altitude_relative_m + target.altitude_relative_m
+    home_altitude_amsl_m = position.altitude_amsl_m - position.altitude_relative_m
+    return home_altitude_amsl_m + target.altitude_relative_m
 
 
 class LocalOrigin:
@@ -74,8 +75,9 @@ class LocalOrigin:
         return north, east, altitude_amsl_m
 
     def to_position(self, point: LocalPoint) -> Position:
-        there = self._origin.offset(north_m=point[0], east_m=point[1])
-        return Position(there.latitude_deg, there.longitude_deg, altitude_amsl_m=point[2])
+        north_m, east_m, altitude_amsl_m = point
+        position = self._origin.offset(north_m=north_m, east_m=east_m)
+        return Position(position.latitude_deg, position.longitude_deg, altitude_amsl_m=altitude_amsl_m)
 
     def of_member(self, member: Member) -> LocalPoint:
         """Return the current position of a member.
@@ -83,8 +85,8 @@ class LocalOrigin:
         Raises:
             ValueUnknownError, StaleValueError: the position is unknown.
         """
-        here = position_of(member)
-        return self.to_local(here, altitude_amsl(member, here))
+        position = position_of(member)
+        return self.to_local(position, altitude_amsl(member, position))
 
 
 class DistanceMonitor:
@@ -104,38 +106,39 @@ class DistanceMonitor:
 
     def check(self) -> None:
         points = to_local_points(self._flying_positions())
-        pairs = pairs_within(points, RESET_FACTOR * self._min_distance_m)
-        self._reported &= {(one, other) for one, other, _ in pairs}
-        for one, other, distance_m in pairs:
-            if distance_m < self._min_distance_m and (one, other) not in self._reported:
-                self._reported.add((one, other))
-                self._on_too_close(self._context.members[one], self._context.members[other], distance_m)
+        near_pairs = pairs_within(points, RESET_FACTOR * self._min_distance_m)
+        self._reported &= {(first, second) for first, second, _ in near_pairs}
+        for first, second, distance_m in near_pairs:
+            if distance_m < self._min_distance_m and (first, second) not in self._reported:
+                self._reported.add((first, second))
+                self._on_too_close(self._context.members[first], self._context.members[second], distance_m)
 
     def _flying_positions(self) -> dict[str, tuple[float, float, float]]:
         """Return latitude, longitude and altitude of all members in the air, whoever controls them."""
         positions: dict[str, tuple[float, float, float]] = {}
         for member in self._context.members.values():
             vehicle = member.vehicle
-            here = vehicle.position.latest
-            if here is None or here.altitude_amsl_m is None or vehicle.position.age > POSITION_MAX_AGE_S:
+            position = vehicle.position.latest
+            if position is None or position.altitude_amsl_m is None or vehicle.position.age > POSITION_MAX_AGE_S:
                 continue
             if vehicle.is_armed and vehicle.landed_state.latest != MavLandedState.ON_GROUND:
-                positions[member.name] = here.latitude_deg, here.longitude_deg, here.altitude_amsl_m
+                positions[member.name] = position.latitude_deg, position.longitude_deg, position.altitude_amsl_m
         return positions
 
-    def _on_too_close(self, one: Member, other: Member, distance_m: float) -> None:
-        for member in (one, other):
+    def _on_too_close(self, first: Member, second: Member, distance_m: float) -> None:
+        pair = (first, second)
+        for member in pair:
             member.refresh()
-        ordered = [member for member in (one, other) if self._holds and member.is_flown_by_program]
-        for member in ordered:
+        holding = [member for member in pair if self._holds and member.is_flown_by_program]
+        for member in holding:
             self._context.hold(member, f"aerokit too close {member.name}")
         self._context.publish(
             TooClose(
                 self._context.now(),
-                one.vehicle.system_id,
-                one.name,
-                other.name,
+                first.vehicle.system_id,
+                first.name,
+                second.name,
                 distance_m,
-                tuple(member.name for member in ordered),
+                tuple(member.name for member in holding),
             )
         )

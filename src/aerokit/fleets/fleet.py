@@ -36,8 +36,8 @@ class Selection(Actions, Missions, Formations, Shows):
     """
 
     def __getitem__(self, pattern: str) -> Selection:
-        found = self._context.matching(pattern)
-        return Selection(self._context, tuple(name for name in found if name in self.members))
+        matching = self._context.matching(pattern)
+        return Selection(self._context, tuple(name for name in matching if name in self.members))
 
     def group(self, name: str) -> Selection:
         """Select the members of one group.
@@ -56,12 +56,12 @@ class Selection(Actions, Missions, Formations, Shows):
         return self._select("role", name)
 
     def _select(self, attribute: str, name: str) -> Selection:
-        found = tuple(member.name for member in self if getattr(member, attribute) == name)
-        if not found:
-            values = dict.fromkeys(getattr(member, attribute) for member in self if getattr(member, attribute))
-            known = f"the {attribute}s are {', '.join(values)}" if values else f"there are no {attribute}s"
-            raise InvalidArgument(f"{attribute} = {short_repr(name)} is not allowed: {known}")
-        return Selection(self._context, found)
+        selected = tuple(member.name for member in self if getattr(member, attribute) == name)
+        if not selected:
+            existing = dict.fromkeys(getattr(member, attribute) for member in self if getattr(member, attribute))
+            allowed = f"the {attribute}s are {', '.join(existing)}" if existing else f"there are no {attribute}s"
+            raise InvalidArgument(f"{attribute} = {short_repr(name)} is not allowed: {allowed}")
+        return Selection(self._context, selected)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {len(self)}: {', '.join(self.members)}>"
@@ -141,15 +141,17 @@ class Fleet(Selection):
         Raises:
             InvalidArgument: a type is not an event.
         """
-        wanted: tuple[type[Event], ...] = types or (FleetEvent, Event)
+        event_types: tuple[type[Event], ...] = types or (FleetEvent, Event)
 
         def attach(sink: Sink) -> list[Detach]:
             detach: list[Detach] = []
-            for kind in wanted:
-                if issubclass(kind, FleetEvent):
-                    detach.append(self._context.bus.attach_event(kind, sink))
-                if kind is MemberEvent or not issubclass(kind, FleetEvent):
-                    detach += self._attach_member_events(Event if kind is MemberEvent else kind, sink)
+            for event_type in event_types:
+                if event_type is MemberEvent:
+                    detach += self._attach_member_events(Event, sink)
+                elif not issubclass(event_type, FleetEvent):
+                    detach += self._attach_member_events(event_type, sink)
+                else:
+                    detach.append(self._context.bus.attach_event(event_type, sink))
             return detach
 
         return Subscription(attach, capacity=capacity, overflow=overflow)
@@ -174,7 +176,7 @@ class Fleet(Selection):
             InvalidArgument: a name is unknown, or none is given.
         """
         for member in self:
-            for name in names or ("",):
+            for name in names or ("",):  # without names, "" raises
                 if name not in member.vehicle.telemetry.cells:
                     raise InvalidArgument(f"names: {short_repr(name)} is not a state; docs/states.md lists them")
 
@@ -192,15 +194,16 @@ class Fleet(Selection):
 
         return Subscription(attach, capacity=capacity, overflow=overflow)
 
-    def _attach_member_events(self, kind: type[Event], sink: Sink) -> list[Detach]:
+    def _attach_member_events(self, event_type: type[Event], sink: Sink) -> list[Detach]:
         names = {(member.network, member.vehicle.system_id): member.name for member in self._context.members.values()}
 
         def publish(network: str, event: Event) -> None:
-            member = names.get((network, event.system_id)) if event.system_id else network
-            if member is not None:
-                sink(MemberEvent(event.at, event.system_id, member, event))
+            is_about_link = event.system_id == 0
+            name = network if is_about_link else names.get((network, event.system_id))
+            if name is not None:
+                sink(MemberEvent(event.at, event.system_id, name, event))
 
         return [
-            connection.bus.attach_event(kind, partial(publish, network))
+            connection.bus.attach_event(event_type, partial(publish, network))
             for network, connection in self._context.networks.items()
         ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Mapping
+from itertools import combinations
 from typing import TYPE_CHECKING, Literal
 
 import anyio
@@ -81,11 +82,12 @@ class Formation(Snapshot):
     @classmethod
     def wedge(cls, names: Sequence[str], spacing_m: float, *, frame: Literal["north", "heading"] = "heading") -> Self:
         """Make a V behind the leader, alternating left and right; each row is ``spacing_m`` farther back and out."""
-        places = {
-            name: Offset(-spacing_m * (number // 2 + 1), spacing_m * (number // 2 + 1) * (1 if number % 2 else -1))
-            for number, name in enumerate(names)
-        }
-        return cls(places, frame)
+        offsets: dict[str, Offset] = {}
+        for index, name in enumerate(names):
+            row = index // 2 + 1
+            side = 1 if index % 2 else -1  # right or left
+            offsets[name] = Offset(-spacing_m * row, spacing_m * row * side)
+        return cls(offsets, frame)
 
     def offset_of(self, name: str, heading_deg: float | None) -> Offset:
         """Return the offset of a member as metres north, east and up of the leader.
@@ -103,8 +105,8 @@ class Formation(Snapshot):
     def min_distance_m(self) -> float:
         """Return the smallest distance between any two places, including the leader's."""
         places = [(offset.north_m, offset.east_m, offset.up_m) for offset in (Offset(), *self.offsets.values())]
-        pairs = (math.dist(one, other) for number, one in enumerate(places) for other in places[:number])
-        return min(pairs, default=math.inf)
+        distances = (math.dist(first, second) for first, second in combinations(places, 2))
+        return min(distances, default=math.inf)
 
     def _check(self) -> None:
         object.__setattr__(self, "offsets", dict(self.offsets))
@@ -116,8 +118,8 @@ class Formation(Snapshot):
 
 
 def follow_velocity(
-    to_go: tuple[float, float, float],
-    of_target: tuple[float, float, float],
+    distance_vector: tuple[float, float, float],
+    target_velocity: tuple[float, float, float],
     *,
     gain: float,
     max_speed_m_s: float,
@@ -125,12 +127,12 @@ def follow_velocity(
     """Return the velocity to reach a moving target: the target's velocity plus ``gain`` times the distance vector.
 
     Args:
-        to_go: distance vector to the target in metres.
-        of_target: velocity of the target in m/s.
+        distance_vector: distance vector to the target in metres.
+        target_velocity: velocity of the target in m/s.
         gain: 1/s.
         max_speed_m_s: limit of the resulting speed.
     """
-    velocity = [v + gain * d for v, d in zip(of_target, to_go, strict=True)]
+    velocity = [speed + gain * distance for speed, distance in zip(target_velocity, distance_vector, strict=True)]
     speed = math.hypot(*velocity)
     scale = 1.0 if speed <= max_speed_m_s else max_speed_m_s / speed
     return velocity[0] * scale, velocity[1] * scale, velocity[2] * scale
@@ -157,14 +159,14 @@ class Following:
         self._context, self._leader, self._followers, self._formation = context, leader, followers, formation
         self._period_s, self._rate_hz, self._max_speed_m_s = 1 / rate_hz, rate_hz, max_speed_m_s
         self._tasks = BackgroundTasks(self._on_error)
-        self._ended = asyncio.Event()
-        self._was_entered = self._was_raised = False
+        self._stopped = asyncio.Event()
+        self._was_entered = self._has_raised = False
         self._reason = ""
 
     @property
     def is_running(self) -> bool:
         """True while the followers follow."""
-        return self._was_entered and not self._ended.is_set()
+        return self._was_entered and not self._stopped.is_set()
 
     @property
     def reason(self) -> str:
@@ -175,13 +177,13 @@ class Following:
         """Return the distance of a follower from its place in metres; infinite if unknown."""
         member = next((follower for follower in self._followers if follower.name == name), None)
         try:
-            return math.inf if member is None else math.hypot(*self._to_go(member))
+            return math.inf if member is None else math.hypot(*self._vector_to_place(member))
         except (ValueUnknownError, OperationRejected):
             return math.inf
 
     async def wait_stopped(self) -> str:
         """Wait for an early stop and return its reason; an empty string after the block has ended."""
-        await self._ended.wait()
+        await self._stopped.wait()
         return self._reason
 
     def raise_if_stopped(self) -> None:
@@ -191,7 +193,7 @@ class Following:
             SetpointStreamStopped: following has stopped; the text has the reason.
         """
         if self._reason:
-            self._was_raised = True
+            self._has_raised = True
             raise SetpointStreamStopped(f"following has stopped: {self._reason}")
 
     async def __aenter__(self) -> Self:
@@ -199,14 +201,14 @@ class Following:
             raise BusyError("a Following can be entered only once; call following() again")
         self._was_entered = True
         self._check_leader()
-        self._action = FleetAction(self._context, "following", self._followers, self._fly)
+        self._action = FleetAction(self._context, "following", self._followers, self._fly_follower)
         self._tasks.start(self._follow, "aerokit following")
         return self
 
     async def __aexit__(self, exc_type: object, exc: object, traceback: object) -> None:
-        self._ended.set()
+        self._stopped.set()
         await self._tasks.aclose()
-        if exc is None and not self._was_raised:
+        if exc is None and not self._has_raised:
             self.raise_if_stopped()
 
     # --------------------------------------------------------------------------------------- private
@@ -215,17 +217,16 @@ class Following:
         await self._action.run()
         self._stop_if_no_followers()
 
-    async def _fly(self, member: Member) -> None:
+    async def _fly_follower(self, member: Member) -> None:
         try:
             async with member.vehicle.guided.velocity(rate_hz=self._rate_hz) as stream:
                 while not self._stop_if_leader_lost():
                     stream.set(self._setpoint(member))
                     await anyio.sleep(self._period_s)
-                # Wait for the cancellation by `_stop_if_leader_lost`: leaving the stream then makes the vehicle hold.
-                await asyncio.Event().wait()
+                await asyncio.Event().wait()  # until cancelled, which makes the vehicle hold
         finally:
-            # Deferred until the action has recorded the failure. The end of the action would be too late, because the
-            # policy may land the other members first.
+            # Deferred until the action has recorded this follower's failure. The end of the action would be too late,
+            # because it also waits until the policy's orders, such as landing the others, are done.
             asyncio.get_running_loop().call_soon(self._stop_if_no_followers)
 
     def _stop_if_no_followers(self) -> None:
@@ -236,52 +237,60 @@ class Following:
             self._stop(reason or "no follower is left", self._action.orders, {**result.skipped, **failed})
 
     def _stop_if_leader_lost(self) -> bool:
-        if not self._ended.is_set():
+        """Stop if the leader is unavailable or its position is unknown; return True once following has stopped."""
+        if not self._stopped.is_set():
             try:
                 self._check_leader()
                 position_of(self._leader, LEADER_MAX_AGE_S)
             except (OperationRejected, ValueUnknownError) as error:
-                following = self._action.active  # these members hold, because their streams are cancelled below
+                holding = self._action.active  # the end of their streams, below, makes them hold
                 skipped = {
                     member.name: member.status if member.reason else "it does not follow"
                     for member in self._followers
-                    if member.name not in following
+                    if member.name not in holding
                 }
-                self._stop(str(error), dict.fromkeys(following, "hold"), skipped)
+                self._stop(str(error), dict.fromkeys(holding, "hold"), skipped)
                 self._tasks.cancel()
-        return self._ended.is_set()
+        return self._stopped.is_set()
 
     def _setpoint(self, member: Member) -> VelocitySetpoint:
-        moving = self._leader.vehicle.velocity.latest
-        target = (0.0, 0.0, 0.0) if moving is None else (moving.north_m_s, moving.east_m_s, -moving.down_m_s)
+        velocity, leader_velocity = self._leader.vehicle.velocity.latest, (0.0, 0.0, 0.0)
+        if velocity is not None:
+            leader_velocity = velocity.north_m_s, velocity.east_m_s, -velocity.down_m_s
         north, east, up = follow_velocity(
-            self._to_go(member), target, gain=FOLLOW_GAIN, max_speed_m_s=self._max_speed_m_s
+            self._vector_to_place(member), leader_velocity, gain=FOLLOW_GAIN, max_speed_m_s=self._max_speed_m_s
         )
         return VelocitySetpoint(north, east, -up)
 
-    def _to_go(self, member: Member) -> tuple[float, float, float]:
+    def _vector_to_place(self, member: Member) -> tuple[float, float, float]:
         """Return metres north, east and up to the member's place, with both positions extrapolated to now."""
         leader, vehicle = self._leader.vehicle, member.vehicle
-        there, here = position_of(self._leader, LEADER_MAX_AGE_S), position_of(member, LEADER_MAX_AGE_S)
+        leader_position = position_of(self._leader, LEADER_MAX_AGE_S)
+        position = position_of(member, LEADER_MAX_AGE_S)
         points = to_local_points(
             {
-                "there": (there.latitude_deg, there.longitude_deg, altitude_amsl(self._leader, there)),
-                "here": (here.latitude_deg, here.longitude_deg, altitude_amsl(member, here)),
+                "leader": (
+                    leader_position.latitude_deg,
+                    leader_position.longitude_deg,
+                    altitude_amsl(self._leader, leader_position),
+                ),
+                "member": (position.latitude_deg, position.longitude_deg, altitude_amsl(member, position)),
             }
         )
         offset = self._formation.offset_of(member.name, leader.heading_deg.latest)
-        to_go = [
-            points["there"][i] - points["here"][i] + metres
+        north, east, up = (
+            points["leader"][i] - points["member"][i] + metres
             for i, metres in enumerate((offset.north_m, offset.east_m, offset.up_m))
-        ]
-        for source, sign in ((leader, 1.0), (vehicle, -1.0)):
-            moving = source.velocity.latest
-            if moving is not None:
-                age = sign * source.position.age
-                to_go[0] += age * moving.north_m_s
-                to_go[1] += age * moving.east_m_s
-                to_go[2] -= age * moving.down_m_s
-        return to_go[0], to_go[1], to_go[2]
+        )
+        # Add the leader's way since its position was measured, and subtract the member's.
+        for moving_vehicle, sign in ((leader, 1.0), (vehicle, -1.0)):
+            velocity = moving_vehicle.velocity.latest
+            if velocity is not None:
+                signed_age = sign * moving_vehicle.position.age
+                north += signed_age * velocity.north_m_s
+                east += signed_age * velocity.east_m_s
+                up -= signed_age * velocity.down_m_s
+        return north, east, up
 
     def _check_leader(self) -> None:
         self._leader.refresh()
@@ -289,10 +298,10 @@ class Following:
             raise OperationRejected(f"the leader {self._leader.name} is {self._leader.status}")
 
     def _stop(self, reason: str, orders: Mapping[str, str], skipped: Mapping[str, str]) -> None:
-        if self._ended.is_set():
+        if self._stopped.is_set():
             return
         self._reason = reason
-        self._ended.set()
+        self._stopped.set()
         leader = self._leader
         event = FollowingStopped(
             self._context.now(), leader.vehicle.system_id, leader.name, reason, dict(orders), dict(skipped)
@@ -330,18 +339,15 @@ class Formations(Travel):
             ValueUnknownError: the position of the leader or of a follower is unknown.
         """
         member, followers = self._leader_and_followers(formation, leader)
-        here, heading = position_of(member), member.vehicle.heading_deg.latest
+        leader_position, heading = position_of(member), member.vehicle.heading_deg.latest
         targets: dict[str, Position] = {}
         for follower in followers:
             offset = formation.offset_of(follower.name, heading)
-            there = here.offset(north_m=offset.north_m, east_m=offset.east_m, up_m=offset.up_m)
-            # Targets are above sea level, because the homes of followers may be at other altitudes than the leader's
-            # home.
-            targets[follower.name] = (
-                there
-                if there.altitude_amsl_m is None
-                else Position(there.latitude_deg, there.longitude_deg, altitude_amsl_m=there.altitude_amsl_m)
-            )
+            target = leader_position.offset(north_m=offset.north_m, east_m=offset.east_m, up_m=offset.up_m)
+            if target.altitude_amsl_m is not None:
+                # Only above sea level: the homes of followers may be at other altitudes than the leader's home.
+                target = Position(target.latitude_deg, target.longitude_deg, altitude_amsl_m=target.altitude_amsl_m)
+            targets[follower.name] = target
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
         return await self._travel("form", targets, speed_m_s, timeout)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from aerokit.events import VehicleRecovered, VehicleSilent
 from aerokit.fleets.events import MemberBack, MemberFailed, MemberLost, MemberReclaimed, MemberTakenOver
 from aerokit.mavlink.enums import MavState
-from aerokit.vehicle.commanding.order import FAILSAFE_STATES, is_worse
+from aerokit.vehicle.commanding.order import FAILSAFE_STATES, is_worse_failsafe
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -55,8 +55,9 @@ class Member:
         self.reason: str = ""
         """The cause of the state; empty while it is ACTIVE."""
         self._lost_at = 0.0
+        # The vehicle's newest order and its mode at the time of `reclaim`; no takeover while neither has changed.
         self._control_when_reclaimed: tuple[object, object] | None = None
-        # MAV_STATE at the time of `reclaim`. If this is a failsafe, it does not count as a takeover.
+        # MAV_STATE at the time of `reclaim`. A failsafe that was active then does not count as a takeover.
         self._ignored_failsafe: int | None = None
         self._detach: list[Detach] = []
         self._publish: Callable[[FleetEvent], None] = lambda _: None
@@ -88,12 +89,11 @@ class Member:
         vehicle, bus = self.vehicle, self.vehicle.connection.bus
         self._detach = [
             bus.attach_event(VehicleSilent, self._on_silent),
-            bus.attach_event(VehicleRecovered, self._on_back),
+            bus.attach_event(VehicleRecovered, self._on_recovered),
             vehicle.mode.observe(self._refresh_soon),
-            # every_arrival: CURRENT_MODE may already have reported the mode, but the HEARTBEAT reports more than the
-            # mode.
+            # On every HEARTBEAT, because it reports the state too, which may change while mode and arming do not.
             vehicle.armed.observe(self._refresh_soon, every_arrival=True),
-            vehicle.connection.on_end(self._on_end),
+            vehicle.connection.on_end(self._on_connection_end),
         ]
         if vehicle.is_silent:
             self._set_lost(vehicle.describe_link())
@@ -117,13 +117,13 @@ class Member:
         """Set the state to FAILED, unless the member is lost or taken over, and publish :class:`MemberFailed`."""
         self.refresh()
         if self.is_available:
-            self._change(MemberState.FAILED, str(error))
-        self._publish(MemberFailed(*self._when(), action, str(error)))
+            self._set_state(MemberState.FAILED, str(error))
+        self._publish(MemberFailed(*self._event_fields(), action, str(error)))
 
     def record_success(self) -> None:
         """Set the state back to ACTIVE after FAILED."""
         if self.state is MemberState.FAILED:
-            self._change(MemberState.ACTIVE, "")
+            self._set_state(MemberState.ACTIVE, "")
 
     def reclaim(self) -> None:
         """Make the member available again. The takeover or failsafe that is active now no longer counts."""
@@ -132,14 +132,14 @@ class Member:
         self.vehicle._arbiter.clear_failsafe()
         if self.vehicle.is_silent:
             self._lost_at = self.vehicle.connection.now()
-            self._change(MemberState.LOST, self.vehicle.describe_link())
+            self._set_state(MemberState.LOST, self.vehicle.describe_link())
         elif self.state is not MemberState.ACTIVE:
-            self._change(MemberState.ACTIVE, "")
-            self._publish(MemberReclaimed(*self._when()))
+            self._set_state(MemberState.ACTIVE, "")
+            self._publish(MemberReclaimed(*self._event_fields()))
 
     def release(self, reason: str) -> None:
         """Set the state to RELEASED."""
-        self._change(MemberState.RELEASED, reason)
+        self._set_state(MemberState.RELEASED, reason)
 
     # --------------------------------------------------------------------------------- private
 
@@ -150,56 +150,62 @@ class Member:
         state = vehicle.system_status.latest
         if state not in FAILSAFE_STATES:
             self._ignored_failsafe = None
-        elif state is not None and is_worse(state, self._ignored_failsafe):
+        elif state is not None and is_worse_failsafe(state, self._ignored_failsafe):
             return f"it is in a failsafe (MAV_STATE {MavState(state).name})"
-        has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.explains_mode
-        if has_ended_mission or self._current_control() == self._control_when_reclaimed:
+        uses_missions = "mission" in vars(vehicle)  # the attribute is created at its first use
+        if uses_missions and vehicle.mission.explains_mode:
             return ""
-        armed_elsewhere = vehicle.is_armed and vehicle._arbiter.current is None
-        return vehicle.taken_over or ("this program did not arm it" if armed_elsewhere else "")
+        if self._current_control() == self._control_when_reclaimed:
+            return ""
+        if vehicle.taken_over:
+            return vehicle.taken_over
+        has_no_order = vehicle._arbiter.current is None
+        return "this program did not arm it" if vehicle.is_armed and has_no_order else ""
 
     def _current_control(self) -> tuple[object, object]:
+        """Return the newest order and the mode."""
         return self.vehicle._arbiter.newest, self.vehicle.mode.latest
 
     def _refresh_soon(self, *_: object) -> None:
-        # Deferred until the whole HEARTBEAT is read, because it reports disarming and a mode change together after a
-        # landing.
+        # Deferred until the whole HEARTBEAT is processed: after a landing it reports disarming together with a mode
+        # change, which is no takeover then.
         asyncio.get_running_loop().call_soon(self.refresh)
 
     def _on_silent(self, event: VehicleSilent) -> None:
         if event.system_id == self.vehicle.system_id:
             self._set_lost(f"no heartbeat for {event.silent_for_s:.1f} s")
 
-    def _on_end(self, error: Exception) -> None:
+    def _on_connection_end(self, error: Exception) -> None:
         self._set_lost(str(error))
 
-    def _on_back(self, event: VehicleRecovered) -> None:
+    def _on_recovered(self, event: VehicleRecovered) -> None:
         if event.system_id == self.vehicle.system_id:  # its HEARTBEAT is still being processed
-            asyncio.get_running_loop().call_soon(self._set_back)
+            asyncio.get_running_loop().call_soon(self._set_active_again)
 
     def _set_lost(self, reason: str) -> None:
         if not self.is_available:
             return
         self._lost_at = self.vehicle.connection.now()
-        self._change(MemberState.LOST, reason)
-        self._publish(MemberLost(*self._when(), reason))
+        self._set_state(MemberState.LOST, reason)
+        self._publish(MemberLost(*self._event_fields(), reason))
         self._on_unavailable(self)
 
-    def _set_back(self) -> None:
+    def _set_active_again(self) -> None:
         if self.state is not MemberState.LOST or not self._detach:
             return
         if reason := self._takeover_reason():
             self._set_taken_over(reason)
         else:
-            self._change(MemberState.ACTIVE, "")
-            self._publish(MemberBack(*self._when(), self.vehicle.connection.now() - self._lost_at))
+            self._set_state(MemberState.ACTIVE, "")
+            self._publish(MemberBack(*self._event_fields(), self.vehicle.connection.now() - self._lost_at))
 
     def _set_taken_over(self, reason: str) -> None:
-        self._change(MemberState.TAKEN_OVER, reason)
-        self._publish(MemberTakenOver(*self._when(), reason))
+        self._set_state(MemberState.TAKEN_OVER, reason)
+        self._publish(MemberTakenOver(*self._event_fields(), reason))
 
-    def _change(self, state: MemberState, reason: str) -> None:
+    def _set_state(self, state: MemberState, reason: str) -> None:
         self.state, self.reason = state, reason
 
-    def _when(self) -> tuple[float, int, str]:
+    def _event_fields(self) -> tuple[float, int, str]:
+        """Return the first fields of a FleetEvent: time, system id and name."""
         return self.vehicle.connection.now(), self.vehicle.system_id, self.name

@@ -41,7 +41,7 @@ TooCloseAction = Literal["hold", "report"]
 """Reaction to two members that come too close to each other in flight."""
 Source = str | Link | Connection | Vehicle
 
-DISCOVERY_S = 2.5  # time for two heartbeats at 1 Hz
+DISCOVERY_S = 2.5  # long enough for two heartbeats at 1 Hz, in case one is lost
 WAIT_WARNING_S = 5.0
 
 
@@ -91,25 +91,25 @@ async def fleet(
     """
     rules = PolicyRules(on_error, on_error_by_group or {})
     if min_distance_m is not None and not 0 < min_distance_m < 10_000:
-        raise InvalidArgument(f"min_distance_m = {min_distance_m!r} is not allowed: above 0 to 10,000 metres")
+        raise InvalidArgument(f"min_distance_m = {min_distance_m!r} is not allowed: above 0 and below 10,000 metres")
     if on_too_close not in ("hold", "report"):
         raise InvalidArgument(f"on_too_close = {on_too_close!r} is not allowed: 'hold' or 'report'")
     unknown = [group for group in on_error_by_group or {} if group and group not in (groups or {})]
     if unknown:
-        known = f"the groups are {', '.join(groups)}" if groups else "there are no groups"
-        raise InvalidArgument(f"on_error_by_group = {short_repr(unknown[0])} is not allowed: {known}")
+        allowed = f"the groups are {', '.join(groups)}" if groups else "there are no groups"
+        raise InvalidArgument(f"on_error_by_group = {short_repr(unknown[0])} is not allowed: {allowed}")
     if count is not None and count < 1:
         raise InvalidArgument(f"count = {count} is not allowed: 1 or more, or None")
-    named = _named_sources(sources)
+    sources_by_name = _named_sources(sources)
     async with AsyncExitStack() as stack:
         networks: dict[str, Connection] = {}
-        for name, source in named.items():
+        for name, source in sources_by_name.items():
             if isinstance(source, (str, Link)):
                 networks[name] = await stack.enter_async_context(open_connection(source))
             elif isinstance(source, Connection):
                 networks[name] = source
-        members = _members_of_vehicles(named, networks)
-        searched = [name for name, source in named.items() if not isinstance(source, Vehicle)]
+        members = _members_of_vehicles(sources_by_name, networks)
+        searched = [name for name, source in sources_by_name.items() if not isinstance(source, Vehicle)]
         ids = await find_systems(
             {name: networks[name] for name in searched},
             _requested_ids(system_ids, searched),
@@ -136,31 +136,33 @@ async def fleet(
 
 
 def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[str, Source]:
-    named: dict[str, Source] = {}
+    sources_by_name: dict[str, Source] = {}
     for number, source in enumerate(sources, 1):
         entries = source if isinstance(source, Mapping) else {str(number): source}
         for name, entry in entries.items():
             if not isinstance(name, str) or not name:
                 raise InvalidArgument(f"sources: {short_repr(name)} is not a name: a non-empty string is needed")
-            if name in named:
+            if name in sources_by_name:
                 raise InvalidArgument(f"sources: two are named {name!r}")
-            named[name] = entry
-    if not named:
+            sources_by_name[name] = entry
+    if not sources_by_name:
         raise InvalidArgument("sources: a fleet needs an address, a connection or a vehicle")
-    return named
+    return sources_by_name
 
 
-def _members_of_vehicles(named: Mapping[str, Source], networks: dict[str, Connection]) -> list[Member]:
+def _members_of_vehicles(sources_by_name: Mapping[str, Source], networks: dict[str, Connection]) -> list[Member]:
     """Return the members for vehicles among the sources, and add their connections to the networks."""
     members: list[Member] = []
-    for name, source in named.items():
+    for name, source in sources_by_name.items():
         if isinstance(source, Vehicle):
-            network = next((known for known, connection in networks.items() if connection is source.connection), None)
+            same_connection = (key for key, connection in networks.items() if connection is source.connection)
+            network = next(same_connection, None)
             if network is None:
                 network = name
                 networks[name] = source.connection
-            is_numbered = name.isdecimal()
-            members.append(Member(f"{network}/{source.system_id}" if is_numbered else name, network, source))
+            is_named_by_program = not name.isdecimal()
+            member_name = name if is_named_by_program else f"{network}/{source.system_id}"
+            members.append(Member(member_name, network, source))
     return members
 
 
@@ -190,17 +192,17 @@ def _check_names(members: list[Member]) -> None:
     for member in members:
         if seen.setdefault(member.name, member) is not member:
             raise InvalidArgument(f"two vehicles are named {member.name!r}: name them in a mapping")
-        twice = next((other.name for other in members if other is not member and other.vehicle is member.vehicle), None)
-        if twice is not None:
-            raise InvalidArgument(f"{member.name!r} and {twice!r} are the same vehicle")
+        for other in members:
+            if other is not member and other.vehicle is member.vehicle:
+                raise InvalidArgument(f"{member.name!r} and {other.name!r} are the same vehicle")
 
 
 def _assign(context: FleetContext, patterns_by_name: Mapping[str, Iterable[str]], attribute: str) -> None:
     for name, patterns in patterns_by_name.items():
         for member in context.matching(*([patterns] if isinstance(patterns, str) else patterns)):
-            before = getattr(context.members[member], attribute)
-            if before:
-                raise InvalidArgument(f"{member} is in two {attribute}s: {before!r} and {name!r}")
+            previous = getattr(context.members[member], attribute)
+            if previous:
+                raise InvalidArgument(f"{member} is in two {attribute}s: {previous!r} and {name!r}")
             setattr(context.members[member], attribute, name)
 
 
@@ -215,7 +217,7 @@ async def find_systems(
     networks: Mapping[str, Connection],
     requested: Mapping[str, list[int] | None],
     count: int | None,
-    given: int,
+    passed_count: int,
     timeout: float,
 ) -> dict[str, list[int]]:
     """Return the system ids to connect to, by network: the requested ids, or all found without a vehicle object.
@@ -223,14 +225,15 @@ async def find_systems(
     Args:
         networks: connections by name.
         requested: system ids by network; None: all that are found.
-        count: total number to wait for, including ``given``.
-        given: number of vehicles that the program passed to ``fleet()``.
+        count: total number to wait for, including ``passed_count``.
+        passed_count: number of vehicles that the program passed to ``fleet()``.
         timeout: seconds.
 
     Raises:
         ConnectFailed: not enough were found in time.
     """
     searched = [name for name in networks if requested[name] is None]
+    # By network, an ordered set of system ids.
     found: dict[str, dict[int, None]] = {name: dict.fromkeys(requested[name] or ()) for name in networks}
     changed = anyio.Event()
 
@@ -241,18 +244,20 @@ async def find_systems(
 
     def is_complete() -> bool:
         if count is not None:
-            return given + sum(map(len, found.values())) >= count
+            return passed_count + sum(map(len, found.values())) >= count
         return all(found[name] for name in searched)
 
     def progress() -> str:
         names = [f"{name}/{system_id}" for name, ids in found.items() for system_id in ids]
-        passed = f", {given} of them passed as vehicles" if given else ""
         listed = ", ".join(names)
         if count is not None:
-            found_count = given + len(names) or "none"
-            return f"{found_count} of {count} vehicles were found{passed}{f': {listed}' if names else ''}"
-        silent = ", ".join(name for name in searched if not found[name])
-        return f"no vehicle was found on {silent}{f'; found: {listed}' if names else ''}"
+            text = f"{passed_count + len(names) or 'none'} of {count} vehicles were found"
+            if passed_count:
+                text += f", {passed_count} of them passed as vehicles"
+            return f"{text}: {listed}" if names else text
+        silent_networks = ", ".join(name for name in searched if not found[name])
+        text = f"no vehicle was found on {silent_networks}"
+        return f"{text}; found: {listed}" if names else text
 
     detach = []
     try:
@@ -304,58 +309,59 @@ class MemberConnections:
     def __init__(self, timeout: float, rates: Mapping[type[Message], float] | None) -> None:
         self._timeout, self._rates = timeout, rates
         self._tasks = BackgroundTasks(self._on_error)
-        self._open: dict[int, tuple[str, Vehicle]] = {}
+        self._open: dict[int, tuple[str, Vehicle]] = {}  # by position in the list of systems
         self._error: Exception | None = None
         self._changed = asyncio.Event()
         self._close = asyncio.Event()
-        self._block_failed = False
+        self._has_block_failed = False
         self._running = 0
         self._all_closed = asyncio.Event()
 
     async def open(self, systems: Sequence[tuple[str, Connection, int]]) -> list[tuple[str, Vehicle]]:
         """Connect to all systems, given as network, connection and system id. The result is in the same order."""
-        for number, (network, connection, system_id) in enumerate(systems):
+        for index, (network, connection, system_id) in enumerate(systems):
             self._running += 1
-            self._tasks.start(partial(self._run, number, network, connection, system_id))
+            self._tasks.start(partial(self._run, index, network, connection, system_id))
 
-        def missing() -> str:
+        def describe_missing() -> str:
             names = (
                 f"{network}/{system_id}"
-                for number, (network, _, system_id) in enumerate(systems)
-                if number not in self._open
+                for index, (network, _, system_id) in enumerate(systems)
+                if index not in self._open
             )
             return f"no heartbeat of {', '.join(names)}"
 
-        with warn_while_waiting(self._timeout, missing):
+        with warn_while_waiting(self._timeout, describe_missing):
             while len(self._open) < len(systems) and self._error is None:
                 self._changed.clear()
                 await self._changed.wait()
         if self._error is not None:
             raise self._error
-        return [self._open[number] for number in range(len(systems))]
+        return [self._open[index] for index in range(len(systems))]
 
     async def aclose(
         self,
-        kind: type[BaseException] | None = None,
+        error_class: type[BaseException] | None = None,
         error: BaseException | None = None,
         traceback: TracebackType | None = None,
     ) -> None:
-        self._block_failed = error is not None
+        self._has_block_failed = error is not None
         self._close.set()
-        if self._running and len(self._open) == self._running:
+        is_every_vehicle_connected = len(self._open) == self._running
+        if self._running and is_every_vehicle_connected:  # otherwise cancelling the tasks is enough
             await run_shielded(self._wait_until_all_closed())
         await self._tasks.aclose()
 
     async def _wait_until_all_closed(self) -> None:
         await self._all_closed.wait()
 
-    async def _run(self, number: int, network: str, connection: Connection, system_id: int) -> None:
+    async def _run(self, index: int, network: str, connection: Connection, system_id: int) -> None:
         try:
             async with connect(connection, system_id=system_id, timeout=self._timeout, rates=self._rates) as vehicle:
-                self._open[number] = (network, vehicle)
+                self._open[index] = (network, vehicle)
                 self._changed.set()
                 await self._close.wait()
-                if self._block_failed:
+                if self._has_block_failed:
                     raise _BlockFailed
         except _BlockFailed:
             pass

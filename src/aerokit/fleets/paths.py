@@ -20,7 +20,7 @@ __all__ = ["Approach", "LocalPoint", "Path", "PathPoint", "horizontal_distance",
 
 LocalPoint = tuple[float, float, float]
 """Metres north, east and up."""
-TOLERANCE = 1e-9
+TOLERANCE = 1e-9  # for rounding errors: a polygon's corner this far outside counts as inside
 
 
 class PathPoint(Snapshot):
@@ -86,9 +86,9 @@ class Path(Snapshot):
         object.__setattr__(self, "points", tuple(self.points))
         if not self.points:
             raise InvalidArgument(f"points: the path of {self.name} has no points")
-        for one, other in pairwise(self.points):
-            if other.t_s < one.t_s:
-                raise InvalidArgument(f"points: the times of {self.name} decrease at {other.t_s:g} s")
+        for point, next_point in pairwise(self.points):
+            if next_point.t_s < point.t_s:
+                raise InvalidArgument(f"points: the times of {self.name} decrease at {next_point.t_s:g} s")
 
 
 class Approach(Snapshot):
@@ -99,128 +99,150 @@ class Approach(Snapshot):
     other_at_s: float
 
 
-def min_path_distance(one: Path, other: Path, *, slack_s: float = math.inf, below_m: float = math.inf) -> Approach:
+Leg = tuple[PathPoint, PathPoint]
+"""A straight line between two points of a path."""
+
+
+def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, below_m: float = math.inf) -> Approach:
     """Return the closest approach of two paths.
 
     Args:
-        one: the first path.
+        path: the first path.
         other: the second path.
         slack_s: compare points whose times differ by at most this many seconds. 0: both vehicles are exactly on time;
             infinite: ignore times.
         below_m: larger distances are not computed exactly; the result is then at least this distance.
     """
-    begin = min(one.begins_at_s, other.begins_at_s)
-    end = max(one.ends_at_s, other.ends_at_s)
+    begin = min(path.begins_at_s, other.begins_at_s)
+    end = max(path.ends_at_s, other.ends_at_s)
     best = Approach(math.inf, begin, begin)
-    others = other.legs(begin, end)
-    for leg in one.legs(begin, end):
-        for other_leg in others:
+    other_legs = other.legs(begin, end)
+    for leg in path.legs(begin, end):
+        for other_leg in other_legs:
             if other_leg[0].t_s - slack_s > leg[1].t_s or other_leg[1].t_s + slack_s < leg[0].t_s:
                 continue
             if _lower_bound(leg, other_leg) >= min(best.distance_m, below_m):
-                best = best if best.distance_m < math.inf else Approach(below_m, leg[0].t_s, other_leg[0].t_s)
+                if best.distance_m == math.inf:  # the first legs whose times match; they are at least `below_m` apart
+                    best = Approach(below_m, leg[0].t_s, other_leg[0].t_s)
                 continue
-            found = _closest(leg, other_leg, slack_s)
-            if found is not None and found.distance_m < best.distance_m:
-                best = found
+            approach = _closest(leg, other_leg, slack_s)
+            if approach is not None and approach.distance_m < best.distance_m:
+                best = approach
     return best
 
 
-def horizontal_distance(one: tuple[LocalPoint, LocalPoint], other: tuple[LocalPoint, LocalPoint]) -> float:
+def horizontal_distance(line: tuple[LocalPoint, LocalPoint], other: tuple[LocalPoint, LocalPoint]) -> float:
     """Return the distance in metres between two straight lines as seen from above, regardless of time."""
-    (a, b), (c, d) = [tuple(PathPoint(0.0, place[0], place[1], 0.0) for place in path) for path in (one, other)]
-    found = _closest((a, b), (c, d), math.inf)
-    assert found is not None
-    return found.distance_m
+    approach = _closest(_flat_leg(*line), _flat_leg(*other), math.inf)
+    assert approach is not None
+    return approach.distance_m
 
 
-def _lower_bound(one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint]) -> float:
+def _flat_leg(start: LocalPoint, end: LocalPoint) -> Leg:
+    return PathPoint(0.0, start[0], start[1], 0.0), PathPoint(0.0, end[0], end[1], 0.0)
+
+
+def _lower_bound(leg: Leg, other: Leg) -> float:
     """Return a lower bound of the distance of two legs: distance of the midpoints minus half of both lengths."""
-    middles = [tuple((a + b) / 2 for a, b in zip(leg[0].place, leg[1].place, strict=True)) for leg in (one, other)]
-    lengths = math.dist(one[0].place, one[1].place) + math.dist(other[0].place, other[1].place)
-    return math.dist(*middles) - lengths / 2
+    lengths = math.dist(leg[0].place, leg[1].place) + math.dist(other[0].place, other[1].place)
+    return math.dist(_midpoint(leg), _midpoint(other)) - lengths / 2
 
 
-def _closest(one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint], slack_s: float) -> Approach | None:
+def _midpoint(leg: Leg) -> tuple[float, ...]:
+    return tuple((start + end) / 2 for start, end in zip(leg[0].place, leg[1].place, strict=True))
+
+
+def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
     """Return the closest approach of two legs at times at most ``slack_s`` apart; None if there are no such times.
 
     With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The time condition
-    limits the unit square to a strip. The minimum is inside this polygon or on its border.
+    limits the unit square of (s, t) to a strip. The minimum is inside this polygon or on its border.
     """
-    a, b = one[0].place, other[0].place
-    along = [one[1].place[i] - a[i] for i in range(3)]
-    others = [other[1].place[i] - b[i] for i in range(3)]
-    between = [a[i] - b[i] for i in range(3)]
-    one_lasts, other_lasts = one[1].t_s - one[0].t_s, other[1].t_s - other[0].t_s
+    start, other_start = leg[0].place, other[0].place
+    vector = [leg[1].place[i] - start[i] for i in range(3)]
+    other_vector = [other[1].place[i] - other_start[i] for i in range(3)]
+    start_difference = [start[i] - other_start[i] for i in range(3)]
+    duration_s, other_duration_s = leg[1].t_s - leg[0].t_s, other[1].t_s - other[0].t_s
 
     def time_difference(s: float, t: float) -> float:
-        return (one[0].t_s + s * one_lasts) - (other[0].t_s + t * other_lasts)
+        return (leg[0].t_s + s * duration_s) - (other[0].t_s + t * other_duration_s)
 
     def difference(s: float, t: float) -> list[float]:
-        return [between[i] + s * along[i] - t * others[i] for i in range(3)]
+        return [start_difference[i] + s * vector[i] - t * other_vector[i] for i in range(3)]
 
-    inside = _closest_inside(between, along, others)
+    inside = _closest_inside(start_difference, vector, other_vector)
     if inside is not None and abs(time_difference(*inside)) <= slack_s:
         corners = [inside]
     else:
         corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
         if slack_s < math.inf:
-            corners = _cut(corners, lambda s, t: time_difference(s, t) - slack_s)
-            corners = _cut(corners, lambda s, t: -time_difference(s, t) - slack_s)
-    best: tuple[float, float, float] | None = None
-    for number, corner in enumerate(corners):
-        s, t = _closest_on_edge(corner, corners[number - 1], difference(*corner), difference(*corners[number - 1]))
+            corners = _clip(corners, lambda s, t: time_difference(s, t) - slack_s)
+            corners = _clip(corners, lambda s, t: -time_difference(s, t) - slack_s)
+    best: tuple[float, float, float] | None = None  # distance, s and t
+    for index, corner in enumerate(corners):
+        previous = corners[index - 1]
+        s, t = _closest_on_edge(corner, previous, difference(*corner), difference(*previous))
         distance = math.hypot(*difference(s, t))
         if best is None or distance < best[0]:
             best = distance, s, t
     if best is None:
         return None
     distance, s, t = best
-    return Approach(distance, one[0].t_s + s * one_lasts, other[0].t_s + t * other_lasts)
+    return Approach(distance, leg[0].t_s + s * duration_s, other[0].t_s + t * other_duration_s)
 
 
 def _closest_inside(
-    between: Sequence[float], along: Sequence[float], others: Sequence[float]
+    start_difference: Sequence[float], vector: Sequence[float], other_vector: Sequence[float]
 ) -> tuple[float, float] | None:
-    """Return the closest point of two lines; None if it is outside of a leg, or the lines are parallel."""
-    aa, bb, ab = _dot(along, along), _dot(others, others), _dot(along, others)
+    """Return s and t of the closest points of two lines; None if one is outside of its leg, or the lines are parallel.
+
+    They solve the two equations by which the derivatives of the squared distance with respect to s and t are 0.
+    """
+    aa, bb, ab = _dot(vector, vector), _dot(other_vector, other_vector), _dot(vector, other_vector)
     determinant = aa * bb - ab * ab
     if determinant <= TOLERANCE * max(aa * bb, TOLERANCE):
         return None
-    c, d = _dot(between, along), _dot(between, others)
-    s, t = (ab * d - bb * c) / determinant, (aa * d - ab * c) / determinant
+    da, db = _dot(start_difference, vector), _dot(start_difference, other_vector)
+    s, t = (ab * db - bb * da) / determinant, (aa * db - ab * da) / determinant
     return (s, t) if 0 <= s <= 1 and 0 <= t <= 1 else None
 
 
-def _cut(corners: list[tuple[float, float]], outside: _Outside) -> list[tuple[float, float]]:
-    """Return the part of a convex polygon where ``outside`` is not positive."""
-    kept: list[tuple[float, float]] = []
-    for number, corner in enumerate(corners):
-        before = corners[number - 1]
-        here, there = outside(*corner), outside(*before)
-        if (here > TOLERANCE) != (there > TOLERANCE):
-            share = there / (there - here)
-            kept.append(tuple(p + share * (q - p) for p, q in zip(before, corner, strict=True)))  # type: ignore[arg-type]
-        if here <= TOLERANCE:
-            kept.append(corner)
-    return kept
+def _clip(corners: list[tuple[float, float]], outside: _Outside) -> list[tuple[float, float]]:
+    """Return the part of a convex polygon where ``outside`` is not positive (Sutherland-Hodgman)."""
+    clipped: list[tuple[float, float]] = []
+    for index, corner in enumerate(corners):
+        previous = corners[index - 1]
+        value, previous_value = outside(*corner), outside(*previous)
+        if (value > TOLERANCE) != (previous_value > TOLERANCE):  # the edge crosses the border
+            fraction = previous_value / (previous_value - value)
+            crossing = tuple(p + fraction * (q - p) for p, q in zip(previous, corner, strict=True))
+            clipped.append(crossing)  # type: ignore[arg-type]
+        if value <= TOLERANCE:
+            clipped.append(corner)
+    return clipped
 
 
 def _closest_on_edge(
-    one: tuple[float, float], other: tuple[float, float], here: Sequence[float], there: Sequence[float]
+    corner: tuple[float, float],
+    other_corner: tuple[float, float],
+    difference: Sequence[float],
+    other_difference: Sequence[float],
 ) -> tuple[float, float]:
-    """Return the point on an edge where the distance is smallest."""
-    step = [q - p for p, q in zip(here, there, strict=True)]
+    """Return s and t where the distance is smallest on an edge, given the difference vectors at both its corners."""
+    step = [q - p for p, q in zip(difference, other_difference, strict=True)]
     length = _dot(step, step)
-    share = 0.0 if length == 0 else min(1.0, max(0.0, -_dot(here, step) / length))
-    return one[0] + share * (other[0] - one[0]), one[1] + share * (other[1] - one[1])
+    fraction = 0.0 if length == 0 else min(1.0, max(0.0, -_dot(difference, step) / length))
+    return (
+        corner[0] + fraction * (other_corner[0] - corner[0]),
+        corner[1] + fraction * (other_corner[1] - corner[1]),
+    )
 
 
-def _dot(one: Sequence[float], other: Sequence[float]) -> float:
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+def _dot(vector: Sequence[float], other: Sequence[float]) -> float:
+    return vector[0] * other[0] + vector[1] * other[1] + vector[2] * other[2]
 
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    _Outside = Callable[[float, float], float]
+    _Outside = Callable[[float, float], float]  # of s and t: positive outside

@@ -55,17 +55,16 @@ ORDERS: Mapping[str, PolicyOrder] = {
 class PolicyRules:
     """The policies of a fleet and of its groups. The group of the failed member selects the policy."""
 
-    def __init__(self, policy: Policy, of_groups: Mapping[str, Policy]) -> None:
-        for name, candidate in (
-            ("on_error", policy),
-            *((f"on_error_by_group[{group!r}]", of_groups[group]) for group in of_groups),
-        ):
-            if not callable(candidate) and candidate not in get_args(PolicyName):
+    def __init__(self, policy: Policy, by_group: Mapping[str, Policy]) -> None:
+        arguments = {"on_error": policy}
+        arguments.update({f"on_error_by_group[{group!r}]": by_group[group] for group in by_group})
+        for name, value in arguments.items():
+            if not callable(value) and value not in get_args(PolicyName):
                 raise InvalidArgument(
-                    f"{name} = {short_repr(candidate)} is not allowed: one of"
+                    f"{name} = {short_repr(value)} is not allowed: one of"
                     f" {', '.join(get_args(PolicyName))}, or a function"
                 )
-        self._policy, self._of_groups = policy, dict(of_groups)
+        self._policy, self._by_group = policy, dict(by_group)
 
     def decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
         """Return the orders for ``failure.others``; members without an order continue.
@@ -73,25 +72,26 @@ class PolicyRules:
         Raises:
             InvalidArgument: the policy function returned something else, or a name that is not in ``others``.
         """
-        policy = self._of_groups.get(failure.group, self._policy)
-        decided = policy(failure) if callable(policy) else policy
-        if decided is None or decided == "continue_others":
+        policy = self._by_group.get(failure.group, self._policy)
+        decision = policy(failure) if callable(policy) else policy
+        if decision is None or decision == "continue_others":
             return {}
-        if isinstance(decided, str) and decided in ORDERS:
-            return dict.fromkeys(failure.others, ORDERS[decided])
-        if isinstance(decided, Mapping):
-            wrong: list[str] = [name for name in decided if name not in failure.others] or [
-                str(order) for order in decided.values() if order not in get_args(PolicyOrder)
-            ]
-            if not wrong:
-                return dict(decided)
-            raise self._invalid_decision(wrong[0])
-        raise self._invalid_decision(decided)
+        if isinstance(decision, str) and decision in ORDERS:
+            return dict.fromkeys(failure.others, ORDERS[decision])
+        if not isinstance(decision, Mapping):
+            raise self._invalid_decision(decision)
+        for name in decision:
+            if name not in failure.others:
+                raise self._invalid_decision(name)
+        for order in decision.values():
+            if order not in get_args(PolicyOrder):
+                raise self._invalid_decision(str(order))
+        return dict(decision)
 
     @staticmethod
-    def _invalid_decision(decided: object) -> InvalidArgument:
+    def _invalid_decision(returned: object) -> InvalidArgument:
         return InvalidArgument(
-            f"the policy function returned {short_repr(decided)}: allowed are {', '.join(get_args(PolicyName))}, or a"
+            f"the policy function returned {short_repr(returned)}: allowed are {', '.join(get_args(PolicyName))}, or a"
             f" mapping of other members to {', '.join(get_args(PolicyOrder))}"
         )
 

@@ -72,13 +72,13 @@ def find_conflicts(paths: Sequence[Path], min_distance_m: float, *, slack_s: flo
         slack_s: how early or late one vehicle may be relative to another, in seconds; infinite: ignore times.
     """
     _check_distance(min_distance_m)
-    found: list[Conflict] = []
-    for one, other in combinations(paths, 2):
-        near = min_path_distance(one, other, slack_s=slack_s, below_m=min_distance_m)
-        if near.distance_m < min_distance_m:
-            at_s = near.at_s if slack_s < math.inf else None
-            found.append(Conflict(one.name, other.name, near.distance_m, at_s))
-    return tuple(found)
+    conflicts: list[Conflict] = []
+    for path, other in combinations(paths, 2):
+        approach = min_path_distance(path, other, slack_s=slack_s, below_m=min_distance_m)
+        if approach.distance_m < min_distance_m:
+            at_s = approach.at_s if slack_s < math.inf else None
+            conflicts.append(Conflict(path.name, other.name, approach.distance_m, at_s))
+    return tuple(conflicts)
 
 
 def separate_by_altitude(
@@ -105,24 +105,25 @@ def separate_by_altitude(
     reason = _vertical_conflict(routes, stationary, min_distance_m)
     if reason:
         return Deconfliction("refused", reason, min_distance_m, conflicts)
-    base = max(max(route.start[2], route.target[2]) for route in routes)
+    lowest_m = max(max(route.start[2], route.target[2]) for route in routes)
     layers: dict[str, int] = {}
     for route in routes:
-        taken = {
+        used_layers = {
             layers[earlier.name]
             for earlier in routes
-            if earlier.name in layers and _cross(earlier, route, min_distance_m)
+            if earlier.name in layers and _paths_cross(earlier, route, min_distance_m)
         }
-        layer = 0
-        while layer in taken or _meets(route, stationary, base + layer * min_distance_m, min_distance_m):
+        layer, height_m = 0, lowest_m
+        while layer in used_layers or _is_layer_blocked(route, stationary, height_m, min_distance_m):
             layer += 1
+            height_m = lowest_m + layer * min_distance_m
         layers[route.name] = layer
-    heights = {name: base + layer * min_distance_m for name, layer in layers.items()}
+    heights = {name: lowest_m + layer * min_distance_m for name, layer in layers.items()}
     highest = max(heights.values())
     if highest > max_altitude_m:
         reason = f"the paths cross, and the layers would reach {highest:.0f} m, above {max_altitude_m:.0f} m"
         return Deconfliction("refused", reason, min_distance_m, conflicts)
-    reason = f"{_pairs(conflicts)} come too close; they cross in {len(set(layers.values()))} layers"
+    reason = f"{_describe_pairs(conflicts)} come too close; they cross in {len(set(layers.values()))} layers"
     return Deconfliction("layers", reason, min_distance_m, conflicts, heights)
 
 
@@ -148,19 +149,17 @@ def separate_by_time(
     conflicts = _conflicts(routes, stationary, min_distance_m)
     if not conflicts:
         return Deconfliction("clear", "no paths come too close", min_distance_m)
-    rests = [Path(name, (PathPoint(0.0, *place),)) for name, place in stationary.items()]
+    resting_paths = _resting_paths(stationary)
     order, refusal = list(routes), ""
     for _ in routes:
-        delays, blocked, blocker = _delays(order, rests, min_distance_m, speed_m_s, slack_s, max_delay_s)
+        delays, blocked, blocker = _delays(order, resting_paths, min_distance_m, speed_m_s, slack_s, max_delay_s)
         if blocked is None:
-            in_order = {route.name: delays[route.name] for route in routes}
-            reason = f"{_pairs(conflicts)} come too close; starts are delayed by up to {max(delays.values()):g} s"
-            return Deconfliction("corridors", reason, min_distance_m, conflicts, {}, in_order)
+            delays = {route.name: delays[route.name] for route in routes}  # in the order of `routes`
+            max_s = max(delays.values())
+            reason = f"{_describe_pairs(conflicts)} come too close; starts are delayed by up to {max_s:g} s"
+            return Deconfliction("corridors", reason, min_distance_m, conflicts, {}, delays)
         refusal = f"{blocked.name} would have to wait for {blocker} longer than {max_delay_s:g} s"
-        order = [
-            blocked,
-            *(route for route in order if route is not blocked),
-        ]  # Retry with the blocked route first.
+        order = [blocked, *(route for route in order if route is not blocked)]  # retry with the blocked route first
     return Deconfliction("refused", refusal, min_distance_m, conflicts)
 
 
@@ -169,80 +168,86 @@ def _conflicts(
 ) -> tuple[Conflict, ...]:
     _check_distance(min_distance_m)
     paths = [Path.straight(route.name, route.start, route.target, 1.0) for route in routes]
-    moving = find_conflicts(paths, min_distance_m)
-    rests = [Path(name, (PathPoint(0.0, *place),)) for name, place in stationary.items()]
-    found = list(moving)
+    conflicts = list(find_conflicts(paths, min_distance_m))
     for path in paths:
-        for rest in rests:
-            near = min_path_distance(path, rest, below_m=min_distance_m)
-            if near.distance_m < min_distance_m:
-                found.append(Conflict(path.name, rest.name, near.distance_m))
-    return tuple(found)
+        for resting_path in _resting_paths(stationary):
+            approach = min_path_distance(path, resting_path, below_m=min_distance_m)
+            if approach.distance_m < min_distance_m:
+                conflicts.append(Conflict(path.name, resting_path.name, approach.distance_m))
+    return tuple(conflicts)
+
+
+def _resting_paths(stationary: Mapping[str, LocalPoint]) -> list[Path]:
+    return [Path(name, (PathPoint(0.0, *point),)) for name, point in stationary.items()]
 
 
 def _delays(
     order: Sequence[Route],
-    rests: Sequence[Path],
+    resting_paths: Sequence[Path],
     min_distance_m: float,
     speed_m_s: float,
     slack_s: float,
     max_delay_s: float,
 ) -> tuple[dict[str, float], Route | None, str]:
     """Return the delay of each route. If a delay exceeds the maximum, also return its route and the blocker's name."""
-    placed: list[Path] = []
+    delayed_paths: list[Path] = []
     delays: dict[str, float] = {}
     for route in order:
         delay_s = 0.0
         while True:
             path = Path.straight(route.name, route.start, route.target, speed_m_s, delay_s)
-            blocker = _first_near(path, [*placed, *rests], min_distance_m, slack_s)
+            blocker = _find_blocker(path, [*delayed_paths, *resting_paths], min_distance_m, slack_s)
             if blocker is None:
                 break
             delay_s += DELAY_STEP_S
             if delay_s > max_delay_s:
                 return delays, route, blocker
-        placed.append(path)
+        delayed_paths.append(path)
         delays[route.name] = delay_s
     return delays, None, ""
 
 
 def _vertical_conflict(routes: Sequence[Route], stationary: Mapping[str, LocalPoint], min_distance_m: float) -> str:
     """Return the reason why the vehicles cannot climb and descend vertically; empty if they can."""
-    for what in ("start", "target"):
-        ends = {route.name: getattr(route, what) for route in routes}
-        # A stationary vehicle well below an end point is not on the vertical path above it.
-        for name, place in ends.items():
-            near = {other: there for other, there in stationary.items() if there[2] > place[2] - min_distance_m}
-            for other, there in {**ends, **near}.items():
-                distance = math.dist(place[:2], there[:2])
+    for end in ("start", "target"):
+        points: dict[str, LocalPoint] = {route.name: getattr(route, end) for route in routes}
+        for name, point in points.items():
+            # A stationary vehicle well below an end point is not on the vertical path above it.
+            lowest_m = point[2] - min_distance_m
+            obstacles = {other: place for other, place in stationary.items() if place[2] > lowest_m}
+            for other, other_point in {**points, **obstacles}.items():
+                distance = math.dist(point[:2], other_point[:2])
                 if other != name and distance < min_distance_m:
-                    return f"the {what} of {name} is {distance:.1f} m from that of {other} horizontally: too close"
+                    return f"the {end} of {name} is {distance:.1f} m from that of {other} horizontally: too close"
     return ""
 
 
-def _cross(one: Route, other: Route, min_distance_m: float) -> bool:
-    return horizontal_distance((one.start, one.target), (other.start, other.target)) < min_distance_m
+def _paths_cross(route: Route, other: Route, min_distance_m: float) -> bool:
+    return horizontal_distance((route.start, route.target), (other.start, other.target)) < min_distance_m
 
 
-def _meets(route: Route, stationary: Mapping[str, LocalPoint], height_m: float, min_distance_m: float) -> bool:
+def _is_layer_blocked(
+    route: Route, stationary: Mapping[str, LocalPoint], height_m: float, min_distance_m: float
+) -> bool:
     return any(
-        abs(place[2] - height_m) < min_distance_m
-        and horizontal_distance((route.start, route.target), (place, place)) < min_distance_m
-        for place in stationary.values()
+        abs(point[2] - height_m) < min_distance_m
+        and horizontal_distance((route.start, route.target), (point, point)) < min_distance_m
+        for point in stationary.values()
     )
 
 
-def _first_near(path: Path, others: Sequence[Path], min_distance_m: float, slack_s: float) -> str | None:
+def _find_blocker(path: Path, others: Sequence[Path], min_distance_m: float, slack_s: float) -> str | None:
     for other in others:
         if min_path_distance(path, other, slack_s=slack_s, below_m=min_distance_m).distance_m < min_distance_m:
             return other.name
     return None
 
 
-def _pairs(conflicts: Sequence[Conflict]) -> str:
+def _describe_pairs(conflicts: Sequence[Conflict]) -> str:
     texts = [f"{conflict.name} and {conflict.other} ({conflict.distance_m:.1f} m)" for conflict in conflicts[:3]]
     more = len(conflicts) - len(texts)
-    return ", ".join(texts) + (f" and {more} more pairs" if more else "")
+    more_text = f" and {more} more pairs" if more else ""
+    return ", ".join(texts) + more_text
 
 
 def _check_distance(min_distance_m: float) -> None:
@@ -252,49 +257,49 @@ def _check_distance(min_distance_m: float) -> None:
 
 METRES_PER_DEGREE = 111_319.5
 
-# Half of the 26 neighbours of a cube, so that each pair of neighbouring cubes is compared once.
+# Steps to half of the 26 neighbours of a cube, so that each pair of neighbouring cubes is compared once.
 NEIGHBOURS = tuple(step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0))
 
 
-def pairs_within(places: Mapping[str, LocalPoint], within_m: float) -> list[tuple[str, str, float]]:
-    """Return all pairs that are closer than ``within_m``, with their distance in metres.
+def pairs_within(points: Mapping[str, LocalPoint], max_distance_m: float) -> list[tuple[str, str, float]]:
+    """Return all pairs that are closer than ``max_distance_m``, as two names and the distance in metres.
 
     Space is divided into cubes of that size, and only vehicles in the same or neighbouring cubes are compared.
     """
     cubes: dict[tuple[int, int, int], list[str]] = {}
-    for name, (north, east, up) in places.items():
-        cube = math.floor(north / within_m), math.floor(east / within_m), math.floor(up / within_m)
+    for name, (north, east, up) in points.items():
+        cube = math.floor(north / max_distance_m), math.floor(east / max_distance_m), math.floor(up / max_distance_m)
         cubes.setdefault(cube, []).append(name)
-    order = {name: number for number, name in enumerate(places)}
-    found: list[tuple[str, str, float]] = []
+    index_of = {name: index for index, name in enumerate(points)}
+    near_pairs: list[tuple[str, str, float]] = []
     for (x, y, z), names in cubes.items():
-        pairs = list(combinations(names, 2))
+        candidates = list(combinations(names, 2))
         for dx, dy, dz in NEIGHBOURS:
-            others = cubes.get((x + dx, y + dy, z + dz))
-            if others is not None:
-                pairs += product(names, others)
-        for one, other in pairs:
-            distance = math.dist(places[one], places[other])
-            if distance < within_m:
-                first, second = (one, other) if order[one] < order[other] else (other, one)
-                found.append((first, second, distance))
-    return sorted(found, key=lambda pair: (order[pair[0]], order[pair[1]]))
+            neighbours = cubes.get((x + dx, y + dy, z + dz))
+            if neighbours is not None:
+                candidates += product(names, neighbours)
+        for pair in candidates:
+            distance = math.dist(points[pair[0]], points[pair[1]])
+            if distance < max_distance_m:
+                first, second = sorted(pair, key=index_of.__getitem__)
+                near_pairs.append((first, second, distance))
+    return sorted(near_pairs, key=lambda near_pair: (index_of[near_pair[0]], index_of[near_pair[1]]))
 
 
-def to_local_points(places: Mapping[str, tuple[float, float, float]]) -> dict[str, LocalPoint]:
+def to_local_points(positions: Mapping[str, tuple[float, float, float]]) -> dict[str, LocalPoint]:
     """Convert latitude, longitude (degrees) and altitude (metres) to metres around the first position.
 
     Accurate to 0.1 % within a few kilometres.
     """
-    if not places:
+    if not positions:
         return {}
-    latitude, longitude, _ = next(iter(places.values()))
-    east = METRES_PER_DEGREE * math.cos(math.radians(latitude))
+    first_latitude, first_longitude, _ = next(iter(positions.values()))
+    metres_per_degree_east = METRES_PER_DEGREE * math.cos(math.radians(first_latitude))
     return {
         name: (
-            (place[0] - latitude) * METRES_PER_DEGREE,
-            math.remainder(place[1] - longitude, 360.0) * east,
-            place[2],
+            (latitude - first_latitude) * METRES_PER_DEGREE,
+            math.remainder(longitude - first_longitude, 360.0) * metres_per_degree_east,
+            altitude,
         )
-        for name, place in places.items()
+        for name, (latitude, longitude, altitude) in positions.items()
     }

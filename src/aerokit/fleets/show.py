@@ -48,7 +48,7 @@ class Show(Snapshot):
     def top_speed_m_s(self, name: str) -> float:
         """Return the speed of the fastest leg of one track, in m/s."""
         legs = pairwise(self.tracks[name].points)
-        return max((_speed(one, other) for one, other in legs), default=0.0)
+        return max((_speed_between(start, end) for start, end in legs), default=0.0)
 
     def conflicts(self, min_distance_m: float, *, slack_s: float = 0.5) -> tuple[Conflict, ...]:
         """Return all pairs of tracks that come closer than ``min_distance_m``.
@@ -66,8 +66,10 @@ class Show(Snapshot):
             InvalidArgument: a name is missing, or two tracks get the same name.
         """
         missing = [name for name in self.tracks if name not in names]
-        if missing or len(set(names.values())) < len(self.tracks):
-            raise InvalidArgument(f"names: {f'no member for {missing}' if missing else 'one member for two tracks'}")
+        if missing:
+            raise InvalidArgument(f"names: no member for {missing}")
+        if len(set(names.values())) < len(self.tracks):
+            raise InvalidArgument("names: one member for two tracks")
         return type(self)({names[name]: track.replace(name=names[name]) for name, track in self.tracks.items()})
 
     @classmethod
@@ -162,29 +164,34 @@ class Show(Snapshot):
         for name, track in self.tracks.items():
             if not isinstance(track, Path) or track.begins_at_s < 0:
                 raise InvalidArgument(f"tracks: {name!r} needs a Path that begins at 0 s or later")
-            for one, other in pairwise(track.points):
-                if not _speed(one, other) < math.inf:
-                    raise InvalidArgument(f"tracks: {name!r} has two positions at {other.t_s:g} s")
+            for start, end in pairwise(track.points):
+                if not _speed_between(start, end) < math.inf:
+                    raise InvalidArgument(f"tracks: {name!r} has two positions at {end.t_s:g} s")
 
 
 def state_at(path: Path, at_s: float) -> tuple[LocalPoint, LocalPoint]:
     """Return position and velocity on a path at a time, as metres and m/s north, east and up."""
     points = path.points
-    after = bisect_right(points, at_s, key=_time_of)
-    if after == 0 or after == len(points):
-        return points[min(after, len(points) - 1)].place, (0.0, 0.0, 0.0)
-    one, other = points[after - 1], points[after]
-    lasts = other.t_s - one.t_s
-    share = (at_s - one.t_s) / lasts
-    way = [b - a for a, b in zip(one.place, other.place, strict=True)]
-    place = tuple(a + share * d for a, d in zip(one.place, way, strict=True))
-    return place, (way[0] / lasts, way[1] / lasts, way[2] / lasts)  # type: ignore[return-value]
+    next_index = bisect_right(points, at_s, key=_time_of)
+    if next_index == 0:
+        return points[0].place, (0.0, 0.0, 0.0)
+    if next_index == len(points):
+        return points[-1].place, (0.0, 0.0, 0.0)
+    start, end = points[next_index - 1], points[next_index]
+    duration_s = end.t_s - start.t_s
+    fraction = (at_s - start.t_s) / duration_s
+    vector = [b - a for a, b in zip(start.place, end.place, strict=True)]
+    place = tuple(a + fraction * d for a, d in zip(start.place, vector, strict=True))
+    velocity = vector[0] / duration_s, vector[1] / duration_s, vector[2] / duration_s
+    return place, velocity  # type: ignore[return-value]
 
 
 def _time_of(point: PathPoint) -> float:
     return point.t_s
 
 
-def _speed(one: PathPoint, other: PathPoint) -> float:
-    way, lasts = math.dist(one.place, other.place), other.t_s - one.t_s
-    return way / lasts if lasts > 0 else (math.inf if way > 0 else 0.0)
+def _speed_between(start: PathPoint, end: PathPoint) -> float:
+    distance_m, duration_s = math.dist(start.place, end.place), end.t_s - start.t_s
+    if duration_s > 0:
+        return distance_m / duration_s
+    return math.inf if distance_m > 0 else 0.0

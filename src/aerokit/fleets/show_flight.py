@@ -48,7 +48,7 @@ __all__ = [
 # Correction speed per metre of deviation from the track, in 1/s.
 TRACK_GAIN = 0.8
 
-# Speed limit while catching up: the track's speed times this factor, plus this many m/s.
+# Speed limit while catching up: the track's speed times the factor, but at least CATCH_UP_M_S; plus CATCH_UP_M_S.
 CATCH_UP_FACTOR, CATCH_UP_M_S = 1.5, 1.0
 
 CONFLICT_SLACK_S = 0.5
@@ -89,35 +89,36 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
         ConnectionClosed, LinkLost: the connection ended.
     """
     connection = vehicle.connection
-    sent: dict[int, float] = {}
-    found: list[tuple[float, float]] = []
+    sent_at_by_timestamp: dict[int, float] = {}
+    measurements: list[tuple[float, float]] = []  # round trip and offset in seconds
 
     def on_timesync(message: Timesync) -> None:
         frame = message.received_frame
-        sent_at = sent.pop(message.ts1, None)
-        if frame is None or sent_at is None or message.tc1 == 0 or frame.component_id != vehicle.component_id:
+        sent_at = sent_at_by_timestamp.pop(message.ts1, None)
+        is_answer = message.tc1 != 0
+        if frame is None or sent_at is None or not is_answer or frame.component_id != vehicle.component_id:
             return
         round_trip_s = frame.received_at - sent_at
-        found.append((round_trip_s, message.tc1 / 1e9 - (sent_at + round_trip_s / 2)))
+        measurements.append((round_trip_s, message.tc1 / 1e9 - (sent_at + round_trip_s / 2)))
 
     detach = connection.bus.attach(Timesync, on_timesync, system_id=vehicle.system_id)
     try:
         for _ in range(requests):
             now = connection.now()
             timestamp = int(now * 1e9) | 1  # odd, unlike the timestamps of the link's own requests
-            sent[timestamp] = now
+            sent_at_by_timestamp[timestamp] = now
             connection.send(Timesync(0, timestamp), to=vehicle.system_id)
             await anyio.sleep(TIMESYNC_INTERVAL_S)
         deadline = connection.now() + TIMESYNC_TIMEOUT_S
-        while sent and not found and connection.now() < deadline:
+        while sent_at_by_timestamp and not measurements and connection.now() < deadline:
             connection.raise_if_ended()
             await anyio.sleep(TIMESYNC_INTERVAL_S)
     finally:
         detach()
-    if not found:
+    if not measurements:
         raise OperationTimeout(f"TIMESYNC was not answered; {vehicle.describe_link()}")
-    round_trip_s, offset_s = min(found)
-    return ClockOffset(offset_s, round_trip_s, len(found))
+    round_trip_s, offset_s = min(measurements)  # the shortest round trip is the most accurate
+    return ClockOffset(offset_s, round_trip_s, len(measurements))
 
 
 # ------------------------------------------------------------------------------------------ report
@@ -160,18 +161,20 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
     The lag is the time shift of the path that fits the samples best (least squares along the track).
     """
     errors: list[float] = []
-    along = moved = 0.0
+    # A lag causes an error of lag × velocity. The best fit is sum(error · velocity) / sum(velocity²).
+    error_times_velocity = velocity_squared = 0.0
     for at_s, point in samples:
         planned, velocity = state_at(path, at_s)
         error = [p - q for p, q in zip(planned, point, strict=True)]
         errors.append(math.hypot(*error))
         if math.hypot(*velocity) >= MIN_LAG_SPEED_M_S:
-            along += sum(e * v for e, v in zip(error, velocity, strict=True))
-            moved += sum(v * v for v in velocity)
+            error_times_velocity += sum(e * v for e, v in zip(error, velocity, strict=True))
+            velocity_squared += sum(v * v for v in velocity)
     if not errors:
         return TrackDeviation(math.nan, math.nan, None, 0)
     rms = math.sqrt(sum(error * error for error in errors) / len(errors))
-    return TrackDeviation(max(errors), rms, along / moved if moved else None, len(errors))
+    lag_s = error_times_velocity / velocity_squared if velocity_squared else None
+    return TrackDeviation(max(errors), rms, lag_s, len(errors))
 
 
 def max_relative_error(
@@ -181,28 +184,29 @@ def max_relative_error(
 
     Evaluated at 60 times of the show, with positions interpolated between samples.
     """
-    worst: float | None = None
+    largest_m: float | None = None
     for number in range(RELATIVE_ERROR_SAMPLES + 1):
         at_s = duration_s * number / RELATIVE_ERROR_SAMPLES
         errors: list[LocalPoint] = []
         for name, path in paths.items():
-            here = _interpolate(samples.get(name, ()), at_s)
-            if here is not None:
-                planned = state_at(path, at_s)[0]
-                errors.append((planned[0] - here[0], planned[1] - here[1], planned[2] - here[2]))
+            point = _interpolate(samples.get(name, ()), at_s)
+            if point is not None:
+                planned, _ = state_at(path, at_s)
+                errors.append((planned[0] - point[0], planned[1] - point[1], planned[2] - point[2]))
         if len(errors) > 1:
-            worst = max(worst or 0.0, max(math.dist(one, other) for one, other in combinations(errors, 2)))
-    return worst
+            relative_errors = (math.dist(first, second) for first, second in combinations(errors, 2))
+            largest_m = max(largest_m or 0.0, *relative_errors)
+    return largest_m
 
 
 def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> LocalPoint | None:
-    for (before, one), (after, other) in pairwise(samples):
-        if before <= at_s <= after:
-            share = 0.0 if after == before else (at_s - before) / (after - before)
+    for (start_s, start), (end_s, end) in pairwise(samples):
+        if start_s <= at_s <= end_s:
+            fraction = 0.0 if end_s == start_s else (at_s - start_s) / (end_s - start_s)
             return (
-                one[0] + share * (other[0] - one[0]),
-                one[1] + share * (other[1] - one[1]),
-                one[2] + share * (other[2] - one[2]),
+                start[0] + fraction * (end[0] - start[0]),
+                start[1] + fraction * (end[1] - start[1]),
+                start[2] + fraction * (end[2] - start[2]),
             )
     return None
 
@@ -217,13 +221,16 @@ class TrackRecorder:
     the time is the time of arrival.
     """
 
-    def __init__(self, vehicle: Vehicle, clock: ClockOffset, origin: LocalOrigin, begin: float, base_m: float) -> None:
-        self._vehicle, self._clock, self._begin, self._base_m = vehicle, clock, begin, base_m
-        position = origin.to_position((0.0, 0.0, base_m))
+    def __init__(
+        self, vehicle: Vehicle, clock: ClockOffset, origin: LocalOrigin, begin_at: float, origin_amsl_m: float
+    ) -> None:
+        self._vehicle, self._clock, self._begin_at, self._origin_amsl_m = vehicle, clock, begin_at, origin_amsl_m
+        position = origin.to_position((0.0, 0.0, origin_amsl_m))
         self._latitude, self._longitude = position.latitude_deg, position.longitude_deg
-        self._north_m, self._east_m = _metres_per_degree(origin, self._latitude, self._longitude)
+        metres_per_degree = _metres_per_degree(origin, self._latitude, self._longitude)
+        self._metres_per_latitude_degree, self._metres_per_longitude_degree = metres_per_degree
         self.samples: list[tuple[float, LocalPoint]] = []  # times count from the start of the show
-        self._latest: tuple[float, LocalPoint, LocalPoint] | None = None
+        self._latest: tuple[float, LocalPoint, LocalPoint] | None = None  # time, position and velocity
         self._detach: Detach | None = None
 
     def __enter__(self) -> Self:
@@ -248,25 +255,25 @@ class TrackRecorder:
         now = self._vehicle.connection.now()
         if self._latest is None or now - self._latest[0] > POSITION_MAX_AGE_S:
             raise StaleValueError(f"no GLOBAL_POSITION_INT was received in the last {POSITION_MAX_AGE_S:g} s")
-        at, place, velocity = self._latest
-        age = now - at
+        measured_at, place, velocity = self._latest
+        age = now - measured_at
         return place[0] + age * velocity[0], place[1] + age * velocity[1], place[2] + age * velocity[2]
 
     def _on_message(self, message: GlobalPositionInt) -> None:
         frame = message.received_frame
         if frame is None or frame.component_id != self._vehicle.component_id:
             return
-        at = self._clock.to_local_time(message.time_boot_ms / 1000)
-        if abs(at - frame.received_at) > MAX_CLOCK_ERROR_S:
-            at = frame.received_at
+        measured_at = self._clock.to_local_time(message.time_boot_ms / 1000)
+        if abs(measured_at - frame.received_at) > MAX_CLOCK_ERROR_S:
+            measured_at = frame.received_at
         place = (
-            (message.lat / 1e7 - self._latitude) * self._north_m,
-            math.remainder(message.lon / 1e7 - self._longitude, 360.0) * self._east_m,
-            message.alt / 1000 - self._base_m,
+            (message.lat / 1e7 - self._latitude) * self._metres_per_latitude_degree,
+            math.remainder(message.lon / 1e7 - self._longitude, 360.0) * self._metres_per_longitude_degree,
+            message.alt / 1000 - self._origin_amsl_m,
         )
-        self._latest = at, place, (message.vx / 100, message.vy / 100, -message.vz / 100)
-        if at >= self._begin:
-            self.samples.append((at - self._begin, place))
+        self._latest = measured_at, place, (message.vx / 100, message.vy / 100, -message.vz / 100)
+        if measured_at >= self._begin_at:
+            self.samples.append((measured_at - self._begin_at, place))
 
 
 def _metres_per_degree(origin: LocalOrigin, latitude: float, longitude: float) -> tuple[float, float]:
@@ -274,7 +281,7 @@ def _metres_per_degree(origin: LocalOrigin, latitude: float, longitude: float) -
     step = 1e-3
     north = origin.to_local(Position(min(latitude + step, 90.0), longitude), 0.0)[0] / step
     east = origin.to_local(Position(latitude, longitude + step), 0.0)[1] / step
-    return north or METRES_PER_DEGREE, east
+    return north or METRES_PER_DEGREE, east  # at the pole, the step north is 0
 
 
 @checks_arguments
@@ -327,25 +334,25 @@ class Shows(Travel):
             ValueUnknownError: the position of a member is unknown.
         """
         check_range("rate_hz", rate_hz, 2, 50)
-        local_origin, base_m = self._local_origin(show, origin)
+        local_origin, origin_amsl_m = self._local_origin(show, origin)
         self._check_show(show)
         names = tuple(show.tracks)
         clocks: FleetResult = await self._run("clocks", lambda member: measure_clock(member.vehicle), names=names)
         clocks.raise_for_errors()
-        arrived = await self.go_to(self._start_positions(show, local_origin, base_m), speed_m_s=speed_m_s)
+        arrived = await self.go_to(self._start_positions(show, local_origin, origin_amsl_m), speed_m_s=speed_m_s)
         arrived.raise_for_errors()
-        begin = self._context.now() + start_in_s
+        begin_at = self._context.now() + start_in_s
         with ExitStack() as stack:
             recorders = {
                 name: stack.enter_context(
-                    TrackRecorder(self.members[name].vehicle, clocks[name], local_origin, begin, base_m)
+                    TrackRecorder(self.members[name].vehicle, clocks[name], local_origin, begin_at, origin_amsl_m)
                 )
                 for name in names
             }
 
             async def fly(member: Member) -> None:
                 track, recorder = show.tracks[member.name], recorders[member.name]
-                await _fly_track(member, track, recorder, begin, rate_hz, lead_s or 0.0)
+                await _fly_track(member, track, recorder, begin_at, rate_hz, lead_s or 0.0)
 
             result = await self._run("show", fly, names=names)
         samples = {name: recorder.samples for name, recorder in recorders.items()}
@@ -363,17 +370,17 @@ class Shows(Travel):
         for name in show.tracks:
             if name not in self.members:
                 raise InvalidArgument(f"show: {short_repr(name)} is not one of {', '.join(self.members)}")
-        first = self.members[next(iter(show.tracks))]
         if origin.altitude_amsl_m is not None:
             return LocalOrigin(origin), origin.altitude_amsl_m
-        home = origin.replace(altitude_relative_m=origin.altitude_relative_m or 0.0)
-        return LocalOrigin(origin), altitude_amsl(first, home)
+        first_member = self.members[next(iter(show.tracks))]
+        above_home = origin.replace(altitude_relative_m=origin.altitude_relative_m or 0.0)
+        return LocalOrigin(origin), altitude_amsl(first_member, above_home)
 
     @staticmethod
-    def _start_positions(show: Show, origin: LocalOrigin, base_m: float) -> dict[str, Position]:
+    def _start_positions(show: Show, origin: LocalOrigin, origin_amsl_m: float) -> dict[str, Position]:
         starts = {name: track.points[0] for name, track in show.tracks.items()}
         return {
-            name: origin.to_position((start.north_m, start.east_m, start.up_m + base_m))
+            name: origin.to_position((start.north_m, start.east_m, start.up_m + origin_amsl_m))
             for name, start in starts.items()
         }
 
@@ -386,33 +393,35 @@ class Shows(Travel):
         min_m = self._context.min_distance_m
         conflicts = () if min_m is None else show.conflicts(min_m, slack_s=CONFLICT_SLACK_S)
         if conflicts:
-            first = conflicts[0]
+            conflict = conflicts[0]
             more = f" (and {len(conflicts) - 1} more pairs)" if len(conflicts) > 1 else ""
             raise OperationRejected(
-                f"fly_show: {first.name} and {first.other} come within {first.distance_m:.1f} m of each other{more},"
-                f" closer than the minimum of {min_m:g} m; nothing was sent"
+                f"fly_show: {conflict.name} and {conflict.other} come within {conflict.distance_m:.1f} m of each"
+                f" other{more}, closer than the minimum of {min_m:g} m; nothing was sent"
             )
 
 
 async def _fly_track(
-    member: Member, path: Path, recorder: TrackRecorder, begin: float, rate_hz: float, lead_s: float
+    member: Member, path: Path, recorder: TrackRecorder, begin_at: float, rate_hz: float, lead_s: float
 ) -> None:
     vehicle, period_s = member.vehicle, 1 / rate_hz
     with vehicle._session.streaming("position"):
         async with vehicle.guided.velocity(rate_hz=rate_hz) as stream:
-            while (at_s := vehicle.connection.now() - begin) < path.ends_at_s:
-                if at_s >= 0 or recorder.has_position:
-                    stream.set(_setpoint(path, at_s, lead_s, recorder.extrapolated_position()))
+            while (at_s := vehicle.connection.now() - begin_at) < path.ends_at_s:
+                if at_s < 0 and not recorder.has_position:
+                    stream.set(VelocitySetpoint())  # stay until the first position arrives
                 else:
-                    stream.set(VelocitySetpoint())
+                    stream.set(_setpoint(path, at_s, lead_s, recorder.extrapolated_position()))
                 await anyio.sleep(period_s)
 
 
-def _setpoint(path: Path, at_s: float, lead_s: float, here: LocalPoint) -> VelocitySetpoint:
-    planned, velocity = state_at(path, at_s)[0], state_at(path, at_s + lead_s)[1]
+def _setpoint(path: Path, at_s: float, lead_s: float, position: LocalPoint) -> VelocitySetpoint:
+    """Return the path's velocity ``lead_s`` later, plus a correction towards the path's position at this time."""
+    planned, _ = state_at(path, at_s)
+    _, velocity = state_at(path, at_s + lead_s)
     speed = math.hypot(*velocity)
     north, east, up = follow_velocity(
-        (planned[0] - here[0], planned[1] - here[1], planned[2] - here[2]),
+        (planned[0] - position[0], planned[1] - position[1], planned[2] - position[2]),
         velocity,
         gain=TRACK_GAIN,
         max_speed_m_s=max(CATCH_UP_FACTOR * speed, CATCH_UP_M_S) + CATCH_UP_M_S,

@@ -15,7 +15,7 @@ from aerokit.fleets.action import SelectionBase
 from aerokit.fleets.distances import LocalOrigin, altitude_amsl, position_of
 from aerokit.fleets.events import PathsCompared
 from aerokit.fleets.members import Member
-from aerokit.fleets.paths import Path, PathPoint
+from aerokit.fleets.paths import LocalPoint, Path, PathPoint
 from aerokit.fleets.policy import FleetResult
 from aerokit.fleets.separation import (
     Deconfliction,
@@ -69,6 +69,7 @@ class Travel(SelectionBase):
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
         positions = self._resolve_targets(targets)
+        # A function gives targets to available members only; all are named, so that the result lists the others too.
         names = tuple(self.members) if callable(targets) else tuple(positions)
         for name, target in positions.items():
             self.members[name].vehicle._position.check_reach(f"targets[{name!r}]", [target], max_distance_m)
@@ -157,13 +158,13 @@ class Travel(SelectionBase):
         for member in self:
             member.refresh()
         if callable(targets):
-            return {member.name: _call(targets, member) for member in self if member.is_available}
+            return {member.name: _target_from_function(targets, member) for member in self if member.is_available}
         for name in targets:
             if name not in self.members:
                 raise InvalidArgument(f"targets: {short_repr(name)} is not one of {', '.join(self.members)}")
         return {name: travel_target(target) for name, target in targets.items()}
 
-    def _routes(self, targets: Mapping[str, Position]) -> tuple[list[Route], dict[str, tuple[float, float, float]]]:
+    def _routes(self, targets: Mapping[str, Position]) -> tuple[list[Route], dict[str, LocalPoint]]:
         """Return the routes of the moving members, and the known positions of all other members of the fleet."""
         members = self._context.members
         moving = [members[name] for name in targets if members[name].is_available]
@@ -178,11 +179,11 @@ class Travel(SelectionBase):
             )
             for member in moving
         ]
-        stationary = {
-            member.name: origin.to_local(here, here.altitude_amsl_m)
-            for member in members.values()
-            if member not in moving and (here := member.vehicle.position.latest) and here.altitude_amsl_m is not None
-        }
+        stationary: dict[str, LocalPoint] = {}
+        for member in members.values():
+            position = member.vehicle.position.latest
+            if member not in moving and position is not None and position.altitude_amsl_m is not None:
+                stationary[member.name] = origin.to_local(position, position.altitude_amsl_m)
         return routes, stationary
 
     async def _fly_to(
@@ -215,9 +216,9 @@ class Travel(SelectionBase):
         max_distance_m: float,
     ) -> FleetResult:
         """Fly up, across and down. All members finish one leg before the next begins."""
-        here = {name: position_of(self._context.members[name], math.inf) for name in heights_m}
+        starts = {name: position_of(self._context.members[name], math.inf) for name in heights_m}
         legs: tuple[dict[str, Position], ...] = (
-            {name: _at_altitude(here[name], height) for name, height in heights_m.items()},
+            {name: _at_altitude(starts[name], height) for name, height in heights_m.items()},
             {name: _at_altitude(targets[name], height) for name, height in heights_m.items()},
             {name: targets[name] for name in heights_m},
         )
@@ -236,7 +237,7 @@ class Travel(SelectionBase):
         return result
 
 
-def _call(targets: Callable[[Member], Position | Home], member: Member) -> Position:
+def _target_from_function(targets: Callable[[Member], Position | Home], member: Member) -> Position:
     try:
         return travel_target(targets(member))
     except ValueUnknownError as error:
@@ -359,9 +360,11 @@ class Missions(SelectionBase):
         if min_m is None:
             raise InvalidArgument("min_distance_m is required: this fleet was created without one")
         members = self._require_available(missions)
-        first = next(iter(members.values()), None)
-        origin = None if first is None else LocalOrigin(position_of(first, math.inf))
-        paths = [] if origin is None else [_path(origin, members[name], mission) for name, mission in missions.items()]
+        paths: list[Path | None] = []
+        if members:
+            first_member = next(iter(members.values()))
+            origin = LocalOrigin(position_of(first_member, math.inf))
+            paths = [_mission_path(origin, members[name], mission) for name, mission in missions.items()]
         conflicts = find_conflicts([path for path in paths if path is not None], min_m)
         pairs = ", ".join(
             f"{conflict.name} and {conflict.other} ({conflict.distance_m:.1f} m)" for conflict in conflicts[:3]
@@ -372,18 +375,20 @@ class Missions(SelectionBase):
         return deconfliction
 
     def _require_available(self, missions: Mapping[str, Any]) -> dict[str, Member]:
-        found: dict[str, Member] = {}
+        """Return the members of these missions; raise if a name is unknown or a member unavailable."""
+        members: dict[str, Member] = {}
         for name in missions:
             if name not in self.members:
                 raise InvalidArgument(f"missions: {short_repr(name)} is not one of {', '.join(self.members)}")
-            member = found[name] = self.members[name]
+            member = members[name] = self.members[name]
             member.refresh()
             if not member.is_available:
                 raise OperationRejected(f"missions: {name} is {member.status}; nothing was sent")
-        return found
+        return members
 
 
-def _path(origin: LocalOrigin, member: Member, mission: Mission) -> Path | None:
+def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path | None:
+    """Return the path of a mission; None if no item has a position. Its points have no times."""
     points = [
         PathPoint(0.0, *origin.to_local(position, altitude_amsl(member, position)))
         for position in (item.position for item in mission)

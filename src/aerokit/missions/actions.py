@@ -38,7 +38,7 @@ def change_speed(
     return action_item(
         MavCmd.DO_CHANGE_SPEED,
         _SPEEDS[kind],
-        in_range("speed_m_s", speed_m_s, 0, 1000, or_=(-1, -2)),
+        in_range("speed_m_s", speed_m_s, 0, 1000, also_allowed=(-1, -2)),
         -1.0 if throttle_percent is None else in_range("throttle_percent", throttle_percent, 0, 100),
     )
 
@@ -52,7 +52,8 @@ def delay(duration_s: float) -> MissionItem:
         raise InvalidArgument(
             "duration_s = 0 is not allowed: it must be above 0, because ArduPilot then uses a time of day instead"
         )
-    return action_item(MavCmd.NAV_DELAY, in_range("duration_s", duration_s, 0, _MAX_DURATION_S), -1.0, -1.0, -1.0)
+    no_time_of_day = (-1.0, -1.0, -1.0)
+    return action_item(MavCmd.NAV_DELAY, in_range("duration_s", duration_s, 0, _MAX_DURATION_S), *no_time_of_day)
 
 
 def delay_until(hour: int, minute: int = 0, second: int = 0) -> MissionItem:
@@ -62,7 +63,7 @@ def delay_until(hour: int, minute: int = 0, second: int = 0) -> MissionItem:
     """
     return action_item(
         MavCmd.NAV_DELAY,
-        -1.0,
+        -1.0,  # no duration
         whole_number("hour", hour, 0, 23),
         whole_number("minute", minute, 0, 59),
         whole_number("second", second, 0, 59),
@@ -115,7 +116,7 @@ def set_servo(servo: int, pwm_us: int) -> MissionItem:
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_SERVO
     """
     number = whole_number("servo", servo, 1, 32)
-    return action_item(MavCmd.DO_SET_SERVO, number, in_range("pwm_us", pwm_us, 500, 2500, or_=(0,)))
+    return action_item(MavCmd.DO_SET_SERVO, number, in_range("pwm_us", pwm_us, 500, 2500, also_allowed=(0,)))
 
 
 def set_relay(relay: int, on: bool) -> MissionItem:
@@ -241,7 +242,7 @@ def trigger_camera() -> MissionItem:
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_DIGICAM_CONTROL
     """
-    return action_item(MavCmd.DO_DIGICAM_CONTROL).replace(x=1)
+    return action_item(MavCmd.DO_DIGICAM_CONTROL).replace(x=1)  # param5 = 1: take a picture.
 
 
 @overload

@@ -14,7 +14,7 @@ from aerokit.missions.item import (
     FENCE_COMMANDS,
     GLOBAL_FRAMES,
     LOCAL_FRAMES,
-    NUMBERS,
+    PARAMS_WITHOUT_NAN,
     RALLY_COMMANDS,
     MissionItem,
     xy_scale,
@@ -70,8 +70,9 @@ def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) ->
     _check_frame(where, item, mission_type)
     for number in (1, 2, 3, 4):
         name = f"param{number}"
-        _check_float(where, name, getattr(item, name), number not in NUMBERS.get(item.command, ()))
-    _check_float(where, "z", item.z, item.command not in DESTINATIONS)
+        may_be_nan = number not in PARAMS_WITHOUT_NAN.get(item.command, ())
+        _check_float(where, name, getattr(item, name), may_be_nan=may_be_nan)
+    _check_float(where, "z", item.z, may_be_nan=item.command not in DESTINATIONS)
     _check_place(where, item)
     if not isinstance(item.autocontinue, bool):
         raise _wrong(where, "autocontinue", item.autocontinue, "True or False")
@@ -81,13 +82,16 @@ def check_jumps(items: Sequence[MissionItem]) -> None:
     """Raise :class:`InvalidArgument` if a DO_JUMP or DO_JUMP_TAG has no target. Items are counted from 0."""
     tags = {item.param1 for item in items if item.command == MavCmd.JUMP_TAG}
     for index, item in enumerate(items):
-        where = f"item {index} ({item.name})" if item.command in (MavCmd.DO_JUMP, MavCmd.DO_JUMP_TAG) else ""
-        if item.command == MavCmd.DO_JUMP and not (0 <= item.param1 < len(items) and float(item.param1).is_integer()):
+        if item.command == MavCmd.DO_JUMP:
+            is_valid = 0 <= item.param1 < len(items) and float(item.param1).is_integer()
             allowed = f"an item of this mission: 0 to {len(items) - 1}, the first item is 0"
-            raise _wrong(where, "param1", item.param1, allowed)
-        if item.command == MavCmd.DO_JUMP_TAG and item.param1 not in tags:
+        elif item.command == MavCmd.DO_JUMP_TAG:
+            is_valid = item.param1 in tags
             allowed = f"the tag of a JUMP_TAG in this mission: {sorted(tags) or 'it has none'}"
-            raise _wrong(where, "param1", item.param1, allowed)
+        else:
+            continue
+        if not is_valid:
+            raise _wrong(f"item {index} ({item.name})", "param1", item.param1, allowed)
 
 
 def _wrong(where: str, field: str, value: object, allowed: str) -> InvalidArgument:
@@ -100,13 +104,16 @@ def _check_integer(where: str, field: str, value: object, high: int) -> None:
 
 
 def _check_command(where: str, command: int, mission_type: int) -> None:
-    kinds = {MavMissionType.FENCE: FENCE_COMMANDS, MavMissionType.RALLY: RALLY_COMMANDS}
-    for kind, commands in kinds.items():
-        if (command in commands) != (mission_type == kind):
-            plan = {1: "a fence", 2: "rally points"}.get(mission_type, "a mission")
-            allowed = {1: "fence commands (5000 to 5004)", 2: "NAV_RALLY_POINT (5100)"}
-            text = allowed.get(mission_type, "commands other than those of fences and rally points")
-            raise _wrong(where, "command", int(command), f"{text}, in {plan}")
+    is_fence_command, is_rally_command = command in FENCE_COMMANDS, command in RALLY_COMMANDS
+    if mission_type == MavMissionType.FENCE:
+        is_allowed, allowed = is_fence_command, "fence commands (5000 to 5004), in a fence"
+    elif mission_type == MavMissionType.RALLY:
+        is_allowed, allowed = is_rally_command, "NAV_RALLY_POINT (5100), in rally points"
+    else:
+        is_allowed = not is_fence_command and not is_rally_command
+        allowed = "commands other than those of fences and rally points, in a mission"
+    if not is_allowed:
+        raise _wrong(where, "command", int(command), allowed)
 
 
 def _check_frame(where: str, item: MissionItem, mission_type: int) -> None:
@@ -119,13 +126,14 @@ def _check_frame(where: str, item: MissionItem, mission_type: int) -> None:
         raise _wrong(where, "frame", item.frame, _FRAME_TEXT)
 
 
-def _check_float(where: str, field: str, value: object, nan_allowed: bool) -> None:
+def _check_float(where: str, field: str, value: object, *, may_be_nan: bool) -> None:
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         raise _wrong(where, field, value, "a number")
-    if math.isnan(value) and nan_allowed:
+    if math.isnan(value) and may_be_nan:
         return
     if math.isnan(value) or not _fits_float32(value):
-        raise _wrong(where, field, value, "a finite number that fits into 32 bits" + ", or NaN" * nan_allowed)
+        or_nan = ", or NaN" if may_be_nan else ""
+        raise _wrong(where, field, value, f"a finite number that fits into 32 bits{or_nan}")
 
 
 def _fits_float32(value: float) -> bool:

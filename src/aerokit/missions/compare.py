@@ -159,8 +159,12 @@ def _convert(letter: str, value: float) -> Iterator[float]:
         yield 0.0
     elif letter == "2":
         yield 2.0
-    elif letter in "?g" or not math.isfinite(value):
-        yield {"?": float(value > 0), "g": -1.0 if value < 0 else 1.0}.get(letter, math.nan)
+    elif letter == "?":
+        yield 1.0 if value > 0 else 0.0
+    elif letter == "g":
+        yield -1.0 if value < 0 else 1.0
+    elif not math.isfinite(value):
+        yield math.nan
     elif letter in _INTEGERS:
         low, high = _INTEGERS[letter]
         if low <= math.trunc(value) <= high:
@@ -170,28 +174,26 @@ def _convert(letter: str, value: float) -> Iterator[float]:
 
 
 def _convert_special(letter: str, value: float) -> Iterator[float]:
-    if letter == "f":
+    whole = math.trunc(value)
+    if letter == "f":  # 32-bit float
         yield struct.unpack("<f", struct.pack("<f", value))[0]
-    elif letter == "c":
-        yield float(min(255, math.trunc(value))) if value >= 0 else 0.0
-    elif letter == "U":
-        yield float(math.trunc(value) & 0xFFFF)
-    elif letter == "y":
+    elif letter == "c":  # 0 to 255
+        yield float(max(0, min(255, whole)))
+    elif letter == "U":  # 16 bits that wrap
+        yield float(whole & 0xFFFF)
+    elif letter == "y":  # heading
         yield value % 360.0
-    elif letter == "k":
+    elif letter == "k":  # centimetres
         yield math.trunc(value * 100.0) / 100.0
-    elif letter == "h" and abs(value) <= 65_504:
+    elif letter == "h" and abs(value) <= 65_504:  # 16-bit float, whose maximum is 65504
         yield struct.unpack("<e", struct.pack("<e", value))[0]
-    elif letter == "n":
-        yield math.trunc(value * 256.0) / 256.0 if 0 < value < 1 else float(min(255, math.trunc(value)))
-    elif letter in "rR":
-        yield math.copysign(_radius(abs(value), letter == "R"), value)
-
-
-def _radius(metres: float, in_a_byte: bool) -> float:
-    if not in_a_byte:
-        return float(math.trunc(metres))
-    return float(math.trunc(metres) if metres <= 255 else 10 * min(255, math.trunc(metres / 10)))
+    elif letter == "n":  # at most 255; below 1 in steps of 1/256
+        yield math.trunc(value * 256.0) / 256.0 if 0 < value < 1 else float(min(255, whole))
+    elif letter == "r":  # metres
+        yield float(whole)
+    elif letter == "R":  # metres in a byte, above 255 m in tens
+        radius = math.trunc(abs(value)) if abs(value) <= 255 else 10 * min(255, math.trunc(abs(value) / 10))
+        yield math.copysign(radius, value)
 
 
 ALTITUDE_TOLERANCE_M = 0.011  # ArduPilot stores altitudes in whole centimetres
@@ -211,30 +213,30 @@ _HEADING_IS_PARAM4 = frozenset(
 
 
 def plan_differences(
-    wanted: Sequence[MissionItem], found: Sequence[MissionItem], storage: ItemStorage = ItemStorage.ANY
+    expected: Sequence[MissionItem], actual: Sequence[MissionItem], storage: ItemStorage = ItemStorage.ANY
 ) -> tuple[str, ...]:
     """Describe each difference: ``"item 3 (NAV_WAYPOINT): z is 20.0 instead of 30.0"``. Empty for equal plans."""
-    texts = [f"there are {len(found)} items instead of {len(wanted)}"] if len(wanted) != len(found) else []
-    for index, (item, other) in enumerate(zip(wanted, found)):  # noqa: B905 - lengths may differ, see above
-        texts += [f"item {index} ({item.name}): {text}" for text in item_differences(item, other, storage)]
+    texts = [f"there are {len(actual)} items instead of {len(expected)}"] if len(expected) != len(actual) else []
+    for index, (item, actual_item) in enumerate(zip(expected, actual)):  # noqa: B905 - lengths may differ, see above
+        texts += [f"item {index} ({item.name}): {text}" for text in item_differences(item, actual_item, storage)]
     return tuple(texts)
 
 
 def changed_items(
-    wanted: Sequence[MissionItem], found: Sequence[MissionItem], storage: ItemStorage = ItemStorage.WIRE
+    expected: Sequence[MissionItem], actual: Sequence[MissionItem], storage: ItemStorage = ItemStorage.WIRE
 ) -> tuple[int, ...]:
-    """Return the indices at which ``found`` does not have the wanted item.
+    """Return the indices at which ``actual`` does not have the expected item, and which a partial update must send.
 
-    These items must be sent in a partial update. By default, only changes made by the protocol itself are tolerated.
+    By default, only changes made by the protocol itself are tolerated.
     """
-    common = min(len(wanted), len(found))
-    changed = [i for i in range(common) if item_differences(wanted[i], found[i], storage)]
-    return (*changed, *range(common, len(wanted)))
+    common = min(len(expected), len(actual))
+    changed = [i for i in range(common) if item_differences(expected[i], actual[i], storage)]
+    return (*changed, *range(common, len(expected)))
 
 
 def item_differences(
-    wanted: MissionItem,
-    found: MissionItem,
+    expected: MissionItem,
+    actual: MissionItem,
     storage: ItemStorage = ItemStorage.ANY,
     *,
     single_precision: bool = False,
@@ -243,89 +245,99 @@ def item_differences(
 
     ``single_precision``: places were sent as 32-bit floats (MISSION_ITEM), whose steps are up to 1.7 m.
     """
-    if wanted.command != found.command:
-        return (f"the command is {found.name} instead of {wanted.name}",)
+    if expected.command != actual.command:
+        return (f"the command is {actual.name} instead of {expected.name}",)
     return tuple(
-        f"{field} is {getattr(found, field)!r} instead of {getattr(wanted, field)!r}"
-        for field in _different_fields(wanted, found, storage, single_precision)
+        f"{field} is {getattr(actual, field)!r} instead of {getattr(expected, field)!r}"
+        for field in _different_fields(expected, actual, storage, single_precision)
     )
 
 
 def _different_fields(
-    wanted: MissionItem, found: MissionItem, storage: ItemStorage, single_precision: bool
+    expected: MissionItem, actual: MissionItem, storage: ItemStorage, single_precision: bool
 ) -> Iterator[str]:
-    if not _frames_alike(wanted, found, storage):
+    if not _frames_match(expected, actual, storage):
         yield "frame"
     for field in ("param1", "param2", "param3", "param4"):
-        if not _same_number(wanted, found, field, storage):
+        if not _same_number(expected, actual, field, storage):
             yield field
     for field in ("x", "y"):
-        if not _same_place(wanted, found, field, storage, single_precision):
+        if not _same_place(expected, actual, field, storage, single_precision):
             yield field
-    if not _same_altitude(wanted, found, storage):
+    if not _same_altitude(expected, actual, storage):
         yield "z"
-    if bool(wanted.autocontinue) != bool(found.autocontinue) and not _drops_autocontinue(found, storage):
+    if bool(expected.autocontinue) != bool(actual.autocontinue) and not _drops_autocontinue(actual, storage):
         yield "autocontinue"
 
 
-def _drops_autocontinue(found: MissionItem, storage: ItemStorage) -> bool:
+def _drops_autocontinue(actual: MissionItem, storage: ItemStorage) -> bool:
     # ArduPilot reports True for items of missions, False for items of fences and rally points.
-    if found.command in FENCE_COMMANDS | RALLY_COMMANDS:
+    if actual.command in FENCE_COMMANDS | RALLY_COMMANDS:
         return True
-    return storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY) and found.autocontinue
+    return storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY) and actual.autocontinue
 
 
-def _frames_alike(wanted: MissionItem, found: MissionItem, storage: ItemStorage) -> bool:
-    frame, other = canonical_frame(wanted.frame), canonical_frame(found.frame)
-    if frame == other or (wanted.command in FENCE_COMMANDS and {wanted.frame, found.frame} <= GLOBAL_FRAMES):
+def _frames_match(expected: MissionItem, actual: MissionItem, storage: ItemStorage) -> bool:
+    expected_frame, actual_frame = canonical_frame(expected.frame), canonical_frame(actual.frame)
+    if expected_frame == actual_frame:
         return True
-    if storage not in (ItemStorage.ARDUPILOT, ItemStorage.ANY) or other != MavFrame.GLOBAL:
+    # A fence has no altitudes, so the reference of the altitude does not matter.
+    if expected.command in FENCE_COMMANDS and {expected.frame, actual.frame} <= GLOBAL_FRAMES:
+        return True
+    # ArduPilot returns the frame GLOBAL for items without a place.
+    if storage not in (ItemStorage.ARDUPILOT, ItemStorage.ANY) or actual_frame != MavFrame.GLOBAL:
         return False
-    return not has_place(wanted.command) or frame == MavFrame.MISSION
+    return not has_place(expected.command) or expected_frame == MavFrame.MISSION
 
 
-def _same_number(wanted: MissionItem, found: MissionItem, field: str, storage: ItemStorage) -> bool:
-    value, other = getattr(wanted, field), getattr(found, field)
-    if _close(value, other):
+def _same_number(expected: MissionItem, actual: MissionItem, field: str, storage: ItemStorage) -> bool:
+    value, actual_value = getattr(expected, field), getattr(actual, field)
+    if _close(value, actual_value):
         return True
-    if field == "param4" and wanted.command in _HEADING_IS_PARAM4 and storage in (ItemStorage.PX4, ItemStorage.ANY):
-        turn = abs(value - other) % 360.0
+    if field == "param4" and expected.command in _HEADING_IS_PARAM4 and storage in (ItemStorage.PX4, ItemStorage.ANY):
+        # A heading, for which 359.9995 and 0 are close.
+        turn = abs(value - actual_value) % 360.0
         if min(turn, 360.0 - turn) <= HEADING_TOLERANCE_DEG:
             return True
-    return any(_close(stored, other) for stored in _stored_values(wanted, field, storage))
+    return any(_close(stored, actual_value) for stored in _stored_values(expected, field, storage))
 
 
 def _same_place(
-    wanted: MissionItem, found: MissionItem, field: str, storage: ItemStorage, single_precision: bool
+    expected: MissionItem, actual: MissionItem, field: str, storage: ItemStorage, single_precision: bool
 ) -> bool:
-    value, other = getattr(wanted, field), getattr(found, field)
-    scale = xy_scale(wanted.command, wanted.frame)
+    value, actual_value = getattr(expected, field), getattr(actual, field)
+    scale = xy_scale(expected.command, expected.frame)
     if scale != 1:
-        return bool(abs(value - other) <= 1 + (_float_step(value / scale) * scale if single_precision else 0))
-    if has_place(wanted.command):  # In the frame MISSION, coordinates are floats that are not scaled.
-        return bool(value == other)
-    return value == other or any(_close(stored, other) for stored in _stored_values(wanted, field, storage))
+        tolerance = 1.0
+        if single_precision:
+            tolerance += _float_step(value / scale) * scale
+        return bool(abs(value - actual_value) <= tolerance)
+    if has_place(expected.command):  # In the frame MISSION, coordinates are floats that are not scaled.
+        return bool(value == actual_value)
+    stored_values = _stored_values(expected, field, storage)
+    return value == actual_value or any(_close(stored, actual_value) for stored in stored_values)
 
 
 def _float_step(value: float) -> float:
-    # This is the distance between neighbouring 32-bit floats.
+    """Return the distance between a 32-bit float and its neighbour."""
     return math.ldexp(1.0, math.frexp(value)[1] - 24)
 
 
-def _same_altitude(wanted: MissionItem, found: MissionItem, storage: ItemStorage) -> bool:
-    if wanted.command in FENCE_COMMANDS or _close(wanted.z, found.z):
+def _same_altitude(expected: MissionItem, actual: MissionItem, storage: ItemStorage) -> bool:
+    if expected.command in FENCE_COMMANDS or _close(expected.z, actual.z):
         return True
-    if not has_place(wanted.command):
-        return any(_close(stored, found.z) for stored in _stored_values(wanted, "z", storage))
+    if not has_place(expected.command):
+        return any(_close(stored, actual.z) for stored in _stored_values(expected, "z", storage))
     if storage not in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
         return False
-    if wanted.command in RALLY_COMMANDS:  # ArduPilot stores whole metres
-        return math.isfinite(wanted.z) and _close(math.trunc(wanted.z), found.z)
-    return abs(wanted.z - found.z) <= ALTITUDE_TOLERANCE_M
+    if expected.command in RALLY_COMMANDS:  # ArduPilot stores whole metres
+        return math.isfinite(expected.z) and _close(math.trunc(expected.z), actual.z)
+    return abs(expected.z - actual.z) <= ALTITUDE_TOLERANCE_M
 
 
 def _close(left: float, right: float) -> bool:
-    # Otherwise compare as 32-bit floats, with some margin for arithmetic on them.
-    if left == right or (left != left and right != right):
+    """Return True if the numbers are equal, both NaN, or equal as 32-bit floats with some margin for rounding."""
+    are_both_nan = left != left and right != right
+    if left == right or are_both_nan:
         return True
     return abs(left - right) <= max(1e-6 * max(abs(left), abs(right)), 1e-9)

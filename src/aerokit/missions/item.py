@@ -70,8 +70,8 @@ PLACES = frozenset(
     }
 )
 
-# Maps common commands to those of parameters 1 to 4 that must not be NaN according to the standard.
-NUMBERS: dict[int, tuple[int, ...]] = {
+# Maps common commands to the numbers of those parameters, from 1 to 4, that must not be NaN according to the standard.
+PARAMS_WITHOUT_NAN: dict[int, tuple[int, ...]] = {
     MavCmd.NAV_WAYPOINT: (1, 2, 3),
     MavCmd.NAV_LOITER_UNLIM: (3,),
     MavCmd.NAV_LOITER_TURNS: (1, 3),
@@ -210,10 +210,9 @@ class MissionItem(Snapshot):
         None for commands without a place, for local frames, and for 0°, 0°, which means "the current position". If the
         frame is relative to terrain, the position has no altitude; use ``z``.
         """
-        if xy_scale(self.command, self.frame) != 10_000_000 or (self.x, self.y) in (
-            (0, 0),
-            (DEFAULT_XY,) * 2,
-        ):
+        if xy_scale(self.command, self.frame) != 10_000_000:
+            return None
+        if (self.x, self.y) in ((0, 0), (DEFAULT_XY, DEFAULT_XY)):
             return None
         altitude = self.z if math.isfinite(self.z) else None
         frame = canonical_frame(self.frame)
@@ -229,6 +228,7 @@ class MissionItem(Snapshot):
 
     def _key(self) -> tuple[Any, ...]:
         values: tuple[Any, ...] = self._values(self)
+        # NaN, the only value that differs from itself, is replaced, so that items with NaN can be equal.
         return tuple("NaN" if value != value else value for value in values)
 
     def __eq__(self, other: object) -> bool:
@@ -261,13 +261,14 @@ def place_item(
             raise InvalidArgument(f"longitude_deg = {longitude_deg!r} is not allowed together with a Position")
         position = travel_target(latitude_deg)
         latitude_deg, longitude_deg = position.latitude_deg, position.longitude_deg
-        altitudes = _altitudes_of(position) if altitudes == (None, None, None) else altitudes
+        if altitudes == (None, None, None):
+            altitudes = _altitudes_of(position)
     z, frame = altitude_and_frame(*altitudes)
     if latitude_deg is None and longitude_deg is None and not is_needed:
         return MissionItem(command, frame, *_four(parameters), z=z)
     if latitude_deg is None or longitude_deg is None:
-        none = "" if is_needed else " or none of them"
-        raise InvalidArgument(f"latitude_deg and longitude_deg: give both{none}, or a Position instead")
+        or_none = "" if is_needed else " or none of them"
+        raise InvalidArgument(f"latitude_deg and longitude_deg: give both{or_none}, or a Position instead")
     in_range("latitude_deg", latitude_deg, -90, 90)
     in_range("longitude_deg", longitude_deg, -180, 180)
     check_place(latitude_deg, longitude_deg)
@@ -286,21 +287,19 @@ def altitude_and_frame(
     relative_m: float | None, amsl_m: float | None, terrain_m: float | None
 ) -> tuple[float, MavFrame]:
     """Return the altitude that is given, which must be exactly one, and its frame."""
-    given = {
-        name: (value, frame)
-        for name, value, frame in (
-            ("altitude_relative_m", relative_m, MavFrame.GLOBAL_RELATIVE_ALT),
-            ("altitude_amsl_m", amsl_m, MavFrame.GLOBAL),
-            ("altitude_terrain_m", terrain_m, MavFrame.GLOBAL_TERRAIN_ALT),
-        )
-        if value is not None
-    }
+    candidates = (
+        ("altitude_relative_m", relative_m, MavFrame.GLOBAL_RELATIVE_ALT),
+        ("altitude_amsl_m", amsl_m, MavFrame.GLOBAL),
+        ("altitude_terrain_m", terrain_m, MavFrame.GLOBAL_TERRAIN_ALT),
+    )
+    given = [(name, value, frame) for name, value, frame in candidates if value is not None]
     if len(given) != 1:
+        names = " and ".join(name for name, _, _ in given)
         raise InvalidArgument(
             "give exactly one of altitude_relative_m (above home), altitude_amsl_m (above mean sea level) and"
-            f" altitude_terrain_m (above the ground), not {' and '.join(given) or 'none'}"
+            f" altitude_terrain_m (above the ground), not {names or 'none'}"
         )
-    ((name, (value, frame)),) = given.items()
+    name, value, frame = given[0]
     in_range(name, value, -MAX_ALTITUDE_M, MAX_ALTITUDE_M)
     return float(value), frame
 
@@ -310,12 +309,16 @@ def action_item(command: int, *parameters: float, z: float = 0.0) -> MissionItem
     return MissionItem(command, MavFrame.MISSION, *_four(parameters), z=z)
 
 
-def in_range(name: str, value: object, low: float, high: float, *, or_: tuple[float, ...] = ()) -> float:
-    """Return the value as a float; raise :class:`InvalidArgument` unless it is from low to high or in ``or_``."""
-    if isinstance(value, (int, float)) and not isinstance(value, bool) and (low <= value <= high or value in or_):
+def in_range(name: str, value: object, low: float, high: float, *, also_allowed: tuple[float, ...] = ()) -> float:
+    """Return the value as a float; raise :class:`InvalidArgument` unless it is in the range or in ``also_allowed``."""
+    if (
+        isinstance(value, (int, float))
+        and not isinstance(value, bool)
+        and (low <= value <= high or value in also_allowed)
+    ):
         return float(value)
-    others = "".join(f", or {other:g}" for other in or_)
-    raise InvalidArgument(f"{name} = {value!r} is not allowed: {low:g} to {high:g}{others}")
+    alternatives = "".join(f", or {number:g}" for number in also_allowed)
+    raise InvalidArgument(f"{name} = {value!r} is not allowed: {low:g} to {high:g}{alternatives}")
 
 
 def whole_number(name: str, value: object, low: int, high: int) -> float:
@@ -331,5 +334,6 @@ def heading(name: str, value: float | None) -> float:
 
 
 def _four(parameters: tuple[float, ...]) -> tuple[float, float, float, float]:
-    one, two, three, four = (*parameters, 0.0, 0.0, 0.0, 0.0)[:4]
-    return one, two, three, four
+    """Return param1 to param4; those that are not given are 0."""
+    param1, param2, param3, param4 = (*parameters, 0.0, 0.0, 0.0, 0.0)[:4]
+    return param1, param2, param3, param4

@@ -97,6 +97,7 @@ class Mission(_ItemSequence):
         return cls(*without_home(items)) if home_is_item_0 else cls(items)
 
 
+# Commands for `inclusion` True and False.
 _POLYGON = {True: MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, False: MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION}
 
 _CIRCLE = {True: MavCmd.NAV_FENCE_CIRCLE_INCLUSION, False: MavCmd.NAV_FENCE_CIRCLE_EXCLUSION}
@@ -184,18 +185,18 @@ class Fence(Snapshot):
         return_point: Position | None = None
         index = 0
         while index < len(items):
-            item, taken = items[index], 1
+            item, item_count = items[index], 1
             if item.command in _POLYGON.values():
                 polygon = _read_polygon(items, index)
                 polygons.append(polygon)
-                taken = len(polygon.vertices)
+                item_count = len(polygon.vertices)
             elif item.command in _CIRCLE.values():
                 circles.append(_read_circle(item, index))
             elif item.command == MavCmd.NAV_FENCE_RETURN_POINT:
                 return_point = _place(item, index)
             else:
                 raise RemoteProtocolError(f"item {index} ({item.name}) does not belong to a fence")
-            index += taken
+            index += item_count
         return cls(polygons, circles, return_point)
 
     def _check(self) -> None:
@@ -245,9 +246,10 @@ def _place(item: MissionItem, index: int) -> Position:
         place = Position(item.x / 1e7, item.y / 1e7)
     except InvalidArgument as error:
         raise RemoteProtocolError(f"item {index} ({item.name}): {error}") from error
-    if item.command != MavCmd.NAV_FENCE_RETURN_POINT or (item.z == 0 and item.frame == MavFrame.GLOBAL):
-        return place
-    return item.position or place
+    # Only a return point has an altitude; `_return_item` writes 0 in the frame GLOBAL if it is unknown.
+    has_altitude = item.command == MavCmd.NAV_FENCE_RETURN_POINT and (item.z != 0 or item.frame != MavFrame.GLOBAL)
+    position_with_altitude = item.position if has_altitude else None
+    return position_with_altitude or place
 
 
 class RallyPoints(_ItemSequence):
@@ -297,7 +299,7 @@ class Plan(Snapshot):
     source: str = ""
 
     def _key(self) -> tuple[Any, ...]:
-        return tuple(self.to_dict().values())[:-1]
+        return tuple(self.to_dict().values())[:-1]  # without the last field, `source`
 
     def __eq__(self, other: object) -> bool:
         return self._key() == other._key() if isinstance(other, Plan) else NotImplemented

@@ -174,7 +174,7 @@ def take_off(
     """
     return place_item(
         MavCmd.NAV_TAKEOFF,
-        *_up(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
+        *_place_or_altitude(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
         in_range("pitch_deg", pitch_deg, 0, 90),
         0.0,
         0.0,
@@ -224,7 +224,7 @@ def vtol_take_off(
     """
     return place_item(
         MavCmd.NAV_VTOL_TAKEOFF,
-        *_up(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
+        *_place_or_altitude(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
         0.0,
         0.0,
         0.0,
@@ -278,7 +278,7 @@ def land(
         MavCmd.NAV_LAND,
         latitude_deg,
         longitude_deg,
-        _ground(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        _altitudes_or_home(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("abort_altitude_m", abort_altitude_m, 0, _MAX_RADIUS_M),
         in_range("precision", precision, 0, 2),
         0.0,
@@ -324,7 +324,7 @@ def vtol_land(
         MavCmd.NAV_VTOL_LAND,
         latitude_deg,
         longitude_deg,
-        _ground(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        _altitudes_or_home(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         0.0,
         0.0,
         0.0,
@@ -530,7 +530,7 @@ def loiter_to_altitude(
     """
     return place_item(
         MavCmd.NAV_LOITER_TO_ALT,
-        *_up(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
+        *_place_or_altitude(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
         0.0,
         in_range("radius_m", radius_m, -_MAX_RADIUS_M, _MAX_RADIUS_M),
         0.0,
@@ -582,15 +582,18 @@ def rally_point(
     return item
 
 
-def _up(
+def _place_or_altitude(
     latitude_deg: Position | Home | float | None, longitude_deg: float | None, altitudes: Altitudes
 ) -> tuple[Position | Home | float | None, float | None, Altitudes]:
-    # A number alone is an altitude above home.
+    """Return latitude, longitude and altitudes. If the only argument is a number, it is an altitude above home."""
     if isinstance(latitude_deg, (int, float)) and longitude_deg is None and altitudes == (None, None, None):
         return None, None, (latitude_deg, None, None)
     return latitude_deg, longitude_deg, altitudes
 
 
-def _ground(*altitudes: float | None) -> Altitudes:
+def _altitudes_or_home(*altitudes: float | None) -> Altitudes:
+    """Return the altitudes of the ground; if none is given, the altitude of home."""
     relative, amsl, terrain = altitudes
-    return (0.0, None, None) if altitudes == (None, None, None) else (relative, amsl, terrain)
+    if altitudes == (None, None, None):
+        return (0.0, None, None)
+    return (relative, amsl, terrain)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _MAX_LISTED = 5
 """Number of objects with missing fields that an error lists."""
 
-_NUMBERS = {
+_NUMBER_KEYS = {
     "firmware_type": "firmwareType",
     "vehicle_type": "vehicleType",
     "cruise_speed_m_s": "cruiseSpeed",
@@ -62,9 +62,11 @@ def write_plan_file(path: str | os.PathLike[str], plan: Plan | Mission) -> None:
 def parse_plan(text: str, name: str = "plan") -> Plan:
     """Parse the text of a file. Errors begin with ``name``."""
     document = load_json(text, name)
-    for key, allowed in (("fileType", "Plan"), ("version", 1)):  # first, because other files lack most fields
-        if (found := document.child(key)) is not None:
-            found.one_of(allowed)
+    # Checked before the missing fields, because another kind of file lacks most of them.
+    for key, allowed in (("fileType", "Plan"), ("version", 1)):
+        member = document.child(key)
+        if member is not None:
+            member.one_of(allowed)
     _check_required(document)
     mission = document.child("mission")
     fence, rally = document.child("geoFence"), document.child("rallyPoints")
@@ -73,7 +75,7 @@ def parse_plan(text: str, name: str = "plan") -> Plan:
         Fence() if fence is None else _read_fence(fence),
         RallyPoints() if rally is None else _read_rally(rally),
         *_read_numbers(mission),
-        text,
+        source=text,
     )
 
 
@@ -106,6 +108,7 @@ def format_plan(plan: Plan | Mission) -> str:
 
 
 def _document(plan: Plan) -> dict[str, Any]:
+    """Return the JSON object of a file: that of ``plan.source``, in which only the changed parts are replaced."""
     document: dict[str, Any]
     if plan.source:
         document, old = json.loads(plan.source), parse_plan(plan.source)
@@ -128,26 +131,32 @@ def _document(plan: Plan) -> dict[str, Any]:
 
 def _check_required(document: JsonValue) -> None:
     """Raise one error for all required fields that are missing. The types of fields are checked when they are read."""
-    missing = [(path, absent) for path, absent in _missing_fields(document.value) if absent]
-    if not missing:
+    incomplete = [(path, keys) for path, keys in _missing_fields(document.value) if keys]
+    if not incomplete:
         return
-    listed = [f"{path} has no {' and '.join(map(repr, absent))}" for path, absent in missing[:_MAX_LISTED]]
-    more = len(missing) - len(listed)
-    listed += [f"{more} more objects are incomplete"] if more else []
-    is_one = len(missing) == len(missing[0][1]) == 1
-    raise FileFormatError(f"{document.name}: {'; '.join(listed)}, which {'is' if is_one else 'are'} required")
+    texts = [f"{path} has no {' and '.join(map(repr, keys))}" for path, keys in incomplete[:_MAX_LISTED]]
+    unlisted = len(incomplete) - len(texts)
+    if unlisted:
+        texts.append(f"{unlisted} more objects are incomplete")
+    missing_count = sum(len(keys) for _, keys in incomplete)
+    raise FileFormatError(
+        f"{document.name}: {'; '.join(texts)}, which {'is' if missing_count == 1 else 'are'} required"
+    )
 
 
 def _missing_fields(plan: Any) -> Iterator[tuple[str, list[str]]]:
     """Yield each object of a plan with the names of the required fields that it lacks."""
     mission, fence, rally = (_member(plan, key) for key in ("mission", "geoFence", "rallyPoints"))
-    is_empty = mission is None and fence is None and rally is None
-    yield _missing_in("the document", plan, "fileType", "version", *(("mission",) if is_empty else ()))
+    document_keys = ["fileType", "version"]
+    if mission is None and fence is None and rally is None:
+        document_keys.append("mission")
+    yield _missing_in("the document", plan, *document_keys)
     yield _missing_in("mission", mission, "version", "items")
     for path, item in _entries("mission.items", _member(mission, "items")):
-        is_simple = _member(item, "type") == "SimpleItem"
-        simple = ("command", "frame", "params", "autoContinue") if is_simple else ()
-        yield _missing_in(path, item, "type", *simple)
+        if _member(item, "type") == "SimpleItem":
+            yield _missing_in(path, item, "type", "command", "frame", "params", "autoContinue")
+        else:
+            yield _missing_in(path, item, "type")
     yield _missing_in("geoFence", fence, "version")
     for path, polygon in _entries("geoFence.polygons", _member(fence, "polygons")):
         yield _missing_in(path, polygon, "polygon", "inclusion")
@@ -157,16 +166,22 @@ def _missing_fields(plan: Any) -> Iterator[tuple[str, list[str]]]:
     yield _missing_in("rallyPoints", rally, "version")
 
 
+# Values of an unexpected type are ignored here: an error about them is raised when they are read.
+
+
 def _member(value: Any, key: str) -> Any:
     return value.get(key) if isinstance(value, dict) else None
 
 
 def _entries(path: str, value: Any) -> Iterator[tuple[str, Any]]:
-    return ((f"{path}[{number}]", entry) for number, entry in enumerate(value if isinstance(value, list) else ()))
+    if isinstance(value, list):
+        for number, entry in enumerate(value):
+            yield f"{path}[{number}]", entry
 
 
 def _missing_in(path: str, value: Any, *keys: str) -> tuple[str, list[str]]:
-    return path, [key for key in keys if key not in value] if isinstance(value, dict) else []
+    missing = [key for key in keys if key not in value] if isinstance(value, dict) else []
+    return path, missing
 
 
 def _read_mission(value: JsonValue) -> Mission:
@@ -181,7 +196,7 @@ def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
     defaults = _numbers(Plan())
     if mission is None:
         return defaults
-    firmware, vehicle, cruise, hover = (mission.child(key) for key in _NUMBERS.values())
+    firmware, vehicle, cruise, hover = (mission.child(key) for key in _NUMBER_KEYS.values())
     return (
         defaults[0] if firmware is None else firmware.integer(0, 0xFF),
         defaults[1] if vehicle is None else vehicle.integer(0, 0xFF),
@@ -191,7 +206,7 @@ def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
 
 
 def _read_fence(value: JsonValue) -> Fence:
-    if _is_empty_and_old(value, "polygon", "polygons", "circles"):
+    if _check_version(value, "polygon", "polygons", "circles") == 1:
         return Fence()
     polygons, circles = (value.child(key) for key in ("polygons", "circles"))
     point = value.child("breachReturn")
@@ -202,11 +217,15 @@ def _read_fence(value: JsonValue) -> Fence:
     )
 
 
-def _is_empty_and_old(value: JsonValue, *keys: str) -> bool:
-    # Version 1 had other contents, but QGroundControl has written it for empty fences and empty rally points, too.
-    is_empty = not any(value.members().get(key) for key in keys)
-    value["version"].one_of(*((1, 2) if is_empty else (2,)))
-    return bool(value["version"].value == 1)
+def _check_version(value: JsonValue, *content_keys: str) -> int:
+    """Return the version; raise FileFormatError unless it is 2, or 1 without content.
+
+    Version 1 had other contents, but QGroundControl has written it for empty fences and empty rally points, too.
+    """
+    is_empty = not any(value.members().get(key) for key in content_keys)
+    allowed = (1, 2) if is_empty else (2,)
+    value["version"].one_of(*allowed)
+    return int(value["version"].value)
 
 
 def _read_polygon(value: JsonValue) -> FencePolygon:
@@ -223,14 +242,12 @@ def _read_circle(value: JsonValue) -> FenceCircle:
     center = _required_place(circle["center"])
     try:
         return FenceCircle(center, radius.number(), value["inclusion"].boolean())
-    except FileFormatError:
-        raise
     except InvalidArgument as error:
         raise radius.error("a number of metres above 0") from error
 
 
 def _read_rally(value: JsonValue) -> RallyPoints:
-    if _is_empty_and_old(value, "points"):
+    if _check_version(value, "points") == 1:
         return RallyPoints()
     return RallyPoints([_read_rally_point(point) for point in value["points"].elements()])
 
@@ -248,7 +265,7 @@ def _required_place(value: JsonValue) -> Position:
 
 
 def _read_place(value: JsonValue, *, altitude: str) -> Position | None:
-    # Null coordinates mean no position.
+    """Return the place; None if coordinates are null. ``altitude`` tells its reference: "amsl" or "relative"."""
     elements = value.elements(2, 3)
     latitude, longitude = elements[0].number(-90, 90, null=True), elements[1].number(-180, 180, null=True)
     if math.isnan(latitude) or math.isnan(longitude):
@@ -280,11 +297,11 @@ def _update_mission(document: dict[str, Any], plan: Plan, old: Plan | None) -> N
     mission = document.setdefault("mission", {})
     if not mission:
         mission.update({"globalPlanAltitudeMode": 1, "items": [], "version": 2})
-        old = None
+        old = None  # There is nothing to keep.
     if old is None or plan.mission.items != old.mission.items:
         groups = read_entries(JsonValue(mission["items"], "plan", "mission.items").elements())
         mission["items"] = merged_entries(mission["items"], groups, plan.mission.items)
-    for name, key in _NUMBERS.items():
+    for name, key in _NUMBER_KEYS.items():
         value = getattr(plan, name)
         if old is None or value != getattr(old, name):
             mission[key] = json_number(value)
@@ -325,7 +342,7 @@ def _fence_members(fence: Fence) -> dict[str, Any]:
 def _rally_point(item: MissionItem, index: int) -> list[int | float | None]:
     if canonical_frame(item.frame) != MavFrame.GLOBAL_RELATIVE_ALT:
         raise InvalidArgument(f"rally[{index}]: frame = {item.frame!r}: a .plan file stores only altitudes above home")
-    return [*map(json_number, (*in_degrees(item), item.z))]
+    return [json_number(number) for number in (*in_degrees(item), item.z)]
 
 
 def _place(position: Position) -> list[int | float | None]:

@@ -32,10 +32,10 @@ LANDING_PATTERNS = {"fwLandingPattern": MavCmd.NAV_LAND, "vtolLandingPattern": M
 def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
     """Generate the items of a ComplexItem whose type is in :data:`LANDING_PATTERNS`."""
     command = LANDING_PATTERNS[pattern["complexItemType"].value]
-    relative = pattern["altitudesAreRelative"].boolean()
-    frame = MavFrame.GLOBAL_RELATIVE_ALT if relative else MavFrame.GLOBAL
-    approach = pattern.child("landingApproachCoordinate") or pattern["loiterCoordinate"]
-    heading = 0.0 if command == MavCmd.NAV_LAND else math.nan
+    is_relative = pattern["altitudesAreRelative"].boolean()
+    frame = MavFrame.GLOBAL_RELATIVE_ALT if is_relative else MavFrame.GLOBAL
+    approach = pattern.child("landingApproachCoordinate") or pattern["loiterCoordinate"]  # The latter in older files.
+    heading = 0.0 if command == MavCmd.NAV_LAND else math.nan  # as QGroundControl sends it
     return (
         MissionItem(MavCmd.DO_LAND_START, MavFrame.MISSION),
         *_reset_items(pattern),
@@ -58,12 +58,12 @@ def _reset_items(pattern: JsonValue) -> list[MissionItem]:
 
 
 def _approach(pattern: JsonValue, frame: MavFrame, place: JsonValue) -> MissionItem:
-    # The approach is a descent in a circle, which is left tangentially, or a waypoint. Older files have circles only.
+    # Either a waypoint, or a descent in a circle that is left tangentially. Older files have only circles.
     if not _flag(pattern, "useLoiterToAlt", default=True):
         return MissionItem(MavCmd.NAV_WAYPOINT, frame, 0.0, 0.0, 0.0, math.nan, *_place(place))
     radius = pattern["loiterRadius"].number(0)
-    turn = radius if pattern["loiterClockwise"].boolean() else -radius
-    return MissionItem(MavCmd.NAV_LOITER_TO_ALT, frame, 1.0, turn, 0.0, 1.0, *_place(place))
+    signed_radius = radius if pattern["loiterClockwise"].boolean() else -radius
+    return MissionItem(MavCmd.NAV_LOITER_TO_ALT, frame, 1.0, signed_radius, 0.0, 1.0, *_place(place))
 
 
 def _flag(pattern: JsonValue, key: str, *, default: bool = False) -> bool:
@@ -93,14 +93,17 @@ _MODE_OF_FRAME: dict[int, int] = {
 
 def read_entries(entries: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
     """Return the items of each entry of ``mission.items``. Jump targets are counted from 0 over all entries."""
-    values = [_simple_values(entry) for entry in entries]
-    generated = [landing_items(entry) if group is None else () for entry, group in zip(entries, values)]  # noqa: B905
-    sizes = [len(items) if group is None else len(group) for items, group in zip(generated, values)]  # noqa: B905
-    ids = _jump_ids(entries, values, sizes)
-    return [
-        items if group is None else tuple(_read_item(value, ids) for value in group)
-        for items, group in zip(generated, values)  # noqa: B905 - same length
-    ]
+    groups = [_simple_values(entry) for entry in entries]  # None for a landing pattern, whose items are generated
+    landings = {number: landing_items(entries[number]) for number, group in enumerate(groups) if group is None}
+    sizes = [len(landings[number]) if group is None else len(group) for number, group in enumerate(groups)]
+    ids = _jump_ids(entries, groups, sizes)
+    items: list[tuple[MissionItem, ...]] = []
+    for number, group in enumerate(groups):
+        if group is None:
+            items.append(landings[number])
+        else:
+            items.append(tuple(_read_item(value, ids) for value in group))
+    return items
 
 
 def merged_entries(
@@ -110,20 +113,26 @@ def merged_entries(
 
     ``groups`` has the items of each old entry.
     """
-    head, used = 0, 0
-    while head < len(groups) and _matches(groups[head], items[used : used + len(groups[head])]):
-        used += len(groups[head])
-        head += 1
-    tail, end = len(groups), len(items)
-    while tail > head and end - len(groups[tail - 1]) >= used:
-        begin = end - len(groups[tail - 1])
-        if not _matches(groups[tail - 1], items[begin:end]):
+    # Entries before `head_end` are kept, and stand for the items before `first_new`.
+    head_end, first_new = 0, 0
+    while head_end < len(groups):
+        group = groups[head_end]
+        if not _matches(group, items[first_new : first_new + len(group)]):
             break
-        tail, end = tail - 1, begin
-    middle = [simple_entry(item) for item in items[used:end]]
-    merged = [*copy.deepcopy(list(entries[:head])), *middle, *copy.deepcopy(list(entries[tail:]))]
-    sizes = [*map(len, groups[:head]), *(1,) * len(middle), *map(len, groups[tail:])]
-    _number(merged, sizes, items)
+        head_end, first_new = head_end + 1, first_new + len(group)
+    # Entries from `tail_start` on are kept, and stand for the items from `end_new` on.
+    tail_start, end_new = len(groups), len(items)
+    while tail_start > head_end:
+        group = groups[tail_start - 1]
+        start = end_new - len(group)
+        if start < first_new or not _matches(group, items[start:end_new]):
+            break
+        tail_start, end_new = tail_start - 1, start
+    new_entries = [simple_entry(item) for item in items[first_new:end_new]]
+    head, tail = copy.deepcopy(list(entries[:head_end])), copy.deepcopy(list(entries[tail_start:]))
+    merged = [*head, *new_entries, *tail]
+    sizes = [*map(len, groups[:head_end]), *(1 for _ in new_entries), *map(len, groups[tail_start:])]
+    _set_jump_ids(merged, sizes, items)
     return merged
 
 
@@ -166,35 +175,38 @@ def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
 
 
 def _jump_ids(
-    entries: Sequence[JsonValue], values: Sequence[Sequence[JsonValue] | None], sizes: Sequence[int]
+    entries: Sequence[JsonValue], groups: Sequence[Sequence[JsonValue] | None], sizes: Sequence[int]
 ) -> dict[int, int]:
     """Map doJumpId to index. Simple items take precedence over those inside surveys."""
-    found: dict[int, int] = {}
-    inner: dict[int, int] = {}
+    ids_of_simple_items: dict[int, int] = {}
+    ids_in_surveys: dict[int, int] = {}
     first = 0
-    for entry, group, size in zip(entries, values, sizes):  # noqa: B905 - same length
+    for entry, group, size in zip(entries, groups, sizes):  # noqa: B905 - same length
         for index, value in enumerate(group or (), first):
-            number = value.child("doJumpId")
-            key = index + 1 if number is None else number.integer(-1, 2**31)
-            (found if value is entry else inner).setdefault(key, index)
+            member = value.child("doJumpId")
+            jump_id = index + 1 if member is None else member.integer(-1, 2**31)
+            if value is entry:
+                ids_of_simple_items.setdefault(jump_id, index)
+            else:
+                ids_in_surveys.setdefault(jump_id, index)
         first += size
-    return inner | found
+    return ids_in_surveys | ids_of_simple_items
 
 
 def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
     command, frame = value["command"].integer(0, 0xFFFF), value["frame"].integer(0, 0xFF)
     params = value["params"].elements(7)
     numbers = [param.number(null=True) for param in params]
-    if xy_scale(command, frame) == 10_000_000:
+    if xy_scale(command, frame) == 10_000_000:  # These calls raise an error for coordinates out of range.
         params[4].number(-90, 90, null=True)
         params[5].number(-180, 180, null=True)
     if command == MavCmd.DO_JUMP:
         numbers[0] = _jump_target(params[0], ids)
-    if math.isnan(numbers[6]) and has_place(command):
+    if math.isnan(numbers[6]) and has_place(command):  # `params` has no altitude.
         frame, numbers[6] = _planned_altitude(value, frame)
-    one, two, three, four, latitude, longitude, z = numbers
+    param1, param2, param3, param4, latitude, longitude, z = numbers
     x, y = (from_degrees(number, command, frame) for number in (latitude, longitude))
-    return MissionItem(command, frame, one, two, three, four, x, y, z, value["autoContinue"].boolean())
+    return MissionItem(command, frame, param1, param2, param3, param4, x, y, z, value["autoContinue"].boolean())
 
 
 def _jump_target(param: JsonValue, ids: dict[int, int]) -> float:
@@ -205,10 +217,13 @@ def _jump_target(param: JsonValue, ids: dict[int, int]) -> float:
 
 
 def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
-    mode = value.child("AltitudeMode")
-    number = 0 if mode is None else mode.integer(0, 0xFF)
-    altitude = value.child("AMSLAltAboveTerrain" if number == 3 else "Altitude")
-    return _FRAME_OF_MODE.get(number, frame), math.nan if altitude is None else altitude.number(null=True)
+    """Return frame and altitude according to the fields for display."""
+    mode_member = value.child("AltitudeMode")
+    mode = 0 if mode_member is None else mode_member.integer(0, 0xFF)
+    # Mode 3 is an altitude above the terrain, which the planner has converted to one above mean sea level.
+    altitude_member = value.child("AMSLAltAboveTerrain" if mode == 3 else "Altitude")
+    altitude = math.nan if altitude_member is None else altitude_member.number(null=True)
+    return _FRAME_OF_MODE.get(mode, frame), altitude
 
 
 def _matches(group: Sequence[MissionItem], items: Sequence[MissionItem]) -> bool:
@@ -218,15 +233,18 @@ def _matches(group: Sequence[MissionItem], items: Sequence[MissionItem]) -> bool
     return tuple(group) == tuple(items)
 
 
-def _number(entries: Sequence[Any], sizes: Sequence[int], items: Sequence[MissionItem]) -> None:
-    """Number the items from 1, and set jump targets to these numbers."""
+def _set_jump_ids(entries: Sequence[Any], sizes: Sequence[int], items: Sequence[MissionItem]) -> None:
+    """Number the items from 1 (doJumpId), and set jump targets to these numbers."""
     first = 0
     for entry, size in zip(entries, sizes):  # noqa: B905 - same length
-        body = entry.get("TransectStyleComplexItem", {})
-        for index, simple in enumerate([entry] if entry["type"] == "SimpleItem" else body.get("Items", []), first):
-            simple["doJumpId"] = index + 1
-            if simple["command"] == MavCmd.DO_JUMP:
-                simple["params"][0] = json_number(items[index].param1 + 1)
+        if entry["type"] == "SimpleItem":
+            simple_items = [entry]
+        else:
+            simple_items = entry.get("TransectStyleComplexItem", {}).get("Items", [])
+        for index, simple_item in enumerate(simple_items, first):
+            simple_item["doJumpId"] = index + 1
+            if simple_item["command"] == MavCmd.DO_JUMP:
+                simple_item["params"][0] = json_number(items[index].param1 + 1)
         first += size
 
 
@@ -258,9 +276,10 @@ class JsonValue:
     def error(self, expected: str) -> FileFormatError:
         """Create an error for a value that is not as expected."""
         # The value is encoded incrementally, because a large value need not be formatted completely to be truncated.
-        found = "".join(islice(json.JSONEncoder().iterencode(self.value), 41))
-        found = found if len(found) <= 40 else f"{found[:37]}..."
-        return FileFormatError(f"{self.name}: {self.path or 'the document'} = {found}: expected {expected}")
+        text = "".join(islice(json.JSONEncoder().iterencode(self.value), 41))
+        if len(text) > 40:
+            text = f"{text[:37]}..."
+        return FileFormatError(f"{self.name}: {self.path or 'the document'} = {text}: expected {expected}")
 
     def child(self, key: str) -> JsonValue | None:
         """Return the value of a key of an object, or None if there is no such key."""
@@ -299,8 +318,13 @@ class JsonValue:
             return math.nan
         value = self._as_float()
         if not math.isfinite(value) or not low <= value <= high:
-            bounds = f" from {low:g} to {high:g}" if math.isfinite(high) else f" from {low:g} on" if low == 0 else ""
-            raise self.error(f"a number{bounds}" + ", or null" * null)
+            bounds = ""
+            if math.isfinite(high):
+                bounds = f" from {low:g} to {high:g}"
+            elif low == 0:
+                bounds = " from 0 on"
+            or_null = ", or null" if null else ""
+            raise self.error(f"a number{bounds}{or_null}")
         return value
 
     def integer(self, low: int, high: int) -> int:

@@ -59,17 +59,19 @@ def write_waypoint_file(path: str | os.PathLike[str], mission: Mission, *, versi
 
 def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
     """Parse the text of a file. Errors begin with ``name``."""
-    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
-    lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
-    version = lines[0][1].split() if lines else []
+    numbered_lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
+    numbered_lines = [(number, line) for number, line in numbered_lines if line and not line.startswith("#")]
+    first_line = numbered_lines[0][1] if numbered_lines else "nothing"
+    version = first_line.split()
     if version not in (["QGC", "WPL", "110"], ["QGC", "WPL", "120"]):
-        found = lines[0][1][:40] if lines else "nothing"
-        raise FileFormatError(f"{name}: line 1: expected 'QGC WPL 110', found {found!r}")
-    rows = [_Row(f"{name}: line {number}", line.split(), index) for index, (number, line) in enumerate(lines[1:])]
-    home = rows[0].home() if rows and version[2] == "110" and rows[0].is_home() else None
-    if home is None:
+        raise FileFormatError(f"{name}: line 1: expected 'QGC WPL 110', found {first_line[:40]!r}")
+    rows = [
+        _Row(f"{name}: line {number}", line.split(), index) for index, (number, line) in enumerate(numbered_lines[1:])
+    ]
+    if not rows or version[2] != "110" or not rows[0].is_home():
         return Mission([row.item() for row in rows])
-    return Mission(shift_jumps([row.item() for row in rows[1:]], -1), home[0])
+    home = rows[0].home()
+    return Mission(shift_jumps([row.item() for row in rows[1:]], -1), home)
 
 
 def format_waypoints(mission: Mission, *, version: int = 110) -> str:
@@ -94,7 +96,7 @@ def format_waypoints(mission: Mission, *, version: int = 110) -> str:
 
 
 class _Row:
-    # One line, split into its columns.
+    """One line, split into its columns."""
 
     def __init__(self, where: str, texts: list[str], index: int) -> None:
         self.where, self.texts = where, texts
@@ -109,30 +111,26 @@ class _Row:
         """Return True for a waypoint above mean sea level. Mission Planner used to write command 0 for home."""
         return self.command in (0, MavCmd.NAV_WAYPOINT) and canonical_frame(self.frame) == MavFrame.GLOBAL
 
-    def home(self) -> tuple[Position | None]:
-        # The result is a tuple, so that ``(None,)`` can stand for a line with an unknown home (0°, 0°).
+    def home(self) -> Position | None:
+        """Return the place in this line; None for 0°, 0°, which stands for an unknown home."""
         latitude, longitude = self._number("latitude", 90), self._number("longitude", 180)
-        return (Position(latitude, longitude, self._number("altitude")) if latitude or longitude else None,)
+        return Position(latitude, longitude, self._number("altitude")) if latitude or longitude else None
 
     def item(self) -> MissionItem:
-        in_degrees = xy_scale(self.command, self.frame) == 10_000_000
-        x, y = (
-            from_degrees(self._number(column, limit if in_degrees else math.inf, nan=True), self.command, self.frame)
-            for column, limit in (("latitude", 90.0), ("longitude", 180.0))
-        )
-        one, two, three, four = (self._number(f"param{number}", nan=True) for number in (1, 2, 3, 4))
-        z = self._number("altitude", nan=True)
+        has_degrees = xy_scale(self.command, self.frame) == 10_000_000
+        latitude = self._number("latitude", 90.0 if has_degrees else math.inf, may_be_nan=True)
+        longitude = self._number("longitude", 180.0 if has_degrees else math.inf, may_be_nan=True)
         return MissionItem(
             self.command,
             self.frame,
-            one,
-            two,
-            three,
-            four,
-            x,
-            y,
-            z,
-            bool(self._integer("autocontinue", 0xFF)),
+            self._number("param1", may_be_nan=True),
+            self._number("param2", may_be_nan=True),
+            self._number("param3", may_be_nan=True),
+            self._number("param4", may_be_nan=True),
+            x=from_degrees(latitude, self.command, self.frame),
+            y=from_degrees(longitude, self.command, self.frame),
+            z=self._number("altitude", may_be_nan=True),
+            autocontinue=bool(self._integer("autocontinue", 0xFF)),
         )
 
     def _integer(self, column: str, high: int) -> int:
@@ -141,24 +139,24 @@ class _Row:
             raise FileFormatError(f"{self.where}: {column} = {text!r}: expected a whole number from 0 to {high}")
         return int(text)
 
-    def _number(self, column: str, limit: float = math.inf, *, nan: bool = False) -> float:
+    def _number(self, column: str, limit: float = math.inf, *, may_be_nan: bool = False) -> float:
         text = self.texts[_COLUMNS.index(column)]
         try:
-            value = float(text) if "_" not in text else math.inf
+            value = float(text) if "_" not in text else math.inf  # float() would accept 1_000.
         except ValueError:
             value = math.inf
-        if math.isinf(value) or (math.isnan(value) and not nan) or abs(value) > limit:
+        if math.isinf(value) or (math.isnan(value) and not may_be_nan) or abs(value) > limit:
             bounds = f" from {-limit:g} to {limit:g}" if math.isfinite(limit) else ""
             raise FileFormatError(f"{self.where}: {column} = {text!r}: expected a number{bounds}")
         return value
 
 
 def _home_row(home: Position | None) -> str:
-    latitude, longitude, altitude = (
-        (home.latitude_deg, home.longitude_deg, home.altitude_amsl_m or 0.0) if home else (0.0, 0.0, 0.0)
-    )
-    place = (_text(value, 6) for value in (latitude, longitude, altitude))
-    return "\t".join(("0\t1\t0\t16\t0\t0\t0\t0", *place, "1"))
+    place = (0.0, 0.0, 0.0)
+    if home is not None:
+        place = (home.latitude_deg, home.longitude_deg, home.altitude_amsl_m or 0.0)
+    # Item 0, the current one, is a NAV_WAYPOINT (16) in the frame GLOBAL (0).
+    return "\t".join(("0\t1\t0\t16\t0\t0\t0\t0", *(_text(value, 6) for value in place), "1"))
 
 
 def _item_row(item: MissionItem, index: int) -> str:

@@ -144,9 +144,13 @@ def home_item(home: Position | None) -> MissionItem:
     return MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL, x=x, y=y, z=home.altitude_amsl_m or 0.0)
 
 
-def shift_jumps(items: Iterable[MissionItem], by: int) -> tuple[MissionItem, ...]:
-    """Add ``by`` to the targets of DO_JUMP, which are the only parameters that refer to items by number."""
-    return tuple(item.replace(param1=item.param1 + by) if item.command == MavCmd.DO_JUMP else item for item in items)
+def shift_jumps(items: Iterable[MissionItem], offset: int) -> tuple[MissionItem, ...]:
+    """Add ``offset`` to the targets of DO_JUMP, which are the only parameters that refer to items by number."""
+
+    def shifted(item: MissionItem) -> MissionItem:
+        return item.replace(param1=item.param1 + offset) if item.command == MavCmd.DO_JUMP else item
+
+    return tuple(map(shifted, items))
 
 
 def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, float] | None) -> Iterator[MissionItem]:
@@ -156,15 +160,15 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
     0°, 0° for the current position. It is replaced by the destination of the previous item, in the first item by
     ``here`` (latitude and longitude in degrees, None if unknown).
     """
-    place = None if here is None else (round(here[0] * 1e7), round(here[1] * 1e7))
+    current_xy = None if here is None else (round(here[0] * 1e7), round(here[1] * 1e7))
     for item in items:
         if item.frame in GLOBAL_FRAMES and not has_place(item.command):
             item = item.replace(frame=int(MavFrame.MISSION))
         if item.command in DESTINATIONS and item.frame in GLOBAL_FRAMES:
-            if place is not None and item.x == item.y == 0:
-                item = item.replace(x=place[0], y=place[1])
+            if current_xy is not None and item.x == item.y == 0:
+                item = item.replace(x=current_xy[0], y=current_xy[1])
             elif DEFAULT_XY not in (item.x, item.y):
-                place = round(item.x), round(item.y)
+                current_xy = round(item.x), round(item.y)
         yield item
 
 
@@ -253,4 +257,4 @@ def unpack_items(data: bytes, mission_type: int | None = None) -> tuple[MissionI
             f"packed plan: expected {header.length} bytes for {header.items} items, received {len(data)} bytes"
         )
     starts = range(HEADER.size, header.length, _ITEM_LENGTH)
-    return tuple(from_wire(messages.MissionItemInt.decode(data[at : at + _ITEM_LENGTH])) for at in starts)
+    return tuple(from_wire(messages.MissionItemInt.decode(data[start : start + _ITEM_LENGTH])) for start in starts)

@@ -52,7 +52,7 @@ class CommandArgument(Snapshot):
     def convert(self, value: float) -> object:
         """Convert a parameter to the argument's type; raise InvalidArgument if its value is not allowed."""
         if not math.isfinite(value):
-            if self.is_optional and value != value:
+            if self.is_optional and math.isnan(value):  # NaN means that the parameter is missing.
                 return None
             raise InvalidArgument(f"{self.name} = {value} is not allowed: a number")
         if not self.range.minimum <= value <= self.range.maximum:
@@ -82,22 +82,23 @@ def arguments_of(function: Callable[..., Any]) -> tuple[CommandArgument, ...]:
     parameters = list(inspect.signature(function).parameters.values())
     if not parameters:
         raise InvalidArgument(f"{name}() must accept the request as its first argument")
-    found = []
+    arguments = []
     for number, parameter in enumerate(parameters[1:], start=1):
         if parameter.kind not in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD):
             raise InvalidArgument(f"{name}(): argument {parameter.name} must be a positional argument")
-        found.append(_argument(name, parameter.name, number, _hint(function, parameter)))
-    return tuple(found)
+        arguments.append(_argument(name, parameter.name, number, _hint(function, parameter)))
+    return tuple(arguments)
 
 
 def _hint(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
     """Return the annotation of one parameter, evaluated in the scope of its function."""
     inner = inspect.unwrap(getattr(function, "__func__", function))
+    # get_type_hints would evaluate all annotations of the function, so it gets an object that has only this one.
     holder = types.SimpleNamespace(__annotations__={"hint": parameter.annotation})
     cells = zip(inner.__code__.co_freevars, inner.__closure__ or ())  # noqa: B905 - equal lengths
-    local = {name: cell.cell_contents for name, cell in cells}
+    closure = {name: cell.cell_contents for name, cell in cells}
     try:
-        return get_type_hints(holder, inner.__globals__, local, include_extras=True)["hint"]
+        return get_type_hints(holder, inner.__globals__, closure, include_extras=True)["hint"]
     except NameError as error:
         raise InvalidArgument(
             f"the annotation of argument {parameter.name} of {inner.__name__}() cannot be evaluated: {error};"
@@ -105,13 +106,14 @@ def _hint(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
         ) from None
 
 
-def _argument(function: str, name: str, number: int, hint: Any) -> CommandArgument:
-    range_ = Range()
+def _argument(function_name: str, name: str, number: int, hint: Any) -> CommandArgument:
+    """Interpret an annotation: a number type, perhaps optional, perhaps Annotated with a Range or a Param."""
+    allowed = Range()
     if get_origin(hint) is Annotated:
         hint, *extras = get_args(hint)
         for extra in extras:
             if isinstance(extra, Range):
-                range_ = extra
+                allowed = extra
             elif isinstance(extra, Param):
                 number = extra.number
     is_optional = False
@@ -122,10 +124,10 @@ def _argument(function: str, name: str, number: int, hint: Any) -> CommandArgume
     is_number = hint in (float, int, bool) or (isinstance(hint, type) and issubclass(hint, Enum))
     if not is_number:
         raise InvalidArgument(
-            f"{function}(): argument {name} must be annotated with float, int, bool or an enum of integers"
+            f"{function_name}(): argument {name} must be annotated with float, int, bool or an enum of integers"
         )
     if number > MAX_ARGUMENTS:
         raise InvalidArgument(
-            f"{function}(): argument {name} would be parameter {number}, but a command has seven parameters"
+            f"{function_name}(): argument {name} would be parameter {number}, but a command has seven parameters"
         )
-    return CommandArgument(name, number, hint, is_optional, range_)
+    return CommandArgument(name, number, hint, is_optional, allowed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
@@ -73,6 +74,8 @@ def add_autopilot(
             raise NotSupported(f"this vehicle does not support {name}")
         await services.commands.call(getattr(driver, name), *arguments)
 
+    # The arguments of each handler after the first are the parameters of its command, in order.
+
     async def arm_disarm(_: CommandRequest, is_armed: bool, force: float | None) -> None:
         await call("arm" if is_armed else "disarm", force in FORCES)
         report(is_armed, None)
@@ -83,18 +86,18 @@ def add_autopilot(
 
     async def take_off(request: CommandRequest) -> None:
         altitude = request.params[6]
-        await call("take_off", altitude if altitude == altitude else None)
+        await call("take_off", None if math.isnan(altitude) else altitude)
 
     async def reboot(_: CommandRequest, action: int) -> None:
         if action not in (_REBOOT, _SHUTDOWN):
             raise NotSupported(f"action {action} is not supported")
         await call("reboot" if action == _REBOOT else "shutdown")
 
-    async def terminate(_: CommandRequest, is_wanted: bool) -> None:
-        if is_wanted:
+    async def terminate(_: CommandRequest, is_activated: bool) -> None:
+        if is_activated:
             await call("terminate")
 
-    def plain(name: str) -> Callable[[CommandRequest], Awaitable[Any]]:
+    def without_arguments(name: str) -> Callable[[CommandRequest], Awaitable[Any]]:
         async def run(_: CommandRequest) -> None:
             await call(name)
 
@@ -104,7 +107,7 @@ def add_autopilot(
     add(MavCmd.COMPONENT_ARM_DISARM, arm_disarm)
     add(MavCmd.DO_SET_MODE, set_mode)
     add(MavCmd.NAV_TAKEOFF, take_off)
-    add(MavCmd.NAV_LAND, plain("land"))
-    add(MavCmd.NAV_RETURN_TO_LAUNCH, plain("return_to_launch"))
+    add(MavCmd.NAV_LAND, without_arguments("land"))
+    add(MavCmd.NAV_RETURN_TO_LAUNCH, without_arguments("return_to_launch"))
     add(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, reboot)
     add(MavCmd.DO_FLIGHTTERMINATION, terminate)

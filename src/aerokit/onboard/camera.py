@@ -170,34 +170,35 @@ class CameraDriver:
         """Called when another program has changed a setting of the definition file."""
 
 
-def _has(camera: CameraDriver, name: str) -> bool:
+def _implements(camera: CameraDriver, name: str) -> bool:
+    """Return True if the camera's class overrides this method of `CameraDriver`."""
     return overrides(camera, CameraDriver, name)
 
 
 def capabilities_of(camera: CameraDriver) -> int:
     """Return the CAMERA_CAP_FLAGS for the methods that the camera's class overrides."""
     flags = CameraCapFlags(0)
-    if _has(camera, "take_photo"):
+    if _implements(camera, "take_photo"):
         flags |= CameraCapFlags.CAPTURE_IMAGE
-    if _has(camera, "start_video"):
+    if _implements(camera, "start_video"):
         flags |= CameraCapFlags.CAPTURE_VIDEO
     if camera.has_modes:
         flags |= CameraCapFlags.HAS_MODES
     else:
         flags |= CameraCapFlags.CAN_CAPTURE_IMAGE_IN_VIDEO_MODE | CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
-    if _has(camera, "zoom_to") or _has(camera, "zoom_at"):
+    if _implements(camera, "zoom_to") or _implements(camera, "zoom_at"):
         flags |= CameraCapFlags.HAS_BASIC_ZOOM
-    if any(_has(camera, name) for name in ("focus_to", "focus_at", "focus_distance", "autofocus")):
+    if any(_implements(camera, name) for name in ("focus_to", "focus_at", "focus_distance", "autofocus")):
         flags |= CameraCapFlags.HAS_BASIC_FOCUS
     if camera.streams:
         flags |= CameraCapFlags.HAS_VIDEO_STREAM
-    if _has(camera, "track"):
+    if _implements(camera, "track"):
         flags |= CameraCapFlags.HAS_TRACKING_POINT | CameraCapFlags.HAS_TRACKING_RECTANGLE
     return int(flags)
 
 
 _STEP_PERCENT = 10.0
-_AUTO = (SetFocusType.AUTO, SetFocusType.AUTO_SINGLE, SetFocusType.AUTO_CONTINUOUS)
+_AUTO_FOCUS_TYPES = (SetFocusType.AUTO, SetFocusType.AUTO_SINGLE, SetFocusType.AUTO_CONTINUOUS)
 
 
 class CameraAdapter(CameraDevice):
@@ -248,7 +249,7 @@ class CameraAdapter(CameraDevice):
         async def take() -> None:
             shot = None
             try:
-                photo = await self._call(self._camera.take_photo, len(self.captures.images))
+                photo = await self._call(self._camera.take_photo, self.captures.image_count)
                 shot = _shot(photo, time_boot_ms, unix_time)
             except Exception as error:
                 self._host.report_error("take_photo", error)
@@ -261,22 +262,22 @@ class CameraAdapter(CameraDevice):
         return image.file_url
 
     def storage(self, number: int) -> list[m.StorageInformation]:
-        found = self._camera.storage()
-        if found is None or number not in (0, 1):
+        storage = self._camera.storage()
+        if storage is None or number not in (0, 1):  # 0 requests all media.
             return []
         return [
             m.StorageInformation(
                 time_boot_ms=self._host.time_boot_ms,
                 storage_id=1,
                 storage_count=1,
-                status=StorageStatus.READY if found.is_ready else StorageStatus.NOT_SUPPORTED,
-                total_capacity=found.total_mib,
-                used_capacity=found.used_mib,
-                available_capacity=found.available_mib,
+                status=StorageStatus.READY if storage.is_ready else StorageStatus.NOT_SUPPORTED,
+                total_capacity=storage.total_mib,
+                used_capacity=storage.used_mib,
+                available_capacity=storage.available_mib,
                 read_speed=math.nan,
                 write_speed=math.nan,
                 type=StorageType.OTHER,
-                name=found.name,
+                name=storage.name,
                 storage_usage=StorageUsageFlag.SET | StorageUsageFlag.PHOTO | StorageUsageFlag.VIDEO,
             )
         ]
@@ -296,29 +297,39 @@ class CameraAdapter(CameraDevice):
 
     async def set_focus(self, kind: int, value: float) -> bool:
         camera = self._camera
-        if kind in _AUTO and _has(camera, "autofocus"):
+        if kind in _AUTO_FOCUS_TYPES and _implements(camera, "autofocus"):
             await self._call(camera.autofocus)
             return True
-        if kind == SetFocusType.METERS and value > 0 and _has(camera, "focus_distance"):
+        if kind == SetFocusType.METERS and value > 0 and _implements(camera, "focus_distance"):
             await self._call(camera.focus_distance, value)
             return True
         return await self._move(kind, value, self.focus, camera.focus_to, camera.focus_at)
 
     async def _move(
-        self, kind: int, value: float, now: float, to: Callable[[float], Any], at: Callable[[float], Any]
+        self,
+        kind: int,
+        value: float,
+        current_percent: float,
+        move_to: Callable[[float], Any],
+        move_at: Callable[[float], Any],
     ) -> bool:
-        """Move the zoom or the focus. One method serves both, because CAMERA_ZOOM_TYPE and SET_FOCUS_TYPE have the same
-        numbers.
+        """Move the zoom or the focus; return False if the camera cannot do that.
+
+        One method serves both, because CAMERA_ZOOM_TYPE and SET_FOCUS_TYPE have the same numbers. A step becomes a
+        move to a percentage.
         """
-        if kind == CameraZoomType.STEP and math.isfinite(now):
-            kind, value = CameraZoomType.RANGE, max(0.0, min(100.0, now + value * _STEP_PERCENT))
-        low, move = (0.0, to) if kind == CameraZoomType.RANGE else (-1.0, at)
-        high = 100.0 if kind == CameraZoomType.RANGE else 1.0
-        is_possible = kind in (CameraZoomType.RANGE, CameraZoomType.CONTINUOUS) and low <= value <= high
-        if is_possible and _has(self._camera, move.__name__):
-            await self._call(move, value)
-            return True
-        return False
+        if kind == CameraZoomType.STEP and math.isfinite(current_percent):
+            kind, value = CameraZoomType.RANGE, max(0.0, min(100.0, current_percent + value * _STEP_PERCENT))
+        if kind == CameraZoomType.RANGE and 0.0 <= value <= 100.0:
+            move = move_to
+        elif kind == CameraZoomType.CONTINUOUS and -1.0 <= value <= 1.0:
+            move = move_at
+        else:
+            return False
+        if not _implements(self._camera, move.__name__):
+            return False
+        await self._call(move, value)
+        return True
 
     async def switch_stream(self, numbers: set[int], *, on: bool) -> None:
         for number in sorted(numbers):
@@ -335,21 +346,23 @@ class CameraAdapter(CameraDevice):
 
 
 def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
-    """Return the content of CAMERA_IMAGE_CAPTURED."""
+    """Return a function that creates the CAMERA_IMAGE_CAPTURED of a photo from the fields that the server adds."""
     if not isinstance(photo, Photo):
         raise InvalidArgument(f"take_photo returned {photo!r}, not a Photo")
     place = photo.position
     angles = (photo.roll_deg, photo.pitch_deg, photo.yaw_deg)
-    known = [math.radians(angle) for angle in angles if angle is not None]
-    shot = partial(
+    known_angles = [math.radians(angle) for angle in angles if angle is not None]
+    message = partial(
         CameraImageCaptured,
-        time_boot_ms,
-        round(unix_time * 1e6),
-        0,
-        0 if place is None else round(place.latitude_deg * 1e7),
-        0 if place is None else round(place.longitude_deg * 1e7),
-        0 if place is None or place.altitude_amsl_m is None else round(place.altitude_amsl_m * 1000),
-        0 if place is None or place.altitude_relative_m is None else round(place.altitude_relative_m * 1000),
-        UNKNOWN_ATTITUDE if len(known) < 3 else quaternion_from_euler(*known),
+        time_boot_ms=time_boot_ms,
+        time_utc=round(unix_time * 1e6),
+        camera_id=0,
+        lat=0 if place is None else round(place.latitude_deg * 1e7),
+        lon=0 if place is None else round(place.longitude_deg * 1e7),
+        alt=0 if place is None or place.altitude_amsl_m is None else round(place.altitude_amsl_m * 1000),
+        relative_alt=0
+        if place is None or place.altitude_relative_m is None
+        else round(place.altitude_relative_m * 1000),
+        q=UNKNOWN_ATTITUDE if len(known_angles) < 3 else quaternion_from_euler(*known_angles),
     )
-    return lambda **fields: shot(**{"file_url": photo.url, **fields})
+    return lambda **fields: message(**{"file_url": photo.url, **fields})

@@ -1,4 +1,4 @@
-"""Command handlers of a component, which may be coroutines: progress, cancellation and results."""
+"""Runs the command handlers of a component (functions or coroutine functions): progress, cancellation, results."""
 
 from __future__ import annotations
 
@@ -72,11 +72,11 @@ class CommandRequest:
         """
         frame = self._command.altitude_frame
         latitude, longitude, altitude = self.params[4:]
-        known = altitude if math.isfinite(altitude) else None
+        altitude_m = altitude if math.isfinite(altitude) else None
         if frame in _ABSOLUTE:
-            return Position(latitude, longitude, altitude_amsl_m=known)
+            return Position(latitude, longitude, altitude_amsl_m=altitude_m)
         if frame in _RELATIVE:
-            return Position(latitude, longitude, altitude_relative_m=known)
+            return Position(latitude, longitude, altitude_relative_m=altitude_m)
         raise InvalidArgument(f"frame = {frame} is not allowed: a global MAV_FRAME")
 
     def report_progress(self, percent: int) -> None:
@@ -95,7 +95,7 @@ def outcome_of(value: object) -> Outcome:
         return Outcome(MavResult.ACCEPTED)
     if isinstance(value, CommandResult):
         return Outcome(value.result, value.progress, value.detail)
-    if isinstance(value, int) and value is not False:
+    if isinstance(value, int) and value is not False:  # False, which is an int too, means FAILED.
         return Outcome(int(value))
     return Outcome(MavResult.FAILED)
 
@@ -156,8 +156,8 @@ class ComponentCommands:
 
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function or coroutine function of the program; with ``uses_threads``, a function runs in a thread."""
-        found = self.begin(function, *arguments)
-        return await found if inspect.isawaitable(found) else found
+        result = self.begin(function, *arguments)
+        return await result if inspect.isawaitable(result) else result
 
     def begin(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Begin to call a function as `call` does; return the result of a plain function, otherwise an awaitable."""
@@ -166,8 +166,8 @@ class ComponentCommands:
         return self._call_in_thread(function, *arguments)
 
     async def _call_in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        found = await asyncio.to_thread(function, *arguments)
-        return await found if inspect.isawaitable(found) else found
+        result = await asyncio.to_thread(function, *arguments)
+        return await result if inspect.isawaitable(result) else result
 
     def add_raw(self, command: int, function: Callable[[ReceivedCommand], Awaitable[int]]) -> None:
         """Register a coroutine function of a protocol server, which checks the parameters itself."""
@@ -183,13 +183,13 @@ class ComponentCommands:
     def _execute(
         self, function: Callable[..., Any], arguments: tuple[CommandArgument, ...], command: ReceivedCommand
     ) -> None:
-        task: list[asyncio.Task[Any]] = []
+        task: asyncio.Task[Any] | None = None
         is_cancelled = False
 
         def cancel() -> None:
             nonlocal is_cancelled
-            if task:
-                task[0].cancel()
+            if task is not None:
+                task.cancel()
             elif not is_cancelled:  # The task has not started yet.
                 is_cancelled = True
                 if inspect.iscoroutine(answer):
@@ -220,11 +220,10 @@ class ComponentCommands:
             return
 
         async def run() -> None:
+            nonlocal task
             if is_cancelled:
                 return
-            current = asyncio.current_task()
-            assert current is not None
-            task.append(current)
+            task = asyncio.current_task()
             await self._finish(running, function, answer)
 
         self._tasks.start(run, f"aerokit {command_name(command.command)}")
@@ -243,6 +242,7 @@ class ComponentCommands:
     def _fail(self, running: RunningCommand, function: Callable[..., Any], error: Exception) -> None:
         """Answer with the result for an error, and explain it in a status text."""
         name = getattr(function, "__name__", "run")
-        name = command_name(running.command.command) if name == "run" else name
+        if name == "run":  # aerokit's own wrapper, whose name tells the sender nothing
+            name = command_name(running.command.command)
         self._host.report_error(name, error)
         self._running.finish(running, Outcome(result_of(error)))

@@ -13,7 +13,7 @@ from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CompMetadataType, MavCmd, MavModeFlag, MavSeverity, MavState, MavType
-from aerokit.mavlink.enums import MavProtocolCapability as Can
+from aerokit.mavlink.enums import MavProtocolCapability as Capability
 from aerokit.mavlink.message import Message
 from aerokit.onboard.events import EventSender, answer_pings, check_severity
 from aerokit.onboard.files import DirectoryFiles
@@ -79,15 +79,15 @@ class OnboardComponent:
         self._ftp: SessionFtpServer[DirectoryFiles] = SessionFtpServer(
             self._host, files, is_congested=self._is_congested
         )
-        self._identity.capabilities |= Can.FTP
+        self._identity.capabilities |= Capability.FTP
         self._events = EventSender(self._host)
         self._missions: ComponentMissions | None = None
         self._sources: ComponentSources | None = None
         answer_pings(self._host)
         if bytewise:
-            self._identity.capabilities |= Can.PARAM_ENCODE_BYTEWISE
+            self._identity.capabilities |= Capability.PARAM_ENCODE_BYTEWISE
         else:
-            self._identity.capabilities |= Can.PARAM_ENCODE_C_CAST
+            self._identity.capabilities |= Capability.PARAM_ENCODE_C_CAST
         self._identity.offer(CompMetadataType.PARAMETER, PARAMETER_PATH, self.parameters.json)
 
     def _start(self) -> None:
@@ -148,9 +148,9 @@ class OnboardComponent:
         """
         if state not in MavState.__members__.values():
             raise InvalidArgument(f"state = {state} is not allowed: a MAV_STATE, 0 to 8")
-        before = self._heartbeat
-        heartbeat = m.Heartbeat(before.type, before.autopilot, base_mode, custom_mode, state, MAVLINK_VERSION)
-        heartbeat.encode()
+        old = self._heartbeat
+        heartbeat = m.Heartbeat(old.type, old.autopilot, base_mode, custom_mode, state, MAVLINK_VERSION)
+        heartbeat.encode()  # raises InvalidArgument before the old heartbeat is replaced
         self._heartbeat = heartbeat
         self._host.send(heartbeat)
 
@@ -290,7 +290,7 @@ class OnboardComponent:
         if self._missions is None:
             self._missions = ComponentMissions(self._host, self._tasks, self._commands)
             self._streams.builders[m.MissionCurrent.ID] = self._missions._build_current
-            self._identity.capabilities |= Can.MISSION_INT | Can.MISSION_FENCE | Can.MISSION_RALLY
+            self._identity.capabilities |= Capability.MISSION_INT | Capability.MISSION_FENCE | Capability.MISSION_RALLY
         return self._missions
 
     # ---------------------------------------------------------------------------- ready-made parts
@@ -312,12 +312,15 @@ class OnboardComponent:
         add_autopilot(self._services, driver, self._report_flight)
 
     def _report_flight(self, is_armed: bool | None, custom_mode: int | None) -> None:
-        before = self._heartbeat
-        flags = before.base_mode | MavModeFlag.CUSTOM_MODE_ENABLED
-        if is_armed is not None:
-            flags = flags & ~MavModeFlag.SAFETY_ARMED | (MavModeFlag.SAFETY_ARMED if is_armed else 0)
-        mode = before.custom_mode if custom_mode is None else custom_mode
-        self.set_state(before.system_status, base_mode=int(flags), custom_mode=mode)
+        """Change the armed state or the mode in the heartbeat; None leaves it unchanged."""
+        old = self._heartbeat
+        flags = old.base_mode | MavModeFlag.CUSTOM_MODE_ENABLED
+        if is_armed is True:
+            flags |= MavModeFlag.SAFETY_ARMED
+        elif is_armed is False:
+            flags &= ~MavModeFlag.SAFETY_ARMED
+        mode = old.custom_mode if custom_mode is None else custom_mode
+        self.set_state(old.system_status, base_mode=int(flags), custom_mode=mode)
 
     def add_camera(self, camera: CameraDriver) -> None:
         """Serve the camera protocol: photos, videos, storage, streams, zoom, focus, tracking, settings.

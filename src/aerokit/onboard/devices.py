@@ -108,7 +108,11 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         name = _WINCH_CALLS.get(action, "")
         if not name or not overrides(winch, WinchDriver, name):
             raise NotSupported(f"this winch does not support action {action}")
-        arguments = {"pay_out": (length, rate), "set_rate": (rate,)}.get(name, ())
+        arguments: tuple[float | None, ...] = ()
+        if name == "pay_out":
+            arguments = (length, rate)
+        elif name == "set_rate":
+            arguments = (rate,)
         if None in arguments:
             raise InvalidArgument("length and rate are required")
         if name == "pay_out" and rate is not None and rate <= 0:
@@ -116,11 +120,12 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         await services.commands.call(getattr(winch, name), *arguments)
 
     def status() -> m.WinchStatus:
-        report, nan = winch.report(), math.nan
-        numbers = (report.length_m, report.speed_m_s, report.tension_kg)
-        length, speed, tension = (nan if number is None else number for number in numbers)
+        report = winch.report()
+        values = (report.length_m, report.speed_m_s, report.tension_kg)
+        length, speed, tension = (math.nan if value is None else value for value in values)
         time_us = round(services.host.connection.unix_time() * 1e6)
-        return m.WinchStatus(time_us, length, speed, tension, nan, nan, _TEMPERATURE_UNKNOWN, report.flags)
+        voltage = current = math.nan
+        return m.WinchStatus(time_us, length, speed, tension, voltage, current, _TEMPERATURE_UNKNOWN, report.flags)
 
     services.commands.add(MavCmd.DO_WINCH, do_winch)
     services.add_message(m.WinchStatus, status, STATUS_HZ)
@@ -143,22 +148,28 @@ def add_gripper(
 
 
 def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> None:
-    """Serve ARM_AUTHORIZATION_REQUEST."""
+    """Serve ARM_AUTHORIZATION_REQUEST.
+
+    ``authorize`` returns the seconds for which arming is allowed, or a CommandResult, and raises an error to deny it.
+    """
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
         try:
             # PX4 sends 0 instead of its system id (ArmAuthorization.cpp).
-            seconds = await services.commands.call(authorize, system_id or request.sender[0])
+            answer = await services.commands.call(authorize, system_id or request.sender[0])
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")
             result = result_of(error)
+            # NONE says that the reason is in the status text, GENERIC that there is no specific reason.
             reason = MavArmAuthDeniedReason.NONE if result == MavResult.DENIED else MavArmAuthDeniedReason.GENERIC
             return CommandResult(MavResult.DENIED, detail=reason)
-        if isinstance(seconds, CommandResult):
-            return seconds
-        if not 0 < seconds <= MAX_AUTHORIZATION_S:
-            raise ValueError(f"the authorizer returned {seconds!r}, not 1 to {MAX_AUTHORIZATION_S} seconds")
+        if isinstance(answer, CommandResult):
+            return answer
+        if not 0 < answer <= MAX_AUTHORIZATION_S:
+            raise ValueError(
+                f"the authorizer returned {answer!r}; it must be above 0 and at most {MAX_AUTHORIZATION_S} s"
+            )
         # The standard puts the seconds into `progress`; PX4 reads them from `result_param2` (ArmAuthorization.cpp).
-        return CommandResult(MavResult.ACCEPTED, progress=math.ceil(seconds), detail=math.ceil(seconds))
+        return CommandResult(MavResult.ACCEPTED, progress=math.ceil(answer), detail=math.ceil(answer))
 
     services.commands.add(MavCmd.ARM_AUTHORIZATION_REQUEST, arm_authorization)

@@ -42,9 +42,10 @@ class EventSender:
         check_severity(severity)
         is_first = self._sequence < 0
         self._sequence = (self._sequence + 1) & 0xFFFF
-        levels = severity << 4 | severity
+        levels = severity << 4 | severity  # the level for logs, and the level for other programs
         time_ms, data = self._host.time_boot_ms, bytes(arguments).ljust(MAX_ARGUMENT_BYTES, b"\0")
-        event = m.Event(0, 0, event_id, time_ms, self._sequence, levels, data)
+        destination = (0, 0)  # all components
+        event = m.Event(*destination, event_id, time_ms, self._sequence, levels, data)
         self._sent.append(event)
         self._host.send(event)
         if is_first:
@@ -56,12 +57,13 @@ class EventSender:
         self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
 
     def _on_request(self, request: m.RequestEvent, channel: Channel) -> None:
-        count = (request.last_sequence - request.first_sequence & 0xFFFF) + 1
-        wanted = {request.first_sequence + number & 0xFFFF for number in range(min(count, MAX_STORED_EVENTS))}
-        found = [event for event in self._sent if event.sequence in wanted]
-        for event in found:
+        # Sequence numbers have 16 bits, and wrap around.
+        count = ((request.last_sequence - request.first_sequence) & 0xFFFF) + 1
+        requested = {(request.first_sequence + i) & 0xFFFF for i in range(min(count, MAX_STORED_EVENTS))}
+        stored = [event for event in self._sent if event.sequence in requested]
+        for event in stored:
             self._host.send(event, channel)
-        if not found:
+        if not stored:
             oldest = self._sent[0].sequence if self._sent else 0
             system, component = channel
             error = m.ResponseEventError(system, component, request.first_sequence, oldest, _UNAVAILABLE)
@@ -76,7 +78,7 @@ def answer_pings(host: ComponentHost) -> None:
             host.send(m.Ping(ping.time_usec, ping.seq, *channel), channel)
 
     def on_timesync(message: m.Timesync, channel: Channel) -> None:
-        if message.tc1 == 0:
+        if message.tc1 == 0:  # A TIMESYNC with another value is an answer.
             host.send(m.Timesync(int(host.now * 1e9), message.ts1, *channel), channel)
 
     host.on(m.Ping, on_ping)

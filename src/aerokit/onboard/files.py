@@ -21,12 +21,14 @@ MAX_FILE_BYTES = 1 << 30
 """Maximum size of a file that a client writes."""
 MAX_ENTRIES = 10_000
 """Maximum number of directory entries that are listed."""
-_NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
+# Flags for `os.open`, if the platform has them: follow no symbolic link, do not convert line ends, do not wait for the
+# other end of a pipe.
+_SAFE_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
 # Linux's error numbers, which MAVFTP clients expect on every platform.
-_NUMBERS = {errno.ENOTEMPTY: 39, errno.ELOOP: ENOENT, errno.ENAMETOOLONG: 36}
+_ERROR_NUMBERS = {errno.ENOTEMPTY: 39, errno.ELOOP: ENOENT, errno.ENAMETOOLONG: 36}
 
 
-def _guarded(function: FunctionT) -> FunctionT:
+def _raises_file_fault(function: FunctionT) -> FunctionT:
     """Turn OSError into FileFault."""
 
     @wraps(function)
@@ -35,7 +37,7 @@ def _guarded(function: FunctionT) -> FunctionT:
             return function(*args, **kwargs)
         except OSError as error:
             number = error.errno or EINVAL
-            raise FileFault(_NUMBERS.get(number, number) & 0xFF) from None
+            raise FileFault(_ERROR_NUMBERS.get(number, number) & 0xFF) from None
 
     return cast("FunctionT", guarded)
 
@@ -44,12 +46,12 @@ class _DiskFile(FileHandle):
     def __init__(self, descriptor: int, *, writing: bool) -> None:
         self._file = os.fdopen(descriptor, "r+b" if writing else "rb", buffering=0)
 
-    @_guarded
+    @_raises_file_fault
     def read(self, offset: int, size: int) -> bytes:
         self._file.seek(offset)
         return self._file.read(size) or b""
 
-    @_guarded
+    @_raises_file_fault
     def write(self, offset: int, data: bytes) -> None:
         if offset + len(data) > MAX_FILE_BYTES:
             raise FileFault(EFBIG)
@@ -58,7 +60,7 @@ class _DiskFile(FileHandle):
         self._file.seek(offset)
         self._file.write(data)
 
-    @_guarded
+    @_raises_file_fault
     def close(self) -> None:
         self._file.close()
 
@@ -88,15 +90,15 @@ class DirectoryFiles:
             return False
         return True
 
-    @_guarded
+    @_raises_file_fault
     def size(self, path: str) -> int:
         """Return the size of a file in bytes."""
         if path in self._memory:
             return self._memory.size(path)
-        found = self._path(path).lstat()
-        return found.st_size if stat.S_ISREG(found.st_mode) else 0
+        status = self._path(path).lstat()
+        return status.st_size if stat.S_ISREG(status.st_mode) else 0
 
-    @_guarded
+    @_raises_file_fault
     def open(self, path: str, *, writing: bool = False, create: bool = False) -> FileHandle:
         """Open a regular file."""
         if path in self._memory:
@@ -106,37 +108,40 @@ class DirectoryFiles:
         target = self._writable(path) if writing else self._path(path)
         if target.is_dir():
             raise FileFault(EISDIR)
-        flags = (os.O_RDWR | (os.O_CREAT | os.O_TRUNC if create else 0)) if writing else os.O_RDONLY
+        flags = os.O_RDWR if writing else os.O_RDONLY
+        if writing and create:
+            flags |= os.O_CREAT | os.O_TRUNC
         if target.exists() and not target.is_file():
             raise FileFault(ENOENT)
-        descriptor = os.open(target, flags | _NO_LINK, 0o644)
+        descriptor = os.open(target, flags | _SAFE_FLAGS, 0o644)
+        # Checked again, because another program may have replaced the file by a device in between.
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)
             raise FileFault(ENOENT)
         return _DiskFile(descriptor, writing=writing)
 
-    @_guarded
+    @_raises_file_fault
     def entries(self, path: str) -> list[Entry]:
         """Return files and directories, by name."""
-        found: dict[str, int | None] = {}
+        sizes: dict[str, int | None] = {}  # None for directories
         if self._root is not None:
             try:
                 with os.scandir(self._path(path)) as entries:
                     for entry in entries:
                         if entry.is_dir(follow_symlinks=False):
-                            found[entry.name] = None
+                            sizes[entry.name] = None
                         elif entry.is_file(follow_symlinks=False):
-                            found[entry.name] = entry.stat(follow_symlinks=False).st_size
-                        if len(found) >= MAX_ENTRIES:
+                            sizes[entry.name] = entry.stat(follow_symlinks=False).st_size
+                        if len(sizes) >= MAX_ENTRIES:
                             break
             except (OSError, FileFault):
                 if path not in self._memory:
                     raise
-        if self._root is None or path in self._memory:
-            found.update(self._memory.entries(path))
-        return sorted(found.items())
+        if self._root is None or path in self._memory:  # Raises if the path is in neither of them.
+            sizes.update(self._memory.entries(path))
+        return sorted(sizes.items())
 
-    @_guarded
+    @_raises_file_fault
     def truncate(self, path: str, size: int) -> None:
         target = self._writable(path)
         if size > MAX_FILE_BYTES:
@@ -145,22 +150,22 @@ class DirectoryFiles:
             raise FileFault(ENOENT)
         os.truncate(target, size)
 
-    @_guarded
+    @_raises_file_fault
     def remove_file(self, path: str) -> None:
         target = self._writable(path)
         if target.is_dir():
             raise FileFault(EISDIR)
         target.unlink()
 
-    @_guarded
+    @_raises_file_fault
     def rename(self, path: str, to: str) -> None:
         self._writable(path).rename(self._writable(to))
 
-    @_guarded
+    @_raises_file_fault
     def make_folder(self, path: str) -> None:
         self._writable(path).mkdir()
 
-    @_guarded
+    @_raises_file_fault
     def remove_folder(self, path: str) -> None:
         self._writable(path).rmdir()
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.enums import GimbalDeviceCapFlags as Can
-from aerokit.mavlink.enums import GimbalManagerFlags as Flags
+from aerokit.mavlink.enums import GimbalDeviceCapFlags as DeviceCapFlags
+from aerokit.mavlink.enums import GimbalManagerFlags as ManagerFlags
 from aerokit.onboard.commands import overrides
 from aerokit.position import Position
 from aerokit.protocols.servers.gimbal import ALL_CAPABILITIES, Angles, GimbalMount, Place
@@ -106,13 +106,14 @@ class GimbalAdapter(GimbalMount):
         self.slew_rad_s: float = math.radians(gimbal.max_rate_deg_s)
         self.can_point_at_positions: bool = overrides(gimbal, GimbalDriver, "look_at")
         self.capabilities: int = ALL_CAPABILITIES
-        for axis, limits in ((_ROLL, roll), (_PITCH, pitch), (_YAW, yaw)):
-            if limits[0] == limits[1]:
-                self.capabilities &= ~axis
+        for axis_flags, (low, high) in ((_ROLL, roll), (_PITCH, pitch), (_YAW, yaw)):
+            if low == high:  # The gimbal does not turn about this axis.
+                self.capabilities &= ~axis_flags
         if yaw == _FULL_TURN_DEG:
-            self.capabilities |= Can.SUPPORTS_INFINITE_YAW
+            self.capabilities |= DeviceCapFlags.SUPPORTS_INFINITE_YAW
         self._gimbal, self._host = gimbal, host
         self._is_locked = False
+        self._followed = 0  # id of the system at which the gimbal points; 0 for none
 
     @property
     def host(self) -> ServerHost:
@@ -138,13 +139,14 @@ class GimbalAdapter(GimbalMount):
         if locked:
             limited[2] = angles[2]  # The yaw limits are relative to the nose, not to north.
         roll, pitch, yaw = map(math.degrees, limited)
-        retracted = bool(flags & Flags.RETRACT)
-        self._apply(GimbalTarget((roll, pitch, yaw), None, locked, retracted), flags)
+        is_retracted = bool(flags & ManagerFlags.RETRACT)
+        target = GimbalTarget((roll, pitch, yaw), rates=None, yaw_locked=locked, is_retracted=is_retracted)
+        self._apply(target, flags)
 
     def turn(self, rates: Angles, flags: int, *, locked: bool) -> None:
         limit = self.slew_rad_s
         roll, pitch, yaw = (math.degrees(max(-limit, min(limit, rate))) for rate in rates)
-        self._apply(GimbalTarget(None, (roll, pitch, yaw), locked), flags)
+        self._apply(GimbalTarget(angles=None, rates=(roll, pitch, yaw), yaw_locked=locked), flags)
 
     def _apply(self, target: GimbalTarget, flags: int) -> None:
         self._gimbal.point(target)
@@ -166,11 +168,9 @@ class GimbalAdapter(GimbalMount):
     def update_followed(self, system_id: int, place: Place) -> None:
         if system_id == self._followed:
             self.look_at(place)
-            self._followed = system_id
-
-    _followed = 0
+            self._followed = system_id  # `look_at` has reset it.
 
 
-_ROLL = Can.HAS_ROLL_AXIS | Can.HAS_ROLL_LOCK | Can.HAS_ROLL_FOLLOW
-_PITCH = Can.HAS_PITCH_AXIS | Can.HAS_PITCH_LOCK | Can.HAS_PITCH_FOLLOW
-_YAW = Can.HAS_YAW_AXIS | Can.HAS_YAW_LOCK | Can.HAS_YAW_FOLLOW
+_ROLL = DeviceCapFlags.HAS_ROLL_AXIS | DeviceCapFlags.HAS_ROLL_LOCK | DeviceCapFlags.HAS_ROLL_FOLLOW
+_PITCH = DeviceCapFlags.HAS_PITCH_AXIS | DeviceCapFlags.HAS_PITCH_LOCK | DeviceCapFlags.HAS_PITCH_FOLLOW
+_YAW = DeviceCapFlags.HAS_YAW_AXIS | DeviceCapFlags.HAS_YAW_LOCK | DeviceCapFlags.HAS_YAW_FOLLOW

@@ -43,8 +43,9 @@ class ComponentHost:
         self.component_id = component_id
         self.knows_command: Callable[[int], bool] = lambda _: True
         self._accepts = None if accepts is None else frozenset(accepts)
-        own = (system_id, component_id) == (connection.source_system, connection.source_component)
-        self._encoder = None if own else FrameEncoder(system_id, component_id)
+        # A component with the ids of the connection uses its encoder, so that both share one sequence of frames.
+        has_ids_of_connection = (system_id, component_id) == (connection.source_system, connection.source_component)
+        self._encoder = None if has_ids_of_connection else FrameEncoder(system_id, component_id)
         self._started_at = connection.now()
         self._detachments: list[Detach] = []
         self._text_id = 0
@@ -78,7 +79,8 @@ class ComponentHost:
             return False
         if system not in (0, self.system_id) or component not in (0, self.component_id):
             return False
-        return component != 0 or message.ID not in _COMMANDS or self.knows_command(message.command)  # type: ignore[attr-defined]
+        is_command_to_all = component == 0 and message.ID in _COMMANDS
+        return not is_command_to_all or self.knows_command(message.command)  # type: ignore[attr-defined]
 
     def send(self, message: Message, channel: Channel = None) -> None:
         """Send a message to one system, or to all if ``channel`` is None. Does nothing after the connection ended."""
@@ -95,7 +97,7 @@ class ComponentHost:
         data = "".join(char if char.isprintable() else " " for char in text)
         data = data.encode("ascii", "replace").decode()[:MAX_TEXT_SIZE]
         if len(data) <= TEXT_SIZE:
-            self.send(m.Statustext(severity, data, 0, 0))
+            self.send(m.Statustext(severity, data, id=0, chunk_seq=0))  # id 0: the text has only one chunk.
             return
         self._text_id = self._text_id % 0xFFFF + 1
         for number, start in enumerate(range(0, len(data), TEXT_SIZE)):
@@ -103,11 +105,11 @@ class ComponentHost:
         if len(data) % TEXT_SIZE == 0:  # an empty chunk follows if the last chunk is full
             self.send(m.Statustext(severity, "", self._text_id, len(data) // TEXT_SIZE))
 
-    def report_error(self, what: str, error: Exception) -> None:
+    def report_error(self, subject: str, error: Exception) -> None:
         """Send an exception of the program's code as a status text. Log the exception unless it is one of aerokit's
         errors.
         """
-        text = f"{what}: {error_text(error)}"
+        text = f"{subject}: {error_text(error)}"
         if not isinstance(error, AerokitError):
             logger.error("component %d/%d: %s", self.system_id, self.component_id, text, exc_info=error)
         self.send_text(MavSeverity.WARNING, text)

@@ -9,7 +9,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CompMetadataType
-from aerokit.mavlink.enums import MavProtocolCapability as Can
+from aerokit.mavlink.enums import MavProtocolCapability as Capability
 from aerokit.protocols.servers.ftp_packets import crc32
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Identity(Snapshot):
             value = getattr(self, name)
             if not isinstance(value, str) or len(value.encode()) > size:
                 raise InvalidArgument(f"{name} = {value!r} is not allowed: a text of at most {size} bytes")
-        _ = self.version_number
+        _ = self.version_number  # Raises InvalidArgument if the version is invalid.
         if not 0 <= self.uid < 1 << 64:
             raise InvalidArgument(f"uid = {self.uid} is not allowed: 0 to 2**64 - 1")
 
@@ -52,15 +52,15 @@ class Identity(Snapshot):
         parts = [*self.version.split("."), "0", "0", "0"][:4]
         if not all(part.isdecimal() and int(part) <= 255 for part in parts):
             raise InvalidArgument(f"version = {self.version!r} is not allowed: numbers up to 255, such as '1.4.2'")
-        major, minor, patch, kind = map(int, parts)
-        return major << 24 | minor << 16 | patch << 8 | kind
+        major, minor, patch, release_type = map(int, parts)
+        return major << 24 | minor << 16 | patch << 8 | release_type
 
 
 class IdentityMessages:
     """Builders of the messages that identify a component."""
 
     def __init__(self, host: ComponentHost, identity: Identity, memory: FileTree) -> None:
-        self.capabilities: int = int(Can.MAVLINK2 | Can.COMMAND_INT)
+        self.capabilities: int = int(Capability.MAVLINK2 | Capability.COMMAND_INT)
         """MAV_PROTOCOL_CAPABILITY of the protocols that are served."""
         self.metadata: dict[int, tuple[str, Callable[[], bytes]]] = {}
         """Maps COMP_METADATA_TYPE to path and content of a metadata file."""

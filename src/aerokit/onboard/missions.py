@@ -32,11 +32,11 @@ class ComponentMissions:
 
     def __init__(self, host: ComponentHost, tasks: BackgroundTasks, commands: ComponentCommands) -> None:
         self._host, self._tasks, self._commands = host, tasks, commands
-        self._server = MissionServer(host, self._judge, on_set_current=self._set_current)
+        self._server = MissionServer(host, self._accept_or_refuse, on_set_current=self._set_current)
         self._server.listen()
         self._on_upload: Callable[[str, tuple[MissionItem, ...]], Any] | None = None
         self._on_current: Callable[[int], object] | None = None
-        commands.add(MavCmd.DO_SET_MISSION_CURRENT, self._current_command)
+        commands.add(MavCmd.DO_SET_MISSION_CURRENT, self._do_set_current)
 
     def items(self, kind: str = "mission") -> tuple[MissionItem, ...]:
         """Return the items of ``"mission"``, ``"fence"`` or ``"rally"``; InvalidArgument for other kinds."""
@@ -55,15 +55,16 @@ class ComponentMissions:
     ) -> Callable[[str, tuple[MissionItem, ...]], Any]:
         """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
-        To refuse a list, the function returns a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes the result
-        INVALID and a status text. It may be a coroutine function. An empty list is a request to clear the list.
+        To refuse a list, the function returns False or a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes
+        the result INVALID and a status text. It may be a coroutine function. An empty list is a request to clear the
+        list.
         """
         self._on_upload = function
         return function
 
     def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
-        """Decorator: ``function(index)`` continues the mission at an item. Without such a function, requests to do so
-        are refused.
+        """Decorator: ``function(index)`` continues the mission at an item. Requests to do so are refused if it returns
+        False or raises, and without such a function.
         """
         self._on_current = function
         return function
@@ -91,34 +92,37 @@ class ComponentMissions:
     def _build_current(self, _: object) -> Iterable[Message]:
         return [self._server.current_message()]
 
-    def _judge(self, mission_type: int, items: tuple[MissionItem, ...], answer: Callable[[int], None]) -> None:
+    def _accept_or_refuse(
+        self, mission_type: int, items: tuple[MissionItem, ...], answer: Callable[[int], None]
+    ) -> None:
         kind = next(name for name, number in _NAMES.items() if number == mission_type)
         function = self._on_upload
+        verdict: Any = None
         try:
             check_items(items, mission_type)
-            verdict: Any = None
             if function is not None:
                 verdict = self._commands.begin(function, kind, items)
         except Exception as error:
-            answer(self._refused(kind, error))
+            answer(self._report_refusal(kind, error))
             return
         if not inspect.isawaitable(verdict):
             answer(_result_of(verdict))
             return
 
         async def wait() -> None:
-            result = int(MavMissionResult.OPERATION_CANCELLED)
+            result = int(MavMissionResult.OPERATION_CANCELLED)  # if this task is cancelled
             try:
                 result = _result_of(await verdict)
             except Exception as error:
-                result = self._refused(kind, error)
+                result = self._report_refusal(kind, error)
             finally:
                 answer(result)
 
         self._tasks.start(wait, "aerokit mission upload")
 
-    def _refused(self, kind: str, error: Exception) -> int:
-        self._host.report_error(f"{kind} refused", error)
+    def _report_refusal(self, subject: str, error: Exception) -> int:
+        """Send the error as a status text, and return the MAV_MISSION_RESULT for it."""
+        self._host.report_error(f"{subject} refused", error)
         is_invalid = isinstance(error, ValueError)
         return MavMissionResult.INVALID if is_invalid else MavMissionResult.ERROR
 
@@ -126,19 +130,23 @@ class ComponentMissions:
         if self._on_current is None:
             return False
         try:
-            self._on_current(index)
+            return self._on_current(index) is not False
         except Exception as error:
-            self._refused("set_current", error)
+            self._report_refusal("set_current", error)
             return False
-        return True
 
-    def _current_command(self, request: CommandRequest, index: int) -> None:
+    def _do_set_current(self, request: CommandRequest, index: int) -> None:
         if not self._server.set_current(index):
             raise InvalidArgument(f"the mission cannot continue at item {index}")
 
 
 def _result_of(verdict: object) -> int:
-    return int(verdict) if isinstance(verdict, int) and not isinstance(verdict, bool) else MavMissionResult.ACCEPTED
+    """Return the MAV_MISSION_RESULT that a function returned; DENIED for False, ACCEPTED for all other values."""
+    if verdict is False:
+        return MavMissionResult.DENIED
+    if isinstance(verdict, int) and not isinstance(verdict, bool):
+        return int(verdict)
+    return MavMissionResult.ACCEPTED
 
 
 def _type_of(kind: str) -> int:

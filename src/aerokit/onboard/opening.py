@@ -90,8 +90,9 @@ async def component(
         raise InvalidArgument(f"system_id, component_id = {system_id}, {component_id} are not allowed: 1 to 255 each")
     if (address is None) == (connection is None):
         raise InvalidArgument("pass either an address or connection=…")
-    own = (baud, mavlink_version, record, reconnect, peers, may_move, signing)
-    if connection is not None and own != (57600, 2, None, False, None, False, None):
+    link_arguments = (baud, mavlink_version, record, reconnect, peers, may_move, signing)
+    defaults = (57600, 2, None, False, None, False, None)
+    if connection is not None and link_arguments != defaults:
         raise InvalidArgument("the arguments of a link are not allowed with connection=…: pass them to open_connection")
     async with AsyncExitStack() as stack:
         if connection is None:
@@ -116,7 +117,7 @@ async def component(
         key = (system_id, component_id)
         if key in connection.components:
             raise BusyError(f"this connection already has a component {system_id}/{component_id}")
-        found = OnboardComponent(
+        onboard_component = OnboardComponent(
             connection,
             system_id=system_id,
             component_id=component_id,
@@ -128,11 +129,11 @@ async def component(
         )
         connection.components.add(key)
         try:
-            found._start()
-            yield found
+            onboard_component._start()
+            yield onboard_component
         finally:
             connection.components.discard(key)
-            await found._aclose()
+            await onboard_component._aclose()
 
 
 def _heartbeat(type_: int, autopilot: int) -> Heartbeat:

@@ -37,6 +37,8 @@ _TYPES: dict[type, MavParamExtType] = {
 
 
 class _Row:
+    """One parameter: its metadata, type, default, value, and the function that may refuse a value."""
+
     def __init__(self, metadata: ParameterMetadata, type_: MavParamExtType, default: ParameterValue) -> None:
         self.metadata, self.type, self.default, self.value = metadata, type_, default, default
         self.on_set: OnSet | None = None
@@ -53,12 +55,12 @@ class ComponentParameters(Mapping[str, ParameterValue]):
     def __init__(self, host: ComponentHost, path: Path | None, *, bytewise: bool) -> None:
         self._host, self._path = host, path
         self._rows: dict[str, _Row] = {}
-        self._small_names: list[str] = []
-        self._stored: dict[str, Any] = _read(path)
+        self._small_names: list[str] = []  # parameters that PARAM_VALUE can carry: no texts
+        self._stored: dict[str, Any] = _read_stored(path)
         self._is_dirty = False
         self._saving: asyncio.Task[None] | None = None
-        self._classic = TypedParameterServer(host, _Store(self), bytewise=bytewise, list_rate_hz=LIST_RATE_HZ)
-        self._extended: TypedExtendedServer | None = None
+        self._param_server = TypedParameterServer(host, _Store(self), bytewise=bytewise, list_rate_hz=LIST_RATE_HZ)
+        self._param_ext_server: TypedExtendedServer | None = None
         self._is_excluded = False
 
     def add(
@@ -126,11 +128,12 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         self._rows[name] = row
         if fits_param_value(row.type):
             self._small_names.append(name)
-        if self._extended is None:  # not earlier: a camera may need PARAM_EXT
-            self._extended = TypedExtendedServer(self._host, _Store(self))
+        # Created only for the first parameter, because the settings of a camera may need PARAM_EXT.
+        if self._param_ext_server is None:
+            self._param_ext_server = TypedExtendedServer(self._host, _Store(self))
 
-    def _give_way(self) -> None:
-        """Stop serving PARAM_EXT, because the settings of a camera definition use it."""
+    def _forbid_parameters(self) -> None:
+        """Accept no parameters from now on, because the settings of a camera definition use PARAM_EXT."""
         if self._rows:
             raise InvalidArgument("a component has either parameters or the settings of a camera definition")
         self._is_excluded = True
@@ -143,7 +146,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         """
         row = self._row(name)
         self._store(name, self._checked(row, value))
-        self._classic.publish(name)
+        self._param_server.publish(name)
 
     def metadata(self, name: str) -> ParameterMetadata:
         """Return unit, range and description of a parameter; raise InvalidArgument if there is no such parameter."""
@@ -166,6 +169,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         return self._rows[name]
 
     def _checked(self, row: _Row, value: object) -> ParameterValue:
+        """Return the value in the parameter's type; raise InvalidArgument if it is not allowed."""
         metadata, name = row.metadata, row.metadata.name
         if isinstance(value, bool):
             raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a number")
@@ -176,6 +180,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             raise InvalidArgument(f"{name} = {value!r} is not allowed: a text")
         if metadata.values and checked not in metadata.values:
             raise InvalidArgument(f"{name} = {checked:g} is not allowed: {', '.join(map(str, metadata.values))}")
+        # The allowed values are checked above, and this program may change a read-only parameter.
         problem = metadata.replace(read_only=False, values={}).problem(checked)
         if problem is not None:
             raise InvalidArgument(problem)
@@ -191,7 +196,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             if self._saving is None:
                 self._saving = asyncio.get_running_loop().create_task(self._save(self._path))
 
-    def _text(self) -> str:
+    def _file_text(self) -> str:
         values = {name: row.value for name, row in self._rows.items() if not row.metadata.read_only}
         return json.dumps({**self._stored, **values}, indent=1) + "\n"
 
@@ -200,7 +205,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         try:
             while self._is_dirty:
                 self._is_dirty = False
-                write = partial(write_atomically, path, self._text())
+                write = partial(write_atomically, path, self._file_text())
                 await asyncio.get_running_loop().run_in_executor(None, write)
         except OSError as error:
             logger.error("the parameters of the component could not be saved: %s", error)
@@ -243,6 +248,7 @@ class _Store:
         return self._parameters._rows[name].type
 
     def problem(self, name: str, value: object, type: int) -> tuple[int, int] | None:  # noqa: A002
+        """Return the MAV_PARAM_ERROR and the PARAM_ACK for a value that is refused; None for an allowed value."""
         row = self._parameters._rows[name]
         if row.metadata.read_only:
             return MavParamError.READ_ONLY, ParamAck.FAILED
@@ -270,6 +276,7 @@ def _as_stored(limit: float | None, default: ParameterValue) -> float | None:
 
 
 def _metadata_entry(row: _Row) -> dict[str, Any]:
+    """Return the entry of a parameter in the metadata file, without empty fields."""
     metadata = row.metadata
     entry: dict[str, Any] = {
         "name": metadata.name,
@@ -285,7 +292,7 @@ def _metadata_entry(row: _Row) -> dict[str, Any]:
     return {key: value for key, value in entry.items() if value not in (None, "", [])}
 
 
-def _read(path: Path | None) -> dict[str, Any]:
+def _read_stored(path: Path | None) -> dict[str, Any]:
     """Return the stored values; an empty dictionary if there is no file yet."""
     if path is None or not path.exists():
         return {}

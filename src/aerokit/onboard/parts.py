@@ -31,12 +31,14 @@ DEFINITION_PATH = "/camera_definition.xml"
 class DefinedSettings(DefinedParameterServer):
     """Settings of a `CameraDriver` with a definition file."""
 
-    def __init__(self, host: ComponentHost, definition: CameraDefinition, changed: Callable[[str, SettingValue], Any]):
-        self._changed = changed
+    def __init__(
+        self, host: ComponentHost, definition: CameraDefinition, on_change: Callable[[str, SettingValue], Any]
+    ):
+        self._on_change = on_change
         super().__init__(host, definition)
 
     def on_set(self, name: str, value: SettingValue) -> None:
-        self._changed(name, value)
+        self._on_change(name, value)
 
 
 def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapter:
@@ -47,7 +49,7 @@ def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapt
         raise InvalidArgument("this component already has a camera: open another component for the second one")
     if camera.definition is not None:
         definition = parse_definition(camera.definition)
-        services.parameters._give_way()
+        services.parameters._forbid_parameters()
         DefinedSettings(host, definition, camera.on_setting)
         services.memory.put(DEFINITION_PATH, camera.definition)
         adapter.definition_version, adapter.definition_uri = definition.version, f"mftp://{DEFINITION_PATH}"
@@ -63,7 +65,7 @@ def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapt
 async def _run(handler: AsyncHandler, command: ReceivedCommand) -> int:
     try:
         return await handler(command)
-    except NotImplementedError:
+    except NotImplementedError:  # The program's class does not override the method.
         return MavResult.UNSUPPORTED
 
 

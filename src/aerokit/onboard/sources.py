@@ -62,8 +62,8 @@ class ComponentSources:
             raise InvalidArgument(f"min_m, max_m = {min_m}, {max_m} are not allowed: 0 to 655, min below max")
         if not 0 < increment_deg <= 360:
             raise InvalidArgument(f"increment_deg = {increment_deg} is not allowed: above 0, at most 360")
-        far = round(max_m * 100) + 1
-        values = [_centimetres(distance, far) for distance in distances_m]
+        nothing_in_range = round(max_m * 100) + 1  # defined by OBSTACLE_DISTANCE
+        values = [_centimetres(distance, nothing_in_range) for distance in distances_m]
         values += [_NOT_MEASURED] * (MAX_DISTANCES - len(values))
         limits, increment = (round(min_m * 100), round(max_m * 100)), min(255, round(increment_deg))
         frame = MavFrame.BODY_FRD
@@ -113,7 +113,8 @@ class ComponentSources:
             (squawk, AdsbFlags.VALID_SQUAWK),
             (callsign or None, AdsbFlags.VALID_CALLSIGN),
         ):
-            flags |= flag if value is not None else AdsbFlags(0)
+            if value is not None:
+                flags |= flag
         if len(callsign) > 8:
             raise InvalidArgument(f"callsign = {callsign!r} is not allowed: at most 8 characters")
         self._send(
@@ -157,7 +158,8 @@ class ComponentSources:
         angles = (math.radians(right_deg), math.radians(down_deg))
         kind = LandingTargetType.LIGHT_BEACON
         frame = MavFrame.BODY_FRD
-        self._send(m.LandingTarget(self._time_us(), target_number, frame, *angles, distance_m, 0.0, 0.0, type=kind))
+        size = (0.0, 0.0)  # unknown
+        self._send(m.LandingTarget(self._time_us(), target_number, frame, *angles, distance_m, *size, type=kind))
 
     def send_corrections(self, rtcm: bytes) -> None:
         """Send GNSS corrections (RTCM 3) in GPS_RTCM_DATA messages.
@@ -179,9 +181,9 @@ class ComponentSources:
         self._host.send(message)
 
 
-def _centimetres(distance_m: float | None, far: int) -> int:
+def _centimetres(distance_m: float | None, nothing_in_range: int) -> int:
     if distance_m is None or math.isnan(distance_m):
         return _NOT_MEASURED
     if distance_m < 0:
         raise InvalidArgument(f"distances_m contains {distance_m}; allowed: 0 or more, or None")
-    return far if math.isinf(distance_m) else min(far, round(distance_m * 100))
+    return nothing_in_range if math.isinf(distance_m) else min(nothing_in_range, round(distance_m * 100))

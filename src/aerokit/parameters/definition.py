@@ -121,38 +121,39 @@ class CameraDefinition(Snapshot):
 
         Texts without a translation are unchanged.
         """
-        found = self.translations.get(locale)
-        if found is None:
+        texts = self.translations.get(locale)
+        if texts is None:
             language = locale.partition("_")[0]
-            alike = (name for name in self.translations if name.partition("_")[0] == language)
-            found = self.translations.get(next(alike, ""))
-        if not found:
+            same_language = (name for name in self.translations if name.partition("_")[0] == language)
+            texts = self.translations.get(next(same_language, ""))
+        if not texts:
             return self
-        settings = {name: _translated(setting, found) for name, setting in self.settings.items()}
+        settings = {name: _translated(setting, texts) for name, setting in self.settings.items()}
         return self.replace(settings=MappingProxyType(settings))
 
     # ---------------------------------------------------------------------------------- dependencies
 
     def dependencies(self, name: str) -> tuple[str, ...]:
         """Return the settings whose values restrict or exclude this setting."""
-        found: dict[str, None] = {}
+        names: list[str] = []
         for setting in self.settings.values():
             for option in setting.options:
                 if name in option.excludes:
-                    found[setting.name] = None
+                    names.append(setting.name)
                 for restriction in option.ranges:
                     if restriction.setting == name:
-                        found[setting.name] = None
-                        tests = _tests(restriction.condition)
-                        found.update((test[0], None) for test in tests if test[0] in self.settings)
-        return tuple(other for other in found if other != name)
+                        names.append(setting.name)
+                        tested = [tested_name for tested_name, *_ in _parse_condition(restriction.condition)]
+                        names += [tested_name for tested_name in tested if tested_name in self.settings]
+        unique_names = dict.fromkeys(names)
+        return tuple(dependency for dependency in unique_names if dependency != name)
 
     def excluded_by(self, name: str, values: Values) -> tuple[str, ...]:
         """Return the selected options that exclude a setting now, as texts such as ``CAM_EXPMODE = Auto``."""
         return tuple(
-            f"{other.name} = {option.name}"
-            for other, option in self._selected(values)
-            if name in option.excludes and other.name != name
+            f"{setting.name} = {option.name}"
+            for setting, option in self._selected(values)
+            if name in option.excludes and setting.name != name
         )
 
     def options(self, name: str, values: Values) -> tuple[SettingOption, ...]:
@@ -161,19 +162,20 @@ class CameraDefinition(Snapshot):
 
     def _options(self, name: str, values: Values) -> tuple[tuple[SettingOption, ...], list[str]]:
         """Return the options of a setting, and the selected options of other settings that restrict them."""
-        own = self.settings.get(name)
-        options = () if own is None else own.options
+        options = self.settings[name].options if name in self.settings else ()
         reasons: list[str] = []
-        keys: frozenset[object] = frozenset()
-        for other, selected in self._selected(values):
+        for setting, selected in self._selected(values):
+            if setting.name == name:  # A setting does not restrict itself.
+                continue
             for restriction in selected.ranges:
-                is_about_it = restriction.setting == name and other.name != name
-                if is_about_it and _evaluate(restriction.condition, values):
-                    allowed = restriction.options
-                    if reasons:  # several restrictions apply together
-                        allowed = tuple(option for option in allowed if setting_key(option.value) in keys)
-                    options, keys = allowed, frozenset(setting_key(option.value) for option in allowed)
-                    reasons.append(f"{other.name} = {selected.name}")
+                if restriction.setting != name or not _evaluate(restriction.condition, values):
+                    continue
+                allowed = restriction.options
+                if reasons:  # Several restrictions apply together.
+                    previous_keys = {setting_key(option.value) for option in options}
+                    allowed = tuple(option for option in allowed if setting_key(option.value) in previous_keys)
+                options = allowed
+                reasons.append(f"{setting.name} = {selected.name}")
         return options, reasons
 
     def _selected(self, values: Values) -> Iterator[tuple[SettingDefinition, SettingOption]]:
@@ -191,16 +193,16 @@ class CameraDefinition(Snapshot):
         Raises:
             InvalidArgument: the setting is read-only, excluded now, or does not accept the value.
         """
-        own = self.settings[name]
-        if own.read_only:
+        setting = self.settings[name]
+        if setting.read_only:
             raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: it can only be read")
         reasons = self.excluded_by(name, values)
         if reasons:
             raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed now: excluded by {', '.join(reasons)}")
         options, restricted_by = self._options(name, values)
         if options or restricted_by:
-            return _check_option(own, value, options, restricted_by)
-        return _check_range(own, value)
+            return _check_option(setting, value, options, restricted_by)
+        return _check_range(setting, value)
 
 
 def load_definition(path: str | os.PathLike[str]) -> CameraDefinition:
@@ -234,57 +236,60 @@ def parse_definition(data: bytes, source: str = "camera definition") -> CameraDe
         raise FileFormatError(f"{source} is not a camera definition: {error!r}") from None
     if root.tag != "mavlinkcamera":
         raise FileFormatError(f"{source} is not a camera definition: its root element is <{root.tag[:100]}>")
-    if next(islice(root.iter(), MAX_ELEMENTS, None), None) is not None:
+    has_more_elements = next(islice(root.iter(), MAX_ELEMENTS, None), None) is not None
+    if has_more_elements:
         raise FileFormatError(f"{source} is too large: more than {MAX_ELEMENTS} elements")
-    found = _Reader(root).definition()
-    if not found.settings:
+    definition = _Reader(root).definition()
+    if not definition.settings:
         raise FileFormatError(f"{source} defines no settings")
-    return found
+    return definition
 
 
 # ------------------------------------------------------------------------------------------ values
 
 
 def _check_option(
-    own: SettingDefinition, value: object, options: tuple[SettingOption, ...], restricted_by: list[str]
+    setting: SettingDefinition, value: object, options: tuple[SettingOption, ...], restricted_by: list[str]
 ) -> SettingValue:
+    """Return the value of the option that has this name or value; raise InvalidArgument if there is none."""
     by_name = {option.name: option.value for option in options}
     if isinstance(value, str) and value in by_name:
         return by_name[value]
-    if not isinstance(value, str) or own.wire_type == MavParamExtType.CUSTOM:
-        wanted = checked_setting(own.name, value, own.wire_type)
+    if not isinstance(value, str) or setting.wire_type == MavParamExtType.CUSTOM:
+        wire_value = checked_setting(setting.name, value, setting.wire_type)
         for option in options:
-            if settings_equal(option.value, wanted):
+            if settings_equal(option.value, wire_value):
                 return option.value
-    now = f" while {', '.join(restricted_by)}" if restricted_by else ""
+    restriction = f" while {', '.join(restricted_by)}" if restricted_by else ""
     shown = list(by_name.items())[:MAX_SHOWN_OPTIONS]
-    names = ", ".join(f"{name!r} ({short_repr(known)})" for name, known in shown)
+    names = ", ".join(f"{name!r} ({short_repr(option_value)})" for name, option_value in shown)
     more = f" and {len(by_name) - MAX_SHOWN_OPTIONS} more" if len(by_name) > MAX_SHOWN_OPTIONS else ""
     raise InvalidArgument(
-        f"{own.name} = {short_repr(value)} is not allowed{now}: {names or 'nothing'}{more}"
+        f"{setting.name} = {short_repr(value)} is not allowed{restriction}: {names or 'nothing'}{more}"
         + did_you_mean(value, by_name)
     )
 
 
-def _check_range(own: SettingDefinition, value: object) -> SettingValue:
-    number = checked_setting(own.name, value, own.wire_type)
+def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
+    number = checked_setting(setting.name, value, setting.wire_type)
     if isinstance(number, (str, bytes)):
         return number
-    if own.type == "bool":
+    if setting.type == "bool":
         if number not in (0, 1):
-            raise InvalidArgument(f"{own.name} = {short_repr(value)} is not allowed: True or False")
+            raise InvalidArgument(f"{setting.name} = {short_repr(value)} is not allowed: True or False")
         return bool(number)
-    low, high, step = own.minimum, own.maximum, own.step
+    low, high, step = setting.minimum, setting.maximum, setting.step
+    # A value that equals a limit as a 32-bit float is allowed.
     is_below = low is not None and number < low and not settings_equal(number, low)
     is_above = high is not None and number > high and not settings_equal(number, high)
     if is_below or is_above:
-        bounds = f"{'' if low is None else f'{low:g}'}..{'' if high is None else f'{high:g}'}"
-        raise InvalidArgument(f"{own.name} = {short_repr(value)} is not allowed: {bounds}")
+        lowest, highest = ("" if limit is None else f"{limit:g}" for limit in (low, high))
+        raise InvalidArgument(f"{setting.name} = {short_repr(value)} is not allowed: {lowest}..{highest}")
     if isinstance(number, int) and isinstance(step, int) and step > 1:
         first = low if isinstance(low, int) else 0
         if (number - first) % step:
             raise InvalidArgument(
-                f"{own.name} = {short_repr(value)} is not allowed: {first}, {first + step}, {first + 2 * step} …"
+                f"{setting.name} = {short_repr(value)} is not allowed: {first}, {first + step}, {first + 2 * step} …"
             )
     return number
 
@@ -292,14 +297,16 @@ def _check_range(own: SettingDefinition, value: object) -> SettingValue:
 # -------------------------------------------------------------------------------------- conditions
 
 
-def _tests(condition: str) -> list[tuple[str, str, str, str]]:
+def _parse_condition(condition: str) -> list[tuple[str, str, str, str]]:
     """Parse a condition into tests: (setting, operator, value, AND or OR with the tests before).
 
     Raises ValueError if the condition is malformed.
     """
+    if not condition:
+        return []
     tests = []
     joiner, words = "AND", list[str]()
-    for word in (*condition.split(), "AND") if condition else ():
+    for word in (*condition.split(), "AND"):  # The added AND ends the last test.
         if word not in ("AND", "OR"):
             words.append(word)
             continue
@@ -316,23 +323,28 @@ def _tests(condition: str) -> list[tuple[str, str, str, str]]:
 def _evaluate(condition: str, values: Values) -> bool:
     """Evaluate a condition from left to right. A test of an unknown setting is False."""
     result = True
-    for name, operator, value, joiner in _tests(condition):
+    for name, operator, value, joiner in _parse_condition(condition):
         is_true = name in values and _compare(values[name], operator, value)
         result = (result and is_true) if joiner == "AND" else (result or is_true)
     return result
 
 
 def _compare(value: SettingValue, operator: str, text: str) -> bool:
+    """Evaluate one test. Texts have only the operators = and !=, and a number is never compared with a text."""
     if isinstance(value, (str, bytes)):
-        return settings_equal(value, text) == (operator == "=") if operator in ("=", "!=") else False
-    wanted = _number(text)
-    if wanted is None:
+        if operator not in ("=", "!="):
+            return False
+        return settings_equal(value, text) == (operator == "=")
+    number = _number(text)
+    if number is None:
         return False
-    is_equal = settings_equal(value, wanted)
+    # Not by ==, because a value that was sent as a 32-bit float differs a little from the decimal number in the file.
+    is_equal = settings_equal(value, number)
     if operator in ("=", "!="):
         return is_equal == (operator == "=")
-    is_right = value > wanted if operator[0] == ">" else value < wanted
-    return is_equal if is_equal and operator.endswith("=") else is_right and not is_equal
+    if is_equal:
+        return operator in (">=", "<=")
+    return value > number if operator in (">", ">=") else value < number
 
 
 # ----------------------------------------------------------------------------------------- the file
@@ -344,28 +356,26 @@ class _Reader:
     def __init__(self, root: Element) -> None:
         self._root = root
         nodes = list(root.iterfind("parameters/parameter"))
+        # Reversed, so that the first of several definitions of a setting counts.
         self._types = {node.get("name", ""): TYPES.get(node.get("type", "")) for node in reversed(nodes)}
 
     def definition(self) -> CameraDefinition:
         root, head = self._root, self._root.find("definition")
         settings: dict[str, SettingDefinition] = {}
         for node in root.iterfind("parameters/parameter"):
-            found = self._setting(node)
-            if found is not None:
-                settings.setdefault(found.name, found)
+            setting = self._setting(node)
+            if setting is not None:
+                settings.setdefault(setting.name, setting)
+        translations: dict[str, Mapping[str, str]] = {}
+        for node in root.iterfind("localization/locale"):
+            texts = {text.get("original", ""): text.get("translated", "") for text in node.iterfind("strings")}
+            translations[node.get("name", "")] = MappingProxyType(texts)
         return CameraDefinition(
             vendor=_text(None if head is None else head.find("vendor")),
             model=_text(None if head is None else head.find("model")),
             version=_int_or_zero("" if head is None else head.get("version", "")),
             settings=MappingProxyType(settings),
-            translations=MappingProxyType(
-                {
-                    node.get("name", ""): MappingProxyType(
-                        {text.get("original", ""): text.get("translated", "") for text in node.iterfind("strings")}
-                    )
-                    for node in root.iterfind("localization/locale")
-                }
-            ),
+            translations=MappingProxyType(translations),
         )
 
     def _setting(self, node: Element) -> SettingDefinition | None:
@@ -373,7 +383,7 @@ class _Reader:
         if not _is_name(name) or kind not in TYPES:
             return None
         wire_type = TYPES[kind]
-        default = _value(node.get("default"), wire_type)
+        default = _parse_value(node.get("default"), wire_type)
         return SettingDefinition(
             name,
             kind,
@@ -392,7 +402,7 @@ class _Reader:
 
     def _options(self, nodes: Iterable[Element], wire_type: int) -> Iterator[SettingOption]:
         for node in nodes:
-            value = _value(node.get("value"), wire_type)
+            value = _parse_value(node.get("value"), wire_type)
             if value is not None:
                 yield SettingOption(
                     node.get("name", ""),
@@ -407,15 +417,15 @@ class _Reader:
             wire_type = self._types.get(setting)
             condition = " ".join(node.get("condition", "").split())
             try:
-                _evaluate(condition, {})
+                _parse_condition(condition)
             except ValueError:
                 continue
             if wire_type is not None:
-                found = (
-                    (option.get("name", ""), _value(option.get("value"), wire_type))
+                names_and_values = [
+                    (option.get("name", ""), _parse_value(option.get("value"), wire_type))
                     for option in node.iterfind("roption")
-                )
-                options = tuple(SettingOption(name, value) for name, value in found if value is not None)
+                ]
+                options = tuple(SettingOption(name, value) for name, value in names_and_values if value is not None)
                 yield SettingRange(setting, condition, options)
 
 
@@ -444,7 +454,7 @@ def _int_or_zero(text: str) -> int:
     return number if isinstance(number, int) else 0
 
 
-def _value(text: str | None, wire_type: int) -> SettingValue | None:
+def _parse_value(text: str | None, wire_type: int) -> SettingValue | None:
     value: object = text if wire_type == MavParamExtType.CUSTOM else _number(text)
     try:
         return None if value is None else checked_setting("", value, wire_type)
@@ -454,7 +464,9 @@ def _value(text: str | None, wire_type: int) -> SettingValue | None:
 
 def _translated(setting: SettingDefinition, texts: Mapping[str, str]) -> SettingDefinition:
     def translated(option: SettingOption) -> SettingOption:
-        ranges = tuple(limit.replace(options=tuple(map(translated, limit.options))) for limit in option.ranges)
+        ranges = tuple(
+            restriction.replace(options=tuple(map(translated, restriction.options))) for restriction in option.ranges
+        )
         return option.replace(name=texts.get(option.name, option.name), ranges=ranges)
 
     return setting.replace(

@@ -71,7 +71,7 @@ def from_wire(param_value: float, type: ParameterType, bytewise: bool) -> int | 
 def value_of(message: ParamSet | ParamValue, bytewise: bool) -> int | float:
     """Return the value in a message. The value of a received message is exact to the bit."""
     type_ = ParameterType.from_wire(message.param_type)
-    if message.param_value == message.param_value or not bytewise:
+    if not bytewise or not math.isnan(message.param_value):
         return from_wire(message.param_value, type_, bytewise)
     return from_bits(_exact_bits(message), type_, bytewise)
 
@@ -80,7 +80,7 @@ def parameter_of(message: ParamValue, bytewise: bool) -> Parameter:
     """Convert a PARAM_VALUE to a parameter without a default. If it is not part of a list, the index is None."""
     index = None if message.param_index == UNKNOWN_INDEX else message.param_index
     type_ = ParameterType.from_wire(message.param_type)
-    return Parameter(message.param_id, value_of(message, bytewise), type_, None, index)
+    return Parameter(message.param_id, value_of(message, bytewise), type_, default=None, index=index)
 
 
 def set_message(
@@ -94,7 +94,7 @@ def set_message(
     """Create a PARAM_SET for a checked name and value."""
     bits = to_bits(value, type, bytewise)
     message = ParamSet(target_system, target_component, name, _FLOAT.unpack(bits)[0], int(type))
-    return _exact(message, _ExactParamSet, bits)
+    return _with_exact_bits(message, _ExactParamSet, bits)
 
 
 def value_message(parameter: Parameter, count: int, bytewise: bool) -> ParamValue:
@@ -102,7 +102,7 @@ def value_message(parameter: Parameter, count: int, bytewise: bool) -> ParamValu
     bits = to_bits(parameter.value, parameter.type, bytewise)
     index = UNKNOWN_INDEX if parameter.index is None else parameter.index
     message = ParamValue(parameter.name, _FLOAT.unpack(bits)[0], int(parameter.type), count, index)
-    return _exact(message, _ExactParamValue, bits)
+    return _with_exact_bits(message, _ExactParamValue, bits)
 
 
 # ------------------------------------------------------------------------------------------ bits
@@ -112,27 +112,29 @@ class _ExactParamSet(ParamSet):
     bits: bytes
 
     def encode(self) -> bytes:
-        return self.bits + super().encode()[4:]
+        return self.bits + super().encode()[4:]  # The value is the first field.
 
 
 class _ExactParamValue(ParamValue):
+    """A PARAM_VALUE of the same kind."""
+
     bits: bytes
 
     def encode(self) -> bytes:
         return self.bits + super().encode()[4:]
 
 
-def _exact(message: _M, kind: type[_ExactParamSet] | type[_ExactParamValue], bits: bytes) -> _M:
+def _with_exact_bits(message: _M, exact_type: type[_ExactParamSet] | type[_ExactParamValue], bits: bytes) -> _M:
     """Return the message, or a copy with the exact bits if its Python float lacks them."""
     if _FLOAT.pack(message.param_value) == bits:
         return message
-    exact = kind(**message.to_dict())
+    exact = exact_type(**message.to_dict())
     exact.bits = bits  # type: ignore[misc]
     return exact  # type: ignore[return-value]
 
 
 def _exact_bits(message: ParamSet | ParamValue) -> bytes:
-    # The value is the first field in both messages.
+    """Return the bytes of ``param_value``, the first field of both messages."""
     if isinstance(message, (_ExactParamSet, _ExactParamValue)):
         return message.bits
     if message.received_frame is None:
@@ -141,8 +143,9 @@ def _exact_bits(message: ParamSet | ParamValue) -> bytes:
 
 
 def _cast(number: float, type_: ParameterType) -> int | float:
-    whole = type_.is_integer and math.isfinite(number) and number == int(number)
-    return int(number) if whole else number
+    """Convert a whole number to int if the type is an integer type."""
+    is_whole = math.isfinite(number) and number == int(number)
+    return int(number) if type_.is_integer and is_whole else number
 
 
 _INTEGER = re.compile(r"[+-]?[0-9]{1,999}")
@@ -164,8 +167,9 @@ def number_text(value: float) -> str:
     if isinstance(value, int):
         return str(int(value))
     if value == int(value) and abs(value) < 1e9:
-        return "-0.0" if str(value) == "-0.0" else str(int(value))
+        return "-0.0" if str(value) == "-0.0" else str(int(value))  # int() would lose the sign of -0.0.
     number = to_float32(value)
+    # Nine digits identify every 32-bit float.
     candidates = (f"{number:.{digits}g}" for digits in range(6, 10))
     return next(text for text in candidates if to_float32(float(text)) == number)
 

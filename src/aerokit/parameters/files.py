@@ -86,10 +86,10 @@ def parse_parameter_file(text: str, source: str = "parameters", *, component_id:
     comments: list[str] = []
     lines: list[tuple[str, str]] = []
     for number, line in enumerate(text.splitlines(), 1):
-        content, mark, comment = line.partition("#")
+        content, hash_sign, comment = line.partition("#")
         if content.strip():
             lines.append((f"{source}, line {number}", content))
-        elif mark:
+        elif hash_sign:
             comments.append(comment.strip())
     if not lines:
         raise FileFormatError(f"{source} contains no parameters")
@@ -133,10 +133,12 @@ def parameter_file_text(
     rows = sorted(_rows(values), key=lambda row: row[0])
     if not rows:
         raise InvalidArgument("there are no parameters to write")
-    lines = [f"# {line}".rstrip() for comment in comments for line in comment.splitlines() or [""]]
+    lines: list[str] = []
+    for comment in comments:
+        lines += [f"# {line}".rstrip() for line in comment.splitlines() or [""]]  # An empty comment is an empty line.
     if format == "qgroundcontrol":
         lines += ["# Vehicle-Id Component-Id Name Value Type"]
-        lines += [f"{system_id}\t{component_id}\t{n}\t{value}\t{int(kind)}" for n, value, kind in rows]
+        lines += [f"{system_id}\t{component_id}\t{name}\t{value}\t{int(kind)}" for name, value, kind in rows]
     else:
         template = "{},{}" if format == "missionplanner" else "{:<16} {}"
         lines += [template.format(name, value) for name, value, _ in rows]
@@ -151,10 +153,11 @@ def _parse_names_and_values(lines: list[tuple[str, str]], comments: list[str]) -
     for place, line in lines:
         fields = line.replace(",", " ").split()
         if len(fields) != 2:
-            raise FileFormatError(f"{place}: {line.strip()!r} is not NAME,VALUE or NAME VALUE{_hint(fields)}")
-        _put(values, place, fields[0], fields[1], ParameterType.REAL32)
-    is_planner = "," in lines[0][1]
-    return ParameterFile(values, format="missionplanner" if is_planner else "mavproxy", comments=comments)
+            hint = _directive_hint(fields)
+            raise FileFormatError(f"{place}: {line.strip()!r} is not NAME,VALUE or NAME VALUE{hint}")
+        _add_value(values, place, fields[0], fields[1], ParameterType.REAL32)
+    _, first_line = lines[0]
+    return ParameterFile(values, format="missionplanner" if "," in first_line else "mavproxy", comments=comments)
 
 
 def _parse_qgroundcontrol(
@@ -163,42 +166,46 @@ def _parse_qgroundcontrol(
     values: dict[int, dict[str, int | float]] = {}
     types: dict[int, dict[str, ParameterType]] = {}
     for place, line in lines:
-        component, name, text, kind = _columns(place, line)
-        _put(values.setdefault(component, {}), place, name, text, kind)
+        component, name, text, kind = _parse_columns(place, line)
+        _add_value(values.setdefault(component, {}), place, name, text, kind)
         types.setdefault(component, {})[name] = kind
-    chosen = _component(component_id, values, source)
+    selected = _select_component(component_id, values, source)
     return ParameterFile(
-        values[chosen],
+        values[selected],
         format="qgroundcontrol",
-        types=types[chosen],
+        types=types[selected],
         comments=comments,
-        component_id=chosen,
+        component_id=selected,
     )
 
 
-def _columns(place: str, line: str) -> tuple[int, str, str, ParameterType]:
+def _parse_columns(place: str, line: str) -> tuple[int, str, str, ParameterType]:
+    """Return component id, name, value as text, and type."""
     fields = line.strip().split("\t")
-    numbers = [fields[i] if len(fields) == 5 else "" for i in (0, 1, 4)]
-    if not all(number.isascii() and number.isdigit() for number in numbers):
+    if len(fields) != 5 or not all(text.isascii() and text.isdigit() for text in (fields[0], fields[1], fields[4])):
         raise FileFormatError(f"{place}: {line.strip()!r} is not {_COLUMNS}")
-    kind = int(numbers[2])
+    _, component_id, name, value, type_number = fields
+    kind = int(type_number)
     if not 1 <= kind <= 10:
         raise FileFormatError(f"{place}: type {kind} is not a MAV_PARAM_TYPE (1 to 10)")
-    return int(numbers[1]), fields[2].strip(), fields[3].strip(), ParameterType(kind)
+    return int(component_id), name.strip(), value.strip(), ParameterType(kind)
 
 
-def _component(requested: int | None, values: Mapping[int, object], source: str) -> int:
+def _select_component(requested: int | None, values: Mapping[int, object], source: str) -> int:
+    """Return the requested component; by default the autopilot, or the only component in the file."""
     if requested is not None and requested in values:
         return requested
-    if requested is None and (_AUTOPILOT in values or len(values) == 1):
-        return _AUTOPILOT if _AUTOPILOT in values else next(iter(values))
+    if requested is None and _AUTOPILOT in values:
+        return _AUTOPILOT
+    if requested is None and len(values) == 1:
+        return next(iter(values))
     present = ", ".join(str(component) for component in sorted(values))
     if requested is None:
         raise FileFormatError(f"{source} has several components: {present}; select one with component_id")
     raise FileFormatError(f"{source} has no parameters of component {requested}, only of: {present}")
 
 
-def _put(values: dict[str, int | float], place: str, name: str, text: str, kind: ParameterType) -> None:
+def _add_value(values: dict[str, int | float], place: str, name: str, text: str, kind: ParameterType) -> None:
     try:
         number = parse_number(text)
     except ValueError:
@@ -212,7 +219,7 @@ def _put(values: dict[str, int | float], place: str, name: str, text: str, kind:
     values[name] = checked if kind.is_integer else number
 
 
-def _hint(fields: list[str]) -> str:
+def _directive_hint(fields: list[str]) -> str:
     if any(field.startswith("@") for field in (*fields[:1], *fields[2:])):
         return " (@include and @READONLY in ArduPilot's default files are not supported)"
     return ""
@@ -223,12 +230,15 @@ def _hint(fields: list[str]) -> str:
 
 def _rows(values: ParameterValues) -> Iterator[tuple[str, str, ParameterType]]:
     """Yield name, formatted value and type of each parameter, after checking them."""
-    types = values.types if isinstance(values, ParameterFile) else {}
-    numbers = plain_values(values)
-    for name, number in numbers.items():
-        given = values[name]
-        guess = ParameterType.INT32 if isinstance(number, int) else ParameterType.REAL32
-        kind = given.type if isinstance(given, Parameter) else types.get(name, guess)
+    file_types = values.types if isinstance(values, ParameterFile) else {}
+    for name, number in plain_values(values).items():
+        parameter = values[name]
+        if isinstance(parameter, Parameter):
+            kind = parameter.type
+        elif name in file_types:
+            kind = file_types[name]
+        else:
+            kind = ParameterType.INT32 if isinstance(number, int) else ParameterType.REAL32
         yield _writable(name), _value_text(name, number, kind), kind
 
 

@@ -79,15 +79,17 @@ class ParameterMetadata(Snapshot):
         if self.read_only:
             return f"{self.name} can only be read"
         low, high = self.minimum, self.maximum
-        inside = (low is None or value >= low) and (high is None or value <= high)
+        is_inside = (low is None or value >= low) and (high is None or value <= high)
         has_range = low is not None or high is not None
-        if value in self.values or (inside and (has_range or not self.values or self.bitmask)):
+        # Beside a range or bits, the documented values are only examples.
+        allows_other_values = has_range or not self.values or bool(self.bitmask)
+        if value in self.values or (is_inside and allows_other_values):
             return None
         if not has_range:
-            known = ", ".join(f"{number:g} {text}" for number, text in self.values.items())
-            return f"{self.name} = {value:g} is not a documented value: {known}"
-        bounds = f"{'' if low is None else f'{low:g}'}..{'' if high is None else f'{high:g}'}"
-        return f"{self.name} = {value:g} is not in {bounds} {self.unit}".rstrip()
+            documented = ", ".join(f"{number:g} {text}" for number, text in self.values.items())
+            return f"{self.name} = {value:g} is not a documented value: {documented}"
+        lowest, highest = ("" if limit is None else f"{limit:g}" for limit in (low, high))
+        return f"{self.name} = {value:g} is not in {lowest}..{highest} {self.unit}".rstrip()
 
     def __hash__(self) -> int:
         return hash(self.name)
@@ -150,16 +152,16 @@ def load_metadata(path: str | os.PathLike[str]) -> Metadata:
 def parse_metadata(data: bytes, source: str = "metadata") -> Metadata:
     """Parse the content of a metadata file. Errors begin with ``source``."""
     try:
-        found = _parse(decompress(data, source))
+        parameters = _parse(decompress(data, source))
     except FileFormatError:
         raise
     except (ValueError, SyntaxError, TypeError, AttributeError, LookupError, RecursionError) as error:
         raise FileFormatError(
             f"{source} is not an apm.pdef.xml, apm.pdef.json, parameters.xml or parameters.json: {error}"
         ) from None
-    if not found:
+    if not parameters:
         raise FileFormatError(f"{source} defines no parameters")
-    return Metadata(found)
+    return Metadata(parameters)
 
 
 _BITS = range(64)
@@ -188,15 +190,15 @@ def _ardupilot_xml(root: Element) -> Iterator[ParameterMetadata]:
             fields = {field.get("name", ""): field.text or "" for field in param.iter("field")}
             low, high = _range(fields.get("Range", ""))
             yield ParameterMetadata(
-                param.attrib["name"].rpartition(":")[2],
+                param.attrib["name"].rpartition(":")[2],  # without the vehicle type in "ArduCopter:RTL_SPEED"
                 short_description=param.get("humanName", ""),
                 description=param.get("documentation", ""),
                 unit=fields.get("Units", ""),
                 minimum=low,
                 maximum=high,
                 increment=_number(fields.get("Increment")),
-                values=_named((value.get("code"), value.text) for value in param.iter("value")),
-                bitmask=_bits((bit.get("code"), bit.text) for bit in param.iter("bit")),
+                values=_names_by_number((value.get("code"), value.text) for value in param.iter("value")),
+                bitmask=_names_by_bit((bit.get("code"), bit.text) for bit in param.iter("bit")),
                 reboot_required=_is_true(fields.get("RebootRequired")),
                 group=group.get("name", ""),
                 category=param.get("user", ""),
@@ -219,8 +221,8 @@ def _ardupilot_json(content: Mapping[str, Any]) -> Iterator[ParameterMetadata]:
                 minimum=_number(limits.get("low")),
                 maximum=_number(limits.get("high")),
                 increment=_number(fields.get("Increment")),
-                values=_named(fields.get("Values", {}).items()),
-                bitmask=_bits(fields.get("Bitmask", {}).items()),
+                values=_names_by_number(fields.get("Values", {}).items()),
+                bitmask=_names_by_bit(fields.get("Bitmask", {}).items()),
                 reboot_required=_is_true(fields.get("RebootRequired")),
                 group=group,
                 category=_text(fields.get("User", "")),
@@ -238,8 +240,9 @@ def _range(text: str) -> tuple[float | None, float | None]:
 def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
     for group in root.iter("group"):
         for param in group.iter("parameter"):
-            is_boolean = _is_true(param.get("boolean"))
-            values = _named((value.get("code"), value.text) for value in param.iter("value"))
+            values = _names_by_number((value.get("code"), value.text) for value in param.iter("value"))
+            if not values and _is_true(param.get("boolean")):
+                values = {0: "Disabled", 1: "Enabled"}
             yield ParameterMetadata(
                 param.attrib["name"],
                 short_description=param.findtext("short_desc", ""),
@@ -249,8 +252,8 @@ def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
                 maximum=_number(param.findtext("max")),
                 increment=_number(param.findtext("increment")),
                 default=_number(param.get("default")),
-                values=values or ({0: "Disabled", 1: "Enabled"} if is_boolean else values),
-                bitmask=_bits((bit.get("index"), bit.text) for bit in param.iter("bit")),
+                values=values,
+                bitmask=_names_by_bit((bit.get("index"), bit.text) for bit in param.iter("bit")),
                 reboot_required=_is_true(param.findtext("reboot_required")),
                 decimal_places=_int_or_none(param.findtext("decimal")),
                 group=group.get("name", ""),
@@ -269,8 +272,8 @@ def _px4_entry(entry: Mapping[str, Any]) -> ParameterMetadata:
         maximum=_number(entry.get("max")),
         increment=_number(entry.get("increment")),
         default=_number(entry.get("default")),
-        values=_named((value["value"], value["description"]) for value in entry.get("values", ())),
-        bitmask=_bits((bit["index"], bit["description"]) for bit in entry.get("bitmask", ())),
+        values=_names_by_number((value["value"], value["description"]) for value in entry.get("values", ())),
+        bitmask=_names_by_bit((bit["index"], bit["description"]) for bit in entry.get("bitmask", ())),
         reboot_required=bool(entry.get("rebootRequired", False)),
         decimal_places=_int_or_none(entry.get("decimalPlaces")),
         group=_text(entry.get("group", "")),
@@ -300,13 +303,13 @@ def _number(value: Any) -> int | float | None:
         return None
 
 
-def _named(pairs: Iterable[tuple[Any, Any]]) -> Mapping[float, str]:
+def _names_by_number(pairs: Iterable[tuple[Any, Any]]) -> Mapping[float, str]:
     numbers = ((_number(code), str(text or "").strip()) for code, text in pairs)
     return {number: text for number, text in numbers if number is not None}
 
 
-def _bits(pairs: Iterable[tuple[Any, Any]]) -> Mapping[int, str]:
-    return {int(bit): text for bit, text in _named(pairs).items() if bit in _BITS}
+def _names_by_bit(pairs: Iterable[tuple[Any, Any]]) -> Mapping[int, str]:
+    return {int(bit): text for bit, text in _names_by_number(pairs).items() if bit in _BITS}
 
 
 def _is_true(text: str | None) -> bool:

@@ -62,7 +62,7 @@ class PackHeader(NamedTuple):
 
 
 class PackEntry(NamedTuple):
-    """One parameter in the file. ``default`` is None if it is not included."""
+    """One parameter in the file. ``default`` is None if it is not included; ``end`` is the position after the entry."""
 
     name: bytes
     type: ParameterType
@@ -84,8 +84,12 @@ def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
     magic, count, total = read_header(data)
     if magic not in (MAGIC, _MAGIC_WITH_DEFAULTS) or count > total:
         raise RemoteProtocolError(f"not a param.pck: its header is {magic:#06x}, {count} of {total}")
-    found = list(_parameters(data, magic == _MAGIC_WITH_DEFAULTS, start))
-    return ParameterTable(_checked(found, count))
+    parameters = list(_parameters(data, magic == _MAGIC_WITH_DEFAULTS, start))
+    if len(parameters) != count:
+        raise RemoteProtocolError(f"param.pck has {len(parameters)} parameters, its header says {count}")
+    if len({parameter.name for parameter in parameters}) != count:
+        raise RemoteProtocolError("param.pck contains a name twice")
+    return ParameterTable(parameters)
 
 
 def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -> bytes:
@@ -100,11 +104,11 @@ def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -
     """
     rows = list(_rows(parameters))
     body = bytearray()
-    last = b""
+    previous_name = b""
     for parameter in rows:
         name, code = check_name(parameter.name).encode("ascii"), _code_of(parameter)
-        body += _entry(name, last, code, checked_value(parameter.name, parameter.value, _CODES[code][0]))
-        last = name
+        body += _entry(name, previous_name, code, checked_value(parameter.name, parameter.value, _CODES[code][0]))
+        previous_name = name
     length = HEADER.size + len(body)
     if length > _MAX_SIZE:
         raise InvalidArgument(f"{len(rows)} parameters need {length} bytes, at most {_MAX_SIZE} are possible")
@@ -129,19 +133,22 @@ def pack_for_download(
     rows = list(_rows(parameters))
     if not 0 <= start < len(rows):
         raise InvalidArgument(f"start = {start!r} must be in 0..{len(rows) - 1}")
-    chosen = rows[start : start + count if count else None]
-    file = bytearray(HEADER.pack(_MAGIC_WITH_DEFAULTS if with_defaults else MAGIC, len(chosen), len(rows)))
-    last = b""
-    for parameter in chosen:
+    selected = rows[start : start + count if count else None]
+    file = bytearray(HEADER.pack(_MAGIC_WITH_DEFAULTS if with_defaults else MAGIC, len(selected), len(rows)))
+    previous_name = b""
+    for parameter in selected:
         values = [parameter.value]
         if with_defaults and parameter.is_changed and parameter.default is not None:
             values.append(parameter.default)
         name, code = parameter.name.encode(), _code_of(parameter)
-        entry = _entry(name, last, code, *values)
-        unsplit = _CODES[code][1].size * (len(values) if whole_defaults else 1)
-        beyond = (len(file) + len(entry)) % block_size
-        file += bytes(unsplit - beyond if 0 < beyond < unsplit else 0) + entry
-        last = name
+        entry = _entry(name, previous_name, code, *values)
+        # The value (and its default) at the end of the entry must not be split between two blocks.
+        unsplit_size = _CODES[code][1].size * (len(values) if whole_defaults else 1)
+        size_in_next_block = (len(file) + len(entry)) % block_size
+        if 0 < size_in_next_block < unsplit_size:
+            file += bytes(unsplit_size - size_in_next_block)  # padding
+        file += entry
+        previous_name = name
     return bytes(file)
 
 
@@ -153,8 +160,10 @@ def read_header(data: bytes) -> PackHeader:
     return PackHeader(*HEADER.unpack_from(data))
 
 
-def read_entry(data: bytes, position: int, last: bytes) -> PackEntry | None:
-    """Decode the entry at ``position``; ``last`` is the previous name. Returns None if the data ends inside the entry.
+def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | None:
+    """Decode the entry at ``position``; return None if the data ends inside the entry.
+
+    ``previous_name`` is the name in the entry before, empty for the first entry.
 
     Raises:
         RemoteProtocolError: there is no entry: the type or flags are undefined, or the name is too long.
@@ -164,28 +173,29 @@ def read_entry(data: bytes, position: int, last: bytes) -> PackEntry | None:
         _damaged(position, f"invalid type {code} or flags {flags >> 4}")
     if position + 1 == len(data):
         return None
-    common, own = data[position + 1] & 0x0F, (data[position + 1] >> 4) + 1
-    if common > len(last) or common + own > NAME_LENGTH:
-        _damaged(position, f"invalid name length {common} + {own} after {last!r}")
+    # The name begins with characters of the previous name, which the file does not repeat.
+    common, own_length = data[position + 1] & 0x0F, (data[position + 1] >> 4) + 1
+    if common > len(previous_name) or common + own_length > NAME_LENGTH:
+        _damaged(position, f"invalid name length {common} + {own_length} after {previous_name!r}")
     kind, format_ = _CODES[code]
-    start = position + 2 + own
+    start = position + 2 + own_length
     end = start + format_.size * (2 if flags else 1)
     if end > len(data):
         return None
     value = format_.unpack_from(data, start)[0]
     default = format_.unpack_from(data, start + format_.size)[0] if flags else None
-    return PackEntry(last[:common] + data[position + 2 : start], kind, value, default, end)
+    return PackEntry(previous_name[:common] + data[position + 2 : start], kind, value, default, end)
 
 
 def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parameter]:
-    position, last = HEADER.size, b""
-    while (position := _skip_padding(data, position)) < len(data):
-        entry = read_entry(data, position, last)
+    position, previous_name = _skip_padding(data, HEADER.size), b""
+    while position < len(data):
+        entry = read_entry(data, position, previous_name)
         if entry is None:
             _damaged(position, "it ends inside an entry")
         default = entry.value if entry.default is None and with_defaults else entry.default
         yield Parameter(_text(entry.name, position), entry.value, entry.type, default, index)
-        position, last, index = entry.end, entry.name, index + 1
+        position, previous_name, index = _skip_padding(data, entry.end), entry.name, index + 1
 
 
 def _skip_padding(data: bytes, position: int) -> int:
@@ -200,16 +210,8 @@ def _text(name: bytes, position: int) -> str:
     return name.decode("ascii")
 
 
-def _damaged(position: int, what: str) -> NoReturn:
-    raise RemoteProtocolError(f"param.pck is damaged at byte {position}: {what}")
-
-
-def _checked(found: list[Parameter], count: int) -> list[Parameter]:
-    if len(found) != count:
-        raise RemoteProtocolError(f"param.pck has {len(found)} parameters, its header says {count}")
-    if len({parameter.name for parameter in found}) != count:
-        raise RemoteProtocolError("param.pck contains a name twice")
-    return found
+def _damaged(position: int, problem: str) -> NoReturn:
+    raise RemoteProtocolError(f"param.pck is damaged at byte {position}: {problem}")
 
 
 # --------------------------------------------------------------------------------------- writing
@@ -223,17 +225,18 @@ def _code_of(parameter: Parameter) -> int:
     return _CODE_OF[parameter.type]
 
 
-def _entry(name: bytes, last: bytes, code: int, *values: float) -> bytes:
-    common, pack = _common_length(name, last), _CODES[code][1].pack
-    first = (code | (_HAS_DEFAULT if len(values) > 1 else 0), common | (len(name) - common - 1) << 4)
-    return bytes(first) + name[common:] + b"".join(map(pack, values))
+def _entry(name: bytes, previous_name: bytes, code: int, *values: float) -> bytes:
+    common, pack = _common_length(name, previous_name), _CODES[code][1].pack
+    type_and_flags = code | (_HAS_DEFAULT if len(values) > 1 else 0)
+    lengths = common | (len(name) - common - 1) << 4
+    return bytes((type_and_flags, lengths)) + name[common:] + b"".join(map(pack, values))
 
 
-def _common_length(name: bytes, last: bytes) -> int:
+def _common_length(name: bytes, previous_name: bytes) -> int:
     # A name must have at least one character that it does not share with the previous name.
     common = 0
-    for char, last_char in zip(name[:-1], last):  # noqa: B905 - the shorter one ends it
-        if char != last_char:
+    for char, previous_char in zip(name[:-1], previous_name):  # noqa: B905 - the shorter one ends it
+        if char != previous_char:
             break
         common += 1
     return common
@@ -253,6 +256,8 @@ def px4_hash(table: ParameterTable, volatile: Container[str] = ()) -> int:
     (:attr:`ParameterMetadata.volatile <aerokit.parameters.ParameterMetadata>`), otherwise the result differs. Because
     the names may be unknown, a cache should store the hash that the vehicle has reported.
     """
-    counted = (table[name] for name in sorted(table) if name not in volatile)
-    data = b"".join(p.name.encode() + to_bits(p.value, p.type, bytewise=True) for p in counted)
+    data = bytearray()
+    for name in sorted(table):
+        if name not in volatile:
+            data += name.encode() + to_bits(table[name].value, table[name].type, bytewise=True)
     return zlib.crc32(data, _ALL_ONES) ^ _ALL_ONES

@@ -49,8 +49,8 @@ class ParameterType(IntEnum):
 
         The result is REAL32 for unknown numbers, because every value is sent as a float.
         """
-        found: ParameterType = cls._value2member_map_.get(number, cls.REAL32)  # type: ignore[assignment]
-        return found
+        member: ParameterType = cls._value2member_map_.get(number, cls.REAL32)  # type: ignore[assignment]
+        return member
 
     @property
     def is_integer(self) -> bool:
@@ -60,7 +60,7 @@ class ParameterType(IntEnum):
     @property
     def is_signed(self) -> bool:
         """True if values can be negative."""
-        return self >= ParameterType.REAL32 or self % 2 == 0
+        return self >= ParameterType.REAL32 or self % 2 == 0  # The signed integer types have even numbers.
 
     @property
     def minimum(self) -> int | float:
@@ -73,7 +73,8 @@ class ParameterType(IntEnum):
     def maximum(self) -> int | float:
         """The maximum of the type."""
         if self.is_integer:
-            return (1 << (_INTEGER_BITS[self] - self.is_signed)) - 1
+            value_bits = _INTEGER_BITS[self] - (1 if self.is_signed else 0)
+            return (1 << value_bits) - 1
         return 3.4028234663852886e38 if self is ParameterType.REAL32 else 1.7976931348623157e308
 
 
@@ -155,7 +156,8 @@ def to_float32(value: float) -> float:
 
 def same_value(left: float, right: float) -> bool:
     """Return True if the values are equal, equal as 32-bit floats, or both NaN."""
-    if left == right or (left != left and right != right):
+    are_both_nan = left != left and right != right
+    if left == right or are_both_nan:
         return True
     if isinstance(left, int) and isinstance(right, int):
         return False
@@ -201,9 +203,10 @@ class Setting(Snapshot):
 
 def setting_value(data: bytes, type: int) -> SettingValue:  # noqa: A002 - the name of the field in the standard
     """Decode the bytes of a value in a message. For unknown types, return the bytes without trailing zeros."""
-    packed = _STRUCTS.get(type)  # type: ignore[call-overload]
-    if packed is not None:
-        number: int | float = packed.unpack(data[: packed.size].ljust(packed.size, b"\0"))[0]
+    layout = _STRUCTS.get(type)  # type: ignore[call-overload]
+    if layout is not None:
+        # MAVLink 2 cuts the zeros at the end of a message.
+        number: int | float = layout.unpack(data[: layout.size].ljust(layout.size, b"\0"))[0]
         return number
     data = data.rstrip(b"\0")
     if type == MavParamExtType.CUSTOM:
@@ -218,9 +221,9 @@ def setting_value(data: bytes, type: int) -> SettingValue:  # noqa: A002 - the n
 
 def setting_bytes(value: SettingValue, type: int) -> bytes:  # noqa: A002
     """Encode a value that :func:`checked_setting` has accepted."""
-    packed = _STRUCTS.get(type)  # type: ignore[call-overload]
-    if packed is not None:
-        data: bytes = packed.pack(value)
+    layout = _STRUCTS.get(type)  # type: ignore[call-overload]
+    if layout is not None:
+        data: bytes = layout.pack(value)
         return data
     return value.encode() if isinstance(value, str) else bytes(value)  # type: ignore[arg-type]
 
@@ -254,7 +257,8 @@ def settings_equal(left: SettingValue, right: SettingValue) -> bool:
     """Return True if the values are equal, equal as 32-bit floats, or both NaN."""
     if isinstance(left, (str, bytes)) or isinstance(right, (str, bytes)):
         return _encoded(left) == _encoded(right)
-    if left == right or (left != left and right != right):
+    are_both_nan = left != left and right != right
+    if left == right or are_both_nan:
         return True
     if not isinstance(left, float) and not isinstance(right, float):
         return False
@@ -273,8 +277,10 @@ def setting_key(value: SettingValue) -> object:
         return _encoded(value)
     if not isinstance(value, float):
         return value
+    if math.isnan(value):
+        return "NaN"  # A float NaN would differ from itself.
     try:
-        return _FLOAT.unpack(_FLOAT.pack(value))[0] if value == value else "NaN"
+        return _FLOAT.unpack(_FLOAT.pack(value))[0]
     except (OverflowError, struct.error):
         return value
 

@@ -128,7 +128,7 @@ def _moved(old: str, new: str, names: str) -> str:
     ``A>B``.
     """
     halves = (name.partition(">") for name in names.split())
-    return " ".join(f"{old}{before}>{new}{after or before}" for before, _, after in halves)
+    return " ".join(f"{old}{old_name}>{new}{new_name or old_name}" for old_name, _, new_name in halves)
 
 
 _XYZ = ["X", "Y", "Z"]
@@ -144,7 +144,7 @@ _RANGEFINDER = (
 
 _OLDER_LOITER = "SPEED>SPEED JERK>BRK_JERK MAXA>ACC_MAX MINA>BRK_ACCEL"
 
-_IGNORED = " ".join(f"IGN_{what}{number}" for what in ("ANG", "WID") for number in range(1, 5))
+_IGNORED_SECTORS = " ".join(f"IGN_{name}{number}" for name in ("ANG", "WID") for number in range(1, 5))
 
 # Version of the new name, vehicle types, divisor from old to new units, and ``OLD>NEW`` pairs.
 OLDER: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
@@ -199,7 +199,7 @@ OLDER: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ),
     ("4.1", _ROVER, 1, "TURN_MAX_G>ATC_TURN_MAX_G"),
     ("4.1", _OLDER_ALL, 1, _moved("RPM_", "RPM1_", "TYPE SCALING MAX MIN MIN_QUAL PIN")),
-    ("4.1", _OLDER_ALL, 1, _moved("PRX_", "PRX1_", f"TYPE ORIENT YAW_CORR {_IGNORED}")),
+    ("4.1", _OLDER_ALL, 1, _moved("PRX_", "PRX1_", f"TYPE ORIENT YAW_CORR {_IGNORED_SECTORS}")),
     ("4.3", _OLDER_ALL, 1, _moved("MNT_", "MNT1_", "TYPE DEFLT_MODE LEAD_RLL LEAD_PTCH")),
     ("4.3", _OLDER_ALL, 1, _moved("MNT_RETRACT_", "MNT1_RETRACT_", " ".join(_XYZ))),
     ("4.3", _OLDER_ALL, 1, _moved("MNT_NEUTRAL_", "MNT1_NEUTRAL_", " ".join(_XYZ))),
@@ -232,7 +232,7 @@ OLDER: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ("4.6", _OLDER_ALL, 1, "GPS_GNSS_MODE>GPS1_GNSS_MODE GPS_GNSS_MODE2>GPS2_GNSS_MODE"),
     ("4.6", _OLDER_ALL, 1, "GPS_DELAY_MS>GPS1_DELAY_MS GPS_DELAY_MS2>GPS2_DELAY_MS"),
     ("4.6", _OLDER_ALL, 1, "GPS_COM_PORT>GPS1_COM_PORT GPS_COM_PORT2>GPS2_COM_PORT"),
-    ("4.6", _OLDER_ALL, 1, " ".join(f"GPS_POS{n}_{axis}>GPS{n}_POS_{axis}" for n in (1, 2) for axis in _XYZ)),
+    ("4.6", _OLDER_ALL, 1, " ".join(f"GPS_POS{k}_{axis}>GPS{k}_POS_{axis}" for k in (1, 2) for axis in _XYZ)),
     ("4.6", _OLDER_ALL, 1, "GPS_CAN_NODEID1>GPS1_CAN_NODEID GPS_CAN_NODEID2>GPS2_CAN_NODEID"),
 )
 
@@ -264,7 +264,7 @@ REPLACED: dict[str, str] = {
     **dict.fromkeys(("FENCE_CHANNEL", "RST_MISSION_CH", "CHUTE_CHAN", "FBWA_TDRAG_CHAN", "FLAP_IN_CHANNEL"), _SWITCH),
     **dict.fromkeys(("INVERTEDFLT_CH", "SOAR_ENABLE_CH", "LEARN_CH"), _SWITCH),
     **dict.fromkeys(("MNT_RC_IN_ROLL", "MNT_RC_IN_TILT", "MNT_RC_IN_PAN"), _SWITCH),
-    **{f"ELEVON_{what}": _OUTPUT for what in ("MIXING", "OUTPUT", "REVERSE", "CH1_REV", "CH2_REV")},
+    **{f"ELEVON_{name}": _OUTPUT for name in ("MIXING", "OUTPUT", "REVERSE", "CH1_REV", "CH2_REV")},
     **dict.fromkeys(("VTAIL_OUTPUT", "FLAPERON_OUTPUT", "SKID_STEER_OUT", "BRD_PWM_COUNT"), _OUTPUT),
     **dict.fromkeys(("MNT_STAB_ROLL", "MNT_STAB_TILT", "MNT_STAB_PAN"), "MNT1_TYPE, 7 for not stabilized"),
     "MNT_JSTICK_SPD": "MNT1_RC_RATE in degrees per second",

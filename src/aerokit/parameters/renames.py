@@ -19,8 +19,8 @@ from aerokit.parameters.rename_table import GROUPS, INVERTED, OLDER, ONE_WAY, OT
 
 # The value 1 of ARMING_CHECK enables all checks, bits 1 to 20 enable single checks. ARMING_SKIPCHK = -1 skips all.
 _ALL_CHECKS = 1
-_CHECKS = 0x1FFFFE
-_EVERYTHING = -1
+_SINGLE_CHECKS = 0x1FFFFE
+_SKIP_ALL = -1
 
 
 class ParameterRenamedWarning(UserWarning):
@@ -105,14 +105,13 @@ class Renamed(Snapshot):
     def warning(self) -> str:
         """Text of the warning for the user."""
         text = f"{self.requested} is called {self.name} by this vehicle's firmware"
-        if not self._has_other_units:
-            pass
-        elif self.rename.is_inverted:
+        is_old_firmware = self.name in self.rename.old_names
+        if self._has_other_units and self.rename.is_inverted:
             text += "; the bits are inverted, and the value was converted"
-        elif self.rename.divisor != 1:
-            old, other = sorted((self.requested, self.name), key=lambda name: name not in self.rename.old_names)
-            text += f"; values were converted ({old} = {self.rename.divisor} × {other})"
-        if self.name in self.rename.old_names:
+        elif self._has_other_units and self.rename.divisor != 1:
+            old, new = (self.name, self.requested) if is_old_firmware else (self.requested, self.name)
+            text += f"; values were converted ({old} = {self.rename.divisor} × {new})"
+        if is_old_firmware:
             return f"{text}. The firmware, perhaps a -dev version, is older than the change in {self.rename.since}."
         return f"{text}. Use {self.rename.new}, its name since ArduPilot {self.rename.since}."
 
@@ -133,12 +132,13 @@ def find_rename(name: str, other: str = "") -> Rename | None:
 
     The new names of a few old names depend on the vehicle type: ``other`` selects one of the new names.
     """
-    return next((row for row in _by_name().get(name, ()) if not other or other in row.names), None)
+    return next((rename for rename in _by_name().get(name, ()) if not other or other in rename.names), None)
 
 
 def other_names(name: str) -> tuple[str, ...]:
     """Return the other names of a parameter, newest first; empty if it was never renamed."""
-    return tuple(other for row in _by_name().get(name, ()) for other in row.names if other != name)
+    renames = _by_name().get(name, ())
+    return tuple(other for rename in renames for other in rename.names if other != name)
 
 
 def replacement_of(name: str) -> str:
@@ -173,12 +173,12 @@ def translate_values(
     translated: dict[str, int | float] = {}
     renamed: list[Renamed] = []
     for name, value in values.items():
-        found = resolve_rename(name, known)
-        if found is None:
+        resolved = resolve_rename(name, known)
+        if resolved is None:
             translated[name] = value
-        elif found.name not in values:
-            translated[found.name] = found.to_vehicle(value, types.get(found.name))
-            renamed.append(found)
+        elif resolved.name not in values:
+            translated[resolved.name] = resolved.to_vehicle(value, types.get(resolved.name))
+            renamed.append(resolved)
     return translated, tuple(renamed)
 
 
@@ -198,32 +198,41 @@ def _checks_to_skip(checks: int) -> int:
     # Otherwise the checks that are not enabled are skipped.
     if checks & _ALL_CHECKS:
         return 0
-    return ~checks & _CHECKS if checks & _CHECKS else _EVERYTHING
+    return ~checks & _SINGLE_CHECKS if checks & _SINGLE_CHECKS else _SKIP_ALL
 
 
 def _checks_to_make(skipped: int) -> int:
-    return _ALL_CHECKS if skipped == 0 else ~skipped & _CHECKS
+    return _ALL_CHECKS if skipped == 0 else ~skipped & _SINGLE_CHECKS
 
 
 @lru_cache(maxsize=1)
 def _by_name() -> Mapping[str, tuple[Rename, ...]]:
-    rows: dict[str, Rename] = {}
+    """Return the renames of each name, old or new, from the table."""
+    two_way: dict[str, Rename] = {}
     for vehicles, divisor, pairs in GROUPS:
         for old, new in _pairs(pairs):
-            row = Rename(old, new, divisor, old in INVERTED, vehicles, OTHER_NEW_NAMES.get(new, ()))
-            rows.update(dict.fromkeys(row.names, row))
+            rename = Rename(
+                old,
+                new,
+                divisor,
+                is_inverted=old in INVERTED,
+                vehicles=vehicles,
+                other_new=OTHER_NEW_NAMES.get(new, ()),
+            )
+            two_way.update(dict.fromkeys(rename.names, rename))
     for since, vehicles, divisor, pairs in OLDER:
         for old, new in _pairs(pairs):
-            row = rows.get(new) or Rename(old, new, divisor, vehicles=vehicles, since=since)
-            if old not in row.names:  # a later rename in the same unit may have this name too
-                row = row.replace(other_old=(*row.other_old, old))
-            rows.update(dict.fromkeys(row.names, row))
-    found: dict[str, tuple[Rename, ...]] = {name: (row,) for name, row in rows.items()}
+            # If the new name was renamed again later, both renames become one with several old names.
+            rename = two_way.get(new) or Rename(old, new, divisor, vehicles=vehicles, since=since)
+            if old not in rename.names:
+                rename = rename.replace(other_old=(*rename.other_old, old))
+            two_way.update(dict.fromkeys(rename.names, rename))
+    by_name: dict[str, tuple[Rename, ...]] = {name: (rename,) for name, rename in two_way.items()}
     for since, vehicles, divisor, pairs in ONE_WAY:
         for old, new in _pairs(pairs):
-            row = Rename(old, new, divisor, vehicles=vehicles, since=since)
-            found[old] = (*found.get(old, ()), row)
-    return MappingProxyType(found)
+            rename = Rename(old, new, divisor, vehicles=vehicles, since=since)
+            by_name[old] = (*by_name.get(old, ()), rename)
+    return MappingProxyType(by_name)
 
 
 def _pairs(text: str) -> list[list[str]]:

@@ -31,9 +31,10 @@ class ParameterTable(Mapping[str, Parameter]):
         types: Mapping[str, ParameterType] = MappingProxyType({}),
     ) -> ParameterTable:
         """Create a table from values. Parameters without a type become REAL32; their values are not converted."""
-        rows = enumerate(values.items())
-        real = ParameterType.REAL32
-        return cls(Parameter(name, value, types.get(name, real), None, i) for i, (name, value) in rows)
+        return cls(
+            Parameter(name, value, types.get(name, ParameterType.REAL32), None, index)
+            for index, (name, value) in enumerate(values.items())
+        )
 
     def __getitem__(self, name: str) -> Parameter:
         return self._by_name[name]
@@ -92,29 +93,35 @@ class ParameterTable(Mapping[str, Parameter]):
 
     def without(self, names: Iterable[str]) -> ParameterTable:
         """Return a copy without these names. Unknown names are ignored."""
-        dropped = set(names)
-        return ParameterTable(p for p in self._by_name.values() if p.name not in dropped)
+        excluded = set(names)
+        return ParameterTable(parameter for name, parameter in self._by_name.items() if name not in excluded)
 
     def matching(self, pattern: str) -> ParameterTable:
         """Return the parameters whose names match a pattern such as ``"WP_*"``, ignoring case."""
         pattern = pattern.upper()
-        return ParameterTable(p for p in self._by_name.values() if fnmatchcase(p.name.upper(), pattern))
+        return ParameterTable(
+            parameter for name, parameter in self._by_name.items() if fnmatchcase(name.upper(), pattern)
+        )
 
     def by_index(self) -> dict[int, Parameter]:
         """Return a dict of the parameters with a known index in the vehicle's list."""
-        return {p.index: p for p in self._by_name.values() if p.index is not None}
+        return {parameter.index: parameter for parameter in self._by_name.values() if parameter.index is not None}
 
     def in_order_of_index(self) -> ParameterTable:
         """Return a copy sorted by index. Parameters without an index come last."""
-        last = 1 << 16
-        return ParameterTable(sorted(self._by_name.values(), key=lambda p: last if p.index is None else p.index))
+
+        def sort_key(parameter: Parameter) -> int:
+            return 1 << 16 if parameter.index is None else parameter.index  # Indices have 16 bits.
+
+        return ParameterTable(sorted(self._by_name.values(), key=sort_key))
 
 
 def _merged(old: Parameter | None, new: Parameter) -> Parameter:
     if old is None or (new.default is not None and new.index is not None):
         return new
     default = old.default if new.default is None else new.default
-    return Parameter(new.name, new.value, new.type, default, old.index if new.index is None else new.index)
+    index = old.index if new.index is None else new.index
+    return Parameter(new.name, new.value, new.type, default, index)
 
 
 ParameterValues = Mapping[str, "int | float"] | Mapping[str, Parameter]
@@ -145,9 +152,12 @@ def diff(
     the comparison: ``diff(file, table, names=file)`` ignores parameters that the file does not have.
     """
     old, new = plain_values(before), plain_values(after)
-    chosen = dict.fromkeys(names) if names is not None else {**dict.fromkeys(old), **dict.fromkeys(new)}
-    pairs = ((name, old.get(name), new.get(name)) for name in chosen)
-    return tuple(ParameterDifference(*pair) for pair in pairs if not _same(pair[1], pair[2], tolerance))
+    compared = dict.fromkeys(names) if names is not None else {**dict.fromkeys(old), **dict.fromkeys(new)}
+    return tuple(
+        ParameterDifference(name, old.get(name), new.get(name))
+        for name in compared
+        if not _same(old.get(name), new.get(name), tolerance)
+    )
 
 
 def plain_values(values: ParameterValues) -> dict[str, int | float]:

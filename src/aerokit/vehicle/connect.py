@@ -114,7 +114,7 @@ async def connect(
         ConnectFailed: no heartbeat of the requested vehicle arrived in time; the error text says what was received
             instead.
     """
-    _check(system_id, timeout, rates, address.bus.dialect if isinstance(address, Connection) else dialect)
+    _check_arguments(system_id, timeout, rates, address.bus.dialect if isinstance(address, Connection) else dialect)
     if isinstance(address, Connection):
         if record is not None:
             raise InvalidArgument("record = … is not allowed here: the connection is open; use its record()")
@@ -139,7 +139,7 @@ async def connect(
         async with _attached(address, system_id, timeout, rates) as vehicle:
             yield vehicle
         return
-    hub = _hub(share, dialect)
+    hub = _create_hub(share, dialect)
     async with (
         open_connection(
             address,
@@ -161,7 +161,7 @@ async def connect(
         yield vehicle
 
 
-def _hub(share: Iterable[str | Endpoint | Link], dialect: Dialect) -> Hub | None:
+def _create_hub(share: Iterable[str | Endpoint | Link], dialect: Dialect) -> Hub | None:
     """Create the hub for ``share``, after validating ``share`` and before opening anything; None without ``share``."""
     endpoints = tuple(share)
     if not endpoints:
@@ -173,6 +173,7 @@ def _hub(share: Iterable[str | Endpoint | Link], dialect: Dialect) -> Hub | None
 
 @asynccontextmanager
 async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None]:
+    """Share the connection by the hub for the duration of the block; do nothing without a hub."""
     if hub is None:
         yield
         return
@@ -181,7 +182,7 @@ async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None
         yield
 
 
-def _check(
+def _check_arguments(
     system_id: int | None, timeout: float, rates: Mapping[type[Message], float] | None, dialect: Dialect
 ) -> None:
     if system_id is not None and not 1 <= system_id <= 255:
@@ -191,7 +192,7 @@ def _check(
     for message_type, hz in (rates or {}).items():
         check_rate(message_type, hz)
         if dialect.get(message_type.ID) is not message_type:
-            raise InvalidArgument(f"{message_type.NAME} is not in the dialect {dialect.name!r}")
+            raise InvalidArgument(f"rates: {message_type.NAME} is not in the dialect {dialect.name!r}")
 
 
 @asynccontextmanager
@@ -203,17 +204,17 @@ async def _attached(
 ) -> AsyncIterator[Vehicle]:
     """Find a vehicle on an open connection and keep it for the duration of the block."""
     context, vehicle, heartbeat = await _find_vehicle(connection, system_id, timeout)
-    is_cut_short = False
+    was_left_by_exception = False
     try:
         context.session.start(heartbeat, rates)
         yield vehicle
     except BaseException:
-        is_cut_short = True
+        was_left_by_exception = True
         raise
     finally:
         try:
-            is_given_up = await context.finish()
-            if is_cut_short or is_given_up:
+            was_flight_abandoned = await context.finish()
+            if was_left_by_exception or was_flight_abandoned:
                 warn_if_left_flying(vehicle)
         finally:
             context.session.close()
@@ -231,12 +232,12 @@ async def _find_vehicle(connection: Connection, system_id: int | None, timeout: 
     """Return the vehicle of the first acceptable heartbeat."""
     connection.raise_if_ended()
     search = _Search(connection, system_id)
-    for known in connection.heartbeats.values():
-        frame = known.received_frame
+    for heartbeat in connection.heartbeats.values():
+        frame = heartbeat.received_frame
         if frame is not None and connection.now() - frame.received_at <= HEARTBEAT_MAX_AGE_S:
-            search.take(known)
+            search.on_heartbeat(heartbeat)
     detachments = [
-        connection.bus.attach(Heartbeat, search.take, system_id=system_id or 0),
+        connection.bus.attach(Heartbeat, search.on_heartbeat, system_id=system_id or 0),
         connection.on_end(search.abort),
     ]
     try:
@@ -245,9 +246,9 @@ async def _find_vehicle(connection: Connection, system_id: int | None, timeout: 
     finally:
         for detach in detachments:
             detach()
-        search.forget()
+        search.close()
     raise ConnectFailed(
-        f"no heartbeat of {search.wanted} within {timeout:g} s on {connection.link.address}:"
+        f"no heartbeat of {search.description} within {timeout:g} s on {connection.link.address}:"
         f" {explain_no_vehicle(connection, system_id)}"
     )
 
@@ -266,14 +267,15 @@ class _Search:
         self._found: _Found | None = None
         self._error: Exception | None = None
         self._ended = asyncio.Event()
-        self._others: dict[tuple[int, int], int] = {}
-        self.wanted = "an autopilot" if system_id is None else f"the autopilot of system {system_id}"
+        self._lone_heartbeats: dict[tuple[int, int], int] = {}
+        self.description = "an autopilot" if system_id is None else f"the autopilot of system {system_id}"
 
-    def take(self, heartbeat: Heartbeat) -> None:
+    def on_heartbeat(self, heartbeat: Heartbeat) -> None:
+        """Create the vehicle if this is the heartbeat of an acceptable autopilot; afterwards, ignore all heartbeats."""
         frame = heartbeat.received_frame
         if frame is None or self._ended.is_set() or not self._is_wanted(frame, heartbeat):
             return
-        if frame.component_id != MavComponent.AUTOPILOT1 and not self._is_alone(frame):
+        if frame.component_id != MavComponent.AUTOPILOT1 and not self._has_sent_enough(frame):
             return
         try:
             if frame.system_id in self._connection.attached:
@@ -285,15 +287,17 @@ class _Search:
             self._error = error
         self._ended.set()
 
-    def _is_alone(self, frame: Frame) -> bool:
+    def _has_sent_enough(self, frame: Frame) -> bool:
         """Count the heartbeats of an autopilot other than component 1; return True after ``MIN_LONE_HEARTBEATS``."""
         source = (frame.system_id, frame.component_id)
-        if source not in self._others and len(self._others) >= MAX_ROUTES:
+        counts = self._lone_heartbeats
+        if source not in counts and len(counts) >= MAX_ROUTES:  # A faulty sender may use many ids.
             return False
-        self._others[source] = self._others.get(source, 0) + 1
-        return self._others[source] >= MIN_LONE_HEARTBEATS
+        counts[source] = counts.get(source, 0) + 1
+        return counts[source] >= MIN_LONE_HEARTBEATS
 
     def abort(self, error: Exception) -> None:
+        """End the search without a vehicle, because the connection has ended."""
         if not self._ended.is_set():
             self._error = copy_exception(error)
             self._ended.set()
@@ -304,10 +308,10 @@ class _Search:
         if self._found is None:
             assert self._error is not None
             raise self._error
-        found, self._found = self._found, None
-        return found
+        result, self._found = self._found, None  # The caller closes the vehicle from now on.
+        return result
 
-    def forget(self) -> None:
+    def close(self) -> None:
         """Close the vehicle if the caller was cancelled before it received the result."""
         self._ended.set()
         if self._found is not None:
@@ -346,22 +350,22 @@ async def vehicles_on(
     connection.raise_if_ended()
     vehicles: dict[int, Vehicle] = {}
 
-    async def keep(system_id: int) -> None:
+    async def stay_connected(system_id: int) -> None:
         try:
             async with connect(connection, system_id=system_id, rates=rates) as vehicle:
                 vehicles[system_id] = vehicle
                 if on_found is not None:
                     on_found(vehicle)
-                await asyncio.Event().wait()
-        # The vehicle fell silent again, the program is connected to it already, or the connection has ended.
+                await asyncio.Event().wait()  # until `vehicles_on` ends and cancels this task
         except AerokitError as error:
+            # The vehicle fell silent again, the program is connected to it already, or the connection has ended.
             logger.info("system %d was not connected: %s", system_id, error)
 
     async def search() -> None:
         try:
-            async for found in connection.vehicles():
-                if found.system_id not in vehicles:
-                    tasks.start(partial(keep, found.system_id))
+            async for event in connection.vehicles():
+                if event.system_id not in vehicles:
+                    tasks.start(partial(stay_connected, event.system_id))
         except AerokitError as error:
             logger.info("the search for vehicles has ended: %s", error)
 

@@ -77,11 +77,11 @@ class Vehicle(
     def __init__(self, context: VehicleContext) -> None:
         super().__init__(context)
         self._plans = PlanContext(context, lambda: self.files)
-        first = partial(self.connection.bus.create_on_first, system_id=self.system_id)
+        create_on_first = partial(self.connection.bus.create_on_first, system_id=self.system_id)
         context.session.at_close(
-            first(GIMBAL_MESSAGE_IDS, lambda: self.gimbal),
-            first([ParamValue.ID], lambda: self.parameters),
-            first(PICTURE_MESSAGE_IDS, lambda: self._cameras),
+            create_on_first(GIMBAL_MESSAGE_IDS, lambda: self.gimbal),
+            create_on_first([ParamValue.ID], lambda: self.parameters),
+            create_on_first(PICTURE_MESSAGE_IDS, lambda: self._cameras),
         )
 
     # A sub-object is imported and created on first use, or when the vehicle first sends a message that the sub-object

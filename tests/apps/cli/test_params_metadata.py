@@ -114,7 +114,7 @@ def test_px4_values_are_checked_with_metadata_of_vehicle(capsys: pytest.CaptureF
 def test_px4_without_answer_says_that_ranges_are_unchecked(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(params_metadata, "_FETCH_TIMEOUT_S", 0.0)
+    monkeypatch.setattr(params_metadata, "_READ_TIMEOUT_S", 0.0)
     assert run_with(SimulatedPx4(boot_time_s=0.0), ["params", "set", "MIS_TAKEOFF_ALT=20"]) == [0]
     assert "the ranges of the values are not checked" in capsys.readouterr().err
 

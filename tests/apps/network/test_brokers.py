@@ -54,7 +54,7 @@ def waiting(publisher: Any) -> dict[str, bytes]:
     """Return the unsent values."""
     assert isinstance(publisher, _LinkPublisher)
     link: Any = publisher._link._link
-    found: dict[str, bytes] = link._waiting
+    found: dict[str, bytes] = link._unsent
     return found
 
 

@@ -245,8 +245,8 @@ def test_state_is_known_for_two_and_a_half_seconds() -> None:
     stage = Stage()
     for later, known in ((MODE_MAX_AGE_S, True), (0.1, False)):
         stage.now += later
-        assert stage.arbiter.is_known is known
-    assert not Stage(mode=None).arbiter.is_known
+        assert stage.arbiter.is_state_recent is known
+    assert not Stage(mode=None).arbiter.is_state_recent
 
 
 # --------------------------------------------------------------------------------- sendings
@@ -462,8 +462,8 @@ def test_posted_mode_after_order_is_no_takeover() -> None:
 def test_device_order_withdrawn_is_not_the_newest() -> None:
     """Then only the previous order is the newest again."""
     arbiter = Stage().arbiter
-    first = arbiter.of_device("video", may_be_withdrawn=True)
-    second = arbiter.of_device("video", may_be_withdrawn=True)
+    first = arbiter.device_order("video", may_be_withdrawn=True)
+    second = arbiter.device_order("video", may_be_withdrawn=True)
     assert (first.is_newest, second.is_newest) == (False, True)
     second.withdraw()
     assert (first.is_newest, second.is_newest) == (True, False)

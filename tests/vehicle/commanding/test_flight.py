@@ -459,7 +459,7 @@ async def test_go_to_without_any_altitude_sends_nothing(flying: Flight) -> None:
     here = flying.vehicle.position.value
     low = Position(here.latitude_deg, here.longitude_deg, altitude_amsl_m=594.0)
     flying.vehicle.telemetry.position.set(low, Source(1, 1, "GLOBAL_POSITION_INT"))
-    with pytest.raises(InvalidArgument, match="has no altitude, and the vehicle's own is not known"):
+    with pytest.raises(InvalidArgument, match="has no altitude, and the vehicle's own altitude is unknown"):
         await flying.vehicle.go_to(Position(here.latitude_deg, here.longitude_deg))
     assert not flying.wire.commands(MavCmd.DO_REPOSITION)
 
@@ -583,7 +583,7 @@ async def test_impact_is_detected_at_any_rate(rate_hz: float, flying: Flight) ->
             cell.set(Velocity(0.0, 0.0, sink), Source(1, 1, "the test"))
         assert not ground.confirms(seconds >= 3)
         await anyio.sleep(0.1)
-    assert "the vehicle hit the ground at" in (ground.trouble(lambda: None) or "")
+    assert "the vehicle hit the ground at" in (ground.failure_reason(lambda: None) or "")
 
 
 @pytest.mark.parametrize("moves_m_s", [0.0, 0.6])
@@ -714,7 +714,7 @@ async def test_set_heading_absolute_and_relative(flying: Flight) -> None:
 
 async def test_set_heading_not_reached_times_out(flying: Flight) -> None:
     flying.copter.faults.lose_ack(MavCmd.CONDITION_YAW)
-    flying.copter.yaw.fixed = lambda *_, **__: None  # type: ignore[method-assign]
+    flying.copter.yaw.turn_to = lambda *_, **__: None  # type: ignore[method-assign]
     with pytest.raises(OperationTimeout, match=r"set_heading\(90°\): not done within 3 s; the heading is \d+° off"):
         await flying.vehicle.set_heading(90.0, timeout=3.0)
 

@@ -209,4 +209,4 @@ async def test_impact_needs_lost_height_and_low_speed(drop_m: float, ground_spee
             telemetry.velocity.set(Velocity(ground_speed_m_s, 0.0, sink_m_s), Source(1, 1, "the test"))
             detector.update()
             await anyio.sleep(0.1)
-        assert bool(detector.text()) is is_impact
+        assert bool(detector.describe()) is is_impact

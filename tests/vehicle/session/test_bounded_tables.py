@@ -71,16 +71,16 @@ async def test_mode_names() -> None:
 def test_classic_parameters() -> None:
     values = ParameterValues()
     for number in range(MAX_PARAMETERS + 100):
-        values.take(Parameter(f"p{number}", 1.0, ParameterType.REAL32))
+        values.store(Parameter(f"p{number}", 1.0, ParameterType.REAL32))
     assert len(values) == MAX_PARAMETERS
-    assert values.take(Parameter("p5", 2.0, ParameterType.REAL32))
+    assert values.store(Parameter("p5", 2.0, ParameterType.REAL32))
 
 
 def test_status_text_open_table_is_bounded() -> None:
     texts = StatusTextAssembler()
     for number in range(1, 5000):
         texts.receive(Statustext(6, "x" * 50, id=number, chunk_seq=0), 0.0)
-    assert len(texts._open) == MAX_OPEN
+    assert len(texts._incomplete) == MAX_OPEN
 
 
 def test_peers_of_a_simulated_vehicle() -> None:

@@ -242,4 +242,4 @@ async def test_thousand_calls_leak_nothing() -> None:
             waiting_on_cells(flight.vehicle),
             attached_sinks(flight.vehicle.connection),
         )
-        assert not flight.vehicle._session.commands._under_way
+        assert not flight.vehicle._session.commands._pending_acks

@@ -121,7 +121,7 @@ async def test_posted_order_already_in_effect_returns(grounded: Flight) -> None:
         grounded.vehicle._session,
         "nothing",
         is_done=lambda: True,
-        trouble=lambda: None,
+        failure_reason=lambda: None,
         describe=str,
         timeout=None,
     )
@@ -138,7 +138,7 @@ async def test_call_silence_exceeds_custom_limit_raises(grounded: Flight) -> Non
             grounded.vehicle._session,
             "nothing",
             is_done=lambda: False,
-            trouble=lambda: None,
+            failure_reason=lambda: None,
             describe=str,
             timeout=None,
             max_silence_s=0.0,
@@ -168,7 +168,7 @@ def sender(grounded: Flight) -> CommandSender:
 
 def awaits_answer(sender: CommandSender) -> bool:
     oldest = anyio.current_time() - PENDING_ACK_TIMEOUT_S
-    return any(at >= oldest for at in sender._under_way.get((1, BANNER), ()))
+    return any(at >= oldest for at in sender._pending_acks.get((1, BANNER), ()))
 
 
 async def test_unconfirmed_command_ack_is_expected_for_two_seconds(grounded: Flight, sender: CommandSender) -> None:

@@ -11,7 +11,7 @@ import aerokit
 import aerokit.sync
 from aerokit.mavlink import messages
 from aerokit.mavlink.enums import MavPowerStatus
-from aerokit.vehicle.session.rates import subscription_rate_hz
+from aerokit.vehicle.session.subscriber import subscription_rate_hz
 from aerokit.vehicle.state.equipment import Power
 from aerokit.vehicle.state.field import MessageSource, StateField
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, STATES

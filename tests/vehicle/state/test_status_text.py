@@ -128,10 +128,10 @@ def test_invalid_chunks_do_not_accumulate() -> None:
     texts = StatusTextAssembler()
     for number in range(1, 1000):
         texts.receive(chunks("y" * 120, number)[0], 0.0)
-    assert len(texts._open) == MAX_OPEN
+    assert len(texts._incomplete) == MAX_OPEN
     for seq in range(100):
         texts.receive(_received(Statustext(6, "", 7, seq), b"z" * 50), 0.0)
-    assert len(texts._open) <= MAX_OPEN
+    assert len(texts._incomplete) <= MAX_OPEN
 
 
 def test_status_text_open_limit_drops_oldest() -> None:
@@ -158,7 +158,7 @@ def test_status_text_any_chunk_sequence_is_processed(sequence: list[tuple[int, i
         for text in texts.receive(_received(Statustext(6, "", number, seq), data), now):
             assert "\0" not in text.text
     texts.expire(now + 3)
-    assert not texts._open
+    assert not texts._incomplete
 
 
 def test_severity_names() -> None:

@@ -83,7 +83,7 @@ def frame_of(message: Message, at: float = 0.0, component_id: int = 1) -> Frame:
 
 
 def take(telemetry: Telemetry, message: Message, at: float, component_id: int = 1) -> None:
-    telemetry.streams[message.ID].take(frame_of(message, at, component_id))
+    telemetry.streams[message.ID].receive(frame_of(message, at, component_id))
 
 
 @pytest.mark.parametrize("name", LAZY)
@@ -247,7 +247,7 @@ def test_cells_can_be_read_by_other_threads(telemetry: Telemetry) -> None:
 def test_decoded_message_is_reused(telemetry: Telemetry) -> None:
     bus, observed = Bus(), list[Message]()
     stream = telemetry.streams[MESSAGE_IDS["Attitude"]]
-    bus.attach_lazily(messages.Attitude, stream.take)
+    bus.attach_lazily(messages.Attitude, stream.receive)
     bus.attach(messages.Attitude, observed.append)
     for at in (100.0, 100.5):
         bus.deliver(frame_of(ANYTHING["Attitude"], at))

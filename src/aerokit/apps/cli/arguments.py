@@ -91,10 +91,10 @@ port: Callable[[str], int] = integer(0, 65535, "a port number")
 system_id: Callable[[str], int] = integer(1, 255, "a system id")
 
 
-_SHARES = ("loss", "loss_incoming")
+_SHARE_FAULTS = ("loss", "loss_incoming")
 FAULTS: tuple[str, ...] = (
     *("gps_lost", "rc_lost", "motor_failed", "silent", "frozen", "heartbeats_stopped", "leak", "no_ftp"),
-    *_SHARES,
+    *_SHARE_FAULTS,
     "prearm_failures",
 )
 """Names of `aerokit.sim.Faults` that ``aerokit sim --fault`` accepts, described in docs/simulator.md."""
@@ -102,18 +102,18 @@ FAULTS: tuple[str, ...] = (
 
 def fault(text: str) -> tuple[str, bool | float | list[str], float]:
     """Parse ``NAME[=VALUE][@SECONDS]``: a fault of the simulator, its value, and the time at which it begins."""
-    named, _, begin = text.partition("@")
-    name, mark, value = named.partition("=")
+    name_and_value, _, begin = text.partition("@")
+    name, equals, value = name_and_value.partition("=")
     if name not in FAULTS:
         raise ArgumentTypeError(f"{name!r} is not a fault{suggestion(name, FAULTS)}; faults: {', '.join(FAULTS)}")
     at_s = number(0, 1e6)(begin) if begin else 0.0
-    if name in _SHARES:
+    if name in _SHARE_FAULTS:
         return name, number(0, 1)(value), at_s
     if name == "prearm_failures":
         if not value:
             raise ArgumentTypeError("prearm_failures needs a reason: 'prearm_failures=Compass not healthy'")
         return name, [value], at_s
-    if mark:
+    if equals:
         raise ArgumentTypeError(f"{name} takes no value: {name}@{at_s:g} begins after {at_s:g} simulated seconds")
     return name, True, at_s
 
@@ -123,8 +123,9 @@ def wind(text: str) -> tuple[float, ...]:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = ()
-    within = all(abs(value) <= 50 for value in values) and min(values[2:], default=0) >= 0
-    if len(values) not in (2, 3) or not within:
+    are_gusts_positive = min(values[2:], default=0) >= 0
+    is_in_range = all(abs(value) <= 50 for value in values) and are_gusts_positive
+    if len(values) not in (2, 3) or not is_in_range:
         raise ArgumentTypeError(f"{text!r} is not NORTH,EAST or NORTH,EAST,GUSTS in m/s, up to 50")
     return values
 
@@ -156,8 +157,8 @@ def number(low: float, high: float) -> Callable[[str], float]:
 
 def assignment(text: str) -> tuple[str, int | float]:
     """Parse ``NAME=VALUE`` for a parameter; whole numbers may be hexadecimal (0x1F)."""
-    name, mark, value = text.partition("=")
-    if not mark:
+    name, equals, value = text.partition("=")
+    if not equals:
         raise ArgumentTypeError(f"{text!r} has no value: write NAME=VALUE without spaces")
     try:
         number = parse_number(value)
@@ -192,8 +193,8 @@ def writable_file(text: str) -> str:
     """Parse the path of a file to write, in an existing directory."""
     path = Path(text)
     if path.is_dir() or not path.parent.is_dir():
-        why = "the path is a directory" if path.is_dir() else f"directory {str(path.parent)!r} does not exist"
-        raise ArgumentTypeError(f"{text!r} cannot be written: {why}")
+        reason = "the path is a directory" if path.is_dir() else f"directory {str(path.parent)!r} does not exist"
+        raise ArgumentTypeError(f"{text!r} cannot be written: {reason}")
     return text
 
 
@@ -209,9 +210,9 @@ def log_file(text: str) -> str:
 def directory(text: str) -> Path:
     """Parse the path of a directory, which the command creates if it does not exist."""
     path = Path(text)
-    for place in (path, *path.parents):
-        if place.exists() and not place.is_dir():
-            raise ArgumentTypeError(f"{text!r} cannot be created: {str(place)!r} is a file")
+    for directory_path in (path, *path.parents):
+        if directory_path.exists() and not directory_path.is_dir():
+            raise ArgumentTypeError(f"{text!r} cannot be created: {str(directory_path)!r} is a file")
     return path
 
 

@@ -47,34 +47,38 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="show these MAVLink messages too, unconverted: 'GPS_*' (repeatable)",
     )
     _add_common(foxglove, 10.0, "topic")
-    for name, where, forms, module, network, shown in (
-        (
-            "zenoh",
-            "to a zenoh network",
-            "zenoh://FLEET/NAME, zenoh://FLEET/NAME?connect=tcp/10.0.0.5:7447 …",
-            "zenoh",
-            _network,
-            str,
-        ),
-        (
-            "mqtt",
-            "to an MQTT broker",
-            "mqtt://HOST/FLEET/NAME, mqtts://USER:PASSWORD@HOST/FLEET/NAME …",
-            "paho",
-            _broker,
-            _without_password,
-        ),
-    ):
-        action = actions.add_parser(
-            name,
-            help=f"publish states {where}",
-            description=f"Publish each state of every vehicle on a link {where}, as JSON, until Ctrl-C"
-            " (docs/network.md). Subscribers cannot send anything to a vehicle.",
-        )
-        action.set_defaults(run=_publish, needs=(module, name), shown=shown)
-        add_address(action, what=_ADDRESS_HELP)
-        action.add_argument("network", type=network, metavar="NETWORK", help=f"where to publish: {forms}")
-        _add_common(action, 5.0, "state")
+    zenoh = _add_publishing(actions, "zenoh", "to a zenoh network")
+    zenoh.set_defaults(extra=("zenoh", "zenoh"), network_text=str)
+    zenoh.add_argument(
+        "network",
+        type=_network,
+        metavar="NETWORK",
+        help="where to publish: zenoh://FLEET/NAME, zenoh://FLEET/NAME?connect=tcp/10.0.0.5:7447 …",
+    )
+    _add_common(zenoh, 5.0, "state")
+    mqtt = _add_publishing(actions, "mqtt", "to an MQTT broker")
+    mqtt.set_defaults(extra=("paho", "mqtt"), network_text=_without_password)
+    mqtt.add_argument(
+        "network",
+        type=_broker,
+        metavar="NETWORK",
+        help="where to publish: mqtt://HOST/FLEET/NAME, mqtts://USER:PASSWORD@HOST/FLEET/NAME …",
+    )
+    _add_common(mqtt, 5.0, "state")
+
+
+def _add_publishing(
+    actions: argparse._SubParsersAction[argparse.ArgumentParser], name: str, destination: str
+) -> argparse.ArgumentParser:
+    action = actions.add_parser(
+        name,
+        help=f"publish states {destination}",
+        description=f"Publish each state of every vehicle on a link {destination}, as JSON, until Ctrl-C"
+        " (docs/network.md). Subscribers cannot send anything to a vehicle.",
+    )
+    action.set_defaults(run=_publish)
+    add_address(action, what=_ADDRESS_HELP)
+    return action
 
 
 def _add_common(action: argparse.ArgumentParser, rate_hz: float, what: str) -> None:
@@ -137,12 +141,13 @@ async def _foxglove(options: argparse.Namespace) -> int:
             ) as bridge,
         ):
             _emit_serving(options, bridge)
-            await _wait_end(connection, stop)
+            await _wait_until_ended(connection, stop)
     return DONE
 
 
 async def _publish(options: argparse.Namespace) -> int:
-    import_extra(*options.needs)
+    module, extra = options.extra
+    import_extra(module, extra)
     from aerokit.apps.network import Publishing
     from aerokit.apps.network.publishing import publisher_for
     from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
@@ -150,7 +155,7 @@ async def _publish(options: argparse.Namespace) -> int:
 
     stop = asyncio.Event()
     signing = signing_of(options)
-    network = options.shown(options.network)
+    network = options.network_text(options.network)
     with on_interrupt(stop.set):
         async with (
             open_connection(
@@ -163,9 +168,9 @@ async def _publish(options: argparse.Namespace) -> int:
                 on_found=lambda vehicle: _emit_vehicle(options, vehicle),
             ) as vehicles,
         ):
-            where = {"network": network, "address": options.address}
+            record = {"network": network, "address": options.address}
             text = f"listening to {options.address}\npublishing to {network}\nuntil Ctrl-C"
-            emit(options, "publishing", where, text)
+            emit(options, "publishing", record, text)
             published: dict[int, Publishing] = {}
             while not stop.is_set():
                 connection.raise_if_ended()
@@ -178,7 +183,7 @@ async def _publish(options: argparse.Namespace) -> int:
     return DONE
 
 
-async def _wait_end(connection: Connection, stop: asyncio.Event) -> None:
+async def _wait_until_ended(connection: Connection, stop: asyncio.Event) -> None:
     """Wait until ``stop`` is set or the connection ends; raise what ended the connection."""
     ended: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
     connection.on_end(ended.set_result)

@@ -108,8 +108,8 @@ async def _run(options: argparse.Namespace) -> int:
 def _calibration(vehicle: Vehicle, sensor: str) -> Calibration:
     if sensor == "escs":
         return vehicle.calibrate.escs(intent="propellers are removed")
-    made: Calibration = getattr(vehicle.calibrate, sensor)()
-    return made
+    calibration: Calibration = getattr(vehicle.calibrate, sensor)()
+    return calibration
 
 
 async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
@@ -121,7 +121,7 @@ async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
                 display.show(step)
                 if step.needs_confirmation and not await press_enter():
                     scope.cancel()
-                    await anyio.lowlevel.checkpoint()
+                    await anyio.lowlevel.checkpoint()  # the cancellation takes effect here, before the next step
             return DONE
         return await _cancel(options, calibration)
 
@@ -150,9 +150,14 @@ class Display:
             return
         record = step.to_dict()
         del record["result"]
-        shown, self._shown = self._shown, (step.pose, step.instruction)
-        lines = lines_of(step if step.pose is not shown[0] else step.replace(pose=None))
-        emit(self._options, "calibration_step", record, "\n".join(lines) if self._shown != shown else None)
+        shown_pose, shown_instruction = self._shown
+        self._shown = step.pose, step.instruction
+        text = None  # only the progress has changed
+        if step.pose is not shown_pose:
+            text = "\n".join(lines_of(step))
+        elif step.instruction != shown_instruction:
+            text = "\n".join(lines_of(step.replace(pose=None)))  # without the picture
+        emit(self._options, "calibration_step", record, text)
         if not self._options.json and step.progress is not None and sys.stdout.isatty():
             print(f"{CLEAR_LINE}{bar(step.progress)}", end="\r", flush=True)
 
@@ -170,10 +175,10 @@ def lines_of(step: CalibrationStep) -> list[str]:
     """Return a step as lines of text: the picture of the pose, the instruction, and the poses that follow."""
     lines = []
     if step.pose is not None:
-        seen = "seen from behind" if step.pose in _FROM_BEHIND else "seen from the right side"
-        others = ", ".join(pose.value for pose in step.remaining if pose is not step.pose)
-        lines = ["", f"  {step.pose.value.upper()} ({seen})", *PICTURES[step.pose].strip("\n").splitlines(), _GROUND]
-        lines += [f"  then: {others}"] if others else []
+        view = "seen from behind" if step.pose in _FROM_BEHIND else "seen from the right side"
+        next_poses = ", ".join(pose.value for pose in step.remaining if pose is not step.pose)
+        lines = ["", f"  {step.pose.value.upper()} ({view})", *PICTURES[step.pose].strip("\n").splitlines(), _GROUND]
+        lines += [f"  then: {next_poses}"] if next_poses else []
     return [*lines, f"  {step.instruction[:76]}"]
 
 

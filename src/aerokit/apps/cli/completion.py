@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 _SHELLS = ("bash", "zsh", "fish")
 _COMMON_ADDRESSES = ("udpin:0.0.0.0:14550", "udpin:0.0.0.0:14540", "tcp:127.0.0.1:5760")
-_DEVICES = ("/dev/serial/by-id/*", "/dev/ttyACM*", "/dev/ttyUSB*", "/dev/cu.usb*")
-_TABLES = {
+_DEVICE_PATTERNS = ("/dev/serial/by-id/*", "/dev/ttyACM*", "/dev/ttyUSB*", "/dev/cu.usb*")
+_PARAMETER_TABLES = {
     "ArduPilot": tuple(f"sim/ardupilot/{kind}.param.csv" for kind in ("copter", "plane", "rover", "sub")),
     "PX4": ("sim/px4/quadrotor.param.csv", "sim/px4/airplane.param.csv"),
 }
@@ -43,11 +43,11 @@ def offer(action: argparse.Action, values: Callable[[], Iterable[str]]) -> None:
 
 
 def addresses() -> list[str]:
-    own = os.environ.get("AEROKIT_ADDRESS", "").strip()
+    default = os.environ.get("AEROKIT_ADDRESS", "").strip()
     return [
-        *([own] if own else []),
+        *([default] if default else []),
         *_COMMON_ADDRESSES,
-        *(path for form in _DEVICES for path in sorted(glob(form))),
+        *(path for pattern in _DEVICE_PATTERNS for path in sorted(glob(pattern))),
     ]
 
 
@@ -63,7 +63,7 @@ def kinds() -> tuple[str, ...]:
 
 def parameter_names(autopilot: str | None = None) -> list[str]:
     """Return the sorted parameter names of simulated vehicles of "ArduPilot" or "PX4"; of both by default."""
-    paths = _TABLES.get(autopilot or "") or [path for group in _TABLES.values() for path in group]
+    paths = _PARAMETER_TABLES.get(autopilot or "") or [path for group in _PARAMETER_TABLES.values() for path in group]
     names = set()
     for path in paths:
         lines = files("aerokit").joinpath(path).read_text(encoding="utf-8").splitlines()

@@ -51,9 +51,9 @@ async def _check_only_vehicle(vehicle: Vehicle, options: argparse.Namespace) -> 
         async for found in vehicle.connection.vehicles():
             system_ids.add(found.system_id)
             if len(system_ids) > 1:
-                numbers = ", ".join(map(str, sorted(system_ids)))
+                listed = ", ".join(map(str, sorted(system_ids)))
                 raise InvalidArgument(
-                    f"several vehicles are on the link (system ids {numbers}): choose one with --system-id;"
+                    f"several vehicles are on the link (system ids {listed}): choose one with --system-id;"
                     " nothing was sent"
                 )
 
@@ -75,8 +75,8 @@ def key_file(path: str) -> SigningKey:
         with open(path, encoding="utf-8-sig") as file:
             return SigningKey.from_text(file.read())
     except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "it is not a text file"
-        raise ArgumentTypeError(f"cannot read a signing key from {path!r}: {why}") from None
+        reason = error.strerror if isinstance(error, OSError) else "it is not a text file"
+        raise ArgumentTypeError(f"cannot read a signing key from {path!r}: {reason}") from None
     except InvalidArgument as error:
         raise ArgumentTypeError(f"{path!r} has no signing key: {error}") from None
 
@@ -107,17 +107,17 @@ def add_address(
         what: text before the examples in the help.
         default: description of the default in the help; None if the usual default address is used.
     """
-    options: dict[str, Any] = {} if name.startswith("-") else {"nargs": "?"}
-    usual = f"${ADDRESS_VARIABLE}, or {_DEFAULT_ADDRESS}"
-    place = command.add_argument(
+    keywords: dict[str, Any] = {} if name.startswith("-") else {"nargs": "?"}
+    usual_default = f"${ADDRESS_VARIABLE}, or {_DEFAULT_ADDRESS}"
+    argument = command.add_argument(
         name,
         type=address,
         default=default_address() if default is None else None,
         metavar="ADDRESS",
-        help=f"{what}udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … ({default or usual})",
-        **options,
+        help=f"{what}udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … ({default or usual_default})",
+        **keywords,
     )
-    offer(place, addresses)
+    offer(argument, addresses)
     add_baud(command)
 
 
@@ -260,13 +260,13 @@ async def opened(options: argparse.Namespace, *, reconnect: bool = False) -> Asy
     """
     from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
 
-    place: str | Link = options.address
+    link: str | Link = options.address
     async with open_connection(
-        place,
+        link,
         baud=options.baud,
         signing=signing_of(options),
         source_system=OBSERVER_SYSTEM_ID,
-        reconnect=reconnect and isinstance(place, str),
+        reconnect=reconnect and isinstance(link, str),
     ) as connection:
         yield connection
 

@@ -29,13 +29,13 @@ _DEFAULT_LOG = "demo.tlog"
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_demo)
-    place = command.add_argument(
+    address_option = command.add_argument(
         "--connect",
         type=address,
         metavar="ADDRESS",
         help="vehicle to fly: udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … (a simulated one)",
     )
-    offer(place, addresses)
+    offer(address_option, addresses)
     add_vehicle_kind(command, "copter, plane (ArduPilot), px4, px4_plane (copter)")
     command.add_argument(
         "--altitude",

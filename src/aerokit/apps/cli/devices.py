@@ -52,10 +52,14 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     record = command_action("camera video {what}", "video {what}: done", _record_video, _camera)
     video = add_action(actions, "video", record, "Start or stop video recording.")
     video.add_argument("what", choices=("start", "stop"), help="start or stop")
-    set_mode = command_action("camera mode", "mode {mode}", lambda camera, o: camera.set_mode(o.mode), _camera)
+    set_mode = command_action(
+        "camera mode", "mode {mode}", lambda camera, options: camera.set_mode(options.mode), _camera
+    )
     mode = add_action(actions, "mode", set_mode, "Change the camera's mode.")
     mode.add_argument("mode", choices=("photo", "video", "survey"), help="camera mode")
-    zoom_to = command_action("camera zoom", "zoom {percent:g} %", lambda camera, o: camera.zoom_to(o.percent), _camera)
+    zoom_to = command_action(
+        "camera zoom", "zoom {percent:g} %", lambda camera, options: camera.zoom_to(options.percent), _camera
+    )
     zoom = add_action(actions, "zoom", zoom_to, "Zoom.")
     zoom.add_argument("percent", type=number(0, 100), metavar="PERCENT", help="of the zoom range, 0 to 100")
     streams = add_action(actions, "streams", _streams, "List the video streams with their addresses.")
@@ -80,11 +84,11 @@ async def _camera(options: argparse.Namespace, *, changes: bool = True) -> Async
 
 async def _info(options: argparse.Namespace) -> int:
     async with _camera(options, changes=False) as camera:
-        about = camera.information.value
-        name = _plain(f"{about.vendor} {about.model}")
-        capabilities = ", ".join(sorted(about.capabilities)) or "none reported"
-        text = f"{camera.number}  {name}, firmware {about.firmware or 'unknown'}\ncapabilities: {capabilities}"
-        record = {**about.to_dict(), "capabilities": sorted(about.capabilities)}
+        information = camera.information.value
+        name = _printable_text(f"{information.vendor} {information.model}")
+        capabilities = ", ".join(sorted(information.capabilities)) or "none reported"
+        text = f"{camera.number}  {name}, firmware {information.firmware or 'unknown'}\ncapabilities: {capabilities}"
+        record = {**information.to_dict(), "capabilities": sorted(information.capabilities)}
         emit(options, "camera", record, text)
         for card in await camera.load_storage():
             free = "" if card.available_mib is None else f", {card.available_mib:.0f} MiB free"
@@ -108,47 +112,47 @@ async def _photo(options: argparse.Namespace) -> int:
 
 async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -> bool:
     """Print a picture, and download it with ``--to``. Return False if taking or downloading it failed."""
-    place, to = capture.place, options.to
-    where = "position unknown" if place is None else f"{place.latitude_deg:.7f} {place.longitude_deg:.7f}"
-    text = f"{capture.index:>5}  {where}  {_plain(capture.file_url)}".rstrip()
+    position, folder = capture.place, options.to
+    place = "position unknown" if position is None else f"{position.latitude_deg:.7f} {position.longitude_deg:.7f}"
+    text = f"{capture.index:>5}  {place}  {_printable_text(capture.file_url)}".rstrip()
     record = {name: value for name, value in capture.to_dict().items() if name != "received_at"}
     emit(options, "picture", record, text)
-    if to is None or not capture.success:
-        return capture.success is not False
+    if folder is None or not capture.success:
+        return capture.success is not False  # None: the camera has not reported whether it succeeded
     name = _file_name(capture)
     if name is None:
         not_fetched = {"index": capture.index, "file": None, "bytes": None}
         emit(options, "fetched_picture", not_fetched, "       not downloaded: unsafe file name in its address")
         return False
     content = await camera.read_picture(capture)
-    target = _write_new(to, name, content)
+    target = _write_new(folder, name, content)
     fetched = {"index": capture.index, "file": target, "bytes": len(content)}
     emit(options, "fetched_picture", fetched, f"       {target}")
     return True
 
 
-def _plain(text: str) -> str:
+def _printable_text(text: str) -> str:
     """Replace control characters, which a terminal would execute."""
     return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
 
 
 def _file_name(capture: Capture) -> str | None:
     """Return ``INDEX-NAME``, made from the last part of the address; None if that is no portable file name."""
-    base = unquote(capture.file_url.rpartition("/")[2]) or "capture.jpg"
-    is_name = base.isprintable() and not set(base) & set('/\\:*?"<>|') and base.strip(" .") == base
-    return f"{capture.index:05}-{base}" if is_name and len(base) <= _MAX_FILE_NAME else None
+    name = unquote(capture.file_url.rpartition("/")[2]) or "capture.jpg"
+    is_portable = name.isprintable() and not set(name) & set('/\\:*?"<>|') and name.strip(" .") == name
+    return f"{capture.index:05}-{name}" if is_portable and len(name) <= _MAX_FILE_NAME else None
 
 
-def _write_new(to: Path, name: str, content: bytes) -> Path:
+def _write_new(folder: Path, name: str, content: bytes) -> Path:
     """Write to a new file; append a number to the name if the file exists."""
     stem, dot, ending = name.rpartition(".")
-    at, target = 1, to / name
+    number, target = 1, folder / name
     while True:
         with suppress(FileExistsError), target.open("xb") as file:
             file.write(content)
             return target
-        at += 1
-        target = to / (f"{stem}-{at}.{ending}" if dot else f"{name}-{at}")
+        number += 1
+        target = folder / (f"{stem}-{number}.{ending}" if dot else f"{name}-{number}")
 
 
 async def _record_video(camera: Camera, options: argparse.Namespace) -> None:
@@ -159,8 +163,8 @@ async def _streams(options: argparse.Namespace) -> int:
     async with _camera(options) as camera:
         for stream in await camera.load_streams():
             size = f"{stream.width_px}x{stream.height_px}"
-            name = _plain(stream.name)
-            text = f"{stream.number:>3}  {_plain(stream.uri)}  {size}  {stream.encoding}  {name}".rstrip()
+            name = _printable_text(stream.name)
+            text = f"{stream.number:>3}  {_printable_text(stream.uri)}  {size}  {stream.encoding}  {name}".rstrip()
             emit(options, "stream", stream.to_dict(), text)
     return DONE
 
@@ -201,10 +205,13 @@ def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
     look.add_argument("longitude", type=number(-180, 180), metavar="LONGITUDE", help="degrees")
     look.add_argument("altitude", type=number(-500, 10_000), metavar="ALTITUDE", help="metres above home")
     run = command_action(
-        "gimbal neutral", "in neutral position", lambda gimbal, o: gimbal.neutral(timeout=o.patience), _gimbal
+        "gimbal neutral",
+        "in neutral position",
+        lambda gimbal, options: gimbal.neutral(timeout=options.patience),
+        _gimbal,
     )
     neutral = add_action(actions, "neutral", run, "Turn the gimbal to its neutral position.")
-    run = command_action("gimbal release", "control returned to the pilot", lambda gimbal, o: gimbal.release(), _gimbal)
+    run = command_action("gimbal release", "control returned to the pilot", lambda gimbal, _: gimbal.release(), _gimbal)
     release = add_action(actions, "release", run, "Return control of the gimbal to the pilot.")
     for action in (info, point, look, neutral, release):
         action.add_argument(
@@ -225,17 +232,17 @@ async def _gimbal(options: argparse.Namespace, *, changes: bool = True) -> Async
 async def _gimbal_info(options: argparse.Namespace) -> int:
     async with _gimbal(options, changes=False) as gimbal:
         try:
-            about = await gimbal.information()
+            information = await gimbal.information()
         except AerokitError as error:
             emit(options, "gimbal_silent", {"reason": str(error)}, f"gimbal information unavailable: {error}")
         else:
-            emit(options, "gimbal", about.to_dict(), "\n".join(_lines(about)))
+            emit(options, "gimbal", information.to_dict(), "\n".join(_information_lines(information)))
         with anyio.move_on_after(_ATTITUDE_TIMEOUT_S):
             attitude = await gimbal.attitude.wait_until(lambda _: True)
             angles = {"pitch": attitude.pitch_deg, "roll": attitude.roll_deg, "yaw": attitude.yaw_deg}
-            shown = ", ".join(f"{name} {angle:.0f}" for name, angle in angles.items() if angle is not None)
+            text = ", ".join(f"{name} {angle:.0f}" for name, angle in angles.items() if angle is not None)
             record = {f"{name}_deg": angle for name, angle in angles.items()}
-            emit(options, "gimbal_attitude", record, f"attitude: {shown}")
+            emit(options, "gimbal_attitude", record, f"attitude: {text}")
     return DONE
 
 
@@ -248,11 +255,11 @@ async def _look_at(gimbal: Gimbal, options: argparse.Namespace) -> None:
     await gimbal.look_at(position, timeout=options.patience)
 
 
-def _lines(about: GimbalInformation) -> list[str]:
-    name = f"{about.vendor} {about.model}".strip() or "unnamed gimbal"
-    lines = [f"{about.gimbal_device_id}  {name}, managed by component {about.manager_component_id}"]
+def _information_lines(information: GimbalInformation) -> list[str]:
+    name = f"{information.vendor} {information.model}".strip() or "unnamed gimbal"
+    lines = [f"{information.gimbal_device_id}  {name}, managed by component {information.manager_component_id}"]
     for axis in ("roll", "pitch", "yaw"):
-        limits = getattr(about, f"{axis}_deg")
+        limits = getattr(information, f"{axis}_deg")
         if limits is not None:
             lines.append(f"{axis:>6}  {limits[0]:.0f} to {limits[1]:.0f} degrees")
     return lines

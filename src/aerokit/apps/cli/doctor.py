@@ -63,22 +63,19 @@ def check_installation() -> Iterator[Finding]:
     yield Finding("ok", "aerokit", f"{aerokit.__version__}, {where}")
     wire = "compiled" if wire_implementation == "c" else "Python (slower; see docs/benchmarks.md)"
     yield Finding("ok", "wire", wire)
-    if mixed := installation_problem(aerokit.__path__[0]):
-        yield Finding("problem", "installation", mixed, "uninstall both, then install aerokit-mavlink again")
+    if problem := installation_problem(aerokit.__path__[0]):
+        yield Finding("problem", "installation", problem, "uninstall both, then install aerokit-mavlink again")
     try:
         requires(_DISTRIBUTION)
     except PackageNotFoundError:
         yield Finding("note", "installation", f"not installed as {_DISTRIBUTION}; running from source")
-    missing = {
-        extra: lacking
-        for extra, names in EXTRAS.items()
-        if (lacking := [name for name in names if not find_spec(name)])
-    }
-    installed = ", ".join(extra for extra in EXTRAS if extra not in missing) or "none"
+    missing_modules = {extra: [name for name in names if not find_spec(name)] for extra, names in EXTRAS.items()}
+    installed = ", ".join(extra for extra, missing in missing_modules.items() if not missing) or "none"
     yield Finding("ok", "extras", f"installed: {installed}")
-    for extra, lacking in missing.items():
-        text = f"{extra} is incomplete: {', '.join(lacking)} not installed"
-        yield Finding("note", "extras", text, f"to use it: pip install '{_DISTRIBUTION}[{extra}]'")
+    for extra, missing in missing_modules.items():
+        if missing:
+            text = f"{extra} is incomplete: {', '.join(missing)} not installed"
+            yield Finding("note", "extras", text, f"to use it: pip install '{_DISTRIBUTION}[{extra}]'")
 
 
 def check_serial_port(device: str, description: str = "") -> Finding:
@@ -89,32 +86,32 @@ def check_serial_port(device: str, description: str = "") -> Finding:
     name = f"{device} ({description})" if description and description != "n/a" else device
     if os.name == "posix" and os.path.exists(device) and not os.access(device, os.R_OK | os.W_OK):
         return Finding("problem", "serial port", f"{name}: permission denied", _permission_advice(device))
-    if users := _users_of(device):
+    if programs := _programs_using(device):
         return Finding(
             "problem",
             "serial port",
-            f"{name}: in use by {', '.join(users)}",
+            f"{name}: in use by {', '.join(programs)}",
             "close that program, or let it forward MAVLink by UDP",
         )
     return Finding("ok", "serial port", f"{name}: available", f"try: aerokit doctor {device}")
 
 
-def _users_of(device: str) -> list[str]:
+def _programs_using(device: str) -> list[str]:
     """Return the names of other programs that have the port open. Linux shows programs of other users only to root."""
-    users: list[str] = []
+    programs: list[str] = []
     if sys.platform != "linux" or os.path.realpath(device).startswith("/dev/pts/"):
-        return users  # no users, because the creator of a pseudo-terminal keeps it open
+        return programs  # the creator of a pseudo-terminal keeps it open, but does not use it in this sense
     for process in glob("/proc/[0-9]*"):
-        number = int(process.rpartition("/")[2])
-        if number == os.getpid():
+        process_id = int(process.rpartition("/")[2])
+        if process_id == os.getpid():
             continue
         try:
-            opened = {os.readlink(f"{process}/fd/{descriptor}") for descriptor in os.listdir(f"{process}/fd")}
-            if os.path.realpath(device) in opened:
-                users.append(f"{Path(process, 'comm').read_text().strip()} (process {number})")
+            open_files = {os.readlink(f"{process}/fd/{descriptor}") for descriptor in os.listdir(f"{process}/fd")}
+            if os.path.realpath(device) in open_files:
+                programs.append(f"{Path(process, 'comm').read_text().strip()} (process {process_id})")
         except OSError:  # the process belongs to another user, or has ended
             continue
-    return users
+    return programs
 
 
 def _permission_advice(device: str) -> str:
@@ -158,66 +155,68 @@ async def run_doctor(options: argparse.Namespace) -> int:
     """Print all findings. Return FAILED if there is a problem, NO_VEHICLE if the link is silent."""
     levels: set[Level] = set()
 
-    def found(finding: Finding) -> None:
+    def report(finding: Finding) -> None:
         levels.add(finding.level)
         emit_finding(options, finding)
 
     if options.address is None:
-        _check_computer(found)
-    elif not await _check_link(options, found):
+        _check_computer(report)
+    elif not await _check_link(options, report):
         return NO_VEHICLE
     return FAILED if "problem" in levels else DONE
 
 
-def _check_computer(found: Callable[[Finding], None]) -> None:
+def _check_computer(report: Callable[[Finding], None]) -> None:
     for finding in check_installation():
-        found(finding)
+        report(finding)
     ports = serial_ports()
     for port in ports:
-        found(check_serial_port(port.device, port.description))
+        report(check_serial_port(port.device, port.description))
     if not ports:
-        do = (
+        advice = (
             "check that the device is plugged in, and that the USB cable has data lines; pass the port through to a"
             " virtual machine or container"
         )
-        found(Finding("note", "serial ports", "none found", do))
-    for number, meaning, udp in _COMMON_PORTS:
-        found(check_network_port(number, meaning, udp=udp))
-    found(Finding("ok", "next", "only this computer was checked", "check a link: aerokit doctor ADDRESS"))
+        report(Finding("note", "serial ports", "none found", advice))
+    for number, meaning, is_udp in _COMMON_PORTS:
+        report(check_network_port(number, meaning, udp=is_udp))
+    report(Finding("ok", "next", "only this computer was checked", "check a link: aerokit doctor ADDRESS"))
 
 
-async def _check_link(options: argparse.Namespace, found: Callable[[Finding], None]) -> bool:
+async def _check_link(options: argparse.Namespace, report: Callable[[Finding], None]) -> bool:
     """Return True if anything was received."""
     from aerokit.apps.cli.doctor_link import LinkExamination
 
-    place = parse_address(options.address) if isinstance(options.address, str) else None
-    if place is not None and place.kind == "serial":
-        baud = await _find_baud_rate(options, place.device, place.baud or options.baud, found)
-        options.address = str(LinkAddress("serial", device=place.device, baud=baud, options=place.options))
+    parsed = parse_address(options.address) if isinstance(options.address, str) else None
+    if parsed is not None and parsed.kind == "serial":
+        baud = await _find_baud_rate(options, parsed.device, parsed.baud or options.baud, report)
+        options.address = str(LinkAddress("serial", device=parsed.device, baud=baud, options=parsed.options))
     try:
         async with opened(options) as connection:
             examination = LinkExamination(connection)
             async with waiting(options, connection.link.address, options.seconds, "messages"):
                 await anyio.sleep(options.seconds)
             for finding in examination.findings():
-                found(finding)
+                report(finding)
             try:
                 connection.raise_if_ended()
             except AerokitError as error:
-                found(Finding("problem", "link", str(error)))
+                report(Finding("problem", "link", str(error)))
             return not examination.is_silent
     except LinkOpenError as error:
-        found(Finding("problem", "link", str(error)))
+        report(Finding("problem", "link", str(error)))
         return False
 
 
-async def _find_baud_rate(options: argparse.Namespace, device: str, baud: int, found: Callable[[Finding], None]) -> int:
+async def _find_baud_rate(
+    options: argparse.Namespace, device: str, baud: int, report: Callable[[Finding], None]
+) -> int:
     """Return the rate at which MAVLink is received; ``baud`` if there is none."""
     from aerokit.apps.cli.doctor_link import BAUD_RATES, listen_at
 
     port = check_serial_port(device)
     if port.level != "ok":
-        found(port)
+        report(port)
     probes = []
     for rate in dict.fromkeys((baud, *BAUD_RATES)):
         async with waiting(options, f"{device} at {rate}", BAUD_RATE_TIMEOUT_S, "MAVLink"):
@@ -226,18 +225,18 @@ async def _find_baud_rate(options: argparse.Namespace, device: str, baud: int, f
             except AerokitError:  # reported when the link is opened
                 return baud
         if probe.is_mavlink:
-            found(_baud_finding(device, rate, baud))
+            report(_baud_finding(device, rate, baud))
             return rate
         probes.append(probe)
         if probe.bytes == 0:
             break  # no signal at all, so other rates receive nothing either
     rates = ", ".join(f"{probe.baud}: {probe.bytes} bytes" for probe in probes)
-    found(Finding("note", "baud rate", f"no MAVLink on {device} at any rate tried ({rates})"))
+    report(Finding("note", "baud rate", f"no MAVLink on {device} at any rate tried ({rates})"))
     return baud
 
 
-def _baud_finding(device: str, rate: int, given: int) -> Finding:
-    if rate == given:
+def _baud_finding(device: str, rate: int, configured: int) -> Finding:
+    if rate == configured:
         return Finding("ok", "baud rate", f"{device} receives MAVLink at {rate}")
-    text = f"{device} receives MAVLink at {rate}, not at {given}"
+    text = f"{device} receives MAVLink at {rate}, not at {configured}"
     return Finding("problem", "baud rate", text, f"use {device},{rate}")

@@ -123,15 +123,16 @@ class LinkExamination:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._own = (connection.source_system, connection.source_component)
+        self._own_ids = (connection.source_system, connection.source_component)
+        # All by system and component id. A source with several types or autopilots stands for several senders.
         self._versions: dict[tuple[int, int], set[int]] = {}
         self._signed: Counter[tuple[int, int]] = Counter()
         self._frames: Counter[tuple[int, int]] = Counter()
-        self._kinds: dict[tuple[int, int], set[tuple[int, int]]] = {}
+        self._types_and_autopilots: dict[tuple[int, int], set[tuple[int, int]]] = {}
         self._duplicate_sources: set[tuple[int, int]] = set()
         connection.observe_frames(self._on_frame)
         connection.bus.attach(Heartbeat, self._on_heartbeat)
-        connection.bus.attach_event(DuplicateSender, self._on_heard_twice)
+        connection.bus.attach_event(DuplicateSender, self._on_duplicate_sender)
 
     def _on_frame(self, frame: Frame, peer: Peer) -> None:
         if self._connection.bus.dialect.get(frame.message_id) is None:
@@ -144,10 +145,10 @@ class LinkExamination:
     def _on_heartbeat(self, heartbeat: Heartbeat) -> None:
         frame = heartbeat.received_frame
         if frame is not None:
-            kinds = self._kinds.setdefault((frame.system_id, frame.component_id), set())
-            kinds.add((heartbeat.type, heartbeat.autopilot))
+            pairs = self._types_and_autopilots.setdefault((frame.system_id, frame.component_id), set())
+            pairs.add((heartbeat.type, heartbeat.autopilot))
 
-    def _on_heard_twice(self, event: DuplicateSender) -> None:
+    def _on_duplicate_sender(self, event: DuplicateSender) -> None:
         self._duplicate_sources.add((event.system_id, event.component_id))
 
     def findings(self) -> Iterator[Finding]:
@@ -162,7 +163,7 @@ class LinkExamination:
     @property
     def is_silent(self) -> bool:
         """Return True if no other system was received."""
-        return not set(self._frames) - {self._own}
+        return not set(self._frames) - {self._own_ids}
 
     def _silence(self) -> Iterator[Finding]:
         connection = self._connection
@@ -170,27 +171,27 @@ class LinkExamination:
             return
         text = explain_no_vehicle(connection, None)
         total = sum(statistics.bytes for statistics in connection.statistics())
-        if set(self._frames) == {self._own}:
+        if set(self._frames) == {self._own_ids}:
             text += "; they seem to be an echo of what this program sends"
-            do = "check whether TX and RX are shorted, or a router sends everything back"
+            advice = "check whether TX and RX are shorted, or a router sends everything back"
         elif total == 0:
-            do = (
+            advice = (
                 "check that the vehicle is on. Serial: TX to RX and RX to TX, ground to ground, SERIALn_PROTOCOL 2"
                 " (ArduPilot) or MAV_n_CONFIG (PX4). UDP: the vehicle must send to this computer and port, and no"
                 " firewall may block it"
             )
         elif not self._frames:
-            do = (
+            advice = (
                 "serial: try other baud rates (SERIALn_BAUD, SER_TELn_BAUD), and check that the port is MAVLink and not"
                 " GPS, RC or a console. UDP: check for other programs that send to this port"
             )
         else:
-            do = "check that this port is connected to the autopilot"
-        yield Finding("problem", "vehicle", text, do)
+            advice = "check that this port is connected to the autopilot"
+        yield Finding("problem", "vehicle", text, advice)
 
     def _ids(self) -> Iterator[Finding]:
-        different = {source for source, kinds in self._kinds.items() if len(kinds) > 1}
-        for system, component in sorted((self._duplicate_sources | different) - {self._own}):
+        ambiguous = {source for source, pairs in self._types_and_autopilots.items() if len(pairs) > 1}
+        for system, component in sorted((self._duplicate_sources | ambiguous) - {self._own_ids}):
             yield Finding(
                 "problem",
                 "ids",
@@ -198,14 +199,17 @@ class LinkExamination:
                 "give each vehicle a unique system id (ArduPilot MAV_SYSID or SYSID_THISMAV, PX4 MAV_SYS_ID), and check"
                 " for a second path to the same vehicle",
             )
-        autopilots = [source for source, beat in self._connection.heartbeats.items() if is_autopilot(beat)]
-        for system, count in Counter(system for system, _ in autopilots).items():
-            if count > 1:
-                components = ", ".join(str(component) for other, component in sorted(autopilots) if other == system)
+        components_by_system: dict[int, list[int]] = {}
+        for (system, component), heartbeat in sorted(self._connection.heartbeats.items()):
+            if is_autopilot(heartbeat):
+                components_by_system.setdefault(system, []).append(component)
+        for system, components in components_by_system.items():
+            if len(components) > 1:
+                listed = ", ".join(map(str, components))
                 yield Finding(
                     "problem",
                     "ids",
-                    f"system {system} has {count} autopilots (components {components})",
+                    f"system {system} has {len(components)} autopilots (components {listed})",
                     "give each vehicle a unique system id",
                 )
         if _PROGRAM_IDS in self._frames:
@@ -225,12 +229,13 @@ class LinkExamination:
 
     def _senders(self) -> Iterator[Finding]:
         for source, heartbeat in sorted(self._connection.heartbeats.items()):
-            if source == self._own:
+            if source == self._own_ids:
                 continue
+            system, component = source
             versions = self._versions.get(source, set())
-            kind = "autopilot" if is_autopilot(heartbeat) else _kind(heartbeat.type)
-            number = " and ".join(str(version) for version in sorted(versions)) or "?"
-            text = f"system {source[0]}, component {source[1]}: {kind}, MAVLink {number}, {self._frames[source]} frames"
+            kind = "autopilot" if is_autopilot(heartbeat) else _type_name(heartbeat.type)
+            mavlink = " and ".join(str(version) for version in sorted(versions)) or "?"
+            text = f"system {system}, component {component}: {kind}, MAVLink {mavlink}, {self._frames[source]} frames"
             if is_autopilot(heartbeat) and 2 not in versions:
                 yield Finding(
                     "note",
@@ -246,8 +251,8 @@ class LinkExamination:
     def _signing(self) -> Iterator[Finding]:
         signing = self._connection.signing
         if signing is not None:
-            if refused := self._connection.describe_signature_problems():
-                yield Finding("problem", "signing", refused, "check that the key is the vehicle's (docs/signing.md)")
+            if problems := self._connection.describe_signature_problems():
+                yield Finding("problem", "signing", problems, "check that the key is the vehicle's (docs/signing.md)")
             return
         signed = sorted(source for source, count in self._signed.items() if count)
         if signed:
@@ -260,11 +265,12 @@ class LinkExamination:
             )
 
     def _unknown(self) -> Iterator[Finding]:
-        numbers: Counter[int] = Counter()
+        unknown_messages: Counter[int] = Counter()
         for statistics in self._connection.statistics():
-            numbers.update(statistics.unknown_messages)
-        if numbers:
-            listed = ", ".join(f"{number} ({count})" for number, count in sorted(numbers.items())[:10])
+            unknown_messages.update(statistics.unknown_messages)
+        if unknown_messages:
+            first = sorted(unknown_messages.items())[:10]
+            listed = ", ".join(f"{message_id} ({count})" for message_id, count in first)
             yield Finding(
                 "note",
                 "dialect",
@@ -283,19 +289,19 @@ class LinkExamination:
 
     def _loss(self) -> Iterator[Finding]:
         is_serial = self._connection.link.address.startswith(("serial:", "/dev/", "COM"))
-        for system in sorted({system for system, _ in self._frames} - {self._own[0]}):
+        for system in sorted({system for system, _ in self._frames} - {self._own_ids[0]}):
             received, lost = self._connection.counts(system)
             if received + lost < _MIN_FRAMES_FOR_LOSS:
                 continue
-            share = lost / (received + lost)
-            text = f"system {system}: {100 * share:.1f} % of {received + lost} frames lost"
-            if share <= _MAX_LOSS:
+            loss = lost / (received + lost)
+            text = f"system {system}: {100 * loss:.1f} % of {received + lost} frames lost"
+            if loss <= _MAX_LOSS:
                 yield Finding("ok", "loss", text)
             else:
                 yield Finding("problem", "loss", text, _SERIAL_LOSS_ADVICE if is_serial else _NETWORK_LOSS_ADVICE)
 
 
-def _kind(number: int) -> str:
+def _type_name(number: int) -> str:
     try:
         return MavType(number).name.lower().replace("_", " ").replace("gcs", "ground station")
     except ValueError:

@@ -37,7 +37,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     rename = command_action(
         "files mv",
         "renamed {path} to {new_path}",
-        lambda v, o: v.files.rename(o.path, o.new_path, idle_timeout_s=o.patience),
+        lambda vehicle, options: vehicle.files.rename(options.path, options.new_path, idle_timeout_s=options.patience),
     )
     for name, run, text in (
         ("rm", remove, "Remove a file."),
@@ -52,7 +52,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def _call(method: str) -> Callable[[Vehicle, argparse.Namespace], Awaitable[object]]:
-    return lambda vehicle, o: getattr(vehicle.files, method)(o.path, idle_timeout_s=o.patience)
+    return lambda vehicle, options: getattr(vehicle.files, method)(options.path, idle_timeout_s=options.patience)
 
 
 def _size(path: str | os.PathLike[str]) -> int:
@@ -69,28 +69,30 @@ async def _list(options: argparse.Namespace) -> int:
 
 
 async def _get(options: argparse.Namespace) -> int:
-    to = _destination(options)
+    target = _destination(options)
     async with connected(options) as vehicle:
-        with progress_bar(to.name, "B") as show:
+        with progress_bar(target.name, "B") as on_progress:
             await vehicle.files.download(
-                options.path, to, resume=True, idle_timeout_s=options.patience, on_progress=show
+                options.path, target, resume=True, idle_timeout_s=options.patience, on_progress=on_progress
             )
-    size = _size(to)
-    emit(options, "fetched", {"path": options.path, "file": to, "bytes": size}, f"{to}: {size} bytes")
+    size = _size(target)
+    emit(options, "fetched", {"path": options.path, "file": target, "bytes": size}, f"{target}: {size} bytes")
     return DONE
 
 
 def _destination(options: argparse.Namespace) -> Path:
     name = PurePosixPath(options.path).name
-    to = Path(options.to or name)
-    return to / name if to.is_dir() else to
+    target = Path(options.to or name)
+    return target / name if target.is_dir() else target
 
 
 async def _put(options: argparse.Namespace) -> int:
     size = _size(options.file)
     async with connected(options, changes=True) as vehicle:
-        with progress_bar(Path(options.file).name, "B") as show:
-            await vehicle.files.upload(options.file, options.path, idle_timeout_s=options.patience, on_progress=show)
+        with progress_bar(Path(options.file).name, "B") as on_progress:
+            await vehicle.files.upload(
+                options.file, options.path, idle_timeout_s=options.patience, on_progress=on_progress
+            )
     record = {"file": options.file, "path": options.path, "bytes": size}
     emit(options, "sent", record, f"{options.path}: {size} bytes")
     return DONE
@@ -134,26 +136,28 @@ async def _get_logs(options: argparse.Namespace) -> int:
         entries = await vehicle.logs.list(idle_timeout_s=options.patience)
         options.to.mkdir(parents=True, exist_ok=True)
         for entry in _chosen(entries, options):
-            to = options.to / f"log{entry.id:05}{vehicle.autopilot.log_suffix}"
-            with progress_bar(to.name, "B") as show:
+            target = options.to / f"log{entry.id:05}{vehicle.autopilot.log_suffix}"
+            with progress_bar(target.name, "B") as on_progress:
                 await vehicle.logs.download(
-                    entry, to, method=options.method, idle_timeout_s=options.patience, on_progress=show
+                    entry, target, method=options.method, idle_timeout_s=options.patience, on_progress=on_progress
                 )
-            size = _size(to)
-            emit(options, "fetched_log", {"id": entry.id, "file": to, "bytes": size}, f"{to}: {size} bytes")
+            size = _size(target)
+            emit(options, "fetched_log", {"id": entry.id, "file": target, "bytes": size}, f"{target}: {size} bytes")
     if not entries:
         print("aerokit: the vehicle has no logs", file=sys.stderr)
     return DONE if entries else FAILED
 
 
 def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequence[LogEntry]:
-    if options.all or not options.ids:
-        return entries if options.all else entries[-1:]
-    known = {entry.id: entry for entry in entries}
+    if options.all:
+        return entries
+    if not options.ids:
+        return entries[-1:]  # the newest
+    by_id = {entry.id: entry for entry in entries}
     for log_id in options.ids:
-        if log_id not in known:
-            raise InvalidArgument(f"the vehicle has no log {log_id}; its logs: {', '.join(map(str, known)) or 'none'}")
-    return [known[log_id] for log_id in options.ids]
+        if log_id not in by_id:
+            raise InvalidArgument(f"the vehicle has no log {log_id}; its logs: {', '.join(map(str, by_id)) or 'none'}")
+    return [by_id[log_id] for log_id in options.ids]
 
 
 async def _erase(options: argparse.Namespace) -> int:

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from aerokit.logs.report import Report
 
 # The noun for `Conversion.written`; an .mcap also gets a message for each state that an entry changes.
-_WRITTEN = {".mcap": "message", ".gpx": "point", ".kml": "point"}
-_NEEDS = {".mcap": "mcap", ".parquet": "pyarrow", ".gpx": "gpxpy", ".kml": "simplekml"}
+_WRITTEN_NOUNS = {".mcap": "message", ".gpx": "point", ".kml": "point"}
+_REQUIRED_MODULES = {".mcap": "mcap", ".parquet": "pyarrow", ".gpx": "gpxpy", ".kml": "simplekml"}
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -42,41 +42,42 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def _convert(options: argparse.Namespace) -> int:
-    needed = _NEEDS.get(options.out.suffix.lower() or f".{options.tables}")
-    if needed is not None:
-        import_extra(needed, "convert")
+    module = _REQUIRED_MODULES.get(options.out.suffix.lower() or f".{options.tables}")
+    if module is not None:
+        import_extra(module, "convert")
     if options.log.suffix.lower() == ".ulg":
         import_extra("pyulog", "convert")
     from aerokit.logs.convert import convert
 
     check_log_name(options.log)
-    if not (options.out.is_dir() and not any(options.out.iterdir())):
+    is_empty_folder = options.out.is_dir() and not any(options.out.iterdir())
+    if not is_empty_folder:
         check_not_existing(options.out, options)
     with progress_bar(options.log.name, "B") as on_progress:
-        done = convert(options.log, options.out, tables=options.tables, force=options.force, on_progress=on_progress)
-    for note in done.notes:
+        result = convert(options.log, options.out, tables=options.tables, force=options.force, on_progress=on_progress)
+    for note in result.notes:
         print(printable(f"aerokit: {options.log}: {note}"), file=sys.stderr)
     emit(
         options,
         "conversion",
-        {**done.to_dict(), "log": options.log},
-        f"{done.target}: {_number(done.written, _WRITTEN.get(done.target.suffix.lower(), 'row'))}"
-        f" from {_number(done.entries, 'entry')}, {_size(done.bytes)},"
-        f" {_shown(done.begins_at)} to {_shown(done.ends_at)} UTC",
+        {**result.to_dict(), "log": options.log},
+        f"{result.target}: {_counted_noun(result.written, _WRITTEN_NOUNS.get(result.target.suffix.lower(), 'row'))}"
+        f" from {_counted_noun(result.entries, 'entry')}, {_size(result.bytes)},"
+        f" {_utc_text(result.begins_at)} to {_utc_text(result.ends_at)} UTC",
     )
     return DONE
 
 
-def _number(count: int, what: str) -> str:
-    many = f"{what[:-1]}ies" if what.endswith("y") else f"{what}s"
-    return f"{count:,} {what if count == 1 else many}"
+def _counted_noun(count: int, singular: str) -> str:
+    plural = f"{singular[:-1]}ies" if singular.endswith("y") else f"{singular}s"
+    return f"{count:,} {singular if count == 1 else plural}"
 
 
 def _size(number: int) -> str:
     return f"{number / 1e6:.1f} MB" if number >= 1e6 else f"{number / 1e3:.1f} kB"
 
 
-def _shown(unix_s: float) -> str:
+def _utc_text(unix_s: float) -> str:
     return f"{datetime.fromtimestamp(unix_s, timezone.utc):%Y-%m-%d %H:%M:%S}"
 
 
@@ -135,5 +136,5 @@ def _report_text(report: Report) -> str:
         for failsafe in failsafes:
             lines.append(f"{clock(failsafe.time_s)} {failsafe.title}: {failsafe.reaction}")
             lines += [f"  {fact}" for fact in failsafe.context]
-    found = [f"; {fall_text(fall)}" for flight_falls in report.falls for fall in flight_falls]
-    return "\n".join([*lines, f"{report.target}: {report.bytes / 1e6:.1f} MB{''.join(found)}"])
+    fall_texts = [f"; {fall_text(fall)}" for flight_falls in report.falls for fall in flight_falls]
+    return "\n".join([*lines, f"{report.target}: {report.bytes / 1e6:.1f} MB{''.join(fall_texts)}"])

@@ -76,28 +76,29 @@ class PlanFlight(SupervisedFlight):
             )
         self._print("arming")
         await self._arm()
-        following = asyncio.create_task(self._follow())
+        progress = asyncio.create_task(self._print_progress())
         try:
             self._print("armed; starting the mission")
             await vehicle.mission.start()
             self._has_started = True
             await vehicle.mission.wait_finished()
         finally:
-            following.cancel()
+            progress.cancel()
             with suppress(asyncio.CancelledError):
-                await following
+                await progress
         return await self._finish()
 
     async def _download_mission(self) -> tuple[MissionItem, ...]:
         return tuple((await self._vehicle.mission.download(idle_timeout_s=self._options.patience)).items)
 
     def _check_vehicle(self) -> None:
-        vehicle, wanted = self._vehicle, self._options.on_interrupt
+        """Raise unless the vehicle is disarmed and can fly the mission, and ``--on-interrupt`` is possible."""
+        vehicle, interrupt_action = self._vehicle, self._options.on_interrupt
         self._check_disarmed()
         possible = [action for action in INTERRUPT_ACTIONS if action == "nothing" or self._has_mode_for(action)]
-        if wanted not in possible:
+        if interrupt_action not in possible:
             raise NotSupported(
-                f"{vehicle.autopilot.firmware} has no mode for --on-interrupt {wanted}: choose"
+                f"{vehicle.autopilot.firmware} has no mode for --on-interrupt {interrupt_action}: choose"
                 f" {' or '.join(possible)}; nothing was sent"
             )
         mission = self._plan.mission
@@ -114,9 +115,9 @@ class PlanFlight(SupervisedFlight):
 
     def _warnings(self) -> list[str]:
         items, warnings = self._plan.mission.items, []
-        place = next((item.position for item in items if item.position is not None), None)
-        if place is not None:
-            distance = self._vehicle.distance_to(place)
+        first_position = next((item.position for item in items if item.position is not None), None)
+        if first_position is not None:
+            distance = self._vehicle.distance_to(first_position)
             if distance > _MAX_START_DISTANCE_M:
                 warnings.append(f"the first waypoint is {distance / 1000:.1f} km away")
         if not any(part in items[-1].name for part in ("LAND", "RETURN_TO_LAUNCH")):
@@ -138,13 +139,12 @@ class PlanFlight(SupervisedFlight):
         finally:
             self._report.prints_status = True
 
-    async def _follow(self) -> None:
-
+    async def _print_progress(self) -> None:
         with (
-            self._vehicle.subscribe(events.MissionCurrentChanged, capacity=100) as progress,
+            self._vehicle.subscribe(events.MissionCurrentChanged, capacity=100) as changes,
             suppress(AerokitError),
         ):
-            async for event in progress:
+            async for event in changes:
                 if event.after is not None:
                     self._print(f"to item {event.after}{self._name_of(event.after)}")
 
@@ -160,8 +160,8 @@ class PlanFlight(SupervisedFlight):
         return DONE
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # Land and return modes may come from a failsafe, so they are not included. A cancelled mission start ends in
-        # hold.
+        # Modes for landing and returning are not included, because a failsafe may have set them. The mode for holding
+        # is this program's only before the start: a cancelled start of the mission ends in it.
         return ("mission",) if self._has_started else ("mission", "hold")
 
 
@@ -207,6 +207,7 @@ async def run_fly(options: argparse.Namespace) -> int:
         items = getattr(plan, part).to_items()
         if items:
             emit_items(options, part, items, "in the file")
+    # `_connect_and_fly` adds its flight to `flights`, so that the flight's state is known after an interrupt.
     interrupts, flights = InterruptStack(), list[PlanFlight]()
     with on_interrupt(interrupts.interrupt):
         code = await interrupts.run(lambda: _connect_and_fly(options, plan, interrupts, flights))
@@ -238,7 +239,7 @@ async def _connect_and_fly(
         stack.enter_context(new_recording(options.record))
         link: str | Link = options.connect or default_address()
         if options.sim:
-            link = await _simulated(options, plan, stack)
+            link = await _start_simulation(options, plan, stack)
         address = link if isinstance(link, str) else link.address
         if not options.sim:
             emit(options, "connecting", {"address": address}, f"connecting to {address}")
@@ -260,7 +261,7 @@ async def _connect_and_fly(
     return code
 
 
-async def _simulated(options: argparse.Namespace, plan: Plan, stack: AsyncExitStack) -> Link:
+async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: AsyncExitStack) -> Link:
     """Start a simulated vehicle of the plan's type at the start of the mission."""
     from aerokit.apps.cli.sim import simulated_vehicle
     from aerokit.sim import simulated_link
@@ -268,8 +269,8 @@ async def _simulated(options: argparse.Namespace, plan: Plan, stack: AsyncExitSt
     from aerokit.sim.motion import HOME
 
     kind = options.vehicle or _kind_for(plan)
-    places = [plan.mission.home, *(item.position for item in plan.mission.items)]
-    start = next((place for place in places if place is not None), None)
+    positions = [plan.mission.home, *(item.position for item in plan.mission.items)]
+    start = next((position for position in positions if position is not None), None)
     home = HOME
     if start is not None:
         home = (start.latitude_deg, start.longitude_deg, start.altitude_amsl_m or HOME[2])

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
     from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent
 
-_NAMED = re.compile(r"([A-Za-z][\w-]*)=(.+)", re.DOTALL)
-_FILTER = "'GPS_*,HEARTBEAT@NAME'"
+_NAMED_ADDRESS = re.compile(r"([A-Za-z][\w-]*)=(.+)", re.DOTALL)
+_FILTER_EXAMPLE = "'GPS_*,HEARTBEAT@NAME'"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=_hub)
-    place = command.add_argument(
+    endpoints = command.add_argument(
         "endpoints",
         nargs="+",
         type=_named_address,
@@ -35,12 +35,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="tcpin:0.0.0.0:5760, udpout:10.0.0.7:14550, radio=/dev/ttyUSB0,57600 …; options refer to an endpoint by"
         " NAME, or by ADDRESS as written",
     )
-    offer(place, addresses)
+    offer(endpoints, addresses)
     _add_names(command, "--read-only", "do not forward messages received there, heartbeats included")
     _add_names(command, "--patient", "if it cannot be opened, start without it and keep trying")
-    only = f"send only these messages, at one endpoint or, without @NAME, at all: {_FILTER}"
+    only = f"send only these messages, at one endpoint or, without @NAME, at all: {_FILTER_EXAMPLE}"
     _add_filter(command, "--only", _messages, only)
-    _add_filter(command, "--block", _messages, f"do not send these messages: {_FILTER}")
+    _add_filter(command, "--block", _messages, f"do not send these messages: {_FILTER_EXAMPLE}")
     _add_filter(command, "--rate", _rate, "limit messages to a rate in Hz, for each sender: 'ATTITUDE=5@NAME'")
     _add_names(command, "--signed", "sign what is sent there, and accept only signed messages")
     add_signing_key(command, f"key for --signed (${SIGNING_KEY_VARIABLE})")
@@ -63,19 +63,19 @@ def _add_filter(command: argparse.ArgumentParser, option: str, read: Callable[[s
 
 def _named_address(text: str) -> tuple[str, str]:
     """Parse ``[NAME=]ADDRESS`` into name and address."""
-    named = _NAMED.fullmatch(text)
-    return (named[1], address(named[2])) if named else (text, address(text))
+    match = _NAMED_ADDRESS.fullmatch(text)
+    return (match[1], address(match[2])) if match else (text, address(text))
 
 
 def _messages(text: str) -> tuple[str, tuple[str, ...]]:
     """Parse ``MESSAGE,…[@NAME]`` into the endpoint ("" for all) and message patterns."""
     names, at, endpoint = text.partition("@")
-    found = tuple(name.strip() for name in names.split(",") if name.strip())
-    if not found:
-        raise argparse.ArgumentTypeError(f"{text!r} has no message name; expected {_FILTER}")
+    patterns = tuple(name.strip() for name in names.split(",") if name.strip())
+    if not patterns:
+        raise argparse.ArgumentTypeError(f"{text!r} has no message name; expected {_FILTER_EXAMPLE}")
     if at and not endpoint:
-        raise argparse.ArgumentTypeError(f"{text!r} has no endpoint after the @; expected {_FILTER}")
-    return endpoint, found
+        raise argparse.ArgumentTypeError(f"{text!r} has no endpoint after the @; expected {_FILTER_EXAMPLE}")
+    return endpoint, patterns
 
 
 def _rate(text: str) -> tuple[str, dict[str, float]]:
@@ -137,22 +137,31 @@ def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
         raise InvalidArgument(f"--signed needs a key: give --signing-key FILE, or set ${SIGNING_KEY_VARIABLE}")
     return [
         Endpoint(
-            place,
+            endpoint_address,
             name=name,
-            only=_for(name, options.only),
-            block=_for(name, options.block),
-            rates={key: hz for where, rates in options.rate if where in ("", name) for key, hz in rates.items()},
+            only=_patterns_for(name, options.only),
+            block=_patterns_for(name, options.block),
+            rates=_rates_for(name, options.rate),
             read_only=name in options.read_only,
             signing=signing_of(options) if name in options.signed else None,
             baud=options.baud,
             retry_open=name in options.patient,
         )
-        for name, place in options.endpoints
+        for name, endpoint_address in options.endpoints
     ]
 
 
-def _for(name: str, filters: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[str, ...]:
-    return tuple(pattern for where, patterns in filters if where in ("", name) for pattern in patterns)
+def _patterns_for(name: str, filters: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[str, ...]:
+    """Return the patterns of the filters for this endpoint, or for all ("")."""
+    return tuple(pattern for endpoint, patterns in filters if endpoint in ("", name) for pattern in patterns)
+
+
+def _rates_for(name: str, filters: Sequence[tuple[str, dict[str, float]]]) -> dict[str, float]:
+    rates: dict[str, float] = {}
+    for endpoint, filter_rates in filters:
+        if endpoint in ("", name):
+            rates.update(filter_rates)
+    return rates
 
 
 def _check_known(name: str, names: list[str]) -> None:

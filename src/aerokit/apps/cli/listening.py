@@ -77,16 +77,16 @@ async def run_record(options: argparse.Namespace) -> int:
     error: AerokitError | None = None
     try:
         async with opened(options, reconnect=True) as connection:
-            started = connection.now()
+            started_at = connection.now()
             connection.record(options.file)
             connection.observe_frames(count)
             text = f"recording {connection.link.address} to {options.file} until Ctrl-C"
             emit(options, "recording", {"address": connection.link.address, "file": options.file}, text)
             try:
                 is_interrupted = await _record(connection, options)
-            except AerokitError as ended:  # report the counts before the error
-                error, is_interrupted = ended, False
-            seconds = connection.now() - started
+            except AerokitError as connection_error:  # raised below, after the counts are reported
+                error, is_interrupted = connection_error, False
+            seconds = connection.now() - started_at
     except BaseException:
         remove_if_empty(options.file)
         raise
@@ -111,9 +111,9 @@ def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], 
     from aerokit.mavlink.dialect import STANDARD
 
     messages: Counter[str] = Counter()
-    for (_, message_id), number in counts.items():
-        known = STANDARD.get(message_id)
-        messages[str(message_id) if known is None else known.NAME] += number
+    for (_, message_id), count in counts.items():
+        message = STANDARD.get(message_id)
+        messages[str(message_id) if message is None else message.NAME] += count
     systems = sorted({system_id for system_id, _ in counts})
     size = os.path.getsize(options.file)
     record = {
@@ -125,7 +125,7 @@ def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], 
         "messages": dict(messages.most_common()),
     }
     sources = f" from system{'s' if len(systems) > 1 else ''} {', '.join(map(str, systems))}" if systems else ""
-    details = ", ".join(f"{name} {number}" for name, number in messages.most_common(5))
+    details = ", ".join(f"{name} {count}" for name, count in messages.most_common(5))
     text = f"{options.file}: {sum(counts.values())} frames received{sources} in {seconds:.1f} s, {size} bytes"
     if set(messages) == {"HEARTBEAT"} and options.as_is:
         details += "; no other messages: without --as-is, position, attitude and other messages are requested"
@@ -154,7 +154,7 @@ async def run_events(options: argparse.Namespace) -> int:
 
 
 async def _print_all(connection: Connection, options: argparse.Namespace) -> None:
-    wall_at_0 = connection.unix_time() - connection.now()
+    unix_time_at_0 = connection.unix_time() - connection.now()
     async with AsyncExitStack() as stack:
         events = stack.enter_context(connection.subscribe(Event, capacity=_MAX_WAITING_EVENTS))
         missed = 0
@@ -163,7 +163,7 @@ async def _print_all(connection: Connection, options: argparse.Namespace) -> Non
         with suppress(AerokitError):  # the connection has ended; await_end raises the error
             while True:
                 if options.all or not isinstance(event, LinkReport):
-                    _emit_event(event, wall_at_0 + event.at, options)
+                    _emit_event(event, unix_time_at_0 + event.at, options)
                 if events.missed > missed:
                     emit(options, "missed", {"events": events.missed - missed}, None)
                     missed = events.missed
@@ -217,13 +217,13 @@ async def run_monitor(options: argparse.Namespace) -> int:
         raise InvalidArgument("aerokit monitor needs a terminal: stdin or stdout is redirected")
     with ExitStack() as stack:
 
-        def end_soon(number: int) -> None:
-            if number == getattr(signal, "SIGHUP", None):
+        def exit_soon(signal_number: int) -> None:
+            if signal_number == getattr(signal, "SIGHUP", None):
                 _detach_terminal()
-            end = threading.Timer(EXIT_TIMEOUT_S, os._exit, (INTERRUPTED,))
-            end.daemon = True
-            end.start()
-            stack.callback(end.cancel)
+            timer = threading.Timer(EXIT_TIMEOUT_S, os._exit, (INTERRUPTED,))
+            timer.daemon = True
+            timer.start()
+            stack.callback(timer.cancel)
 
         stack.enter_context(new_recording(options.record))
         return await run(
@@ -231,7 +231,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
             baud=options.baud,
             signing=signing_of(options),
             record=options.record,
-            on_start=lambda app: stack.enter_context(on_interrupt(app.exit, end_soon)),
+            on_start=lambda app: stack.enter_context(on_interrupt(app.exit, exit_soon)),
         )
 
 
@@ -240,6 +240,6 @@ def _detach_terminal() -> None:
 
     Textual's output thread ends when it writes to a terminal that was closed. Later writes would block the event loop.
     """
-    with open(os.devnull, "w") as nothing:
-        for stream in (1, 2):
-            os.dup2(nothing.fileno(), stream)
+    with open(os.devnull, "w") as null_device:
+        for stream in (1, 2):  # stdout and stderr
+            os.dup2(null_device.fileno(), stream)

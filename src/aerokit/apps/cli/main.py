@@ -197,18 +197,20 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and the message, and exit with code 2."""
-        if found := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
-            hint = suggestion(found[1], re.findall(r"[\w.-]+", found[2]))
+        match = re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message)
+        if match is not None:
+            choice, choices = match.groups()
+            hint = suggestion(choice, re.findall(r"[\w.-]+", choices))
             is_command = message.startswith("argument COMMAND:")
-            if is_command and is_address(found[1]):
-                hint = f"; to see the vehicle there: aerokit status {found[1]}"
-            if found[1].lower() in _ARMING_WORDS:
+            if is_command and is_address(choice):
+                hint = f"; to see the vehicle there: aerokit status {choice}"
+            if choice.lower() in _ARMING_WORDS:
                 hint = "; `aerokit fly PLAN`, the web page of `aerokit serve` and Python programs arm and fly a vehicle"
-            message = f"unknown command {found[1]!r}{hint}; `aerokit` lists them" if is_command else message + hint
+            message = f"unknown command {choice!r}{hint}; `aerokit` lists them" if is_command else message + hint
         super().error(message)
 
 
-# Actions of the library that are no commands, because a command ends before the action does.
+# Actions of the library for which there is no command.
 _ARMING_WORDS = ("arm", "disarm", "takeoff", "take_off", "take-off", "land", "goto", "go_to", "rtl")
 
 
@@ -216,15 +218,15 @@ class _TopParser(Parser):
     """The parser of ``aerokit`` itself, whose help lists the commands by task."""
 
     def format_help(self) -> str:
-        *options, commands = self._actions
-        assert isinstance(commands, argparse._SubParsersAction)
-        listed = {action.dest: action for action in commands._get_subactions()}
+        *options, subparsers = self._actions
+        assert isinstance(subparsers, argparse._SubParsersAction)
+        commands = {action.dest: action for action in subparsers._get_subactions()}
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
         formatter.add_text(self.description)
         for title, names in GROUPS.items():
             formatter.start_section(title)
-            formatter.add_arguments(listed[name] for name in names)
+            formatter.add_arguments(commands[name] for name in names)
             formatter.end_section()
         formatter.start_section("options")
         formatter.add_arguments(options)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_ADDRESS = re.compile(
+_ADDRESS_PATTERN = re.compile(
     r"(udp(in|out|bcast)?|tcp(in|out)?|serial|zenoh(in)?):.+|\d+(\.\d+){3}:\d+|/dev/(tty|cu|serial).+|com\d+([,:]\d+)?",
     re.IGNORECASE,
 )
@@ -29,14 +29,16 @@ _COMMANDS_BY_SUFFIX = {
 
 def is_address(word: str) -> bool:
     """Return True for an address of a link that is unlikely to be anything else."""
-    return _ADDRESS.fullmatch(word) is not None
+    return _ADDRESS_PATTERN.fullmatch(word) is not None
 
 
 def misplaced_file(word: str) -> str | None:
     """Return an error text, with the right command, if a word given as an address is a file; otherwise None."""
     path = Path(word)
-    advice = _COMMANDS_BY_SUFFIX.get(path.suffix.lower())
-    if advice is None and not (path.is_file() and path.suffix.lower() != ".tlog"):
+    suffix = path.suffix.lower()
+    advice = _COMMANDS_BY_SUFFIX.get(suffix)
+    is_other_file = path.is_file() and suffix != ".tlog"  # a recording is an address: it is replayed
+    if advice is None and not is_other_file:
         return None
     text = f"{word!r} is a file; an address is expected, such as udpin:0.0.0.0:14550"
     return text if advice is None else f"{text}. {advice.replace('{}', shlex.quote(word))}"
@@ -53,28 +55,30 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
         is_connected = any(word.partition("=")[0] == "--connect" for word in words)
         line = shlex.join([*command, *(word.removeprefix("--connect=") for word in words if word != "--connect")])
         return f"`{parser.prog}` takes the address without --connect: {line}" if is_connected else None
-    for number, word in enumerate(words):
+    for index, word in enumerate(words):
         # `aerokit files` takes paths on the vehicle, which may begin with /dev.
         is_path = word.startswith("/") and command[1] == "files"
-        if is_path or not is_address(word) or (number and _takes_value(parser, words[number - 1])):
+        is_option_value = index > 0 and _takes_value(parser, words[index - 1])
+        if is_path or not is_address(word) or is_option_value:
             continue
         if not has_connect:
             return f"`{parser.prog}` takes no address; to record a link: aerokit record {shlex.quote(word)} flight.tlog"
-        if any(other.startswith("--connect") for other in words):
+        if any(argument.startswith("--connect") for argument in words):
             return f"{word!r} is a second address, after --connect"
-        others = words[:number] + words[number + 1 :] or _required(parser)
-        line = shlex.join([*command, *others, "--connect", word])
+        other_words = words[:index] + words[index + 1 :] or _required_arguments(parser)
+        line = shlex.join([*command, *other_words, "--connect", word])
         return f"{word!r} is an address, which needs --connect: {line}"
     return None
 
 
 def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) -> str:
     """Return the error text for ``aerokit params udpin:… list``."""
-    address, action, *rest = [*words, "ACTION"] if len(words) == 1 else words
+    address, action, *arguments = [*words, "ACTION"] if len(words) == 1 else words
     actions = next(item.choices for item in parser._actions if isinstance(item, argparse._SubParsersAction))
-    known = actions.get(action) or next(iter(actions.values()))
-    place = ["--connect", address] if "--connect" in known._option_string_actions else [address]
-    line = shlex.join([*parser.prog.split(), action, *place, *rest])
+    action_parser = actions.get(action) or next(iter(actions.values()))
+    has_connect = "--connect" in action_parser._option_string_actions
+    address_words = ["--connect", address] if has_connect else [address]
+    line = shlex.join([*parser.prog.split(), action, *address_words, *arguments])
     return f"{address!r} is an address, but an action comes first: {line}"
 
 
@@ -84,7 +88,7 @@ def _takes_value(parser: argparse.ArgumentParser, option: str) -> bool:
     return option.startswith("--") and any(action.nargs != 0 for action in actions)
 
 
-def _required(parser: argparse.ArgumentParser) -> list[str]:
+def _required_arguments(parser: argparse.ArgumentParser) -> list[str]:
     """Return the names of the positional arguments that a command requires."""
     positional = (action for action in parser._actions if not action.option_strings)
     return [str(action.metavar or action.dest).upper() for action in positional if action.nargs not in ("?", "*")]

@@ -41,21 +41,22 @@ def read_plan(path: str) -> Plan:
 
 def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
     """Return True if the first navigation command is a take-off; a delay may precede it, as in AP_Mission."""
-    steers = (item.command for item in items if item.command < MavCmd.NAV_LAST and item.command != MavCmd.NAV_DELAY)
-    return next(steers, None) in _TAKE_OFFS
+    for item in items:
+        if item.command < MavCmd.NAV_LAST and item.command != MavCmd.NAV_DELAY:
+            return item.command in _TAKE_OFFS
+    return False
 
 
 def plan_warnings(plan: Plan) -> list[str]:
     """Return texts about parts of a plan that can be sent, but that a vehicle will probably refuse."""
     from aerokit.autopilots.ardupilot import COPTERS
 
-    standard = frozenset(MavCmd)
-    names = [(part, getattr(plan, part).to_items()) for part in PARTS]
+    standard_commands = frozenset(MavCmd)
     warnings = [
         f"{part} item {index}: command {item.command} is not a MAV_CMD; a vehicle that does not know it refuses it"
-        for part, items in names
-        for index, item in enumerate(items)
-        if item.command not in standard
+        for part in PARTS
+        for index, item in enumerate(getattr(plan, part).to_items())
+        if item.command not in standard_commands
     ]
     mission = plan.mission.items
     may_be_arducopter = plan.vehicle_type in COPTERS and plan.firmware_type != MavAutopilot.PX4
@@ -81,7 +82,7 @@ def emit_items(options: argparse.Namespace, part: str, items: Sequence[MissionIt
             "longitude_deg": None if position is None else position.longitude_deg,
             **item.to_dict(),
         }
-        emit(options, "plan_item", record, f"{index:>5}  {item.name:32} {_place(item)}".rstrip())
+        emit(options, "plan_item", record, f"{index:>5}  {item.name:32} {_place_text(item)}".rstrip())
 
 
 async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace) -> None:
@@ -95,13 +96,13 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
         count = len(content.to_items())
         if count == 0:
             continue
-        with progress_bar(part, None) as show:  # counts items or, over MAVFTP, bytes
+        with progress_bar(part, None) as on_progress:  # only a percentage: of items or, over MAVFTP, of bytes
             try:
                 await getattr(vehicle, part).upload(
                     content,
                     idle_timeout_s=options.patience,
                     max_distance_m=options.max_distance_m,
-                    on_progress=show,
+                    on_progress=on_progress,
                 )
             except InvalidArgument as error:
                 text = str(error).replace("a greater max_distance_m", "a greater --max-distance-m")
@@ -109,12 +110,14 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
         emit_part(options, part, count, "uploaded", f"{part}: {count} items uploaded to vehicle {vehicle.system_id}")
 
 
-def _place(item: MissionItem) -> str:
+def _place_text(item: MissionItem) -> str:
     position = item.position
     if position is not None:
         return f"{position.latitude_deg:.7f} {position.longitude_deg:.7f} {item.z:g} m"
     numbers = (item.param1, item.param2, item.param3, item.param4, item.x, item.y, item.z)
-    return " ".join("–" if math.isnan(number) else f"{number:g}" for number in numbers) if any(numbers) else ""
+    if not any(numbers):
+        return ""
+    return " ".join("–" if math.isnan(number) else f"{number:g}" for number in numbers)
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -231,8 +234,8 @@ async def _check(options: argparse.Namespace) -> int:
     for warning in warnings:
         emit(options, "warning", {"text": warning}, f"warning: {warning}")
     if not options.json:
-        found = f", but {len(warnings)} warning{'' if len(warnings) == 1 else 's'}" if warnings else ""
-        print(f"{options.file} has no errors{found}")
+        warning_count = f", but {len(warnings)} warning{'' if len(warnings) == 1 else 's'}" if warnings else ""
+        print(f"{options.file} has no errors{warning_count}")
     return DONE
 
 
@@ -245,5 +248,5 @@ async def _clear(options: argparse.Namespace) -> int:
 
 
 async def _download_part(vehicle: Vehicle, part: str, options: argparse.Namespace) -> Any:
-    with progress_bar(part, None) as show:
-        return await getattr(vehicle, part).download(idle_timeout_s=options.patience, on_progress=show)
+    with progress_bar(part, None) as on_progress:
+        return await getattr(vehicle, part).download(idle_timeout_s=options.patience, on_progress=on_progress)

@@ -111,9 +111,12 @@ def plain_text(error: BaseException) -> str:
     that only announce a mission item are left out.
     """
     text = _MISSION_REASON.sub("", str(error))
-    if (found := _CALL.match(text)) is None:
+    call = _CALL.match(text)
+    if call is None:
         return text
-    return " ".join(filter(None, (_PLAIN_NAMES[found[1]], found[2]))) + text[found.end() :]
+    name, arguments = call.groups()
+    plain_name = f"{_PLAIN_NAMES[name]} {arguments}" if arguments else _PLAIN_NAMES[name]
+    return plain_name + text[call.end() :]
 
 
 @contextmanager
@@ -146,7 +149,7 @@ def _rewrite_for_commands(record: logging.LogRecord) -> bool:
         record.msg = "disconnected from vehicle %d: %s"
     if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):
         record.msg = "this computer was busy for %.1f s: no messages or heartbeats were processed"
-        record.args = record.args[:1]
+        record.args = record.args[:1]  # the new text has one placeholder
     return True
 
 
@@ -188,7 +191,7 @@ _CODES: tuple[tuple[type[BaseException], int], ...] = (
 
 
 def exit_code(error: BaseException) -> int:
-    return next((code for kind, code in _CODES if isinstance(error, kind)), FAILED)
+    return next((code for error_class, code in _CODES if isinstance(error, error_class)), FAILED)
 
 
 def exit_codes_help() -> str:
@@ -227,15 +230,17 @@ def near_names(name: str, known: Iterable[str], count: int = 1) -> list[str]:
     """Return known names that begin with ``name`` or are similar to it, the most similar first."""
     from difflib import SequenceMatcher
 
-    bare, ratios = name.strip("-").upper(), dict[str, float]()
-    for other in known:
-        plain_other = other.strip("-").upper()
-        is_beginning = len(bare) >= 3 and plain_other.startswith(bare)
-        matcher = SequenceMatcher(None, bare, plain_other)
-        if is_beginning or (matcher.real_quick_ratio() >= _MIN_SIMILARITY and matcher.quick_ratio() >= _MIN_SIMILARITY):
-            ratios[other] = 1.0 if is_beginning else matcher.ratio()
-    near = (other for other in ratios if ratios[other] >= _MIN_SIMILARITY)
-    return sorted(near, key=lambda other: (-ratios[other], len(other), other))[:count]
+    plain_name, ratios = name.strip("-").upper(), dict[str, float]()
+    for known_name in known:
+        plain_known_name = known_name.strip("-").upper()
+        is_beginning = len(plain_name) >= 3 and plain_known_name.startswith(plain_name)
+        matcher = SequenceMatcher(None, plain_name, plain_known_name)
+        # The quick ratios are upper bounds that save most of the calculation.
+        may_be_near = matcher.real_quick_ratio() >= _MIN_SIMILARITY and matcher.quick_ratio() >= _MIN_SIMILARITY
+        if is_beginning or may_be_near:
+            ratios[known_name] = 1.0 if is_beginning else matcher.ratio()
+    near = (known_name for known_name, ratio in ratios.items() if ratio >= _MIN_SIMILARITY)
+    return sorted(near, key=lambda near_name: (-ratios[near_name], len(near_name), near_name))[:count]
 
 
 def suggestion(name: str, known: Iterable[str], count: int = 1) -> str:

@@ -14,12 +14,12 @@ from aerokit.apps.cli.connecting import add_action
 from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, exit_code, suggestion
 from aerokit.apps.cli.params_metadata import (
     RANGES_NOT_CHECKED,
-    about,
-    about_text,
     add_metadata,
-    check_given,
-    load_given,
+    check_allowed,
+    load_metadata_option,
+    metadata_facts,
     metadata_for_check,
+    metadata_text,
     reboot_note,
 )
 from aerokit.apps.cli.terminal import progress_bar
@@ -78,16 +78,17 @@ def connected(options: argparse.Namespace, *, changes: bool = False) -> Abstract
 
 
 async def _list(options: argparse.Namespace) -> int:
-    metadata = load_given(options)
+    metadata = load_metadata_option(options)
     async with connected(options) as vehicle:
         table = await _download(vehicle, options)
     if options.changed:
         table = table.changed_from_default()
     pattern = options.pattern.upper()
-    pattern = pattern if any(mark in pattern for mark in "*?[") else f"*{pattern}*"
-    found = [value for name, value in table.items() if fnmatch.fnmatch(name, pattern)]
-    _emit_parameters(options, found, metadata)
-    if not found and options.pattern != "*":
+    if not any(wildcard in pattern for wildcard in "*?["):
+        pattern = f"*{pattern}*"
+    matching = [parameter for name, parameter in table.items() if fnmatch.fnmatch(name, pattern)]
+    _emit_parameters(options, matching, metadata)
+    if not matching and options.pattern != "*":
         hint = suggestion(options.pattern.strip("*"), table, 3)
         print(f"aerokit: none of {len(table)} parameters matches {options.pattern!r}{hint}", file=sys.stderr)
         return FAILED
@@ -95,7 +96,7 @@ async def _list(options: argparse.Namespace) -> int:
 
 
 async def _get(options: argparse.Namespace) -> int:
-    metadata = load_given(options)
+    metadata = load_metadata_option(options)
     async with connected(options) as vehicle:
         for name in options.names:
             _emit_parameters(options, [await _read(vehicle, name, options)], metadata)
@@ -117,45 +118,48 @@ async def _save(options: argparse.Namespace) -> int:
 async def _diff(options: argparse.Namespace) -> int:
     from aerokit.parameters import read_parameter_file
 
-    wanted = read_parameter_file(options.file)
+    file_values = read_parameter_file(options.file)
     async with connected(options) as vehicle:
         await _download(vehicle, options)
-        differences = await vehicle.parameters.diff(wanted, idle_timeout_s=options.patience)
+        differences = await vehicle.parameters.diff(file_values, idle_timeout_s=options.patience)
     for difference in differences:
-        sides = f"vehicle {_side(difference.before)}, file {_side(difference.after)}"
-        emit(options, "parameter_difference", difference.to_dict(), f"{difference.name:16} {sides}")
-    record = {"file": options.file, "parameters": len(wanted), "different": len(differences)}
-    emit(options, "comparison", record, f"{len(differences)} of {len(wanted)} parameters differ")
+        values = f"vehicle {_value_or_missing(difference.before)}, file {_value_or_missing(difference.after)}"
+        emit(options, "parameter_difference", difference.to_dict(), f"{difference.name:16} {values}")
+    record = {"file": options.file, "parameters": len(file_values), "different": len(differences)}
+    emit(options, "comparison", record, f"{len(differences)} of {len(file_values)} parameters differ")
     return DONE if not differences else FAILED
 
 
 async def _set(options: argparse.Namespace) -> int:
-    given = load_given(options)
+    metadata = load_metadata_option(options)
     if not options.force:
-        check_given(given, dict(options.values))
+        check_allowed(metadata, dict(options.values))  # before the vehicle is connected
     async with connected(options, changes=True) as vehicle:
-        if given is None:
-            given = await metadata_for_check(vehicle, None, options)
-            check_given(given, dict(options.values))
+        if metadata is None:
+            metadata = await metadata_for_check(vehicle, None, options)
+            check_allowed(metadata, dict(options.values))
         results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
     if not options.force:
-        results = {name: with_range_note(given, each, "--metadata FILE") for name, each in results.items()}
-    return _emit_results(options, results.values(), vehicle, given)
+        results = {name: with_range_note(metadata, result, "--metadata FILE") for name, result in results.items()}
+    return _emit_results(options, results.values(), vehicle, metadata)
 
 
 async def _load(options: argparse.Namespace) -> int:
     from aerokit.parameters import read_parameter_file
 
-    wanted, given = read_parameter_file(options.file), load_given(options)
+    file_values, file_metadata = read_parameter_file(options.file), load_metadata_option(options)
     async with connected(options, changes=True) as vehicle:
         await _download(vehicle, options)
-        metadata = await metadata_for_check(vehicle, given, options)
+        metadata = await metadata_for_check(vehicle, file_metadata, options)
         if metadata is not None:
             # Only changes are checked, because a backup may have unusual values that the vehicle has already.
-            differences = await vehicle.parameters.diff(wanted, idle_timeout_s=options.patience)
-            check_given(metadata, {one.name: one.after for one in differences if one.after is not None})
-        with progress_bar("parameters", "parameter") as show:
-            results = await vehicle.parameters.upload(wanted, idle_timeout_s=options.patience, on_progress=show)
+            differences = await vehicle.parameters.diff(file_values, idle_timeout_s=options.patience)
+            new_values = {change.name: change.after for change in differences if change.after is not None}
+            check_allowed(metadata, new_values)
+        with progress_bar("parameters", "parameter") as on_progress:
+            results = await vehicle.parameters.upload(
+                file_values, idle_timeout_s=options.patience, on_progress=on_progress
+            )
     if options.json:
         return _emit_results(options, results.values(), vehicle, metadata)
     changed = [result for result in results.values() if result.outcome != "unchanged"]
@@ -166,8 +170,8 @@ async def _load(options: argparse.Namespace) -> int:
 
 
 async def _download(vehicle: Vehicle, options: argparse.Namespace) -> ParameterTable:
-    with progress_bar("parameters", "parameter") as show:
-        return await vehicle.parameters.download(idle_timeout_s=options.patience, on_progress=show)
+    with progress_bar("parameters", "parameter") as on_progress:
+        return await vehicle.parameters.download(idle_timeout_s=options.patience, on_progress=on_progress)
 
 
 async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Parameter:
@@ -181,22 +185,20 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
 def _hint(name: str, error: Exception, vehicle: Vehicle) -> str:
     """Suggest similar parameter names, or the command that lists them. Empty if the error contains a suggestion."""
     names = parameter_names(vehicle.autopilot.name)
-    is_lacking = "has no parameter" in str(error)  # `names` are those of all vehicle types
-    if "did you mean" in str(error) or (name.upper() in names and not is_lacking):
+    is_missing = "has no parameter" in str(error)  # `names` are those of all vehicle types, so it may be among them
+    if "did you mean" in str(error) or (name.upper() in names and not is_missing):
         return ""
-    return (
-        suggestion(name, [other for other in names if other != name.upper()], 3)
-        or "; `aerokit params list` shows all names"
-    )
+    other_names = [known_name for known_name in names if known_name != name.upper()]
+    return suggestion(name, other_names, 3) or "; `aerokit params list` shows all names"
 
 
 def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter], metadata: Metadata | None) -> None:
     for parameter in parameters:
         is_changed = parameter.default is not None and parameter.default != parameter.value
         default = f"  (default {_text(parameter.default)})" if is_changed else ""
-        facts = about(metadata, parameter)
-        described = f"  {about_text(facts)}".rstrip()
-        text = f"{parameter.name:16} {_text(parameter.value):<12}{default}{described}".rstrip()
+        facts = metadata_facts(metadata, parameter)
+        description = f"  {metadata_text(facts)}".rstrip()
+        text = f"{parameter.name:16} {_text(parameter.value):<12}{default}{description}".rstrip()
         emit(options, "parameter", {**_record(parameter), **facts}, text)
 
 
@@ -211,8 +213,8 @@ def _emit_results(
     code = DONE
     for result in results:
         if result.error is None and result.outcome != "unchanged":
-            due = reboot_note(metadata, result.name, result.value)
-            result = result.replace(note="; ".join(filter(None, (result.note, due))))
+            reboot = reboot_note(metadata, result.name, result.value)
+            result = result.replace(note="; ".join(filter(None, (result.note, reboot))))
         if result.error is None:
             text = f"{result.name:16} {_text(result.value):<12} {result.outcome} {result.note}".rstrip()
         else:
@@ -226,12 +228,12 @@ def _emit_results(
 
 
 def _record(parameter: Parameter | ParameterWrite) -> dict[str, object]:
-    # the key "type" is reserved for the type of the record
+    # The key "type" is reserved for the type of the record.
     fields = parameter.to_dict()
     return {("value_type" if name == "type" else name): value for name, value in fields.items()}
 
 
-def _side(value: float | None) -> str:
+def _value_or_missing(value: float | None) -> str:
     return "does not have it" if value is None else _text(value)
 
 

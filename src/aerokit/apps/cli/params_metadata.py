@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # ArduPilot uses a new system id at once (GCS_Common.cpp, update_send), PX4 and old ArduPilots after a reboot.
 _SYSTEM_ID_NAMES = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
 # Maximum time for reading the metadata from the vehicle. Reading takes longer over a slow radio and is then given up.
-_FETCH_TIMEOUT_S = 10.0
+_READ_TIMEOUT_S = 10.0
 RANGES_NOT_CHECKED = "ranges not checked (--metadata FILE checks them)"
 
 
@@ -37,7 +37,7 @@ def add_metadata(command: argparse.ArgumentParser, *, checks: bool = False) -> N
         command.add_argument("--force", action="store_true", help="also set values that the metadata does not allow")
 
 
-def load_given(options: argparse.Namespace) -> Metadata | None:
+def load_metadata_option(options: argparse.Namespace) -> Metadata | None:
     """Read the file given as ``--metadata``, if any."""
     if options.metadata is None:
         return None
@@ -46,19 +46,22 @@ def load_given(options: argparse.Namespace) -> Metadata | None:
     return load_metadata(options.metadata)
 
 
-async def metadata_for_check(vehicle: Vehicle, given: Metadata | None, options: argparse.Namespace) -> Metadata | None:
-    """Return the metadata for checking values: the given metadata, else that of the vehicle. None with --force."""
+async def metadata_for_check(
+    vehicle: Vehicle, from_file: Metadata | None, options: argparse.Namespace
+) -> Metadata | None:
+    """Return the metadata for checking values: that of the file, else that of the vehicle. None with --force."""
     if options.force:
         return None
-    # ArduPilot has no component metadata.
-    return given if given is not None or vehicle.autopilot.name != "PX4" else await _fetch(vehicle)
+    if from_file is not None or vehicle.autopilot.name != "PX4":  # ArduPilot has no component metadata
+        return from_file
+    return await _read_from_vehicle(vehicle)
 
 
-async def _fetch(vehicle: Vehicle) -> Metadata | None:
+async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
     from aerokit.parameters.metadata import parse_metadata
 
-    problem = f"not read within {_FETCH_TIMEOUT_S:g} s"
-    with anyio.move_on_after(_FETCH_TIMEOUT_S):
+    problem = f"not read within {_READ_TIMEOUT_S:g} s"
+    with anyio.move_on_after(_READ_TIMEOUT_S):
         try:
             content = await vehicle.component(vehicle.component_id).metadata("parameter")
             return parse_metadata(json.dumps(content).encode(), "the vehicle's metadata")
@@ -71,7 +74,7 @@ async def _fetch(vehicle: Vehicle) -> Metadata | None:
     return None
 
 
-def check_given(metadata: Metadata | None, values: Mapping[str, float]) -> None:
+def check_allowed(metadata: Metadata | None, values: Mapping[str, float]) -> None:
     """Raise InvalidArgument with all values that the metadata does not allow. Unknown names are accepted."""
     check_values(metadata, values, "--force")
 
@@ -84,22 +87,22 @@ def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
     return "takes effect after a reboot" if entry is not None and entry.reboot_required else ""
 
 
-def about(metadata: Metadata | None, parameter: Parameter) -> dict[str, object]:
+def metadata_facts(metadata: Metadata | None, parameter: Parameter) -> dict[str, object]:
     """Return unit, range and meaning of a parameter, for its record; null if unknown."""
-    # Metadata under another name may have another unit.
-    known = None if metadata is None else metadata.get(parameter.name)
-    if known is None:
+    # Only under exactly this name, because metadata under another name may have another unit.
+    entry = None if metadata is None else metadata.get(parameter.name)
+    if entry is None:
         return {"unit": None, "minimum": None, "maximum": None, "meaning": None}
-    has_names = parameter.value in known.values or known.bitmask
-    meaning = known.describe(parameter.value) if has_names else None
-    return {"unit": known.unit or None, "minimum": known.minimum, "maximum": known.maximum, "meaning": meaning}
+    has_names = parameter.value in entry.values or entry.bitmask
+    meaning = entry.describe(parameter.value) if has_names else None
+    return {"unit": entry.unit or None, "minimum": entry.minimum, "maximum": entry.maximum, "meaning": meaning}
 
 
-def about_text(facts: Mapping[str, Any]) -> str:
+def metadata_text(facts: Mapping[str, Any]) -> str:
     """Return unit, range and meaning in a few words; empty if unknown."""
     low, high = facts["minimum"], facts["maximum"]
-    bounds = "" if low is None and high is None else f"{_bound(low)} to {_bound(high)}"
-    parts = (facts["unit"], facts["meaning"], bounds and f"range {bounds}")
+    has_range = low is not None or high is not None
+    parts = (facts["unit"], facts["meaning"], f"range {_bound(low)} to {_bound(high)}" if has_range else "")
     return ", ".join(part for part in parts if part)
 
 

@@ -103,8 +103,9 @@ async def _connection(options: argparse.Namespace) -> AsyncIterator[Connection]:
             link = await stack.enter_async_context(simulated_link(fleet))
             yield await stack.enter_async_context(open_connection(link))
         else:
-            opening = open_connection(options.address, baud=options.baud, signing=signing_of(options), reconnect=True)
-            yield await stack.enter_async_context(opening)
+            signing = signing_of(options)
+            connection = open_connection(options.address, baud=options.baud, signing=signing, reconnect=True)
+            yield await stack.enter_async_context(connection)
 
 
 def _token(path: str | None) -> str | None:
@@ -176,9 +177,8 @@ def _server_class(uvicorn: Any) -> Any:
 
 
 def _emit_serving(options: argparse.Namespace, app: ServeApp, port: int) -> None:
-    name: str = _LOOPBACK if options.host == "0.0.0.0" else "::1" if options.host == "::" else options.host
-    name = f"[{name}]" if ":" in name else name
-    url = f"http://{name}:{port}/"
+    host: str = {"0.0.0.0": _LOOPBACK, "::": "::1"}.get(options.host, options.host)  # a browser cannot open the former
+    url = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
     # Browsers do not send the part after the #, so that the token never reaches a server log.
     page = url if options.read_only and _is_loopback(options.host) else f"{url}#token={app.token}"
     source = f"{options.sim} simulated" if options.sim else options.address

@@ -70,11 +70,11 @@ def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
     """
     from aerokit.sim.kinds import kind_class, simulated
 
-    taken = _options_of(kind_class(name))
-    if "boot_text" not in taken:
+    accepted = _accepted_options(kind_class(name))
+    if "boot_text" not in accepted:
         options.pop("boot_text", None)
     for option in options:
-        if option not in taken:
+        if option not in accepted:
             raise InvalidArgument(f"the simulated {name} has no option {option}")
     return simulated(name, **options)
 
@@ -104,22 +104,21 @@ def simulated_fleet(
         raise InvalidArgument(f"{count} vehicles from system id {system_id} need ids up to {last}; the maximum is 255")
     home = home or HOME
     frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
-    places = [frame.to_global(0.0, number * spacing_m, 0.0) for number in range(count)]
+    homes = [frame.to_global(0.0, number * spacing_m, 0.0) for number in range(count)]
     return [
         simulated_vehicle(
             name,
-            home=(place.latitude_e7 / 1e7, place.longitude_e7 / 1e7, home[2]),
+            home=(vehicle_home.latitude_e7 / 1e7, vehicle_home.longitude_e7 / 1e7, home[2]),
             system_id=system_id + number,
             seed=seed + number,
             components=components(),
             **options,
         )
-        for number, place in enumerate(places)
+        for number, vehicle_home in enumerate(homes)
     ]
 
 
 def _recorded(path: str, count: int) -> SimulatedVehicle:
-
     from aerokit.testing.recorded import RecordedVehicle
 
     if count != 1:
@@ -127,10 +126,10 @@ def _recorded(path: str, count: int) -> SimulatedVehicle:
     return RecordedVehicle(path)
 
 
-def _options_of(kind: type) -> set[str]:
+def _accepted_options(vehicle_class: type) -> set[str]:
     """Return the arguments of a constructor, including those it passes to base classes by ``**kwargs``."""
     names: set[str] = set()
-    for cls in kind.__mro__:
+    for cls in vehicle_class.__mro__:
         if "__init__" not in vars(cls):
             continue
         parameters = inspect.signature(vars(cls)["__init__"]).parameters.values()
@@ -181,6 +180,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     _add_conditions(command)
 
 
+# Option → maximum number, function that makes the device with a number from 0, and its description.
 _DEVICES: dict[str, tuple[int, Callable[[int], AttachableComponent], str]] = {
     "camera": (6, lambda number: SimulatedCamera(100 + number), "camera (component 100 to 105)"),
     "gimbal": (
@@ -197,21 +197,22 @@ _DEVICES: dict[str, tuple[int, Callable[[int], AttachableComponent], str]] = {
 
 
 def _add_devices(command: argparse.ArgumentParser) -> None:
-    for name, (most, _, text) in _DEVICES.items():
+    for name, (max_count, _, text) in _DEVICES.items():
         command.add_argument(
             f"--{name}",
             action="count",
             default=0,
-            help=f"fit each vehicle with a {text}; repeatable, up to {most}",
+            help=f"fit each vehicle with a {text}; repeatable, up to {max_count}",
         )
 
 
 def _devices(options: argparse.Namespace) -> list[AttachableComponent]:
     components = []
-    for name, (most, make, _) in _DEVICES.items():
-        if (count := getattr(options, name)) > most:
-            raise InvalidArgument(f"--{name} is given {count} times; a vehicle has {most} at most")
-        components += [make(number) for number in range(count)]
+    for name, (max_count, make_device, _) in _DEVICES.items():
+        count = getattr(options, name)
+        if count > max_count:
+            raise InvalidArgument(f"--{name} is given {count} times; a vehicle has {max_count} at most")
+        components += [make_device(number) for number in range(count)]
     return components
 
 
@@ -274,8 +275,9 @@ async def run_sim(options: argparse.Namespace) -> int:
         async with server:
             injecting = asyncio.create_task(_inject(vehicles, options))
             _emit(server, options)
+            real_duration_s = None if options.duration is None else options.duration / options.speedup
             with suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(stop.wait(), options.duration and options.duration / options.speedup)
+                await asyncio.wait_for(stop.wait(), real_duration_s)
             injecting.cancel()
     emit(options, "stopped", {}, "stopped")
     if options.picture is not None:
@@ -290,9 +292,9 @@ async def run_sim(options: argparse.Namespace) -> int:
 async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> None:
     """Begin the faults of ``--fault`` at their times."""
     loop = asyncio.get_running_loop()
-    started = loop.time()
+    started_at = loop.time()
     for name, value, at_s in sorted(options.faults, key=lambda fault: fault[2]):
-        await asyncio.sleep(started + at_s / options.speedup - loop.time())
+        await asyncio.sleep(started_at + at_s / options.speedup - loop.time())
         for vehicle in vehicles:
             if isinstance(value, list):
                 getattr(vehicle.faults, name).extend(value)
@@ -338,8 +340,8 @@ def _server(vehicles: Sequence[SimulatedVehicle], addresses: Sequence[str], spee
     links, vehicles_on = [], []
     for address in addresses:
         groups = [[vehicle] for vehicle in vehicles] if is_address_template(address) else [list(vehicles)]
-        for place, group in enumerate(groups):
-            links.append(create_link(expand_address(address, place, group[0].system_id)))
+        for index, group in enumerate(groups):
+            links.append(create_link(expand_address(address, index, group[0].system_id)))
             vehicles_on.append(group)
     return SimulatorServer(vehicles, links, speedup=speedup, vehicles_on=vehicles_on)
 
@@ -355,9 +357,9 @@ def _emit(server: SimulatorServer, options: argparse.Namespace) -> None:
         emit(options, "simulated", record, text)
     if not options.json:
         vehicles = server.vehicles_on[0]
-        place = _client_address(server.addresses[0], options.addresses[0])
-        choice = f" --system-id {vehicles[0].system_id}" if len(vehicles) > 1 else ""
-        print(f"try: aerokit demo --connect {place}{choice}", flush=True)
+        address = _client_address(server.addresses[0], options.addresses[0])
+        system_option = f" --system-id {vehicles[0].system_id}" if len(vehicles) > 1 else ""
+        print(f"try: aerokit demo --connect {address}{system_option}", flush=True)
 
 
 def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
@@ -365,22 +367,28 @@ def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
     return f"system {first}" if first == last else f"systems {first} to {last}"
 
 
-def _client_address(address: str, as_given: str) -> str:
-    """Return the address with which a client on this machine connects."""
-    scheme, _, place = address.partition(":")
+def _client_address(address: str, argument: str) -> str:
+    """Return the address with which a client on this machine connects.
+
+    ``address`` is that of the open link, ``argument`` the address or template in the command line.
+    """
+    scheme, _, location = address.partition(":")
     if scheme == "zenohin":
-        return shlex.quote(f"{_CLIENT_SCHEMES[scheme]}:{place}{_zenoh_options(as_given)}")
+        return shlex.quote(f"{_CLIENT_SCHEMES[scheme]}:{location}{_zenoh_options(argument)}")
     if scheme == "pty":
-        return place
+        return location
     if scheme not in _CLIENT_SCHEMES:
         return "the other end of the serial line"
-    return f"{_CLIENT_SCHEMES[scheme]}:{place.replace('0.0.0.0', '127.0.0.1')}"
+    return f"{_CLIENT_SCHEMES[scheme]}:{location.replace('0.0.0.0', '127.0.0.1')}"
 
 
 def _zenoh_options(address: str) -> str:
     """Return the query of a client's zenoh address, which connects to an endpoint of the simulator."""
-    where = parse_address(expand_address(address, 0, 1))
-    endpoints, config = where.option("listen") or where.option("connect"), where.option("config")
-    options = [f"connect={endpoints.replace('0.0.0.0', '127.0.0.1')}"] if endpoints else []
-    options += [f"config={config}"] if config else []
+    parsed = parse_address(expand_address(address, 0, 1))
+    endpoints, config = parsed.option("listen") or parsed.option("connect"), parsed.option("config")
+    options = []
+    if endpoints:
+        options.append(f"connect={endpoints.replace('0.0.0.0', '127.0.0.1')}")
+    if config:
+        options.append(f"config={config}")
     return f"?{'&'.join(options)}" if options else ""

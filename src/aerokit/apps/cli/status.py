@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _UNKNOWN = "unknown"
 _NO_KEY = "; it signs its frames, and without its key (--signing-key FILE) it may ignore this computer"
-_FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed", "static", "PPP")
+_FIX_NAMES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed", "static", "PPP")
 # States that are requested once if the vehicle does not stream them, and the messages that carry them.
 _REQUESTED = (
     ("sensors", SysStatus),
@@ -61,13 +61,13 @@ def _vehicle_lines(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     frame = _frame_of(heartbeat)
     armed = {None: "armed or not: unknown", True: "ARMED", False: "disarmed"}[vehicle.armed.latest]
     landed = vehicle.landed_state.latest
-    place = "" if landed is None else f", {_words(getattr(landed, 'name', str(landed)))}"
-    kind = "" if heartbeat is None else f", {_words(_name(MavType, heartbeat.type))}"
-    is_locked = frame["signed"] and vehicle.connection.signing is None
+    landed_text = "" if landed is None else f", {_in_words(getattr(landed, 'name', str(landed)))}"
+    type_text = "" if heartbeat is None else f", {_in_words(_enum_name(MavType, heartbeat.type))}"
+    lacks_key = frame["signed"] and vehicle.connection.signing is None
     return [
-        f"system {vehicle.system_id}: {vehicle.autopilot.firmware} {version or '(unknown version)'}{kind}"
-        f"{_NO_KEY if is_locked else ''}",
-        f"  mode     {vehicle.mode_name}, {armed}{place}",
+        f"system {vehicle.system_id}: {vehicle.autopilot.firmware} {version or '(unknown version)'}{type_text}"
+        f"{_NO_KEY if lacks_key else ''}",
+        f"  mode     {vehicle.mode_name}, {armed}{landed_text}",
         f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or _UNKNOWN}",
         f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or _UNKNOWN}",
         f"  link     {_link(vehicle, frame)}",
@@ -83,10 +83,11 @@ def _readiness(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     sensors = vehicle.sensors.latest
     can_arm = sensors is not None and sensors.prearm_checks_pass is True
     is_about_estimates = all(text.startswith(("the estimator has no ", "no GPS receiver has ")) for text in missing)
+    texts = [text.replace("arm() changes to", "aerokit changes to") for text in missing]
     # ArduCopter arms in STABILIZE without a position, for example.
-    note = [f"for autonomous flight; {vehicle.mode_name} allows arming:"] if can_arm and is_about_estimates else []
-    plain = [text.replace("arm() changes to", "aerokit changes to") for text in missing]
-    return _aligned("missing", [*note, *plain])
+    if can_arm and is_about_estimates:
+        texts.insert(0, f"for autonomous flight; {vehicle.mode_name} allows arming:")
+    return _aligned("missing", texts)
 
 
 def _component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> tuple[dict[str, Any], str]:
@@ -95,7 +96,7 @@ def _component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> 
         "system_id": system_id,
         "component_id": component_id,
         "kind": kind,
-        "autopilot": _name(MavAutopilot, heartbeat.autopilot),
+        "autopilot": _enum_name(MavAutopilot, heartbeat.autopilot),
         "vehicle_type": heartbeat.type,
         **_frame_of(heartbeat),
     }
@@ -121,13 +122,15 @@ def _link_line(record: Mapping[str, Any]) -> str:
 def _link(vehicle: Vehicle, frame: Mapping[str, Any]) -> str:
     received, lost = vehicle.connection.counts(vehicle.system_id)
     report = vehicle.link_quality.latest
-    trip = None if report is None else report.round_trip_s
+    round_trip_s = None if report is None else report.round_trip_s
     parts = [
         f"MAVLink {frame['mavlink_version'] or '?'}{', signed' if frame['signed'] else ''}",
         f"last heartbeat {vehicle.heartbeat_age:.1f} s ago",
         f"{_percent(lost, received + lost)} of {received + lost} frames lost",
     ]
-    return ", ".join(parts if trip is None else [*parts, f"round trip {trip * 1000:.0f} ms"])
+    if round_trip_s is not None:
+        parts.append(f"round trip {round_trip_s * 1000:.0f} ms")
+    return ", ".join(parts)
 
 
 def _frame_of(heartbeat: Heartbeat | None) -> dict[str, Any]:
@@ -139,8 +142,8 @@ def _frame_of(heartbeat: Heartbeat | None) -> dict[str, Any]:
 
 
 def _gps(receiver: GpsReceiver) -> str:
-    known = 0 <= receiver.fix_type < len(_FIXES)
-    parts = [_FIXES[receiver.fix_type] if known else f"fix {receiver.fix_type}"]
+    has_name = 0 <= receiver.fix_type < len(_FIX_NAMES)
+    parts = [_FIX_NAMES[receiver.fix_type] if has_name else f"fix {receiver.fix_type}"]
     if receiver.satellites is not None:
         parts.append(f"{receiver.satellites} satellites")
     if receiver.hdop is not None:
@@ -154,22 +157,24 @@ def _battery(battery: Battery) -> str:
         (battery.voltage_v, ".1f", "V"),
         (battery.current_a, ".1f", "A"),
     )
-    return ", ".join(f"{value:{form}} {unit}" for value, form, unit in values if value is not None) or _UNKNOWN
+    known = [f"{value:{number_format}} {unit}" for value, number_format, unit in values if value is not None]
+    return ", ".join(known) or _UNKNOWN
 
 
 def _aligned(label: str, texts: Sequence[str]) -> list[str]:
-    return [f"  {label if place == 0 else '':8} {text}" for place, text in enumerate(texts)]
+    """Return lines with the label before the first text, and spaces before the others."""
+    return [f"  {label if index == 0 else '':8} {text}" for index, text in enumerate(texts)]
 
 
 def _percent(part: int, whole: int) -> str:
     return f"{100 * part / whole if whole else 0:.1f} %"
 
 
-def _words(name: str) -> str:
+def _in_words(name: str) -> str:
     return name.replace("_", " ").lower()
 
 
-def _name(enum: type[MavType | MavAutopilot], number: int) -> str:
+def _enum_name(enum: type[MavType | MavAutopilot], number: int) -> str:
     try:
         return enum(number).name
     except ValueError:
@@ -199,15 +204,15 @@ async def run_status(options: argparse.Namespace) -> int:
         except AerokitError:
             _emit_components(connection, options, {})
             raise
-        started = connection.now()
+        started_at = connection.now()
         await anyio.sleep(options.seconds)
-        found = dict(vehicles)
-        reasons = await asyncio.gather(*map(_missing_for_flight, found.values()))
-        _emit_link(connection, options, connection.now() - started)
-        for vehicle, missing in zip(found.values(), reasons, strict=True):
+        vehicles_found = dict(vehicles)  # more may be found while reasons are requested
+        reasons = await asyncio.gather(*map(_missing_for_flight, vehicles_found.values()))
+        _emit_link(connection, options, connection.now() - started_at)
+        for vehicle, missing in zip(vehicles_found.values(), reasons, strict=True):
             record = _vehicle_record(vehicle, missing)
             emit(options, "status", record, "\n".join(_vehicle_lines(vehicle, missing)))
-        _emit_components(connection, options, found)
+        _emit_components(connection, options, vehicles_found)
         await anyio.sleep(_RELEASE_TIME_S)
     return DONE
 

@@ -47,7 +47,7 @@ INTERRUPT_ACTIONS: dict[str, str] = {
 }
 """Maps the choices of ``--on-interrupt`` to the texts that are printed."""
 _AUTO_DISARM_TIMEOUT_S = 30.0
-_WARNING = 4
+_WARNING_SEVERITY = 4
 # A status line is printed after this time without output.
 _STATUS_INTERVAL_S = 5.0
 
@@ -75,8 +75,10 @@ class SupervisedFlight(ABC):
             code = await self._interrupts.run(self._fly)
         except Exception as error:
             # After any error, a vehicle that this program has armed must not stay armed on the ground.
-            cause, _, reasons = plain_text(error).partition("\n")
-            self._print(f"failed: {cause}" + (f"\n{reasons}" if reasons and self._prints_reasons else ""))
+            text = plain_text(error)
+            if not self._prints_reasons:
+                text = text.partition("\n")[0]
+            self._print(f"failed: {text}")
             if self.armed_by_us:
                 await self._make_safe(partial(self._after_failure, error))
             raise
@@ -141,27 +143,28 @@ class SupervisedFlight(ABC):
 
     async def _after_interrupt(self) -> int:
         """Disarm on the ground. In the air, perform ``--on-interrupt`` if this program has control."""
-        vehicle, wanted = self._vehicle, self._on_interrupt
+        vehicle, action = self._vehicle, self._on_interrupt
         if vehicle.is_confirmed_disarmed:
             await self._watch_late_arming()
             return DONE
         if not self._check_control():
             return DONE
-        if self._is_armed_on_ground and wanted != "nothing":
+        if self._is_armed_on_ground and action != "nothing":
             try:
                 await self._disarm()
             except CommandRejected as error:  # the vehicle has taken off since it last reported its landed state
                 self._print(f"disarming failed: {plain_text(error)}")
             if vehicle.is_confirmed_disarmed or not self._check_control():
                 return DONE
-        self._print(INTERRUPT_ACTIONS[wanted] + ("" if wanted == "nothing" else "; press Ctrl-C again to exit at once"))
-        if wanted == "return":
+        text = INTERRUPT_ACTIONS[action]
+        self._print(text if action == "nothing" else f"{text}; press Ctrl-C again to exit at once")
+        if action == "return":
             await vehicle.return_to_launch(timeout=None)
-        elif wanted == "land":
+        elif action == "land":
             await vehicle.land(timeout=None)
-        elif wanted == "hold":
+        elif action == "hold":
             await vehicle.hold()
-        if wanted in ("return", "land"):
+        if action in ("return", "land"):
             await self._wait_disarmed_on_ground()
         self._print(vehicle.describe_now())
         return DONE
@@ -216,19 +219,19 @@ class FlightReport:
         self._armed_at: float | None = None
         self._arming_texts: dict[str, float] = {}  # the vehicle's reasons against arming, with their times
         self._armed_s = 0.0
-        self._started = self._last_line = vehicle.connection.now()
+        self._started_at = self._last_line_at = vehicle.connection.now()
         self._highest_m = self._fastest_m_s = self._flown_m = 0.0
-        self._before: Position | None = None
+        self._previous_position: Position | None = None
         self.prints_status: bool = True
         """True if status lines are printed when there is no other output. Set it to False during a question."""
 
     def print_line(self, text: str) -> None:
         """Print a line with time and altitude. A closed pipe or a full disk does not end the flight."""
-        here = self._vehicle.position.latest
-        altitude = None if here is None else here.altitude_relative_m
-        height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"
-        self._last_line = self._vehicle.connection.now()
-        seconds = self._speedup * (self._last_line - self._started)
+        position = self._vehicle.position.latest
+        altitude = None if position is None else position.altitude_relative_m
+        height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"  # + 0.0 turns -0.0 into 0.0
+        self._last_line_at = self._vehicle.connection.now()
+        seconds = self._speedup * (self._last_line_at - self._started_at)
         record = {"seconds": seconds, "altitude_relative_m": altitude, "text": text.strip()}
         self._emit("flight", record, f"{seconds:6.1f} s {height} m  {text}")
 
@@ -254,8 +257,8 @@ class FlightReport:
         """Print the statistics of the flight, the link and the batteries."""
         vehicle = self._vehicle
         received, lost = vehicle.connection.counts(vehicle.system_id)
-        seconds = self._speedup * (vehicle.connection.now() - self._started)
-        self._on_armed(None, False)
+        seconds = self._speedup * (vehicle.connection.now() - self._started_at)
+        self._on_armed(None, False)  # adds the time since the last arming, if the vehicle is still armed
         version = vehicle.version.latest
         batteries = vehicle.batteries.latest or ()
         record = {
@@ -276,7 +279,7 @@ class FlightReport:
         }
         lines = [
             f"\n{vehicle.autopilot.firmware} {version or '(unknown version)'},"
-            f" armed for {_duration(self._armed_s)}{self._rehearsal()}:"
+            f" armed for {_duration(self._armed_s)}{self._simulation_note()}:"
             f" flown {self._flown_m:.0f} m, max height {self._highest_m:.1f} m,"
             f" max ground speed {self._fastest_m_s:.1f} m/s",
             *(
@@ -284,18 +287,19 @@ class FlightReport:
                 f" {_number(battery.remaining_percent, '%')} left"
                 for battery in batteries
             ),
-            f"{received} frames received, {lost} lost" + (f"; recorded in {recorded_in}" if recorded_in else ""),
-            f"next: aerokit report {shlex.quote(recorded_in)}"
-            if recorded_in
-            else "next time: --record FILE.tlog records the flight for `aerokit report FILE.tlog`",
         ]
+        frames = f"{received} frames received, {lost} lost"
+        if recorded_in:
+            lines += [f"{frames}; recorded in {recorded_in}", f"next: aerokit report {shlex.quote(recorded_in)}"]
+        else:
+            lines += [frames, "next time: --record FILE.tlog records the flight for `aerokit report FILE.tlog`"]
         self._emit("flight_summary", record, "\n".join(lines))
 
-    def _rehearsal(self) -> str:
-        real = self._armed_s / self._speedup
-        return "" if self._speedup == 1.0 else f" (simulated in {_duration(real)}, {self._speedup:g}x)"
+    def _simulation_note(self) -> str:
+        real_s = self._armed_s / self._speedup
+        return "" if self._speedup == 1.0 else f" (simulated in {_duration(real_s)}, {self._speedup:g}x)"
 
-    def _on_armed(self, before: bool | None, is_armed: bool) -> None:
+    def _on_armed(self, _: bool | None, is_armed: bool) -> None:
         now = self._vehicle.connection.now()
         if self._armed_at is not None:
             self._armed_s += self._speedup * (now - self._armed_at)
@@ -312,26 +316,27 @@ class FlightReport:
                 elif isinstance(event, events.StatusTextReceived) and not MISSION_TEXT.match(event.text):
                     if self._vehicle.autopilot.arming_reason(event.text) is not None:
                         self._arming_texts[event.text] = self._vehicle.connection.now()
-                    self.print_line(f"  {'! ' if event.severity <= _WARNING else ''}{event.text}")
+                    mark = "! " if event.severity <= _WARNING_SEVERITY else ""
+                    self.print_line(f"  {mark}{event.text}")
 
     async def _print_status(self) -> None:
         vehicle = self._vehicle
         while vehicle.connection.is_open:
             await anyio.sleep(_STATUS_INTERVAL_S / 5)
-            if not self.prints_status or vehicle.connection.now() - self._last_line < _STATUS_INTERVAL_S:
+            if not self.prints_status or vehicle.connection.now() - self._last_line_at < _STATUS_INTERVAL_S:
                 continue
             missing = [] if vehicle.is_armed else vehicle.missing_for_flight()
             if missing:
-                since = vehicle.connection.now() - PREARM_REPORT_INTERVAL_S
-                texts = [text for text, at in self._arming_texts.items() if at >= since]
+                oldest = vehicle.connection.now() - PREARM_REPORT_INTERVAL_S
+                texts = [text for text, received_at in self._arming_texts.items() if received_at >= oldest]
                 self.print_line(f"  still missing: {'; '.join([*missing, *texts])}")
             else:
                 self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
 
-    def _on_position(self, before: Position | None, position: Position) -> None:
-        if self._before is not None:
-            self._flown_m += position.distance_to(self._before)
-        self._before = position
+    def _on_position(self, _: Position | None, position: Position) -> None:
+        if self._previous_position is not None:
+            self._flown_m += position.distance_to(self._previous_position)
+        self._previous_position = position
         self._highest_m = max(self._highest_m, position.altitude_relative_m or 0.0)
         self._fastest_m_s = max(self._fastest_m_s, self._vehicle.ground_speed_m_s.latest or 0.0)
 
@@ -343,8 +348,8 @@ class FlightReport:
 
 
 def _duration(seconds: float) -> str:
-    whole = round(seconds)
-    return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60:02} s"
+    minutes, remaining_s = divmod(round(seconds), 60)
+    return f"{minutes} min {remaining_s:02} s" if minutes else f"{remaining_s} s"
 
 
 def _number(value: float | None, unit: str) -> str:

@@ -65,13 +65,13 @@ async def _read_line() -> str:
     loop = asyncio.get_running_loop()
     line: asyncio.Future[str] = loop.create_future()
 
-    def answer(text: str) -> None:
+    def set_line(text: str) -> None:
         if not line.done():
             line.set_result(text)
 
     def read() -> None:
         text = sys.stdin.readline()
-        loop.call_soon_threadsafe(answer, text)
+        loop.call_soon_threadsafe(set_line, text)
 
     try:
         loop.add_reader(sys.stdin, read)
@@ -101,7 +101,7 @@ def on_interrupt(
     """
     loop = asyncio.get_running_loop()
     signals = _signals()
-    before = [signal.getsignal(number) for number in signals]
+    previous_handlers = [signal.getsignal(number) for number in signals]
 
     def handle(number: int, _: object) -> None:
         at_once(number)
@@ -116,7 +116,7 @@ def on_interrupt(
     try:
         yield
     finally:
-        for number, handler in zip(signals, before, strict=True):
+        for number, handler in zip(signals, previous_handlers, strict=True):
             signal.signal(number, handler)
 
 
@@ -162,11 +162,11 @@ async def waiting(
 
 async def _count_down(text: str, seconds: float) -> None:
     loop = asyncio.get_running_loop()
-    until = loop.time() + seconds
+    deadline = loop.time() + seconds
     await asyncio.sleep(COUNTDOWN_DELAY_S)
     try:
-        while (left := until - loop.time()) > 0:
-            print(f"{CLEAR_LINE}{text} … {left:.0f} s", end="", file=sys.stderr, flush=True)
+        while (remaining_s := deadline - loop.time()) > 0:
+            print(f"{CLEAR_LINE}{text} … {remaining_s:.0f} s", end="", file=sys.stderr, flush=True)
             await asyncio.sleep(1.0)
     finally:
         print(CLEAR_LINE, end="", file=sys.stderr, flush=True)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 __all__ = ["ConfirmScreen", "Monitor", "run_monitor"]
 
 REFRESH_INTERVAL_S = 0.5
-WIDE = 120, 30
+WIDE_SIZE = 120, 30
 """Minimum columns and rows of a terminal that shows values of secondary importance."""
 ANSI_THEMES = ("ansi-dark", "textual-ansi", "textual-dark")
 """Themes that use the colours of the terminal; their name depends on the version of Textual."""
@@ -127,7 +127,7 @@ class Monitor(App[None]):
         self.theme = next(name for name in ANSI_THEMES if name in self.available_themes)
         self._model, self._commands, self._name = model, commands, name
         self._began_at = model.connection.now()
-        self._listed: list[int] = []
+        self._listed_ids: list[int] = []
         self._shown: dict[str, object] = {}
         self._is_wide = False
 
@@ -155,7 +155,7 @@ class Monitor(App[None]):
 
     def on_resize(self, event: Resize) -> None:
         """Adapt the layout to the width: on wide terminals, rates are below the state, and texts below the map."""
-        is_wide = event.size.width >= WIDE[0] and event.size.height >= WIDE[1]
+        is_wide = event.size.width >= WIDE_SIZE[0] and event.size.height >= WIDE_SIZE[1]
         if is_wide == self._is_wide:
             return
         self._is_wide = is_wide
@@ -170,35 +170,35 @@ class Monitor(App[None]):
     @property
     def selected(self) -> Vehicle | None:
         """The highlighted vehicle; None if there is none."""
-        place = self.screen_stack[0].query_one("#vehicles", OptionList).highlighted
-        return None if place is None else self._model.vehicles[self._listed[place]]
+        index = self.screen_stack[0].query_one("#vehicles", OptionList).highlighted
+        return None if index is None else self._model.vehicles[self._listed_ids[index]]
 
     def update_view(self) -> None:
         """Update the widgets whose content has changed in the model."""
         self._model.update()
         base = self.screen_stack[0]
-        self._list(base.query_one("#vehicles", OptionList))
+        self._update_list(base.query_one("#vehicles", OptionList))
         self._show("title", self._title())
         rows = self._state_rows()
-        if self._is_new("state", rows):
+        if self._has_changed("state", rows):
             base.query_one("#state", Panel).show(_table(rows) if isinstance(rows, list) else rows)
         self._show_map(base.query_one("#map", Panel))
         self._show("rates", self._rates())
         texts = base.query_one("#texts", RichLog)
         while self._model.lines:
             texts.write(self._model.lines.popleft())
-        if self._is_new("slow", self._model.slow_streams):
+        if self._has_changed("slow", self._model.slow_streams):
             texts.border_subtitle = self._model.slow_streams
 
-    def _is_new(self, name: str, content: object) -> bool:
-        """Return True if the content differs from that on the screen, because drawing is expensive."""
+    def _has_changed(self, name: str, content: object) -> bool:
+        """Return True if the content differs from that of the last call. Drawing only then saves processor time."""
         if self._shown.get(name) == content:
             return False
         self._shown[name] = content
         return True
 
     def _show(self, name: str, content: Text) -> None:
-        if self._is_new(name, content):
+        if self._has_changed(name, content):
             self.screen_stack[0].query_one(f"#{name}", Panel).show(content)
 
     def on_option_list_option_highlighted(self) -> None:
@@ -219,28 +219,28 @@ class Monitor(App[None]):
         self.push_screen(ConfirmScreen(f"{KEY_COMMANDS[method]}: vehicle {vehicle.system_id}?"), on_answer)
 
     async def _run_command(self, vehicle: Vehicle, method: str) -> None:
-        what, note = KEY_COMMANDS[method].lower(), partial(self._model.add_line, vehicle.system_id)
-        note(f"{what}: command sent", "bold")
+        command, add_line = KEY_COMMANDS[method].lower(), partial(self._model.add_line, vehicle.system_id)
+        add_line(f"{command}: command sent", "bold")
         try:
             await getattr(vehicle, method)()
         except AerokitError as error:
-            note(f"{what} failed: {error}", "bold red")
+            add_line(f"{command} failed: {error}", "bold red")
         else:
-            note(f"{what}: done", "bold green")
+            add_line(f"{command}: done", "bold green")
 
-    def _list(self, options: OptionList) -> None:
+    def _update_list(self, options: OptionList) -> None:
         vehicles = self._model.vehicles
         for system_id in vehicles:
-            if system_id not in self._listed:
-                self._listed.append(system_id)
+            if system_id not in self._listed_ids:
+                self._listed_ids.append(system_id)
                 options.add_option(Option("", id=str(system_id)))
-        if self._listed and options.highlighted is None:
+        if self._listed_ids and options.highlighted is None:
             options.highlighted = 0
-        for place, system_id in enumerate(self._listed):
-            is_selected = place == options.highlighted
+        for index, system_id in enumerate(self._listed_ids):
+            is_selected = index == options.highlighted
             row = VehicleText(vehicles[system_id]).row(is_selected=is_selected, more=self._is_wide)
-            if self._is_new(f"row {place}", row):
-                options.replace_option_prompt_at_index(place, row)
+            if self._has_changed(f"row {index}", row):
+                options.replace_option_prompt_at_index(index, row)
 
     def _title(self) -> Text:
         connection, count = self._model.connection, len(self._model.vehicles)
@@ -253,9 +253,9 @@ class Monitor(App[None]):
         vehicle = self.selected
         if vehicle is not None:
             return VehicleText(vehicle).rows(more=self._is_wide, size=self._state_size())
-        waited = self._model.connection.now() - self._began_at
+        waited_s = self._model.connection.now() - self._began_at
         return Text(
-            f"waiting for a vehicle's heartbeat on {self._name} ({waited:.0f} s)\n\n"
+            f"waiting for a vehicle's heartbeat on {self._name} ({waited_s:.0f} s)\n\n"
             f"{explain_no_vehicle(self._model.connection, None)}"
         )
 
@@ -265,13 +265,13 @@ class Monitor(App[None]):
 
     def _show_map(self, widget: Panel) -> None:
         model, size = self._model, widget.content_size
-        homes = [
-            model.metres(home.latitude_deg, home.longitude_deg)
-            for vehicle in model.vehicles.values()
-            if (home := vehicle.home.latest) is not None and model.tracks.get(vehicle.system_id)
-        ]
+        homes = []
+        for vehicle in model.vehicles.values():
+            home = vehicle.home.latest
+            if home is not None and model.tracks.get(vehicle.system_id):
+                homes.append(model.metres(home.latitude_deg, home.longitude_deg))
         marks = [*((home, "H", "bold") for home in homes), *map(self._mark_of, model.tracks)]
-        if not self._is_new("map", (size, marks, [len(track) for track in model.tracks.values()])):
+        if not self._has_changed("map", (size, marks, [len(track) for track in model.tracks.values()])):
             return
         points = [point for track in model.tracks.values() for point in track] + homes
         if not points:
@@ -288,20 +288,33 @@ class Monitor(App[None]):
         vehicle = self._model.vehicles[system_id]
         heading = vehicle.heading_deg.latest
         arrow = "?" if heading is None else ARROWS[round(heading / 45) % 8]
-        style = f"bold {self._style_of(system_id)}" + (" reverse" if vehicle is self.selected else "")
-        return self._model.tracks[system_id][-1], f"{arrow}{system_id}", style
+        style = f"bold {self._style_of(system_id)}"
+        if vehicle is self.selected:
+            style += " reverse"
+        last_point = self._model.tracks[system_id][-1]
+        return last_point, f"{arrow}{system_id}", style
 
     def _style_of(self, system_id: int) -> str:
-        return TRACK_STYLES[self._listed.index(system_id) % len(TRACK_STYLES)] if system_id in self._listed else ""
+        if system_id not in self._listed_ids:
+            return ""
+        return TRACK_STYLES[self._listed_ids.index(system_id) % len(TRACK_STYLES)]
 
     def _rates(self) -> Text:
         vehicle = self.selected
         if vehicle is None:
             return Text(UNKNOWN, "dim")
-        rates = [(number(hz, 0 if hz >= 3 else 1), name) for name, hz in self._model.rates(vehicle.system_id) if hz]
+        rates = [(_rate_text(hz), name) for name, hz in self._model.rates(vehicle.system_id) if hz]
+        if not rates:
+            return Text(UNKNOWN, "dim")
+        # Sorted by the shown numbers, so that rates that look the same stay in the order of the names.
         rates.sort(key=lambda rate: (-float(rate[0]), rate[1]))
-        lines = "\n".join(f"{rate if '.' in rate else rate + '  ':>5} {name}" for rate, name in rates)
-        return Text(lines, no_wrap=True, overflow="ellipsis") if lines else Text(UNKNOWN, "dim")
+        lines = "\n".join(f"{text:>5} {name}" for text, name in rates)
+        return Text(lines, no_wrap=True, overflow="ellipsis")
+
+
+def _rate_text(hz: float) -> str:
+    """Format a rate; spaces in place of missing decimals align the numbers."""
+    return f"{number(hz, 0)}  " if hz >= 3 else number(hz, 1)
 
 
 def _table(rows: list[tuple[str, Text]]) -> Table:

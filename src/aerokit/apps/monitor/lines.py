@@ -29,7 +29,8 @@ DANGER, WARNING = "bold white on red", "black on yellow"
 LINK_STYLES = {LinkState.CONNECTED: "", LinkState.SILENT: WARNING, LinkState.LOST: DANGER}
 ARROWS = "↑↗→↘↓↙←↖"
 """Arrows by heading, clockwise from north."""
-_DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
+# Bits of the dots of a Braille character (U+2800), by row and column.
+_BRAILLE_BITS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
 _MIN_SPAN_M = 20.0
 # Columns between labels and values, and of " (and 10 more)".
 _LABEL_PADDING, _MORE_WIDTH = 2, 14
@@ -59,9 +60,10 @@ class VehicleText:
     def cell(self, cell: StateCell[Any], show: Callable[[Any], str], style: str = "") -> Text:
         if not cell.is_known:
             return Text(UNKNOWN, "dim")
-        text, older_s = printable(show(cell.value)), cell.age - self._silent_s
-        if older_s > MAX_AGE_S:
-            return Text(f"{text} ({age(cell.age if not self._silent_s else older_s)} old)", "dim italic")
+        text = printable(show(cell.value))
+        age_s = cell.age - self._silent_s  # while the vehicle is silent: the age when the silence began
+        if age_s > MAX_AGE_S:
+            return Text(f"{text} ({age(age_s)} old)", "dim italic")
         return Text(text, "dim" if self._silent_s else style)
 
     def rows(self, *, more: bool = False, size: tuple[int, int] = (0, 0)) -> list[tuple[str, Text]]:
@@ -70,9 +72,11 @@ class VehicleText:
         ``size`` is the space, in columns and lines: where it has room, all missing reasons are listed.
         """
         rows = self._main_rows() + (self._more_rows() if more else [])
-        if rows[1][0] == "missing":
-            width = size[0] - max(len(label) for label, _ in rows) - _LABEL_PADDING
-            rows[1] = ("missing", self._missing(1 + size[1] - len(rows), width))
+        if not self._silent_s:
+            columns, lines = size
+            width = columns - max(len(label) for label, _ in rows) - _LABEL_PADDING
+            unused_lines = lines - len(rows)
+            rows[1] = ("missing", self._missing(1 + unused_lines, width))
         return rows
 
     def _main_rows(self) -> list[tuple[str, Text]]:
@@ -82,13 +86,10 @@ class VehicleText:
             ("link" if self._silent_s else "missing", self.silence() or self._missing()),
             ("attitude", cell(vehicle.attitude, _attitude)),
             ("altitude", cell(vehicle.position, _altitude)),
-            ("position", cell(vehicle.position, _place)),
+            ("position", cell(vehicle.position, _coordinates)),
             ("heading", cell(vehicle.heading_deg, lambda heading: f"{heading % 360:.0f}°")),
-            (
-                "speed",
-                Text.assemble(cell(vehicle.ground_speed_m_s, _speed), "  climb ", cell(vehicle.climb_m_s, _climb)),
-            ),
-            ("battery", cell(vehicle.batteries, lambda each: " · ".join(map(_battery, each)))),
+            ("speed", self._speeds()),
+            ("battery", cell(vehicle.batteries, lambda batteries: " · ".join(map(_battery, batteries)))),
             ("GPS", cell(vehicle.gps, lambda receivers: " · ".join(map(_gps, receivers)))),
         ]
         if not self._silent_s:
@@ -102,7 +103,7 @@ class VehicleText:
             ("mission", cell(vehicle.mission_current, _mission)),
             ("airspeed", cell(vehicle.air_speed_m_s, _speed)),
             ("throttle", cell(vehicle.throttle_percent, lambda percent: number(percent, 0, " %"))),
-            ("wind", cell(vehicle.wind, lambda w: f"{number(w.speed_m_s)} m/s from {w.direction_deg:.0f}°")),
+            ("wind", cell(vehicle.wind, lambda wind: f"{number(wind.speed_m_s)} m/s from {wind.direction_deg:.0f}°")),
             ("version", cell_of_constant(vehicle.version)),
         ]
 
@@ -115,7 +116,7 @@ class VehicleText:
             (10, Text(vehicle.autopilot.name)),
             (12, cell(vehicle.mode, _name)),
             (9, self._armed()),
-            (9, cell(vehicle.position, lambda place: number(place.altitude_relative_m, 1, " m"))),
+            (9, cell(vehicle.position, lambda position: number(position.altitude_relative_m, 1, " m"))),
             (6, cell(vehicle.batteries, lambda batteries: number(batteries[0].remaining_percent, 0, " %"))),
         ]
         if more:
@@ -133,6 +134,7 @@ class VehicleText:
         return text.append_text(self.silence(is_short=True))
 
     def silence(self, *, is_short: bool = False) -> Text:
+        """Return the state of the link and the time of silence; empty while the vehicle is not silent."""
         if self._link_state is None or not self._silent_s:
             return Text()
         note = "" if is_short else "; values are from before"
@@ -151,32 +153,32 @@ class VehicleText:
         return Text.assemble(self.cell(ground, _speed), "  climb ", self.cell(climb, _climb))
 
     def _home(self) -> Text:
-        home, place = self._vehicle.home.latest, self._vehicle.position.latest
-        if home is None or place is None:
+        home, position = self._vehicle.home.latest, self._vehicle.position.latest
+        if home is None or position is None:
             return Text(UNKNOWN, "dim")
-        away = place.distance_to(home.position)
-        bearing = f", bearing {place.bearing_to(home.position):.0f}°" if away >= 1.0 else ""
-        return Text(f"{number(away, 0)} m away{bearing}")
+        distance_m = position.distance_to(home.position)
+        bearing = f", bearing {position.bearing_to(home.position):.0f}°" if distance_m >= 1.0 else ""
+        return Text(f"{number(distance_m, 0)} m away{bearing}")
 
     def _link(self) -> Text:
         quality, state = self._vehicle.link_quality, self._link_state
         text = Text() if state is None else Text(f"{state.value}  ", LINK_STYLES[state])
         text.append("loss ").append_text(self.cell(quality, lambda report: number(report.loss_percent, 1, " %")))
         text.append("  round trip ")
-        return text.append_text(
-            self.cell(quality, lambda report: number(report.round_trip_s and report.round_trip_s * 1000, 0, " ms"))
-        )
+        return text.append_text(self.cell(quality, lambda report: _milliseconds(report.round_trip_s)))
 
-    def _missing(self, lines: int = 1, width: int = 0) -> Text:
+    def _missing(self, max_lines: int = 1, width: int = 0) -> Text:
+        """Return the reasons that prevent a flight: the first, and as many more as have room."""
         missing = self._vehicle.missing_for_flight()
         if not missing:
             return Text("nothing")
-        count, used = 1, 0
-        for number_, reason in enumerate(missing, 1):
-            used += math.ceil((len(reason) + _MORE_WIDTH) / max(1, width))
-            count = number_ if used <= lines else count
-        more = f" (and {len(missing) - count} more)" if len(missing) > count else ""
-        return Text("\n".join(map(printable, missing[:count])) + more, WARNING)
+        shown, used_lines = 1, 0
+        for count, reason in enumerate(missing, 1):
+            used_lines += math.ceil((len(reason) + _MORE_WIDTH) / max(1, width))
+            if used_lines <= max_lines:
+                shown = count
+        more = f" (and {len(missing) - shown} more)" if len(missing) > shown else ""
+        return Text("\n".join(map(printable, missing[:shown])) + more, WARNING)
 
 
 def cell_of_constant(cell: StateCell[Any]) -> Text:
@@ -192,9 +194,13 @@ def _attitude(attitude: Any) -> str:
     return f"roll {number(attitude.roll_deg, 0, '°', '+')} pitch {number(attitude.pitch_deg, 0, '°', '+')}"
 
 
-def _altitude(place: Any) -> str:
-    above_home, above_sea = place.altitude_relative_m, place.altitude_amsl_m
+def _altitude(position: Any) -> str:
+    above_home, above_sea = position.altitude_relative_m, position.altitude_amsl_m
     return f"{number(above_home, 1, ' m')} above home, {number(above_sea, 0, ' m')} AMSL"
+
+
+def _milliseconds(seconds: float | None) -> str:
+    return number(None if seconds is None else seconds * 1000, 0, " ms")
 
 
 def _mission(mission: MissionProgress) -> str:
@@ -211,8 +217,8 @@ def _climb(climb: float) -> str:
     return number(climb, 1, " m/s", "+")
 
 
-def _place(place: Any) -> str:
-    return f"{place.latitude_deg:.6f} {place.longitude_deg:.6f}"
+def _coordinates(position: Any) -> str:
+    return f"{position.latitude_deg:.6f} {position.longitude_deg:.6f}"
 
 
 def _battery(battery: Any) -> str:
@@ -239,9 +245,12 @@ class Canvas:
         self._columns, self._rows = max(columns, 2), max(rows - 1, 2)
         norths, easts = zip(*(list(points) or [(0.0, 0.0)]), strict=True)
         self._middle = (max(norths) + min(norths)) / 2, (max(easts) + min(easts)) / 2
-        across, up = 2 * (self._columns - 1), 4 * (self._rows - 1)
+        # A character has two columns and four rows of dots.
+        width_dots, height_dots = 2 * (self._columns - 1), 4 * (self._rows - 1)
         self._metres_per_dot: float = max(
-            (max(easts) - min(easts)) / across, (max(norths) - min(norths)) / up, _MIN_SPAN_M / across
+            (max(easts) - min(easts)) / width_dots,
+            (max(norths) - min(norths)) / height_dots,
+            _MIN_SPAN_M / width_dots,
         )
         self._dots: dict[tuple[int, int], int] = {}
         self._styles: dict[tuple[int, int], str] = {}
@@ -249,35 +258,36 @@ class Canvas:
 
     def line(self, points: Sequence[tuple[float, float]], style: str) -> None:
         """Draw a line through the points."""
-        places = [self._place(point) for point in points]
-        for (x, y), (to_x, to_y) in zip(places, places[1:] or places, strict=False):
-            steps = max(abs(to_x - x), abs(to_y - y), 1)
+        dots = [self._dot_at(point) for point in points]
+        for (x, y), (end_x, end_y) in zip(dots, dots[1:] or dots, strict=False):  # a single point is a line, too
+            steps = max(abs(end_x - x), abs(end_y - y), 1)
             for step in range(steps + 1):
-                across, down = x + round((to_x - x) * step / steps), y + round((to_y - y) * step / steps)
-                cell = down // 4, across // 2
-                self._dots[cell] = self._dots.get(cell, 0) | _DOTS[down % 4][across % 2]
+                dot_x, dot_y = x + round((end_x - x) * step / steps), y + round((end_y - y) * step / steps)
+                cell = dot_y // 4, dot_x // 2
+                self._dots[cell] = self._dots.get(cell, 0) | _BRAILLE_BITS[dot_y % 4][dot_x % 2]
                 self._styles[cell] = style
 
     def mark(self, point: tuple[float, float], text: str, style: str) -> None:
         """Write characters at a point, over dots and earlier marks."""
-        across, down = self._place(point)
-        for number, character in enumerate(text):
-            self._marks[down // 4, across // 2 + number] = character, style
+        dot_x, dot_y = self._dot_at(point)
+        for offset, character in enumerate(text):
+            self._marks[dot_y // 4, dot_x // 2 + offset] = character, style
 
     def _scale(self) -> str:
         """Return a bar of 1, 2 or 5 times a power of ten metres, at most a third of the map wide."""
         column_m = 2 * self._metres_per_dot
-        most_m = max(self._columns / 3, 3) * column_m
-        power = 10.0 ** math.floor(math.log10(most_m))
-        length_m = max(factor * power for factor in (1, 2, 5) if factor * power <= most_m)
+        max_m = max(self._columns / 3, 3) * column_m
+        power = 10.0 ** math.floor(math.log10(max_m))
+        length_m = max(factor * power for factor in (1, 2, 5) if factor * power <= max_m)
         bar = "─" * max(round(length_m / column_m) - 2, 0)
-        return f"├{bar}┤ {f'{length_m / 1000:g} km' if length_m >= 1000 else f'{length_m:g} m'}"
+        label = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
+        return f"├{bar}┤ {label}"
 
     def text(self) -> Text:
         text = Text(no_wrap=True)
-        for list_row in range(self._rows):
+        for row in range(self._rows):
             for column in range(self._columns):
-                cell = list_row, column
+                cell = row, column
                 if cell in self._marks:
                     text.append(*self._marks[cell])
                 elif cell in self._dots:
@@ -287,7 +297,8 @@ class Canvas:
             text.append("\n")
         return text.append(f"{self._scale():{self._columns - 2}}▲N", "bold")
 
-    def _place(self, point: tuple[float, float]) -> tuple[int, int]:
-        across = self._columns + round((point[1] - self._middle[1]) / self._metres_per_dot)
-        down = 2 * self._rows - round((point[0] - self._middle[0]) / self._metres_per_dot)
-        return min(max(across, 0), 2 * self._columns - 1), min(max(down, 0), 4 * self._rows - 1)
+    def _dot_at(self, point: tuple[float, float]) -> tuple[int, int]:
+        """Return the column and row of the dot for a point, counted from the top left."""
+        dot_x = self._columns + round((point[1] - self._middle[1]) / self._metres_per_dot)
+        dot_y = 2 * self._rows - round((point[0] - self._middle[0]) / self._metres_per_dot)
+        return min(max(dot_x, 0), 2 * self._columns - 1), min(max(dot_y, 0), 4 * self._rows - 1)

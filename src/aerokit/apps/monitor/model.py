@@ -50,9 +50,10 @@ class MonitorModel:
         self.reference: tuple[float, float] | None = None
         """Latitude and longitude of the first known position, in degrees."""
         self._counts: Counter[tuple[int, int]] = Counter()
-        self._counted: deque[tuple[float, Counter[tuple[int, int]]]] = deque([(connection.now(), Counter())])
+        # Copies of the counts with their times, one for each second of the window.
+        self._count_samples: deque[tuple[float, Counter[tuple[int, int]]]] = deque([(connection.now(), Counter())])
         self._detach: list[Detach] = [
-            connection.observe_frames(self._count),
+            connection.observe_frames(self._count_frame),
             *connection.attach([Event], self._on_event),
         ]
 
@@ -63,29 +64,30 @@ class MonitorModel:
     def update(self) -> None:
         """Sample the positions and the message counts."""
         now = self.connection.now()
-        if now - self._counted[-1][0] >= 1.0:
-            self._counted.append((now, self._counts.copy()))
-            while now - self._counted[1][0] >= RATE_WINDOW_S:
-                self._counted.popleft()
+        if now - self._count_samples[-1][0] >= 1.0:
+            self._count_samples.append((now, self._counts.copy()))
+            while now - self._count_samples[1][0] >= RATE_WINDOW_S:
+                self._count_samples.popleft()
         for system_id, vehicle in self.vehicles.items():
-            place = vehicle.position.latest
-            if place is not None:
-                point, track = self.metres(place.latitude_deg, place.longitude_deg), self.tracks[system_id]
+            position = vehicle.position.latest
+            if position is not None:
+                point, track = self.metres(position.latitude_deg, position.longitude_deg), self.tracks[system_id]
                 if not track or math.dist(track[-1], point) >= MIN_POINT_DISTANCE_M:
                     track.append(point)
 
     def rates(self, system_id: int) -> list[tuple[str, float]]:
         """Return message names of a system, and their rates in Hz over the last five seconds, the highest first."""
-        (since, before), (until, after) = self._counted[0], self._counted[-1]
-        if until <= since:
+        begin_s, counts_at_begin = self._count_samples[0]
+        end_s, counts_at_end = self._count_samples[-1]
+        if end_s <= begin_s:
             return []
         dialect = self.connection.bus.dialect
         rates = []
-        for (system, number), count in after.items():
-            if system == system_id:
-                known = dialect.get(number)
-                name = f"message {number}" if known is None else known.NAME
-                rates.append((name, (count - before[system, number]) / (until - since)))
+        for (sender_id, message_id), count in counts_at_end.items():
+            if sender_id == system_id:
+                message = dialect.get(message_id)
+                name = f"message {message_id}" if message is None else message.NAME
+                rates.append((name, (count - counts_at_begin[sender_id, message_id]) / (end_s - begin_s)))
         return sorted(rates, key=lambda rate: (-rate[1], rate[0]))
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
@@ -104,10 +106,10 @@ class MonitorModel:
     def _time(self) -> str:
         return time.strftime("%H:%M:%S", time.localtime(self.connection.unix_time()))
 
-    def _count(self, frame: Frame, _peer: object) -> None:
-        kind = frame.system_id, frame.message_id
-        if kind in self._counts or len(self._counts) < MAX_MESSAGE_TYPES:
-            self._counts[kind] += 1
+    def _count_frame(self, frame: Frame, _peer: object) -> None:
+        key = frame.system_id, frame.message_id
+        if key in self._counts or len(self._counts) < MAX_MESSAGE_TYPES:
+            self._counts[key] += 1
 
     def _on_event(self, event: Event) -> None:
         if isinstance(event, StatusTextReceived):

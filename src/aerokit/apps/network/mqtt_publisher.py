@@ -45,12 +45,12 @@ class BrokerAddress(Snapshot):
     """``"mqtt"``, or ``"mqtts"`` for TLS."""
     host: str
     port: int
-    place: KeySpace
+    key_space: KeySpace
     user: str | None = None
     password: str | None = None
 
     def __str__(self) -> str:
-        return f"{self.scheme}://{host_and_port(self.host, self.port)}/{self.place.fleet}/{self.place.name}"
+        return f"{self.scheme}://{host_and_port(self.host, self.port)}/{self.key_space.fleet}/{self.key_space.name}"
 
     def __repr__(self) -> str:
         return f"<{self}>"
@@ -65,16 +65,16 @@ def parse_broker(text: str, *schemes: str) -> BrokerAddress:
     allowed = schemes or tuple(PORTS)
 
     def fail(reason: str) -> NoReturn:
-        shown = f"{scheme}://…" if "@" in text else text
+        shown_address = f"{scheme}://…" if "@" in text else text  # without the password
         raise InvalidArgument(
-            f"address = {shown!r} is not allowed: {reason}; expected"
+            f"address = {shown_address!r} is not allowed: {reason}; expected"
             f" {allowed[0]}://10.0.0.5:{PORTS[allowed[0]]}/fleet/alpha (% and @ : / ? # in a password: %25, %40 …)"
         )
 
     scheme = text.partition("://")[0].strip().lower() if "://" in text else "…"
     if scheme not in allowed:
         if "@" in text:
-            scheme = "…"
+            scheme = "…"  # it may be a part of the password
         fail(f"the scheme is not {' or '.join(f'{name}://' for name in allowed)}")
     try:
         parts = urlsplit(text.strip())
@@ -87,11 +87,11 @@ def parse_broker(text: str, *schemes: str) -> BrokerAddress:
         fail("MQTT addresses have no options")
     fleet, _, name = parts.path.strip("/").partition("/")
     try:
-        place = KeySpace(check_name("fleet", fleet), check_name("name", name))
+        key_space = KeySpace(check_name("fleet", fleet), check_name("name", name))
     except InvalidArgument:
         fail("fleet and name must be up to 63 letters, digits, '_', '.' and '-', starting with a letter or digit")
     user, password = (None if part is None else unquote(part) for part in (parts.username, parts.password))
-    return BrokerAddress(scheme, host, port or PORTS[scheme], place, user, password)
+    return BrokerAddress(scheme, host, port or PORTS[scheme], key_space, user, password)
 
 
 class MqttLink(BaseLink):
@@ -101,25 +101,25 @@ class MqttLink(BaseLink):
     name is kept. These values are discarded when the connection ends.
     """
 
-    def __init__(self, where: BrokerAddress) -> None:
-        super().__init__(str(where))
-        self._where = where
-        self._waiting: dict[str, bytes] = {}
+    def __init__(self, broker: BrokerAddress) -> None:
+        super().__init__(str(broker))
+        self._broker = broker
+        self._unsent: dict[str, bytes] = {}
         self._client: Any = None
         self._timer: asyncio.TimerHandle | None = None
-        self._answered: asyncio.Future[str] | None = None
-        self._is_up = False  # the broker has accepted the connection
-        self._alive = where.place.root + "/alive"
+        self._connect_result: asyncio.Future[str] | None = None  # the reason of a failure; empty: connected
+        self._is_accepted = False  # by the broker
+        self._alive_topic = broker.key_space.root + "/alive"
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """Send a value, or keep it until the broker accepts data."""
         name = str(peer)
-        if self._receiver is None or (name not in self._waiting and len(self._waiting) >= MAX_WAITING):
+        if self._receiver is None or (name not in self._unsent and len(self._unsent) >= MAX_WAITING):
             self._drop(1)
             return
-        self._drop(int(name in self._waiting))
-        self._waiting[name] = data
-        self._send_waiting()
+        self._drop(int(name in self._unsent))  # the new value replaces an unsent one
+        self._unsent[name] = data
+        self._send_unsent()
 
     def _refused(self, error: OSError) -> LinkOpenError:
         is_refused = error.errno == errno.ECONNREFUSED
@@ -128,18 +128,18 @@ class MqttLink(BaseLink):
 
     async def _connect(self) -> None:
         mqtt = import_optional(self.address, "paho.mqtt.client", "paho-mqtt", "mqtt")
-        where, loop = self._where, asyncio.get_running_loop()
+        broker, loop = self._broker, asyncio.get_running_loop()
         client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, reconnect_on_failure=False)
         client.connect_timeout = CONNECT_TIMEOUT_S
-        client.will_set(self._alive, b"offline", retain=True)
-        if where.user is not None:
-            client.username_pw_set(where.user, where.password)
-        self._answered = loop.create_future()
+        client.will_set(self._alive_topic, b"offline", retain=True)
+        if broker.user is not None:
+            client.username_pw_set(broker.user, broker.password)
+        self._connect_result = loop.create_future()
 
         def connect() -> Any:  # runs on a thread, because name resolution, connection and TLS handshake block
-            if where.scheme == "mqtts":
+            if broker.scheme == "mqtts":
                 client.tls_set_context(ssl.create_default_context())
-            client.connect(where.host, where.port, KEEPALIVE_S)
+            client.connect(broker.host, broker.port, KEEPALIVE_S)
             return client
 
         try:
@@ -153,36 +153,38 @@ class MqttLink(BaseLink):
         client.on_socket_close = self._on_socket_close
         loop.add_reader(sock, self._read, client, sock)
         self._poll(client)
-        # wait_for can swallow a cancellation.
-        await asyncio.wait((self._answered,), timeout=CONNECT_TIMEOUT_S)
-        if self._answered.done():
-            refusal = self._answered.result()
+        # Not by wait_for, which can swallow a cancellation before Python 3.12.
+        await asyncio.wait((self._connect_result,), timeout=CONNECT_TIMEOUT_S)
+        if self._connect_result.done():
+            refusal = self._connect_result.result()
         else:
             refusal = f"no answer within {CONNECT_TIMEOUT_S:g} s (is it an MQTT broker?)"
         if not refusal and client.socket() is None:
             refusal = "the broker closed the connection"
         if refusal:
             raise LinkOpenError(f"cannot open {self.address}: {refusal}")
-        self._is_up = True
-        client.publish(self._alive, b"online", retain=True)
+        self._is_accepted = True
+        client.publish(self._alive_topic, b"online", retain=True)
 
-    def _send_waiting(self) -> None:
+    def _send_unsent(self) -> None:
         client = self._client
-        while client is self._client is not None and self._waiting and not client.want_write():
-            name = next(iter(self._waiting))
-            client.publish(self._where.place.state(name), self._waiting.pop(name))
-        if client is self._client is not None and client.want_write() and (sock := client.socket()):
+        # publish() may detect a lost connection, whose callback sets self._client to None.
+        while self._client is not None and self._unsent and not client.want_write():
+            name = next(iter(self._unsent))
+            client.publish(self._broker.key_space.state(name), self._unsent.pop(name))
+        if self._client is not None and client.want_write() and (sock := client.socket()):
             asyncio.get_running_loop().add_writer(sock, self._continue_writing, client, sock)
 
     def _continue_writing(self, client: Any, sock: Any) -> None:
         client.loop_write()
         if client is self._client and not client.want_write():
             asyncio.get_running_loop().remove_writer(sock)
-            self._send_waiting()
+            self._send_unsent()
 
     def _read(self, client: Any, sock: Any) -> None:
         try:
             client.loop_read()
+            # Data that TLS has decrypted already does not make the socket readable again.
             while client.socket() is sock and isinstance(sock, ssl.SSLSocket) and sock.pending():
                 client.loop_read()
         except Exception as error:  # paho 2.1 raises arbitrary errors for malformed packets
@@ -195,11 +197,11 @@ class MqttLink(BaseLink):
             self._timer = asyncio.get_running_loop().call_later(_POLL_INTERVAL_S, self._poll, client)
 
     def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-        self._answer(f"the broker refuses: {reason}" if reason.is_failure else "")
+        self._finish_connecting(f"the broker refuses: {reason}" if reason.is_failure else "")
 
     def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-        self._answer("the broker closed the connection")
-        if self._is_up:
+        self._finish_connecting("the broker closed the connection")
+        if self._is_accepted:
             self._lose(f"the connection to the broker has ended ({reason})")
 
     def _on_socket_close(self, client: Any, _data: Any, sock: Any) -> None:
@@ -209,18 +211,18 @@ class MqttLink(BaseLink):
         if client is self._client:  # the connection was lost; unsent data must not arrive when the network is back
             discard_on_close(sock)
 
-    def _answer(self, text: str) -> None:
-        if self._answered is not None and not self._answered.done():
-            self._answered.set_result(text)
+    def _finish_connecting(self, text: str) -> None:
+        if self._connect_result is not None and not self._connect_result.done():
+            self._connect_result.set_result(text)
 
     def _release(self) -> None:
         client, self._client = self._client, None
-        self._waiting.clear()
+        self._unsent.clear()
         if self._timer is not None:
             self._timer.cancel()
         if client is not None and client.socket() is not None:
             if client.is_connected() and not client.want_write():
-                client.publish(self._alive, b"offline", retain=True)
+                client.publish(self._alive_topic, b"offline", retain=True)
                 client.disconnect()
             _close_socket(client)
         self._released.set()
@@ -278,8 +280,8 @@ async def mqtt_publisher(address: str) -> AsyncIterator[Publisher]:
         InvalidArgument: the address is invalid.
         LinkOpenError: the broker cannot be reached or refuses the connection, or paho-mqtt is not installed.
     """
-    where = parse_broker(address, "mqtt", "mqtts")
-    link = ReconnectingLink(lambda: MqttLink(where))
+    broker = parse_broker(address, "mqtt", "mqtts")
+    link = ReconnectingLink(lambda: MqttLink(broker))
     await link.open(_NullReceiver())
     try:
         yield _LinkPublisher(link)

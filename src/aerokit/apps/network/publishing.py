@@ -74,16 +74,16 @@ class Publishing:
         for name, cell in self._vehicle.telemetry.cells.items():
             if cell.is_known and (not self._states or name in self._states):
                 self._publish(name, to_jsonable(cell.latest), cell.age, now)
-        if not self._states or "link" in self._states:
-            link = overview(self._vehicle)["link"] if self._is_due("link", now) else None
-            if link is not None:
-                self._publish("link", link, 0.0, now)
+        is_link_wanted = not self._states or "link" in self._states
+        # The link's statistics change with every frame, so they are published only at the repeat interval.
+        if is_link_wanted and self._is_repeat_due("link", now):
+            self._publish("link", overview(self._vehicle)["link"], 0.0, now)
 
-    def _is_due(self, name: str, now: float) -> bool:
+    def _is_repeat_due(self, name: str, now: float) -> bool:
         return now - self._sent.get(name, (-math.inf, None))[0] >= REPEAT_INTERVAL_S
 
     def _publish(self, name: str, value: object, age_s: float, now: float) -> None:
-        if name in self._sent and self._sent[name][1] == value and not self._is_due(name, now):
+        if name in self._sent and self._sent[name][1] == value and not self._is_repeat_due(name, now):
             return
         self._sent[name] = (now, value)
         system_id = self._vehicle.system_id
@@ -130,15 +130,15 @@ async def publishing(
     """
     if not 0 < rate_hz <= MAX_RATE_HZ:
         raise InvalidArgument(f"rate_hz = {rate_hz} is not allowed: above 0, at most {MAX_RATE_HZ:g}")
-    wanted = frozenset(states)
-    unknown = sorted(wanted - vehicle.telemetry.cells.keys() - {"link"})
+    state_names = frozenset(states)
+    unknown = sorted(state_names - vehicle.telemetry.cells.keys() - {"link"})
     if unknown:
         raise InvalidArgument(f"states: {unknown[0]!r} is not a state; docs/states.md lists them")
     connection = vehicle.connection
     connection.raise_if_ended()
     async with AsyncExitStack() as stack:
         publisher = await stack.enter_async_context(publisher_for(to)) if isinstance(to, str) else to
-        publication = Publishing(vehicle, publisher, wanted)
+        publication = Publishing(vehicle, publisher, state_names)
 
         async def publish_periodically() -> None:
             while connection.is_open:

@@ -22,7 +22,7 @@ _ABOUT = (
     "States of a vehicle that aerokit publishes (docs/network.md). Units are in the names of fields. null: unknown."
     " Readers must accept unknown fields and states, because they are added without a new version."
 )
-_PLAIN: dict[Any, dict[str, Any]] = {
+_PLAIN_SCHEMAS: dict[Any, dict[str, Any]] = {
     bool: {"type": "boolean"},
     int: {"type": "integer"},
     float: {"type": ["number", "null"]},
@@ -50,20 +50,19 @@ ENUMS: dict[str, type[Enum]] = {
 
 def document() -> dict[str, Any]:
     """Return the schema (draft 2020-12): ``oneOf`` the messages, distinguished by ``state``."""
-    values: dict[str, dict[str, Any]] = {"Message": _MESSAGE}
-    texts = documentation()
-    hints = typing.get_type_hints(States)
-    states = {
-        name: _message(name, texts[name][1], _named(name) or _schema_of(typing.get_args(hints[name])[0], values))
-        for name in texts
-    }
+    definitions: dict[str, dict[str, Any]] = {"Message": _MESSAGE}
+    cell_types = typing.get_type_hints(States)
+    states = {}
+    for name, (_, text) in documentation().items():
+        value_type = typing.get_args(cell_types[name])[0]
+        states[name] = _message(name, text, _enum_schema(name) or _schema_of(value_type, definitions))
     states["link"] = _message("link", "State and statistics of the link to the vehicle.", _LINK)
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "aerokit state",
         "description": _ABOUT,
         "oneOf": list(states.values()),
-        "$defs": dict(sorted(values.items())),
+        "$defs": dict(sorted(definitions.items())),
     }
 
 
@@ -103,45 +102,50 @@ def _message(name: str, text: str, value: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _schema_of(kind: Any, values: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return the schema of a value of this type, as :func:`aerokit._internal.formatting.to_jsonable` converts it."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+def _schema_of(value_type: Any, definitions: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return the schema of a value of this type, as :func:`aerokit._internal.formatting.to_jsonable` converts it.
+
+    Adds the types that the schema refers to by name to ``definitions``.
+    """
+    origin, arguments = typing.get_origin(value_type), typing.get_args(value_type)
     if origin in (typing.Union, types.UnionType):
-        return {"anyOf": [_schema_of(argument, values) for argument in arguments]}
+        return {"anyOf": [_schema_of(argument, definitions) for argument in arguments]}
     if origin in (tuple, list):
         if len(arguments) == 2 and arguments[1] is ...:
-            return {"type": "array", "items": _schema_of(arguments[0], values)}
-        members = [_schema_of(argument, values) for argument in arguments]
-        return {"type": "array", "prefixItems": members, "minItems": len(members), "maxItems": len(members)}
-    if isinstance(kind, type) and issubclass(kind, Snapshot):
-        if kind.__name__ not in values:
-            values[kind.__name__] = {}  # placeholder for recursive types
-            values[kind.__name__] = _object(kind, values)
-        return {"$ref": f"#/$defs/{kind.__name__}"}
-    return dict(_PLAIN[kind])
+            return {"type": "array", "items": _schema_of(arguments[0], definitions)}
+        items = [_schema_of(argument, definitions) for argument in arguments]
+        return {"type": "array", "prefixItems": items, "minItems": len(items), "maxItems": len(items)}
+    if isinstance(value_type, type) and issubclass(value_type, Snapshot):
+        name = value_type.__name__
+        if name not in definitions:
+            definitions[name] = {}  # placeholder for recursive types
+            definitions[name] = _snapshot_schema(value_type, definitions)
+        return {"$ref": f"#/$defs/{name}"}
+    return dict(_PLAIN_SCHEMAS[value_type])
 
 
-def _named(name: str) -> dict[str, Any] | None:
+def _enum_schema(name: str) -> dict[str, Any] | None:
     """Return the schema of an integer with names. Values are a name, a list of names (flags), or else the number."""
     enum = ENUMS.get(name)
     if enum is None:
         return None
     names = {"enum": [member.name for member in enum]}
-    several = [{"type": "array", "items": names}] if issubclass(enum, Flag) else []
-    return {"description": f"of {enum.__name__}", "anyOf": [names, *several, {"type": "integer"}]}
+    name_lists = [{"type": "array", "items": names}] if issubclass(enum, Flag) else []
+    return {"description": f"of {enum.__name__}", "anyOf": [names, *name_lists, {"type": "integer"}]}
 
 
-def _object(kind: type[Snapshot], values: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def _snapshot_schema(value_type: type[Snapshot], definitions: dict[str, dict[str, Any]]) -> dict[str, Any]:
     annotations: dict[str, Any] = {}
-    for base in reversed(kind.__mro__):
+    for base in reversed(value_type.__mro__):
         if issubclass(base, Snapshot) and base is not Snapshot:
             annotations.update(inspect.get_annotations(base, eval_str=True))
-    names = list(kind.__match_args__)
+    names = list(value_type.__match_args__)
     return {
         "type": "object",
-        "description": " ".join((inspect.getdoc(kind) or "").replace("`", "").split()),
+        "description": " ".join((inspect.getdoc(value_type) or "").replace("`", "").split()),
         "properties": {
-            name: _named(f"{kind.__name__}.{name}") or _schema_of(annotations[name], values) for name in names
+            name: _enum_schema(f"{value_type.__name__}.{name}") or _schema_of(annotations[name], definitions)
+            for name in names
         },
         "required": names,
     }
@@ -152,8 +156,8 @@ def rendered() -> str:
     schema = document()
     lines = [f" {json.dumps(key)}: {_json(value)}," for key, value in schema.items() if key not in ("oneOf", "$defs")]
     states = ",\n".join(f"  {_json(state)}" for state in schema["oneOf"])
-    kinds = ",\n".join(f"  {_json(name)}: {_json(definition)}" for name, definition in schema["$defs"].items())
-    return "\n".join(["{", *lines, f' "oneOf": [\n{states}\n ],', f' "$defs": {{\n{kinds}\n }}', "}", ""])
+    types_ = ",\n".join(f"  {_json(name)}: {_json(definition)}" for name, definition in schema["$defs"].items())
+    return "\n".join(["{", *lines, f' "oneOf": [\n{states}\n ],', f' "$defs": {{\n{types_}\n }}', "}", ""])
 
 
 def _json(value: object) -> str:

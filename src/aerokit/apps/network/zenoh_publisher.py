@@ -26,8 +26,8 @@ _CLOSE_SESSION_TIMEOUT_S = 2.0
 class _ZenohPublisher(Publisher):
     """Publishes to the keys ``aerokit/FLEET/NAME/state/…``."""
 
-    def __init__(self, place: KeySpace) -> None:
-        self._place = place
+    def __init__(self, key_space: KeySpace) -> None:
+        self._key_space = key_space
         self._drop: Any = None
         self._session: Any = None
 
@@ -37,7 +37,9 @@ class _ZenohPublisher(Publisher):
 
     def put(self, name: str, data: bytes) -> None:
         with contextlib.suppress(Exception):  # zenoh's own error: the session has ended
-            self._session.put(self._place.state(name), data, encoding="application/json", congestion_control=self._drop)
+            self._session.put(
+                self._key_space.state(name), data, encoding="application/json", congestion_control=self._drop
+            )
 
 
 @checked
@@ -57,14 +59,14 @@ async def zenoh_publisher(address: str) -> AsyncIterator[Publisher]:
         InvalidArgument: the address is invalid.
         LinkOpenError: there is no network, or eclipse-zenoh is not installed.
     """
-    where = parse_address(address)
-    if where.kind not in ("zenoh", "zenohin"):
+    parsed = parse_address(address)
+    if parsed.kind not in ("zenoh", "zenohin"):
         raise InvalidArgument(
             f"address = {address!r} is not allowed: expected a zenoh address like zenoh://fleet/alpha"
         )
-    fleet, _, name = where.path.partition("/")
+    fleet, _, name = parsed.path.partition("/")
     publisher = _ZenohPublisher(KeySpace(fleet, name))
-    session = await open_session(address, network_options(where), publisher.prepare)
+    session = await open_session(address, network_options(parsed), publisher.prepare)
     try:
         yield publisher
     finally:
@@ -102,15 +104,18 @@ async def discover(
     """
     check_name("fleet", fleet)
     keys: set[str] = set()
-    declared: list[Any] = []
+    subscribers: list[Any] = []  # zenoh ends a subscription when its subscriber is garbage collected
 
     def prepare(zenoh: Any, session: Any) -> None:
         def on_sample(sample: Any) -> None:  # on a zenoh thread; set.add and set.discard are atomic
             key = str(sample.key_expr)
-            (keys.add if sample.kind == zenoh.SampleKind.PUT else keys.discard)(key)
+            if sample.kind == zenoh.SampleKind.PUT:
+                keys.add(key)
+            else:
+                keys.discard(key)
 
         all_names = KeySpace(fleet, "*").alive()
-        declared.append(session.liveliness().declare_subscriber(all_names, on_sample, history=True))
+        subscribers.append(session.liveliness().declare_subscriber(all_names, on_sample, history=True))
 
     options = NetworkOptions(tuple(connect), tuple(listen), "", config)
     session = await open_session(f"zenoh://{fleet}", options, prepare)
@@ -118,7 +123,7 @@ async def discover(
     try:
         await anyio.sleep(wait)
     finally:
-        declared.clear()
+        subscribers.clear()
         close_session(session, closed.set)
     await closed.wait()
-    return sorted({key.split("/")[2] for key in keys})
+    return sorted({key.split("/")[2] for key in keys})  # aerokit/FLEET/NAME/…

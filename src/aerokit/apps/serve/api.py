@@ -73,6 +73,7 @@ _FAILURES = {
     "504": "timed out",
 }
 
+# Headers of orders: name, True if required, type and description.
 _HEADERS = (
     (
         "Idempotency-Key",
@@ -151,7 +152,7 @@ def document(operations: Iterable[Operation], root_path: str = "") -> dict[str, 
 def _operation(operation: Operation) -> dict[str, Any]:
     is_order = operation.order is not None
     answer = {"$ref": "#/components/schemas/Order"} if is_order else {"type": "object"}
-    found: dict[str, Any] = {
+    description: dict[str, Any] = {
         "operationId": operation.name,
         "summary": operation.summary,
         "parameters": [*_parameters(operation)],
@@ -161,15 +162,16 @@ def _operation(operation: Operation) -> dict[str, Any]:
         },
     }
     if not operation.is_open:
-        found["security"] = [{"token": []}] if is_order else [{"token": []}, {}]
+        description["security"] = [{"token": []}] if is_order else [{"token": []}, {}]
     if is_order:
-        found["responses"]["202"] = {"description": "running (wait=false)", "content": _json(answer)}
-    if (kind := operation.order or operation.body) is not None:
-        found["requestBody"] = {
-            "required": any(argument.is_required for argument in kind.arguments.values()),
-            "content": _json(_body(kind)),
+        description["responses"]["202"] = {"description": "running (wait=false)", "content": _json(answer)}
+    order_type = operation.order or operation.body
+    if order_type is not None:
+        description["requestBody"] = {
+            "required": any(argument.is_required for argument in order_type.arguments.values()),
+            "content": _json(_body(order_type)),
         }
-    return found
+    return description
 
 
 def _parameters(operation: Operation) -> Iterable[dict[str, Any]]:
@@ -179,40 +181,43 @@ def _parameters(operation: Operation) -> Iterable[dict[str, Any]]:
     for name in operation.query:
         schema = {"type": "boolean"}
         yield {"name": name, "in": "query", "description": _QUERY[name], "schema": schema}
-    for name, is_required, kind, text in _HEADERS if operation.order is not None else ():
+    if operation.order is None:
+        return
+    for name, is_required, json_type, text in _HEADERS:
         yield {
             "name": name,
             "in": "header",
             "required": is_required,
             "description": text,
-            "schema": {"type": kind},
+            "schema": {"type": json_type},
         }
 
 
 def _failures(operation: Operation) -> dict[str, Any]:
     if operation.is_open:
         return {}
-    left_out = set() if operation.order or operation.body else {"413", "415"}
+    impossible = set() if operation.order or operation.body else {"413", "415"}  # only with a body
     problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"description": text, "content": problem}
         for status, text in _FAILURES.items()
-        if status not in left_out
+        if status not in impossible
     }
 
 
-def _body(kind: OrderType) -> dict[str, Any]:
+def _body(order_type: OrderType) -> dict[str, Any]:
+    arguments = order_type.arguments
     return {
         "type": "object",
-        "properties": {name: _schema(argument) for name, argument in kind.arguments.items()},
-        "required": [name for name, argument in kind.arguments.items() if argument.is_required],
+        "properties": {name: _schema(argument) for name, argument in arguments.items()},
+        "required": [name for name, argument in arguments.items() if argument.is_required],
         "additionalProperties": False,
     }
 
 
 def _schema(argument: OrderArgument) -> dict[str, Any]:
-    kind = argument.type if isinstance(argument.type, str) else list(argument.type)
-    return {"type": kind, "description": argument.text}
+    json_type = argument.type if isinstance(argument.type, str) else list(argument.type)
+    return {"type": json_type, "description": argument.text}
 
 
 def _json(schema: dict[str, Any]) -> dict[str, Any]:
@@ -273,24 +278,28 @@ class HttpApi:
         self._served, self._orders, self._access, self._settings = served, orders, access, settings
         self._metadata = metadata
         self._locks: dict[Vehicle, asyncio.Lock] = {}
+        # Downloaded missions, fences and rally points, with the times of the downloads.
         self._plans: dict[tuple[Vehicle, str], tuple[Mission | Fence | RallyPoints, float]] = {}
         served.listen(self._on_message)
 
     def operations(self) -> tuple[Operation, ...]:
-        one, named = "/api/vehicles/{system_id}", "/api/vehicles/{system_id}/parameters/{name}"
+        path, refresh = "/api/vehicles/{system_id}", ("refresh",)
+        parameter_path = f"{path}/parameters/{{name}}"
         get = partial(Operation, "GET")
         return (
             get("/api", "about", "Version and settings of this server", self._about, is_open=True),
             get("/api/openapi.json", "openapi", "This document", self._openapi, is_open=True),
             get("/api/vehicles", "vehicles", "All vehicles", self._list),
-            get(one, "vehicle", "The state of a vehicle, with ages", self._vehicle),
-            get(f"{one}/texts", "texts", "The status texts of a vehicle, the newest last", self._texts),
-            get(f"{one}/track", "track", "The recent track of a vehicle, the newest position last", self._track),
-            get(f"{one}/mission", "mission", "The mission of a vehicle", self._mission, query=("refresh",)),
-            get(f"{one}/fence", "fence", "The fence of a vehicle", self._fence, query=("refresh",)),
-            get(f"{one}/rally", "rally", "The rally points of a vehicle", self._rally, query=("refresh",)),
-            get(f"{one}/parameters", "parameters", "All parameters of a vehicle", self._parameters, query=("refresh",)),
-            get(named, "parameter", "One parameter, read from the vehicle", self._parameter),
+            get(path, "vehicle", "The state of a vehicle, with ages", self._vehicle),
+            get(f"{path}/texts", "texts", "The status texts of a vehicle, the newest last", self._texts),
+            get(f"{path}/track", "track", "The recent track of a vehicle, the newest position last", self._track),
+            get(f"{path}/mission", "mission", "The mission of a vehicle", self._mission, query=refresh),
+            get(f"{path}/fence", "fence", "The fence of a vehicle", self._fence, query=refresh),
+            get(f"{path}/rally", "rally", "The rally points of a vehicle", self._rally, query=refresh),
+            get(
+                f"{path}/parameters", "parameters", "All parameters of a vehicle", self._parameters, query=("refresh",)
+            ),
+            get(parameter_path, "parameter", "One parameter, read from the vehicle", self._parameter),
             get("/api/events", "events", "Recent events, the newest last", self._events),
             get(
                 "/api/orders",
@@ -300,8 +309,8 @@ class HttpApi:
             ),
             get("/api/orders/{key}", "order", "One order, by its Idempotency-Key", self._order),
             Operation("POST", "/api/plan", "plan", "Check a plan; sends nothing", self._check_plan, body=UPLOAD),
-            *(self._order_operation("POST", f"{one}/{kind.name}", kind) for kind in ORDERS),
-            self._order_operation("PUT", named, SET_PARAMETER),
+            *(self._order_operation("POST", f"{path}/{order_type.name}", order_type) for order_type in ORDERS),
+            self._order_operation("PUT", parameter_path, SET_PARAMETER),
         )
 
     def endpoint(self, operation: Operation) -> Handler:
@@ -313,16 +322,16 @@ class HttpApi:
                     self._access.check(request.headers, is_order=operation.order is not None)
                 return await operation.handler(request)
             except Exception as error:
-                answer = problem_response(error)
-                if answer.status_code == 500:
+                response = problem_response(error)
+                if response.status_code == 500:
                     raise
-                return answer
+                return response
 
         return answer
 
-    def _order_operation(self, method: str, path: str, kind: OrderType) -> Operation:
-        name = kind.name.replace("/", "_")
-        return Operation(method, path, name, kind.summary, partial(self._run_order, kind), kind, query=("wait",))
+    def _order_operation(self, method: str, path: str, order_type: OrderType) -> Operation:
+        name, handler = order_type.name.replace("/", "_"), partial(self._run_order, order_type)
+        return Operation(method, path, name, order_type.summary, handler, order_type, query=("wait",))
 
     async def _about(self, request: Request) -> Response:
         return json_response({"aerokit": __version__, "bits": _BITS, **self._settings})
@@ -335,8 +344,8 @@ class HttpApi:
 
     async def _vehicle(self, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
-        known = vehicle.autopilot.modes.names
-        modes = [*known, *(name for name in vehicle.telemetry.mode_names.values() if name not in known)]
+        built_in = vehicle.autopilot.modes.names
+        modes = [*built_in, *(name for name in vehicle.telemetry.mode_names.values() if name not in built_in)]
         return json_response({**overview(vehicle), "modes": modes})
 
     async def _texts(self, request: Request) -> Response:
@@ -359,15 +368,17 @@ class HttpApi:
         return json_response({"items": _items(rally), "age_s": age_s})
 
     async def _plan(self, request: Request, kind: str) -> tuple[Any, float]:
-        vehicle, is_new = self._vehicle_of(request), self._is_refresh(request)
+        """Return the mission, fence or rally points, and their age in seconds."""
+        vehicle, is_refresh = self._vehicle_of(request), self._is_refresh(request)
         async with self._lock(vehicle):
-            known = self._plans.get((vehicle, kind))
+            plan, read_at = self._plans.get((vehicle, kind), (None, 0.0))
             # The vehicle reports how many items its mission has; MAVLink does not report other changes.
             count = vehicle.mission.count.latest if kind == "mission" else None
-            if known is None or is_new or count not in (None, len(known[0].to_items())):
-                read = await getattr(vehicle, kind).download()
-                known = self._plans[vehicle, kind] = read, vehicle.connection.now()
-        return known[0], to_jsonable(vehicle.connection.now() - known[1])
+            if plan is None or is_refresh or count not in (None, len(plan.to_items())):
+                plan = await getattr(vehicle, kind).download()
+                read_at = vehicle.connection.now()
+                self._plans[vehicle, kind] = plan, read_at
+        return plan, to_jsonable(vehicle.connection.now() - read_at)
 
     def _on_message(self, message: dict[str, Any]) -> None:
         # Even an upload that failed half-way may have changed the plans.
@@ -389,9 +400,9 @@ class HttpApi:
         return json_response(counts)
 
     async def _parameters(self, request: Request) -> Response:
-        vehicle, is_new = self._vehicle_of(request), self._is_refresh(request)
+        vehicle, is_refresh = self._vehicle_of(request), self._is_refresh(request)
         async with self._lock(vehicle):
-            table = await vehicle.parameters.download(refresh=is_new)
+            table = await vehicle.parameters.download(refresh=is_refresh)
         metadata = self._metadata_of(vehicle)
         return json_response({"parameters": [_parameter(table[name], metadata) for name in sorted(table)]})
 
@@ -411,19 +422,19 @@ class HttpApi:
     async def _order(self, request: Request) -> Response:
         return json_response(self._orders.get(request.path_params["key"]).to_dict())
 
-    async def _run_order(self, kind: OrderType, request: Request) -> Response:
+    async def _run_order(self, order_type: OrderType, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
         waits = query_flag(request, "wait", default=True)
-        arguments = await read_body(request, kind.max_body_size)
-        kind.check(arguments)
-        if kind is SET_PARAMETER:
+        arguments = await read_body(request, order_type.max_body_size)
+        order_type.check(arguments)
+        if order_type is SET_PARAMETER:
             arguments["name"] = request.path_params["name"]
             metadata = self._metadata_of(vehicle)
             check_parameter(metadata, arguments)
-            kind = parameter_order(metadata)
+            order_type = parameter_order(metadata)
         key = request.headers.get("idempotency-key", "").strip().strip('"')
-        record = self._orders.submit(vehicle, kind, arguments, key, seen_at(request))
-        await _wait_ended(record, None if waits else _REFUSAL_TIMEOUT_S)
+        record = self._orders.submit(vehicle, order_type, arguments, key, seen_at(request))
+        await _wait_until_ended(record, None if waits else _REFUSAL_TIMEOUT_S)
         if record.problem is not None:
             return json_response(
                 {**record.problem, "order": record.to_dict()},
@@ -440,10 +451,10 @@ class HttpApi:
 
     def _is_refresh(self, request: Request) -> bool:
         # A refresh uses the vehicle's link, and therefore needs the token, like an order.
-        is_new = query_flag(request, "refresh", default=False)
-        if is_new:
+        is_refresh = query_flag(request, "refresh", default=False)
+        if is_refresh:
             self._access.check(request.headers, needs_token=True)
-        return is_new
+        return is_refresh
 
     def _lock(self, vehicle: Vehicle) -> asyncio.Lock:
         # One transfer at a time; concurrent requests share its result.
@@ -458,18 +469,19 @@ def _items(items: Iterable[MissionItem]) -> list[dict[str, Any]]:
 
 
 def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any]:
-    known = None if metadata is None else metadata.get(parameter.name)
+    entry = None if metadata is None else metadata.get(parameter.name)
     fields = {**to_jsonable(parameter), "other_names": other_names(parameter.name)}
-    if known is None:
+    if entry is None:
         return fields
-    default = known.default if parameter.default is None else parameter.default
-    about = {name: to_jsonable(getattr(known, name)) for name in _METADATA}
-    about |= {"default": to_jsonable(default), "meaning": known.describe(parameter.value)}
-    about |= {"values": {str(value): text for value, text in known.values.items()}, "has_bits": bool(known.bitmask)}
-    return {**fields, **about}
+    default = entry.default if parameter.default is None else parameter.default
+    fields |= {name: to_jsonable(getattr(entry, name)) for name in _METADATA}
+    fields |= {"default": to_jsonable(default), "meaning": entry.describe(parameter.value)}
+    fields |= {"values": {str(value): text for value, text in entry.values.items()}, "has_bits": bool(entry.bitmask)}
+    return fields
 
 
-async def _wait_ended(record: OrderRecord, timeout_s: float | None) -> None:
+async def _wait_until_ended(record: OrderRecord, timeout_s: float | None) -> None:
+    # Not by asyncio.wait_for, which can swallow a cancellation before Python 3.12.
     waiting = asyncio.ensure_future(record.ended.wait())
     try:
         await asyncio.wait((waiting,), timeout=timeout_s)
@@ -478,6 +490,6 @@ async def _wait_ended(record: OrderRecord, timeout_s: float | None) -> None:
 
 
 def _summary(vehicle: Vehicle) -> dict[str, Any]:
-    known = overview(vehicle)
-    states = known.pop("states")
-    return {**known, "mode": states.get("mode"), "armed": states.get("armed")}
+    summary = overview(vehicle)
+    states = summary.pop("states")
+    return {**summary, "mode": states.get("mode"), "armed": states.get("armed")}

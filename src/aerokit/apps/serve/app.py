@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
 
 STATIC = Path(__file__).parent / "static"
-KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+MEDIA_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
 
 class ServeApp:
@@ -120,7 +120,7 @@ def make_app(
     """
     token = secrets.token_urlsafe(24) if token is None else token
     access = AccessControl(token, open_reading=open_reading, read_only=read_only)
-    content_policy(tiles)
+    content_policy(tiles)  # raises if the URL is invalid
     settings = {
         "read_only": read_only,
         "open_reading": open_reading,
@@ -134,15 +134,15 @@ def _static_routes() -> list[Route]:
     # Files are read once at the start, so that no request can reach other files.
     routes = []
     for path in sorted(STATIC.iterdir()):
-        if path.suffix in KINDS:
-            where = "/" if path.name == "index.html" else f"/static/{path.name}"
-            routes.append(Route(where, _file(path.read_bytes(), KINDS[path.suffix]), methods=["GET"]))
+        if path.suffix in MEDIA_TYPES:
+            url_path = "/" if path.name == "index.html" else f"/static/{path.name}"
+            routes.append(Route(url_path, _file(path.read_bytes(), MEDIA_TYPES[path.suffix]), methods=["GET"]))
     return routes
 
 
-def _file(data: bytes, kind: str) -> Any:
+def _file(data: bytes, media_type: str) -> Any:
     async def answer(request: Request) -> Response:
-        return Response(data, headers={"Cache-Control": "no-cache"}, media_type=kind)
+        return Response(data, headers={"Cache-Control": "no-cache"}, media_type=media_type)
 
     return answer
 

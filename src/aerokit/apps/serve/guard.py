@@ -56,20 +56,20 @@ class AccessControl:
         self.read_only: bool = read_only
 
     def has_token(self, headers: Headers) -> bool:
-        given = _token_of(headers)
-        return given is not None and hmac.compare_digest(given.encode("utf-8", "surrogateescape"), self._token)
+        token = _token_of(headers)
+        return token is not None and hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self._token)
 
     def check(self, headers: Headers, *, is_order: bool = False, needs_token: bool = False) -> None:
         """Raise HttpProblem 401 or 403 if the request is not allowed."""
         if is_order and self.read_only:
             raise HttpProblem(403, "ReadOnly", "this server is read-only and accepts no orders; nothing was sent")
-        given = _token_of(headers)
-        if given is None and self._open_reading and not (is_order or needs_token):
+        token = _token_of(headers)
+        if token is None and self._open_reading and not (is_order or needs_token):
             return
         if not self.has_token(headers):
-            what = "the token is missing" if given is None else "the token is wrong"
-            headers_back = {"WWW-Authenticate": 'Bearer realm="aerokit"'}
-            raise HttpProblem(401, "Unauthorized", f"{what}; nothing was sent", headers_back)
+            reason = "the token is missing" if token is None else "the token is wrong"
+            response_headers = {"WWW-Authenticate": 'Bearer realm="aerokit"'}
+            raise HttpProblem(401, "Unauthorized", f"{reason}; nothing was sent", response_headers)
 
 
 def _token_of(headers: Headers) -> str | None:
@@ -84,17 +84,20 @@ def _token_of(headers: Headers) -> str | None:
 
 def content_policy(tiles: str | None) -> str:
     """Return the Content-Security-Policy of all responses, which allows images from the tile server."""
-    pictures = "'self'"
+    image_sources = "'self'"
     if tiles is not None:
-        place = urlsplit(tiles)
-        is_place = place.scheme in ("http", "https") and place.hostname and "@" not in place.netloc
-        if not is_place or any(f"{{{axis}}}" not in tiles for axis in "xyz") or set(tiles) & set(" \t\n\"';,<>\\"):
+        url = urlsplit(tiles)
+        is_url = url.scheme in ("http", "https") and url.hostname and "@" not in url.netloc
+        lacks_placeholder = any(f"{{{axis}}}" not in tiles for axis in "xyz")
+        # These characters could end the entry in the policy and begin another.
+        has_separator = set(tiles) & set(" \t\n\"';,<>\\")
+        if not is_url or lacks_placeholder or has_separator:
             raise InvalidArgument(
                 f"tiles = {tiles!r} is not a tile URL like https://tiles.example/{{z}}/{{x}}/{{y}}.png"
             )
-        pictures += f" {place.scheme}://{place.netloc}"
+        image_sources += f" {url.scheme}://{url.netloc}"
     return (
-        f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {pictures}; connect-src 'self';"
+        f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {image_sources}; connect-src 'self';"
         " base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     )
 
@@ -123,7 +126,7 @@ class SecurityMiddleware:
             await self._app(scope, receive, send)
             return
 
-        async def sending(message: Message) -> None:
+        async def send_with_headers(message: Message) -> None:
             if message["type"] in ("http.response.start", "websocket.http.response.start"):
                 MutableHeaders(scope=message).update(self._headers)
             await send(message)
@@ -132,24 +135,25 @@ class SecurityMiddleware:
             self._check(Headers(scope=scope))
         except HttpProblem as problem:
             if scope["type"] == "websocket":
-                await receive()
+                await receive()  # websocket.connect, which ASGI expects to be received before the answer
                 await send({"type": "websocket.close", "code": 1008})
             else:
-                await problem_response(problem)(scope, receive, sending)
+                await problem_response(problem)(scope, receive, send_with_headers)
             return
-        await self._app(scope, receive, sending)
+        await self._app(scope, receive, send_with_headers)
 
     def _check(self, headers: Headers) -> None:
         host = headers.get("host", "")
-        if not self._is_own(host):
+        if not self._is_own_host(host):
             raise HttpProblem(421, "WrongHost", f"Host {host[:100]!r} is not allowed; add it with --allow-host")
         origins = headers.getlist("origin")
         if any(urlsplit(origin).netloc.lower() != host.lower() for origin in origins):
             raise HttpProblem(403, "WrongOrigin", "requests from pages of other sites are not allowed")
+        # A link on another site may open the page, but its scripts and images may request nothing.
         if headers.get("sec-fetch-site", "none") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
             raise HttpProblem(403, "WrongOrigin", "requests from pages of other sites are not allowed")
 
-    def _is_own(self, host: str) -> bool:
+    def _is_own_host(self, host: str) -> bool:
         try:
             name = (urlsplit(f"//{host}").hostname or "").lower()
             if name in self._hosts:
@@ -190,49 +194,49 @@ class _HttpConnection(H11Protocol):
         super().connection_made(transport)
         self._anonymous[self] = None
         if len(self._anonymous) > MAX_ANONYMOUS_CONNECTIONS:
-            self._end(_oldest_of_the_most_frequent(self._anonymous))
-        self._await_request()
+            self._abort(_oldest_of_busiest_host(self._anonymous))
+        self._start_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._forget()
+        self._remove_from_anonymous()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
         if self._timer is None and (self.cycle is None or self.cycle.response_complete):
-            self._await_request()
+            self._start_timer()
         super().data_received(data)
 
     def handle_events(self) -> None:
-        before = self.scope
+        previous_scope = self.scope
         super().handle_events()
-        if self.scope is not before:  # True once the headers of a new request are complete
+        if self.scope is not previous_scope:  # the headers of a new request are complete
             self._stop_timer()
             if self._has_token():
                 self._anonymous.pop(self, None)
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        self._forget()  # the application limits WebSockets itself
+        self._remove_from_anonymous()  # the application limits WebSockets itself
         super().handle_websocket_upgrade(event)
 
-    def _await_request(self) -> None:
-        self._timer = self.loop.call_later(REQUEST_TIMEOUT_S, self._end, self)
+    def _start_timer(self) -> None:
+        self._timer = self.loop.call_later(REQUEST_TIMEOUT_S, self._abort, self)
 
     def _stop_timer(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
-    def _forget(self) -> None:
+    def _remove_from_anonymous(self) -> None:
         self._stop_timer()
         self._anonymous.pop(self, None)
 
     @staticmethod
-    def _end(connection: _HttpConnection) -> None:
-        connection._forget()
+    def _abort(connection: _HttpConnection) -> None:
+        connection._remove_from_anonymous()
         connection.transport.abort()
 
 
-def _oldest_of_the_most_frequent(connections: Iterable[_HttpConnection]) -> _HttpConnection:
+def _oldest_of_busiest_host(connections: Iterable[_HttpConnection]) -> _HttpConnection:
     connections = list(connections)
     counts = Counter(_host(connection) for connection in connections)
     # max() returns the first of several maxima, which is the oldest.

@@ -68,20 +68,24 @@ class OrderType:
     run: Callable[[Vehicle, dict[str, Any]], Awaitable[object]]
     arguments: Mapping[str, OrderArgument] = field(default_factory=dict)
     is_safe: bool = False
-    parse: Callable[[Mapping[str, Any]], tuple[dict[str, Any], dict[str, Any]]] = lambda a: (dict(a), dict(a))
+    parse: Callable[[Mapping[str, Any]], tuple[dict[str, Any], dict[str, Any]]] = lambda values: (
+        dict(values),
+        dict(values),
+    )
     max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
         """Check the names of arguments; raise InvalidArgument. The library checks the values."""
         for name in values:
             if name not in self.arguments:
-                known = ", ".join(self.arguments) or "none"
-                raise InvalidArgument(f"{self.name}: unknown argument {name[:40]!r}; arguments: {known}")
+                names = ", ".join(self.arguments) or "none"
+                raise InvalidArgument(f"{self.name}: unknown argument {name[:40]!r}; arguments: {names}")
         for name, argument in self.arguments.items():
-            value = values.get(name)  # bool is a subclass of int, but True is not a mode number
+            value = values.get(name)
+            # Only bools are checked here: they are ints in Python, but True is not a mode number.
             if value is not None and isinstance(value, bool) != (argument.type == "boolean"):
                 raise InvalidArgument(f"{self.name}: {name} = {value!r:.40} is not of type {argument.type}")
-            if argument.is_required and values.get(name) is None:
+            if argument.is_required and value is None:
                 raise InvalidArgument(f"{self.name}: argument {name} is missing ({argument.text})")
 
 
@@ -143,7 +147,7 @@ def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
     return name, text, parse_plan_text(text, name)
 
 
-def _read_plan(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def _parse_plan_arguments(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     name, text, plan = parse_plan_body(values)
     counts = {
         "mission_items": len(plan.mission),
@@ -187,21 +191,26 @@ UPLOAD = OrderType(
     "Replace the mission; the fence and rally points too, if the plan has them",
     _upload,
     _PLAN,
-    parse=_read_plan,
+    parse=_parse_plan_arguments,
     max_body_size=MAX_PLAN_SIZE,
 )
 ORDERS = (
-    OrderType("arm", "Arm the motors: propellers may start to turn", lambda v, a: v.arm()),
-    OrderType("disarm", "Stop the motors, on the ground", lambda v, a: v.disarm(), is_safe=True),
-    OrderType("take_off", "Take off and climb", lambda v, a: v.take_off(**a), _ALTITUDE),
+    OrderType("arm", "Arm the motors: propellers may start to turn", lambda vehicle, _: vehicle.arm()),
+    OrderType("disarm", "Stop the motors, on the ground", lambda vehicle, _: vehicle.disarm(), is_safe=True),
+    OrderType("take_off", "Take off and climb", lambda vehicle, values: vehicle.take_off(**values), _ALTITUDE),
     OrderType("go_to", "Go to a position", _go_to, _GO_TO),
-    OrderType("hold", "Stop and hold position", lambda v, a: v.hold(), is_safe=True),
-    OrderType("land", "Land at the current position", lambda v, a: v.land(), is_safe=True),
-    OrderType("return_to_launch", "Return to the launch position", lambda v, a: v.return_to_launch(), is_safe=True),
-    OrderType("mode", "Change the flight mode", lambda v, a: v.set_mode(a["mode"]), _MODE),
+    OrderType("hold", "Stop and hold position", lambda vehicle, _: vehicle.hold(), is_safe=True),
+    OrderType("land", "Land at the current position", lambda vehicle, _: vehicle.land(), is_safe=True),
+    OrderType(
+        "return_to_launch",
+        "Return to the launch position",
+        lambda vehicle, _: vehicle.return_to_launch(),
+        is_safe=True,
+    ),
+    OrderType("mode", "Change the flight mode", lambda vehicle, values: vehicle.set_mode(values["mode"]), _MODE),
     UPLOAD,
-    OrderType("mission/start", "Fly the mission", lambda v, a: v.mission.start(**a), _ITEM),
-    OrderType("mission/pause", "Pause the mission", lambda v, a: v.mission.pause(), is_safe=True),
+    OrderType("mission/start", "Fly the mission", lambda vehicle, values: vehicle.mission.start(**values), _ITEM),
+    OrderType("mission/pause", "Pause the mission", lambda vehicle, _: vehicle.mission.pause(), is_safe=True),
     OrderType("mission/resume", "Resume the mission, in the air", _resume),
 )
 SET_PARAMETER = OrderType("set_parameter", "Set a parameter", _set_parameter, _VALUE)
@@ -241,9 +250,9 @@ class OrderRunner:
         self._background = BackgroundTasks(lambda error: None)
 
     def submit(
-        self, vehicle: Vehicle, kind: OrderType, arguments: dict[str, Any], key: str, seen_at_s: float | None
+        self, vehicle: Vehicle, order_type: OrderType, arguments: dict[str, Any], key: str, seen_at_s: float | None
     ) -> OrderRecord:
-        """Start an order, or return the earlier order with this key. The arguments have been checked by ``kind.check``.
+        """Start an order, or return the earlier order with this key. ``order_type.check`` has checked the arguments.
 
         Raises:
             HttpProblem: the key is missing, or was used for another order; the client has seen an old state.
@@ -258,16 +267,18 @@ class OrderRunner:
                 "KeyMissing",
                 "an order needs a unique Idempotency-Key header: 8 to 64 characters of A-Z a-z 0-9 . _ ~ -",
             )
-        shown, arguments = kind.parse(arguments)
-        before = self._records.get(key)
-        if before is not None and before.is_same(vehicle.system_id, kind.name, shown):
-            return before
-        if before is not None or key in self._used_keys:
+        recorded_arguments, arguments = order_type.parse(arguments)
+        earlier = self._records.get(key)
+        if earlier is not None and earlier.is_same(vehicle.system_id, order_type.name, recorded_arguments):
+            return earlier
+        if earlier is not None or key in self._used_keys:
             raise HttpProblem(409, "KeyUsed", "this Idempotency-Key was used for another order; nothing was sent")
-        self._check(vehicle, kind, seen_at_s)
-        record = OrderRecord(key, vehicle.system_id, kind.name, shown, vehicle.connection.unix_time())
+        self._check(vehicle, order_type, seen_at_s)
+        unix_s = vehicle.connection.unix_time()
+        record = OrderRecord(key, vehicle.system_id, order_type.name, recorded_arguments, unix_s)
         self._store(record)
-        self._background.start(lambda: self._run(vehicle, kind, record, arguments), f"aerokit serve {kind.name}")
+        run = partial(self._run, vehicle, order_type, record, arguments)
+        self._background.start(run, f"aerokit serve {order_type.name}")
         self._publish(record)
         return record
 
@@ -285,7 +296,8 @@ class OrderRunner:
         """Cancel running orders; the vehicle holds, as after any cancelled action."""
         await self._background.aclose()
 
-    def _check(self, vehicle: Vehicle, kind: OrderType, seen_at_s: float | None) -> None:
+    def _check(self, vehicle: Vehicle, order_type: OrderType, seen_at_s: float | None) -> None:
+        """Raise unless the order may be sent now."""
         vehicle.connection.raise_if_ended()
         now = asyncio.get_running_loop().time()
         if seen_at_s is not None and not 0 <= now - seen_at_s <= STATE_MAX_AGE_S:
@@ -295,11 +307,11 @@ class OrderRunner:
                 f"the client's state of the vehicle is older than {STATE_MAX_AGE_S:g} s; nothing was sent: check the"
                 " current state, then repeat the order",
             )
-        if kind.is_safe:
+        if order_type.is_safe:
             return
         if vehicle.link_state.latest is not LinkState.CONNECTED:
             raise HeartbeatTimeout(
-                f"{kind.name}: vehicle {vehicle.system_id} is silent"
+                f"{order_type.name}: vehicle {vehicle.system_id} is silent"
                 f" (last heartbeat {vehicle.heartbeat_age:.1f} s ago); nothing was sent"
             )
         running = [record for record in self._records.values() if record.state == "running"]
@@ -310,7 +322,8 @@ class OrderRunner:
 
     def _store(self, record: OrderRecord) -> None:
         self._records[record.key] = record
-        for key in [key for key, other in self._records.items() if other.state != "running"]:
+        ended_keys = [key for key, stored in self._records.items() if stored.state != "running"]
+        for key in ended_keys:
             if len(self._records) <= MAX_RESULTS:
                 break
             del self._records[key]
@@ -318,9 +331,11 @@ class OrderRunner:
         while len(self._used_keys) > MAX_USED_KEYS:
             self._used_keys.popitem(last=False)
 
-    async def _run(self, vehicle: Vehicle, kind: OrderType, record: OrderRecord, arguments: dict[str, Any]) -> None:
+    async def _run(
+        self, vehicle: Vehicle, order_type: OrderType, record: OrderRecord, arguments: dict[str, Any]
+    ) -> None:
         try:
-            record.result = to_jsonable(await kind.run(vehicle, arguments))
+            record.result = to_jsonable(await order_type.run(vehicle, arguments))
             record.state = "done"
         except asyncio.CancelledError:
             record.state = "failed"

@@ -63,9 +63,9 @@ def problem_of(error: Exception) -> dict[str, Any]:
         status, kind = error.status, error.kind
     else:
         kind = type(error).__name__
-        status = next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
-    is_public = isinstance(error, (AerokitError, HttpProblem))
-    found: dict[str, Any] = {
+        status = next((status for error_class, status in _STATUS if isinstance(error, error_class)), 500)
+    is_public = isinstance(error, (AerokitError, HttpProblem))  # other texts may reveal internals
+    problem: dict[str, Any] = {
         "type": "about:blank",
         "title": kind,
         "status": status,
@@ -73,14 +73,14 @@ def problem_of(error: Exception) -> dict[str, Any]:
         "detail": str(error) if is_public else "internal server error; see the server's log",
     }
     if reasons := getattr(error, "reasons", ()):
-        found["reasons"] = list(reasons)
-    return found
+        problem["reasons"] = list(reasons)
+    return problem
 
 
-def problem_response(error: Exception, **more: object) -> Response:
-    found = {**problem_of(error), **more}
+def problem_response(error: Exception) -> Response:
+    problem = problem_of(error)
     headers = error.headers if isinstance(error, HttpProblem) else None
-    return json_response(found, found["status"], "application/problem+json", headers)
+    return json_response(problem, problem["status"], "application/problem+json", headers)
 
 
 def json_response(
@@ -101,7 +101,7 @@ async def read_body(request: Request, max_size: int = MAX_BODY_SIZE) -> dict[str
         HttpProblem: 400 not a JSON object, 408 timed out, 413 too large, 415 not declared as JSON.
     """
     try:
-        data = await asyncio.wait_for(_read(request, max_size), BODY_TIMEOUT_S)
+        data = await asyncio.wait_for(_read_bytes(request, max_size), BODY_TIMEOUT_S)
     except asyncio.TimeoutError:
         raise HttpProblem(
             408, "BodyTimeout", f"the body was not received within {BODY_TIMEOUT_S:g} s; nothing was sent"
@@ -111,17 +111,17 @@ async def read_body(request: Request, max_size: int = MAX_BODY_SIZE) -> dict[str
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
         raise HttpProblem(415, "NotJson", "the body must have Content-Type: application/json; nothing was sent")
     try:
-        found = json.loads(data, parse_constant=_refuse, object_pairs_hook=_object)
+        body = json.loads(data, parse_constant=_refuse_constant, object_pairs_hook=_object_without_duplicates)
         # Rejects infinity (1e999) and lone surrogates, which could not be sent to other clients.
-        json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
+        json.dumps(body, ensure_ascii=False, allow_nan=False).encode()
     except (ValueError, RecursionError) as error:
         raise HttpProblem(400, "NotJson", f"the body is not valid JSON: {error}; nothing was sent") from None
-    if not isinstance(found, dict):
+    if not isinstance(body, dict):
         raise HttpProblem(400, "NotJson", "the body is not a JSON object; nothing was sent")
-    return found
+    return body
 
 
-async def _read(request: Request, max_size: int) -> bytes:
+async def _read_bytes(request: Request, max_size: int) -> bytes:
     data = bytearray()
     async for part in request.stream():
         data += part
@@ -130,15 +130,15 @@ async def _read(request: Request, max_size: int) -> bytes:
     return bytes(data)
 
 
-def _refuse(constant: str) -> NoReturn:
+def _refuse_constant(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is not a JSON number")
 
 
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+def _object_without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) < len(pairs):
         raise ValueError("an object has a duplicate name")
-    return found
+    return result
 
 
 def query_flag(request: Request, name: str, *, default: bool) -> bool:

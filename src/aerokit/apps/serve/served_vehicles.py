@@ -59,12 +59,13 @@ class ServedVehicles:
     def __init__(self, source: Connection | Vehicle | Mapping[int, Vehicle]) -> None:
         self.events: deque[dict[str, Any]] = deque(maxlen=MAX_EVENTS)
         self._texts: dict[int, deque[dict[str, Any]]] = {}
-        self._tracks: dict[int, list[tuple[Position, bool]]] = {}
-        self._checked: dict[Vehicle, tuple[str, ...]] = {}
-        self._checked_at: dict[Vehicle, float] = {}
+        self._tracks: dict[int, list[tuple[Position, bool]]] = {}  # True: the first after a gap
+        # The failing sensors for which the arming checks were requested last, and the time of that request.
+        self._requested_for: dict[Vehicle, tuple[str, ...]] = {}
+        self._requested_at: dict[Vehicle, float] = {}
         self._listeners: list[Listener] = []
         self._attached: dict[Connection, list[Detach]] = {}
-        self._count = 0
+        self._message_count = 0
         self._snapshot: tuple[float, str] | None = None
         # The end of a connection is not an error here, because the states of its vehicles show it.
         self._background = BackgroundTasks(lambda error: None)
@@ -72,31 +73,31 @@ class ServedVehicles:
         if isinstance(source, Connection):
             self._attach(source)
             self._attached[source].append(source.on_end(lambda _: self._background.cancel()))
-            self._background.start(lambda: self._follow(source), "aerokit serve")
+            self._background.start(lambda: self._follow_connection(source), "aerokit serve")
         elif isinstance(source, Vehicle):
             self._vehicles = {source.system_id: source}
         elif isinstance(source, Mapping):
             self._vehicles = source
         else:
             raise InvalidArgument(f"source = {source!r} is not a connection, a vehicle or a mapping of vehicles")
-        self._attach_new()
+        self._attach_new_connections()
         self._background.start(self._record_tracks, "aerokit serve tracks")
-        self._background.start(self._request_reasons, "aerokit serve checks")
+        self._background.start(self._request_arming_checks, "aerokit serve checks")
 
     @property
     def vehicles(self) -> Mapping[int, Vehicle]:
-        self._attach_new()
+        self._attach_new_connections()
         return self._vehicles
 
     def vehicle(self, system_id: int) -> Vehicle:
         """Return the vehicle with this system id; raise HttpProblem 404 if there is none."""
-        found = self.vehicles.get(system_id)
-        if found is None:
-            known = ", ".join(map(str, self.vehicles)) or "none"
+        vehicle = self.vehicles.get(system_id)
+        if vehicle is None:
+            known_ids = ", ".join(map(str, self.vehicles)) or "none"
             raise HttpProblem(
-                404, "UnknownVehicle", f"no vehicle has system id {system_id} (vehicles: {known}); nothing was sent"
+                404, "UnknownVehicle", f"no vehicle has system id {system_id} (vehicles: {known_ids}); nothing was sent"
             )
-        return found
+        return vehicle
 
     def texts(self, system_id: int) -> list[dict[str, Any]]:
         return list(self._texts.get(system_id, ()))
@@ -104,7 +105,7 @@ class ServedVehicles:
     def track(self, system_id: int) -> list[tuple[float, float, bool]]:
         """Return a track, the oldest position first: latitude, longitude, and True after a gap."""
         points = self._tracks.get(system_id, ())
-        return [(at.latitude_deg, at.longitude_deg, is_after_gap) for at, is_after_gap in points]
+        return [(position.latitude_deg, position.longitude_deg, is_after_gap) for position, is_after_gap in points]
 
     def snapshot(self) -> str:
         """Return the current state of all vehicles, as a JSON ``state`` message of the stream."""
@@ -122,8 +123,8 @@ class ServedVehicles:
 
     def publish(self, message: dict[str, Any]) -> None:
         """Number a message, and pass it to all listeners."""
-        self._count += 1
-        numbered = {**message, "number": self._count}
+        self._message_count += 1
+        numbered = {**message, "number": self._message_count}
         if message["type"] == "event":
             self.events.append(numbered)
         for listener in tuple(self._listeners):
@@ -136,19 +137,20 @@ class ServedVehicles:
         self._attached.clear()
         await self._background.aclose()
 
-    async def _follow(self, connection: Connection) -> None:
+    async def _follow_connection(self, connection: Connection) -> None:
         async with vehicles_on(connection) as vehicles:
             self._vehicles = vehicles
             await asyncio.Event().wait()
 
-    def _attach_new(self) -> None:
+    def _attach_new_connections(self) -> None:
         for vehicle in self._vehicles.values():
             if vehicle.connection not in self._attached:
                 self._attach(vehicle.connection)
 
     def _attach(self, connection: Connection) -> None:
         def on_event(event: Event) -> None:
-            if isinstance(event, LinkReport) or not (event.system_id == 0 or event.system_id in self._vehicles):
+            is_about_link_or_vehicle = event.system_id == 0 or event.system_id in self._vehicles
+            if isinstance(event, LinkReport) or not is_about_link_or_vehicle:
                 return
             self._record(event, connection.unix_time() - (connection.now() - event.at))
 
@@ -161,7 +163,7 @@ class ServedVehicles:
         self.publish({"type": "event", "event": type(event).__name__, "time_unix_s": unix_s, **to_jsonable(event)})
 
     async def _record_tracks(self) -> None:
-        silent: set[int] = set()
+        silent: set[int] = set()  # system ids whose next position comes after a gap
         while True:
             for system_id, vehicle in tuple(self._vehicles.items()):
                 position, track = vehicle.position.latest, self._tracks.setdefault(system_id, [])
@@ -174,18 +176,16 @@ class ServedVehicles:
                     silent.discard(system_id)
             await anyio.sleep(TRACK_INTERVAL_S)
 
-    async def _request_reasons(self) -> None:
+    async def _request_arming_checks(self) -> None:
         while True:
             for vehicle in tuple(self._vehicles.values()):
                 failing = _failing_checks(vehicle)
                 now = vehicle.connection.now()
+                is_due = now - self._requested_at.get(vehicle, -math.inf) >= MIN_CHECK_INTERVAL_S
                 if failing is None:
-                    self._checked.pop(vehicle, None)
-                elif (
-                    failing != self._checked.get(vehicle)
-                    and now - self._checked_at.get(vehicle, -math.inf) >= MIN_CHECK_INTERVAL_S
-                ):
-                    self._checked[vehicle], self._checked_at[vehicle] = failing, now
+                    self._requested_for.pop(vehicle, None)
+                elif failing != self._requested_for.get(vehicle) and is_due:
+                    self._requested_for[vehicle], self._requested_at[vehicle] = failing, now
                     self._background.start(partial(_run_checks, vehicle), "aerokit serve check")
             await anyio.sleep(TRACK_INTERVAL_S)
 
@@ -211,9 +211,9 @@ class ServedVehicles:
         if not missing or vehicle.link_state.latest is not LinkState.CONNECTED:
             return missing
         # Texts from before the newest check may describe problems that are solved.
-        age_s = min(vehicle.connection.now() - self._checked_at.get(vehicle, -math.inf), PREARM_TEXT_MAX_AGE_S)
-        since = vehicle.connection.unix_time() - age_s
-        recent = [entry["text"] for entry in self.texts(vehicle.system_id) if entry["time_unix_s"] >= since]
+        age_s = min(vehicle.connection.now() - self._requested_at.get(vehicle, -math.inf), PREARM_TEXT_MAX_AGE_S)
+        oldest_unix_s = vehicle.connection.unix_time() - age_s
+        recent = [entry["text"] for entry in self.texts(vehicle.system_id) if entry["time_unix_s"] >= oldest_unix_s]
         reasons = (vehicle.autopilot.arming_reason(text) for text in recent)
         return list(dict.fromkeys([*filter(None, reasons), *missing]))
 
@@ -221,7 +221,8 @@ class ServedVehicles:
 def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
     """Return the failing sensors of a disarmed vehicle whose arming checks do not pass, else None."""
     sensors = vehicle.sensors.latest
-    if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False or sensors is None:
+    is_disarmed = vehicle.armed.latest is False
+    if vehicle.link_state.latest is not LinkState.CONNECTED or not is_disarmed or sensors is None:
         return None
     return tuple(sensors.failing) if sensors.prearm_checks_pass is False else None
 
@@ -237,8 +238,8 @@ def _unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
     autopilot, mode = vehicle.autopilot, vehicle.mode.latest
     if mode is None or mode.name not in autopilot.unarmable_modes.union(autopilot.armable_by_option):
         return None
-    better, option = autopilot.mode_to_arm_in(), autopilot.armable_by_option.get(mode.name)
-    return {"mode": mode.name, "arms_in": None if better is None else better.name, "unless": option}
+    arming_mode, option = autopilot.mode_to_arm_in(), autopilot.armable_by_option.get(mode.name)
+    return {"mode": mode.name, "arms_in": None if arming_mode is None else arming_mode.name, "unless": option}
 
 
 async def _run_checks(vehicle: Vehicle) -> None:

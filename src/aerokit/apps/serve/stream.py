@@ -76,24 +76,25 @@ class StateStream:
     async def _serve(self, socket: WebSocket, period_s: float) -> None:
         sending = asyncio.ensure_future(self._send_messages(socket, period_s))
         receiving = asyncio.ensure_future(_receive(socket))
-        both = {sending, receiving}
+        tasks = {sending, receiving}
         try:
-            await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            for task in both:
+            for task in tasks:
                 task.cancel()
-            await asyncio.gather(*both, return_exceptions=True)
+            await asyncio.gather(*tasks, return_exceptions=True)
         if receiving.done() and not receiving.cancelled() and receiving.exception() is None:
             code = 1008  # policy violation: the client sent a message
         elif sending.done() and not sending.cancelled() and isinstance(sending.exception(), TimeoutError):
             code = 1013  # try again later: the client does not read
         else:
             return
-        with suppress(Exception):
+        with suppress(Exception):  # the client may be gone
             await asyncio.wait_for(socket.close(code), 1.0)
 
     async def _send_messages(self, socket: WebSocket, period_s: float) -> None:
-        loop, queue, missed, changed = asyncio.get_running_loop(), deque[dict[str, Any]](), 0, asyncio.Event()
+        loop, queue, changed = asyncio.get_running_loop(), deque[dict[str, Any]](), asyncio.Event()
+        missed = 0  # messages that were dropped since the last sent message
 
         def enqueue(message: dict[str, Any]) -> None:
             nonlocal missed
@@ -103,26 +104,27 @@ class StateStream:
             queue.append(message)
             changed.set()
 
-        stop = self._served.listen(enqueue)
+        stop_listening = self._served.listen(enqueue)
         try:
             await _send(socket, json.dumps(self._hello(), ensure_ascii=False))
-            due = loop.time()
+            next_snapshot_at = loop.time()
             while True:
-                if loop.time() >= due:
+                if loop.time() >= next_snapshot_at:
                     await _send(socket, self._served.snapshot())
-                    due = loop.time() + period_s
+                    next_snapshot_at = loop.time() + period_s
                 while queue:
-                    message = {**queue.popleft(), **({"missed": missed} if missed else {})}
-                    missed = 0
+                    message = dict(queue.popleft())  # a copy, because all clients share the message
+                    if missed:
+                        message["missed"], missed = missed, 0
                     await _send(socket, json.dumps(message, ensure_ascii=False))
                 changed.clear()
-                timer = loop.call_later(max(0.001, due - loop.time()), changed.set)
+                timer = loop.call_later(max(0.001, next_snapshot_at - loop.time()), changed.set)
                 try:
                     await changed.wait()
                 finally:
                     timer.cancel()
         finally:
-            stop()
+            stop_listening()
 
     def _hello(self) -> dict[str, Any]:
         return {

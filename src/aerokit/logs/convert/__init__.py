@@ -104,31 +104,34 @@ def convert(
         OSError: a file cannot be read or written.
         ModuleNotFoundError: a package of the extra ``convert`` is not installed.
     """
-    source, to = Path(log), Path(target)
-    make_writer = _writer_for(to, tables)
+    source, target_path = Path(log), Path(target)
+    make_writer = _writer_for(target_path, tables)
+    is_folder = not target_path.suffix
     reader_class = LOG_READERS.get(source.suffix.lower())
     if reader_class is None:
         raise FileFormatError(f"{source} is not a flight log; supported suffixes: {', '.join(LOG_READERS)}")
-    if not force and to.exists() and not (to.is_dir() and not to.suffix and not any(to.iterdir())):
-        raise InvalidArgument(f"{to} exists; use force (--force) to replace it")
-    if to.exists() and to.is_dir() != (not to.suffix):
-        kinds = ("folder", "file") if to.is_dir() else ("file", "folder")
-        raise InvalidArgument(f"{to} is a {kinds[0]} and cannot be replaced by a {kinds[1]}")
-    on_bytes = _byte_callback(source, on_progress)
+    is_empty_folder = is_folder and target_path.is_dir() and not any(target_path.iterdir())
+    if not force and target_path.exists() and not is_empty_folder:
+        raise InvalidArgument(f"{target_path} exists; use force (--force) to replace it")
+    if target_path.exists() and target_path.is_dir() != is_folder:
+        existing, new = ("file", "folder") if is_folder else ("folder", "file")
+        raise InvalidArgument(f"{target_path} is a {existing} and cannot be replaced by a {new}")
+    on_bytes = _progress_callback(source, on_progress)
     # The temporary folder is in the target's directory, so that the result can be renamed.
-    with tempfile.TemporaryDirectory(dir=to.parent, prefix=f".{to.name}.") as folder:
-        part = Path(folder) / to.name
-        if not to.suffix:
-            part.mkdir()
+    with tempfile.TemporaryDirectory(dir=target_path.parent, prefix=f".{target_path.name}.") as folder:
+        incomplete = Path(folder) / target_path.name
+        if is_folder:
+            incomplete.mkdir()
         log_reader = reader_class(source)
-        entries, begins_at, ends_at, written = _copy(log_reader, make_writer(part, log_reader), on_bytes)
-        size = _move(part, to)
-    return Conversion(to, entries, written, size, begins_at, ends_at, tuple(log_reader.notes))
+        writer = make_writer(incomplete, log_reader)
+        entries, begins_at, ends_at, written = _write_records(log_reader, writer, on_bytes)
+        size = _move(incomplete, target_path)
+    return Conversion(target_path, entries, written, size, begins_at, ends_at, tuple(log_reader.notes))
 
 
-def _writer_for(to: Path, tables: str) -> Callable[[Path, LogReader], _Writer]:
-    formats: dict[str, Any] = FORMATS if to.suffix else FOLDERS
-    key = to.suffix.lower() if to.suffix else tables
+def _writer_for(target: Path, tables: str) -> Callable[[Path, LogReader], _Writer]:
+    formats: dict[str, Any] = FORMATS if target.suffix else FOLDERS
+    key = target.suffix.lower() if target.suffix else tables
     if key not in formats:
         raise InvalidArgument(
             f"unknown format {key!r}; files: {', '.join(FORMATS)}; tables in folders: {' or '.join(FOLDERS)}"
@@ -137,7 +140,8 @@ def _writer_for(to: Path, tables: str) -> Callable[[Path, LogReader], _Writer]:
     return writer
 
 
-def _copy(log: LogReader, writer: _Writer, on_bytes: Callable[[int], object]) -> tuple[int, float, float, int]:
+def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], object]) -> tuple[int, float, float, int]:
+    """Return the number of records, the times of the first and the last, and the number of written messages."""
     entries, begins_at, ends_at = 0, 0.0, 0.0
     try:
         for entry in log.entries(on_bytes):
@@ -153,25 +157,25 @@ def _copy(log: LogReader, writer: _Writer, on_bytes: Callable[[int], object]) ->
     return entries, begins_at, ends_at, writer.written
 
 
-def _byte_callback(source: Path, on_progress: OnProgress | None) -> Callable[[int], object]:
+def _progress_callback(source: Path, on_progress: OnProgress | None) -> Callable[[int], object]:
     total, started = source.stat().st_size, time.monotonic()
     if on_progress is None:
         return lambda done: None
     return lambda done: on_progress(TransferProgress(min(done, total), total, time.monotonic() - started))
 
 
-def _move(part: Path, to: Path) -> int:
+def _move(complete: Path, target: Path) -> int:
     """Flush the files to disk, and give them their final names. Return their total size."""
-    files = sorted(part.iterdir()) if part.is_dir() else [part]
+    files = sorted(complete.iterdir()) if complete.is_dir() else [complete]
     for file in files:
         with file.open("rb") as opened:
             os.fsync(opened.fileno())  # without fsync, a power failure could leave an empty file
     size = sum(file.stat().st_size for file in files)
-    if not part.is_dir():
-        part.replace(to)
-    elif not to.exists():
-        shutil.move(part, to)
+    if not complete.is_dir():
+        complete.replace(target)
+    elif not target.exists():
+        shutil.move(complete, target)
     else:
         for file in files:
-            file.replace(to / file.name)
+            file.replace(target / file.name)
     return size

@@ -29,19 +29,19 @@ class McapWriter:
         self._channels: dict[str, int] = {}
         self._schemas: dict[bytes, int] = {}
         self._latest: dict[int, dict[str, Any]] = {}
-        self._map = topics.MapFrame()
+        self._map_frame = topics.MapFrame()
         self.written: int = 0
 
     def write(self, record: LogRecord) -> None:
         message, system_id = record.message, record.system_id
         if message is not None:
-            kind = STANDARD[message.ID]
-            name = topics.raw_topic_name(system_id, record.component_id, kind)
+            message_class = STANDARD[message.ID]
+            name = topics.raw_topic_name(system_id, record.component_id, message_class)
             self._put(
                 record.unix_s,
                 name,
                 topics.raw_fields(message),
-                lambda: topics.raw_topic(system_id, record.component_id, kind),
+                lambda: topics.raw_topic(system_id, record.component_id, message_class),
             )
         else:
             name = f"/log/{record.table}"
@@ -62,20 +62,24 @@ class McapWriter:
         for state, value in record.states:
             latest[state] = value
             name = topics.vehicle_topic(system_id, state)
-            make = lambda: topics.state_topic(system_id, state, value)  # noqa: E731, B023
-            self._put(unix_s, name, topics.state_fields(value), make)
+            self._put(
+                unix_s,
+                name,
+                topics.state_fields(value),
+                lambda: topics.state_topic(system_id, state, value),  # noqa: B023 - called in this iteration
+            )
             if state == "status_text":
                 fields = topics.log_entry(unix_s, system_id, value)
                 self._put_foxglove(unix_s, system_id, "log", fields, topics.LOG)
-        moved = {state for state, _ in record.states} & _POSE_STATES
-        place, attitude = latest.get("position"), latest.get("attitude")
-        if not moved or place is None:
+        changed_pose_states = {state for state, _ in record.states} & _POSE_STATES
+        position, attitude = latest.get("position"), latest.get("attitude")
+        if not changed_pose_states or position is None:
             return
-        if "position" in moved:
+        if "position" in changed_pose_states:
             heading, velocity = latest.get("heading_deg"), latest.get("velocity")
-            fix = topics.location_fix(unix_s, system_id, place, heading, velocity)
+            fix = topics.location_fix(unix_s, system_id, position, heading, velocity)
             self._put_foxglove(unix_s, system_id, "location", fix, topics.LOCATION_FIX)
-            latest["metres"] = self._map.east_north_up_m(place)
+            latest["metres"] = self._map_frame.east_north_up_m(position)
         metres = latest["metres"]
         transform = topics.frame_transform(unix_s, system_id, metres, attitude)
         self._put_foxglove(unix_s, system_id, "transform", transform, topics.FRAME_TRANSFORM)
@@ -83,17 +87,18 @@ class McapWriter:
         self._put_foxglove(unix_s, system_id, "pose", pose, topics.POSE_IN_FRAME)
 
     def _put_foxglove(
-        self, unix_s: float, system_id: int, what: str, fields: Mapping[str, Any], schema: Mapping[str, Any]
+        self, unix_s: float, system_id: int, short_name: str, fields: Mapping[str, Any], schema: Mapping[str, Any]
     ) -> None:
-        name = topics.vehicle_topic(system_id, what)
+        name = topics.vehicle_topic(system_id, short_name)
         self._put(unix_s, name, fields, lambda: Topic(name, schema))
 
-    def _put(self, unix_s: float, name: str, fields: Mapping[str, Any], make: Callable[[], Topic]) -> None:
+    def _put(self, unix_s: float, name: str, fields: Mapping[str, Any], make_topic: Callable[[], Topic]) -> None:
+        """Add a message to a topic, which is made for its first message."""
         channel = self._channels.get(name)
         if channel is None:
-            channel = self._channels[name] = self._register(make())
-        at = topics.nanoseconds(unix_s)
-        self._writer.add_message(channel, at, topics.encoded(fields), at)
+            channel = self._channels[name] = self._register(make_topic())
+        time_ns = topics.nanoseconds(unix_s)
+        self._writer.add_message(channel, time_ns, topics.encoded(fields), time_ns)
         self.written += 1
 
     def _register(self, topic: Topic) -> int:
@@ -105,9 +110,8 @@ class McapWriter:
         return int(self._writer.register_channel(topic.name, "json", schema))
 
     def _record_topic(self, record: LogRecord) -> Topic:
-        kinds = {"str": "string"}
         properties = {
-            column.field: {"type": kinds.get(column.kind, "number"), "description": column.name}
+            column.field: {"type": "string" if column.kind == "str" else "number", "description": column.name}
             for column in self._log.columns(record)
         }
         title = f"log.{record.table}"

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from aerokit.logs.flights.records import LogReader, LogRecord
 
-_ROWS, _LINES = 1 << 15, 1 << 8
-_SENDER = (
+_ROWS_PER_FLUSH, _LINES_PER_FLUSH = 1 << 15, 1 << 8
+_SENDER_COLUMNS = (
     TableColumn("time_utc", "", "time"),
     TableColumn("system_id", "", "int"),
     TableColumn("component_id", "", "int"),
@@ -58,7 +58,7 @@ FLIGHT = (
 _FORMULA = re.compile(r"(^|[;\t])(?=[\s\0]*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n\0])")
 
 
-_NUMBERS = (float, int)
+_NUMBER_TYPES = (float, int)
 
 
 def _csv_cell(value: Any) -> Any:
@@ -78,16 +78,17 @@ class CsvTable:
     def __init__(self, path: Path, columns: Sequence[TableColumn]) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")
         self._lines: list[str] = []
+        line_collector: Any = SimpleNamespace(write=self._lines.append)
         # The csv module quotes values with "\r" and "\n" only if the line terminator contains both.
-        lines: Any = SimpleNamespace(write=self._lines.append)
-        self._writer = csv.writer(lines, lineterminator="\r\n")
+        self._writer = csv.writer(line_collector, lineterminator="\r\n")
         self._writer.writerow([_csv_cell(column.name) for column in columns])
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
         """Add a row; the time is ISO 8601 in UTC with microseconds."""
-        shown = [value if type(value) in _NUMBERS and value == value else _csv_cell(value) for value in values]
-        self._writer.writerow([_iso_time(unix_s), *shown])
-        if len(self._lines) >= _LINES:
+        # Most values are numbers; calling _csv_cell for them would take longer. `value == value` is False for NaN.
+        cells = [value if type(value) in _NUMBER_TYPES and value == value else _csv_cell(value) for value in values]
+        self._writer.writerow([_iso_time(unix_s), *cells])
+        if len(self._lines) >= _LINES_PER_FLUSH:
             self._flush()
 
     def close(self) -> None:
@@ -123,7 +124,7 @@ class ParquetTable:
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
         self._rows.append((round(unix_s * 1e6), *values))
-        if len(self._rows) >= _ROWS:
+        if len(self._rows) >= _ROWS_PER_FLUSH:
             self._flush()
 
     def close(self) -> None:
@@ -150,9 +151,9 @@ class FlightTableWriter:
     """Writes one table, with a row for each position of each vehicle. A row includes the newest other values."""
 
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
-        self._table = kind(path, (*_SENDER[:2], *FLIGHT))
+        self._table = kind(path, (*_SENDER_COLUMNS[:2], *FLIGHT))
         self._latest: dict[int, dict[str, Any]] = {}
-        self._readers = [_reader(column.field) for column in FLIGHT]
+        self._value_getters = [_value_getter(column.field) for column in FLIGHT]
         self.written: int = 0
         self._log = log
 
@@ -163,7 +164,9 @@ class FlightTableWriter:
         latest = self._latest.setdefault(record.system_id, {})
         latest.update(record.states)
         if any(state == "position" for state, _ in record.states):
-            self._table.add(record.unix_s, (record.system_id, *(read(latest) for read in self._readers)))
+            self._table.add(
+                record.unix_s, (record.system_id, *(get_value(latest) for get_value in self._value_getters))
+            )
             self.written += 1
 
     def close(self) -> None:
@@ -181,22 +184,25 @@ class MessageTablesWriter:
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
         self._path, self._log, self._kind = path, log, kind
         log.needs_states = False
+        # By record type: the table, and the function that makes its rows.
         self._tables: dict[str, tuple[Table, Callable[[LogRecord], list[Any]]]] = {}
         self.written: int = 0
 
     def write(self, record: LogRecord) -> None:
         """Add a row to the table of a record."""
-        found = self._tables.get(record.table)
-        if found is None:
-            columns = self._log.columns(record)
-            # The log is untrusted input, and the name becomes a file name.
-            name = re.sub(r"[^\w-]", "_", record.table) + self._kind.SUFFIX
-            if (self._path / name).exists():
-                name = f"{len(self._tables)}_{name}"
-            table = self._kind(self._path / name, (*_SENDER, *columns))
-            found = self._tables[record.table] = table, _row_of(columns, record)
-        found[0].add(record.unix_s, (record.system_id, record.component_id, *found[1](record)))
+        table, make_row = self._tables.get(record.table) or self._open_table(record)
+        table.add(record.unix_s, (record.system_id, record.component_id, *make_row(record)))
         self.written += 1
+
+    def _open_table(self, record: LogRecord) -> tuple[Table, Callable[[LogRecord], list[Any]]]:
+        columns = self._log.columns(record)
+        # The log is untrusted input, and the name becomes a file name.
+        name = re.sub(r"[^\w-]", "_", record.table) + self._kind.SUFFIX
+        if (self._path / name).exists():
+            name = f"{len(self._tables)}_{name}"
+        table = self._kind(self._path / name, (*_SENDER_COLUMNS, *columns))
+        table_and_row_maker = self._tables[record.table] = table, _row_maker(columns, record)
+        return table_and_row_maker
 
     def close(self) -> None:
         for table, _ in self._tables.values():
@@ -210,7 +216,7 @@ class MessageTablesWriter:
 def _iso_time(unix_s: float) -> str:
     fraction, second = math.modf(unix_s)
     microseconds = round(fraction * 1e6)
-    if not 0 <= microseconds < 1_000_000:
+    if not 0 <= microseconds < 1_000_000:  # before 1970, or rounded up to a full second
         return datetime.fromtimestamp(unix_s, timezone.utc).isoformat(timespec="microseconds")
     return f"{_iso_second(second)}.{microseconds:06}+00:00"
 
@@ -220,43 +226,50 @@ def _iso_second(unix_s: float) -> str:
     return datetime.fromtimestamp(unix_s, timezone.utc).isoformat()[:19]
 
 
-def _row_of(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[LogRecord], list[Any]]:
+def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[LogRecord], list[Any]]:
     """Return a function that makes table rows from records of this type."""
     if record.message is None:
         names = [column.field for column in columns]
         return lambda record: [_cell(record.fields.get(name)) for name in names]
     parts = [column.field.partition(".") for column in columns]
-    fields = attrgetter("NAME", *(name for name, _, _ in parts))  # a tuple, due to the additional name
-    elements = [(place, int(index)) for place, (_, _, index) in enumerate(parts) if index]
-    texts = [place for place, column in enumerate(columns) if column.kind == "str"]
+    # attrgetter returns a tuple only for several names, and a message may have a single field.
+    get_fields = attrgetter("NAME", *(name for name, _, _ in parts))
+    array_elements = [(position, int(index)) for position, (_, _, index) in enumerate(parts) if index]
+    texts = [position for position, column in enumerate(columns) if column.kind == "str"]
 
-    def row(record: LogRecord) -> list[Any]:
-        _, *values = fields(record.message)
-        for place, index in elements:
-            values[place] = values[place][index]
-        for place in texts:
-            values[place] = _cell(values[place])
+    def make_row(record: LogRecord) -> list[Any]:
+        _, *values = get_fields(record.message)
+        for position, index in array_elements:
+            values[position] = values[position][index]
+        for position in texts:
+            values[position] = _cell(values[position])
         return values
 
-    return row
+    return make_row
 
 
 def _cell(value: Any) -> Any:
     """Convert a value for a table: bytes to hexadecimal digits, lists to text."""
     if isinstance(value, bytes):
         return value.hex()
-    return str(list(value)) if isinstance(value, (list, tuple)) or hasattr(value, "typecode") else value
+    is_array = hasattr(value, "typecode")
+    return str(list(value)) if isinstance(value, (list, tuple)) or is_array else value
 
 
-def _reader(path: str) -> Callable[[dict[str, Any]], Any]:
-    first, *rest = path.split(".")
+def _first(values: Sequence[Any]) -> Any:
+    return values[0] if values else None
 
-    def read(latest: dict[str, Any]) -> Any:
-        value = latest.get(first)
-        for step in rest:
+
+def _value_getter(path: str) -> Callable[[dict[str, Any]], Any]:
+    """Return a function that reads a path such as ``batteries.0.voltage_v`` from states; None for unknown values."""
+    state, *steps = path.split(".")
+
+    def get_value(latest: dict[str, Any]) -> Any:
+        value = latest.get(state)
+        for step in steps:
             if value is None:
                 return None
-            value = (value[0] if value else None) if step == "0" else getattr(value, step)
+            value = _first(value) if step == "0" else getattr(value, step)
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    return read
+    return get_value

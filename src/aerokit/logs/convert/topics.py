@@ -27,26 +27,26 @@ MAP_FRAME = "map"
 """Common frame of all vehicles: x is east, y north, z up, in metres. The origin is the first known position."""
 _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 _NUMBER, _TEXT = {"type": "number"}, {"type": "string"}
-_KINDS = {"float": "number", "int": "number", "str": "string", "bool": "boolean"}
+_JSON_TYPES = {"float": "number", "int": "number", "str": "string", "bool": "boolean"}
 _FATAL, _ERROR, _WARNING, _INFO, _DEBUG = 5, 4, 3, 2, 1
 # MAV_SEVERITY → foxglove.LogLevel.
-_LEVELS = (_FATAL, _FATAL, _FATAL, _ERROR, _WARNING, _INFO, _INFO, _DEBUG)
+_FOXGLOVE_LEVELS = (_FATAL, _FATAL, _FATAL, _ERROR, _WARNING, _INFO, _INFO, _DEBUG)
 
 
 def _object(title: str, /, **properties: Any) -> dict[str, Any]:
     return {"title": title, "type": "object", "properties": properties}
 
 
-def _of_foxglove(name: str, /, **properties: Any) -> dict[str, Any]:
+def _foxglove_object(name: str, /, **properties: Any) -> dict[str, Any]:
     return {**_object(f"foxglove.{name}", **properties), "required": list(properties)}
 
 
 _TIME = _object("time", sec={"type": "integer"}, nsec={"type": "integer"})
-_VECTOR = _of_foxglove("Vector3", x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_QUATERNION = _of_foxglove("Quaternion", x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
+_VECTOR = _foxglove_object("Vector3", x=_NUMBER, y=_NUMBER, z=_NUMBER)
+_QUATERNION = _foxglove_object("Quaternion", x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
 
 LOCATION_FIX: dict[str, Any] = {
-    **_of_foxglove(
+    **_foxglove_object(
         "LocationFix",
         timestamp=_TIME,
         frame_id=_TEXT,
@@ -60,7 +60,7 @@ LOCATION_FIX: dict[str, Any] = {
     ),
     "required": ["timestamp", "frame_id", "latitude", "longitude", "altitude"],
 }
-FRAME_TRANSFORM = _of_foxglove(
+FRAME_TRANSFORM = _foxglove_object(
     "FrameTransform",
     timestamp=_TIME,
     parent_frame_id=_TEXT,
@@ -68,13 +68,13 @@ FRAME_TRANSFORM = _of_foxglove(
     translation=_VECTOR,
     rotation=_QUATERNION,
 )
-POSE_IN_FRAME = _of_foxglove(
+POSE_IN_FRAME = _foxglove_object(
     "PoseInFrame",
     timestamp=_TIME,
     frame_id=_TEXT,
-    pose=_of_foxglove("Pose", position=_VECTOR, orientation=_QUATERNION),
+    pose=_foxglove_object("Pose", position=_VECTOR, orientation=_QUATERNION),
 )
-LOG = _of_foxglove(
+LOG = _foxglove_object(
     "Log",
     timestamp=_TIME,
     level={"type": "integer"},
@@ -111,9 +111,9 @@ class MapFrame:
                 position.longitude_deg,
                 (altitude or 0.0) - (relative or 0.0),
             )
-        latitude, longitude, height = self._origin
+        latitude, longitude, origin_amsl_m = self._origin
         north, east = geo.north_east_m(latitude, longitude, position.latitude_deg, position.longitude_deg)
-        return east, north, height_above(height, altitude, relative)
+        return east, north, height_above(origin_amsl_m, altitude, relative)
 
 
 def height_above(origin_m: float, altitude_amsl_m: float | None, relative_m: float | None) -> float:
@@ -144,8 +144,11 @@ def raw_topic(system_id: int, component_id: int, message: type[Message]) -> Topi
     for field in message.FIELDS:
         if field.name in SECRET_FIELDS:
             continue
-        number: dict[str, Any] = {"type": "string" if field.is_text or _are_bytes(field) else "number"}
-        schema = {"type": "array", "items": number} if field.array_length and number == _NUMBER else number
+        schema: dict[str, Any] = _NUMBER
+        if field.is_text or _is_byte_array(field):
+            schema = _TEXT
+        elif field.array_length:
+            schema = {"type": "array", "items": _NUMBER}
         unit = f" [{field.units}]" if field.units else ""
         properties[field.name] = {**schema, "description": f"{field.description}{unit}"}
     name = raw_topic_name(system_id, component_id, message)
@@ -156,7 +159,7 @@ def raw_topic_name(system_id: int, component_id: int, message: type[Message]) ->
     return f"/mavlink/{system_id}/{component_id}/{message.NAME}"
 
 
-def _are_bytes(field: Any) -> bool:
+def _is_byte_array(field: Any) -> bool:
     return field.type in ("uint8_t", "char") and bool(field.array_length)
 
 
@@ -241,9 +244,12 @@ def pose_in_frame(unix_s: float, east_north_up_m: Sequence[float], attitude: Att
 def log_entry(unix_s: float, system_id: int, text: StatusText) -> dict[str, Any]:
     """Return a ``foxglove.Log`` for a status text; the level is 0 (unknown) if the log has no severity."""
     severity: int | None = text.severity
+    level = 0
+    if severity is not None and 0 <= severity < len(_FOXGLOVE_LEVELS):
+        level = _FOXGLOVE_LEVELS[severity]
     return {
         "timestamp": _time(unix_s),
-        "level": 0 if severity is None or not 0 <= severity < len(_LEVELS) else _LEVELS[severity],
+        "level": level,
         "message": text.text,
         "name": frame_of(system_id),
         "file": "",
@@ -252,8 +258,8 @@ def log_entry(unix_s: float, system_id: int, text: StatusText) -> dict[str, Any]
 
 
 def _time(unix_s: float) -> dict[str, int]:
-    seconds, rest = divmod(nanoseconds(unix_s), 1_000_000_000)
-    return {"sec": seconds, "nsec": rest}
+    seconds, remaining_ns = divmod(nanoseconds(unix_s), 1_000_000_000)
+    return {"sec": seconds, "nsec": remaining_ns}
 
 
 def _vector(x: float, y: float, z: float) -> dict[str, float]:
@@ -263,7 +269,8 @@ def _vector(x: float, y: float, z: float) -> dict[str, float]:
 def _rotation(attitude: Attitude | None) -> dict[str, float]:
     """Return the rotation of a body frame (forward, left, up) in the map frame (east, north, up) as a quaternion.
 
-    MAVLink uses forward, right, down in north, east, down.
+    MAVLink uses forward, right, down in north, east, down. Both changes of axes are rotations by 180°, so that the
+    result only exchanges and adds components of MAVLink's quaternion.
     """
     w, x, y, z = 1.0, 0.0, 0.0, 0.0
     if attitude is not None and all(map(math.isfinite, (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))):
@@ -275,12 +282,12 @@ def _rotation(attitude: Attitude | None) -> dict[str, float]:
 def _schema_of(value: object) -> dict[str, Any]:
     """Return the JSON schema of a converted value. If a field is None, its annotation determines the type."""
     if isinstance(value, Snapshot):
-        kinds = _annotations(type(value))
+        annotations = _annotations(type(value))
         fields = value.to_dict()
         return {
             "type": "object",
             "properties": {
-                name: _declared(kinds.get(name, "")) if field is None else _schema_of(field)
+                name: _schema_of_annotation(annotations.get(name, "")) if field is None else _schema_of(field)
                 for name, field in fields.items()
             },
         }
@@ -288,19 +295,20 @@ def _schema_of(value: object) -> dict[str, Any]:
     if isinstance(converted, dict):
         return {"type": "object", "properties": {name: _schema_of(item) for name, item in converted.items()}}
     if isinstance(converted, list):
-        members = value if isinstance(value, (list, tuple)) else converted
-        return {"type": "array", "items": _schema_of(members[0]) if members else {}}
-    return {} if converted is None else {"type": _KINDS[type(converted).__name__]}
+        items = value if isinstance(value, (list, tuple)) else converted
+        return {"type": "array", "items": _schema_of(items[0]) if items else {}}
+    return {} if converted is None else {"type": _JSON_TYPES[type(converted).__name__]}
 
 
-def _annotations(kind: type) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for base in reversed(kind.__mro__):
-        found.update(inspect.get_annotations(base))
-    return found
+def _annotations(value_class: type) -> dict[str, str]:
+    """Return the annotations of a class and its bases."""
+    annotations: dict[str, str] = {}
+    for base in reversed(value_class.__mro__):
+        annotations.update(inspect.get_annotations(base))
+    return annotations
 
 
-def _declared(annotation: str) -> dict[str, Any]:
+def _schema_of_annotation(annotation: str) -> dict[str, Any]:
     """Return the schema of an annotation like ``"float | None"``."""
-    kind = _KINDS.get(annotation.partition(" | ")[0])
-    return {} if kind is None else {"type": kind}
+    json_type = _JSON_TYPES.get(annotation.partition(" | ")[0])
+    return {} if json_type is None else {"type": json_type}

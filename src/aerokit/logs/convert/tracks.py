@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.records import LogReader, LogRecord
     from aerokit.position import Position
 
-_ABSOLUTE = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
-_RELATIVE = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
-_TERRAIN = frozenset((MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT))
+_AMSL_FRAMES = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
+_RELATIVE_FRAMES = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
+_TERRAIN_FRAMES = frozenset((MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT))
 
 
 def _waypoint_name(waypoint: Waypoint) -> str:
@@ -29,10 +29,11 @@ def _waypoint_name(waypoint: Waypoint) -> str:
 
 
 def _altitude_amsl_m(waypoint: Waypoint, home_amsl_m: float | None) -> float | None:
-    if waypoint.frame in _ABSOLUTE:
+    if waypoint.frame in _AMSL_FRAMES:
         return waypoint.altitude_m
-    is_known = waypoint.frame in _RELATIVE and home_amsl_m is not None
-    return waypoint.altitude_m + home_amsl_m if is_known and home_amsl_m is not None else None
+    if waypoint.frame in _RELATIVE_FRAMES and home_amsl_m is not None:
+        return waypoint.altitude_m + home_amsl_m
+    return None
 
 
 class _Track:
@@ -41,10 +42,10 @@ class _Track:
         self.waypoints: dict[int, Waypoint] = {}
         self.home_amsl_m: float | None = None
 
-    def add(self, unix_s: float, place: Position) -> None:
-        self.points.append((datetime.fromtimestamp(unix_s, timezone.utc), place))
-        if place.altitude_amsl_m is not None and place.altitude_relative_m is not None:
-            self.home_amsl_m = place.altitude_amsl_m - place.altitude_relative_m
+    def add(self, unix_s: float, position: Position) -> None:
+        self.points.append((datetime.fromtimestamp(unix_s, timezone.utc), position))
+        if position.altitude_amsl_m is not None and position.altitude_relative_m is not None:
+            self.home_amsl_m = position.altitude_amsl_m - position.altitude_relative_m
 
 
 class _TrackWriter:
@@ -61,7 +62,7 @@ class _TrackWriter:
             if state == "position":
                 self._tracks.setdefault(record.system_id, _Track()).add(record.unix_s, value)
                 self.written += 1
-        if record.table in _ITEMS:
+        if record.table in _MISSION_ITEM_TABLES:
             self._add_item(record)
 
     def discard(self) -> None:
@@ -74,7 +75,7 @@ class _TrackWriter:
 
     def _add_item(self, record: LogRecord) -> None:
         item: Any = record.message
-        if item is None or item.mission_type or item.frame not in _ABSOLUTE | _RELATIVE | _TERRAIN:
+        if item is None or item.mission_type or item.frame not in _AMSL_FRAMES | _RELATIVE_FRAMES | _TERRAIN_FRAMES:
             return
         if item.target_system in self._tracks:  # sent to the vehicle
             system_id = item.target_system
@@ -95,7 +96,7 @@ class _TrackWriter:
         raise NotImplementedError
 
 
-_ITEMS = frozenset(("MISSION_ITEM_INT", "MISSION_ITEM"))
+_MISSION_ITEM_TABLES = frozenset(("MISSION_ITEM_INT", "MISSION_ITEM"))
 
 
 class GpxWriter(_TrackWriter):
@@ -110,13 +111,15 @@ class GpxWriter(_TrackWriter):
         for system_id, track in self._tracks.items():
             segment = gpx.GPXTrackSegment(
                 [
-                    gpx.GPXTrackPoint(place.latitude_deg, place.longitude_deg, elevation=place.altitude_amsl_m, time=at)
-                    for at, place in track.points
+                    gpx.GPXTrackPoint(
+                        position.latitude_deg, position.longitude_deg, elevation=position.altitude_amsl_m, time=time
+                    )
+                    for time, position in track.points
                 ]
             )
-            written = gpx.GPXTrack(name=f"vehicle {system_id}")
-            written.segments.append(segment)
-            file.tracks.append(written)
+            gpx_track = gpx.GPXTrack(name=f"vehicle {system_id}")
+            gpx_track.segments.append(segment)
+            file.tracks.append(gpx_track)
             for _, waypoint in sorted(track.waypoints.items()):
                 file.waypoints.append(
                     gpx.GPXWaypoint(
@@ -139,32 +142,32 @@ class KmlWriter(_TrackWriter):
             folder = file.newfolder(name=f"vehicle {system_id}")
             # Use altitudes above sea level if all of them are known. Otherwise use altitudes above home, which come
             # closest to KML's "relativeToGround".
-            is_absolute = all(place.altitude_amsl_m is not None for _, place in track.points)
+            is_absolute = all(position.altitude_amsl_m is not None for _, position in track.points)
             mode = kml.AltitudeMode.absolute if is_absolute else kml.AltitudeMode.relativetoground
             line = folder.newgxtrack(name="track", altitudemode=mode)
-            line.newwhen([at.isoformat(timespec="milliseconds") for at, _ in track.points])
+            line.newwhen([time.isoformat(timespec="milliseconds") for time, _ in track.points])
             line.newgxcoord(
                 [
                     (
-                        place.longitude_deg,
-                        place.latitude_deg,
-                        (place.altitude_amsl_m if is_absolute else place.altitude_relative_m) or 0.0,
+                        position.longitude_deg,
+                        position.latitude_deg,
+                        (position.altitude_amsl_m if is_absolute else position.altitude_relative_m) or 0.0,
                     )
-                    for _, place in track.points
+                    for _, position in track.points
                 ]
             )
             for _, waypoint in sorted(track.waypoints.items()):
-                altitude = _altitude_amsl_m(waypoint, track.home_amsl_m)
-                known = altitude is not None
+                amsl_m = _altitude_amsl_m(waypoint, track.home_amsl_m)
+                is_known = amsl_m is not None
                 folder.newpoint(
                     name=_waypoint_name(waypoint),
                     coords=[
                         (
                             waypoint.longitude_deg,
                             waypoint.latitude_deg,
-                            altitude if known else waypoint.altitude_m,
+                            amsl_m if is_known else waypoint.altitude_m,
                         )
                     ],
-                    altitudemode=kml.AltitudeMode.absolute if known else kml.AltitudeMode.relativetoground,
+                    altitudemode=kml.AltitudeMode.absolute if is_known else kml.AltitudeMode.relativetoground,
                 )
         return str(file.kml())

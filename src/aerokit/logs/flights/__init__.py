@@ -54,7 +54,7 @@ LOG_READERS: dict[str, Callable[[FlightLog, int | None, Callable[[int], object]]
 """Maps the suffix of a log to the function that reads it."""
 # Below this height above home, the vehicle may be on the ground. Slower sinking is noise.
 _FLYING_HEIGHT_M, _SINKING_M_S = 1.0, 0.3
-_SAME_ALTITUDE_M = 5.0
+_SAME_ALTITUDE_M = 5.0  # a smaller difference means that both altitudes are the same value
 
 
 def check_log_name(path: Path) -> None:
@@ -85,15 +85,15 @@ def read_flight(
     read = LOG_READERS[path.suffix.lower()]
     total, started = path.stat().st_size, time.monotonic()
 
-    def show(done: int) -> None:
+    def report_progress(done: int) -> None:
         if on_progress is not None:
             on_progress(TransferProgress(min(done, total), total, time.monotonic() - started))
 
-    show(0)
+    report_progress(0)
     flight = FlightLog(path)
-    read(flight, system_id, show)
+    read(flight, system_id, report_progress)
     _complete(flight)
-    show(total)
+    report_progress(total)
     return flight
 
 
@@ -103,10 +103,11 @@ def _complete(flight: FlightLog) -> None:
     if is_armed_at_end:
         flight.armed[-1] = (flight.armed[-1][0], flight.duration_s)
     if flight.home is None and len(flight.track):
-        row = max(flight.track.index_at(flight.armed[0][0]), 0) if flight.armed else 0
-        place = (flight.track[name][row] for name in ("latitude_deg", "longitude_deg", "altitude_amsl_m"))
-        flight.set_home(flight.track.times[row], *place)
-    _fill_relative(flight)
+        first_armed_row = max(flight.track.index_at(flight.armed[0][0]), 0) if flight.armed else 0
+        columns = ("latitude_deg", "longitude_deg", "altitude_amsl_m")
+        position = (flight.track[name][first_armed_row] for name in columns)
+        flight.set_home(flight.track.times[first_armed_row], *position)
+    _complete_altitudes(flight)
     if is_armed_at_end:
         flight.notes.append(_armed_at_end(flight))
     flight.failsafe_evidence += evidence_in_texts(flight.texts)
@@ -130,22 +131,23 @@ def _armed_at_end(flight: FlightLog) -> str:
     return f"{note}{state}: the rest of the flight, and with it a landing or a crash, was not recorded"
 
 
-def _fill_relative(flight: FlightLog) -> None:
+def _complete_altitudes(flight: FlightLog) -> None:
     """Derive heights above home from altitudes above sea level.
 
     While ArduPilot does not know home or the altitude above sea level, it logs the same value as both altitudes.
     """
-    home = flight.home.altitude_amsl_m if flight.home is not None else None
-    if home is None:
+    home_amsl_m = flight.home.altitude_amsl_m if flight.home is not None else None
+    if home_amsl_m is None:
         return
     for columns in (flight.track, flight.position_target):
         amsl, relative = columns["altitude_amsl_m"], columns["altitude_relative_m"]
-        for row, height in enumerate(relative):
-            above_sea = amsl[row]
-            if math.isnan(height):
-                relative[row] = above_sea - home
-            elif abs(home) > _SAME_ALTITUDE_M and abs(height - above_sea) < _SAME_ALTITUDE_M:
-                if abs(above_sea - home) < abs(above_sea):
-                    relative[row] = above_sea - home
+        for row, relative_m in enumerate(relative):
+            amsl_m = amsl[row]
+            if math.isnan(relative_m):
+                relative[row] = amsl_m - home_amsl_m
+            elif abs(home_amsl_m) > _SAME_ALTITUDE_M and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
+                # The value is above sea level if that puts the vehicle closer to home, otherwise above home.
+                if abs(amsl_m - home_amsl_m) < abs(amsl_m):
+                    relative[row] = amsl_m - home_amsl_m
                 else:
                     amsl[row] = math.nan

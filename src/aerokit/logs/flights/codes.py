@@ -99,7 +99,8 @@ ERRORS: Mapping[int, tuple[str, str]] = {
 }
 """Maps a subsystem to the kind of failsafe and a description."""
 
-_CODES: Mapping[tuple[int, int], str] = {
+# Subsystem and error code → details.
+_ERROR_DETAILS: Mapping[tuple[int, int], str] = {
     (2, 2): "late frames",
     (11, 2): "glitch",
     (12, 1): "crash into the ground",
@@ -108,14 +109,16 @@ _CODES: Mapping[tuple[int, int], str] = {
     (18, 2): "glitch",
 }
 
-# Bits of AC_FENCE_TYPE, in the error code of the fence.
-_FENCES = {
+# Subsystems whose error code is the number of the refused mode, the number of the new estimator, and fence bits.
+_MODE_CHANGE, _ESTIMATOR_SWITCH, _FENCE = 10, 24, 9
+# Bits of AC_FENCE_TYPE.
+_FENCE_TYPES = {
     1: "above the maximum altitude",
     2: "outside the circle",
     4: "outside a polygon",
     8: "below the minimum altitude",
 }
-_CONTROL = re.compile(
+_CONTROL_CHARACTERS = re.compile(
     r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]"  # CSI sequences of ECMA-48, such as colours
     r"|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)"  # OSC sequences, such as window titles
     r"|[\x00-\x08\x0b-\x1f\x7f-\x9f]"  # other control characters, except tab and newline
@@ -124,16 +127,16 @@ _CONTROL = re.compile(
 
 def error_text(subsystem: int, code: int, text: str) -> str:
     """Return the description of an ERR message."""
-    if subsystem == 10:
+    if subsystem == _MODE_CHANGE:
         return f"mode {code} was refused"
-    if subsystem == 24:
+    if subsystem == _ESTIMATOR_SWITCH:
         return f"{text}: number {code}"
-    if subsystem == 9:
-        return f"{text}: {' and '.join(words for bit, words in _FENCES.items() if code & bit)}"
-    detail = _CODES.get((subsystem, code))
+    if subsystem == _FENCE:
+        return f"{text}: {' and '.join(words for bit, words in _FENCE_TYPES.items() if code & bit)}"
+    detail = _ERROR_DETAILS.get((subsystem, code))
     return f"{text}: {detail}" if detail else text
 
 
 def clean_text(text: str) -> str:
     """Remove terminal control sequences and surrounding white space; PX4 ends texts with a tab."""
-    return _CONTROL.sub("", text).strip()
+    return _CONTROL_CHARACTERS.sub("", text).strip()

@@ -19,8 +19,10 @@ _SAME_KIND_GAP_S = 8.0
 # Evidence of the kind "general" belongs to the failsafe of specific evidence if they are at most this time apart.
 _GENERAL_GAP_S = 3.0
 _REACTION_TIMEOUT_S = 12.0
-_CONTEXT_S = 10.0
-_IMMEDIATE_S = 3.0
+# Values measured at most this time before a failsafe are shown with it.
+_BEFORE_S = 10.0
+# A change this soon after a failsafe is the autopilot's, even if the log does not contain its cause.
+_AUTOPILOT_REACTION_S = 3.0
 # Kinds of crashes and failures for which autopilots disarm.
 CRASH_KINDS: frozenset[str] = frozenset(("crash", "thrust", "motor", "termination"))
 
@@ -73,12 +75,12 @@ KINDS = {
 }
 """Maps the kind of a failsafe to its title in reports."""
 
-_NO_EVIDENCE = re.compile(
+_NO_EVIDENCE_PATTERN = re.compile(
     r"clear|resolved|\boff$|prearm|pre-arm|preflight|^arm\b|(?<!dis)arming|re-?gained|recovered|restored"
     r"|compensation off|connection .*established|fence enabled|fence disabled",
     re.I,
 )
-_TEXTS: tuple[tuple[re.Pattern[str], str], ...] = tuple(
+_TEXT_PATTERNS: tuple[tuple[re.Pattern[str], str], ...] = tuple(
     (re.compile(pattern, re.I), kind)
     for pattern, kind in (
         (r"battery.*(failsafe|is low|critical|unhealthy|emergency)", "battery"),
@@ -103,11 +105,13 @@ _TEXTS: tuple[tuple[re.Pattern[str], str], ...] = tuple(
         (r"fail-?safe", "general"),
     )
 )  # fmt: skip
-_ACTION = re.compile(r"failsafe activated|changed to|switch|fail-?safe.*[-:] *(rtl|land|hold|brake|disarm)", re.I)
+_ACTION_PATTERN = re.compile(
+    r"failsafe activated|changed to|switch|fail-?safe.*[-:] *(rtl|land|hold|brake|disarm)", re.I
+)
 
 _PX4_PREFIXES = ("BAT_", "COM_", "FD_", "GF_", "NAV_")
 # Parameters that define when a failsafe triggers, and its action.
-_LIMITS: dict[str, tuple[str, ...]] = {
+_LIMIT_PARAMETERS: dict[str, tuple[str, ...]] = {
     "battery": (
         *("BATT_LOW_VOLT", "BATT_CRT_VOLT", "BATT_LOW_MAH", "BATT_CRT_MAH", "BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"),
         *("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR", "COM_LOW_BAT_ACT"),
@@ -129,50 +133,51 @@ _LIMITS: dict[str, tuple[str, ...]] = {
 
 def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
     """Return the failsafe evidence in texts."""
-    found = []
+    evidence = []
     for text in texts:
-        if _NO_EVIDENCE.search(text.text) is None:
-            kind = next((kind for pattern, kind in _TEXTS if pattern.search(text.text)), None)
+        if _NO_EVIDENCE_PATTERN.search(text.text) is None:
+            kind = next((kind for pattern, kind in _TEXT_PATTERNS if pattern.search(text.text)), None)
             if kind is not None:
-                is_action = bool(_ACTION.search(text.text))
-                found.append(FailsafeEvidence(text.time_s, kind, f"text: {text.text}", is_action))
-    return found
+                is_action = bool(_ACTION_PATTERN.search(text.text))
+                evidence.append(FailsafeEvidence(text.time_s, kind, f"text: {text.text}", is_action))
+    return evidence
 
 
 def failsafes(flight: FlightLog) -> list[Failsafe]:
     """Return the failsafes and problems while the vehicle was armed, the oldest first."""
     groups: list[list[FailsafeEvidence]] = []
-    recent: list[list[FailsafeEvidence]] = []
+    recent_groups: list[list[FailsafeEvidence]] = []
     for evidence in flight.failsafe_evidence:
-        if not any(begin - 1 <= evidence.time_s <= end + 2 for begin, end in flight.armed):
+        was_armed = any(begin - 1 <= evidence.time_s <= end + 2 for begin, end in flight.armed)
+        if not was_armed:
             continue
-        recent = [group for group in recent if evidence.time_s - group[-1].time_s <= _SAME_KIND_GAP_S]
-        group = next((group for group in reversed(recent) if _belongs(evidence, group)), None)
+        recent_groups = [group for group in recent_groups if evidence.time_s - group[-1].time_s <= _SAME_KIND_GAP_S]
+        group = next((group for group in reversed(recent_groups) if _belongs_to(evidence, group)), None)
         if group is None:
             groups.append([evidence])
-            recent.append(groups[-1])
+            recent_groups.append(groups[-1])
         else:
             group.append(evidence)
     return [_explain(flight, group) for group in groups]
 
 
-def _belongs(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -> bool:
-    kind, gap = _kind(group), evidence.time_s - group[-1].time_s
+def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -> bool:
+    kind, gap_s = _kind_of(group), evidence.time_s - group[-1].time_s
     if "general" in (kind, evidence.kind):
-        return gap <= _GENERAL_GAP_S
-    return kind == evidence.kind and gap <= _SAME_KIND_GAP_S
+        return gap_s <= _GENERAL_GAP_S
+    return kind == evidence.kind and gap_s <= _SAME_KIND_GAP_S
 
 
-def _kind(group: Sequence[FailsafeEvidence]) -> str:
+def _kind_of(group: Sequence[FailsafeEvidence]) -> str:
     return next((evidence.kind for evidence in group if evidence.kind != "general"), "general")
 
 
 def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> Failsafe:
-    kind, time_s = _kind(group), group[0].time_s
+    kind, time_s = _kind_of(group), group[0].time_s
     reaction, is_sure = _reaction(flight, time_s, group)
     acted = is_sure or any(evidence.is_action for evidence in group)
     facts = [*_location(flight, time_s), *_CONTEXTS.get(kind, _general_context)(flight, time_s)]
-    facts += _limits(flight, kind, time_s)
+    facts += _limit_parameters(flight, kind, time_s)
     facts += _texts_before(flight, time_s)
     return Failsafe(time_s, kind, acted, tuple(group), reaction or "no mode change followed", tuple(facts))
 
@@ -183,112 +188,120 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
     The reaction is the first mode change that was not commanded, or disarming. If the log does not contain the cause of
     a change, an immediate change is attributed to the autopilot. The pilot may have made a later change.
     """
-    last = group[-1].time_s
+    last_s = group[-1].time_s
     for change in flight.modes:
-        if time_s - 2.5 <= change.time_s <= last + _REACTION_TIMEOUT_S and change.by_autopilot is not False:
-            before = flight.mode_at(change.time_s - 1e-6)
-            if before:
-                is_sure = change.by_autopilot is True or change.time_s - last <= _IMMEDIATE_S
+        if time_s - 2.5 <= change.time_s <= last_s + _REACTION_TIMEOUT_S and change.by_autopilot is not False:
+            previous_mode = flight.mode_at(change.time_s - 1e-6)
+            if previous_mode:
+                is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
                 cause = "" if is_sure else "; cause not logged"
-                return _mode_change_text(change, before, time_s) + cause, is_sure
-    ended = next((end for _, end in flight.armed if time_s - 0.5 <= end <= last + 3), None)
-    if ended is not None and ended < flight.duration_s:
-        is_sure = _kind(group) in CRASH_KINDS
+                return _mode_change_text(change, previous_mode, time_s) + cause, is_sure
+    disarmed_s = next((end for _, end in flight.armed if time_s - 0.5 <= end <= last_s + 3), None)
+    if disarmed_s is not None and disarmed_s < flight.duration_s:
+        is_sure = _kind_of(group) in CRASH_KINDS
         cause = "" if is_sure else "; cause not logged"
-        return f"disarmed {max(ended - time_s, 0):.1f} s later{cause}", is_sure
+        return f"disarmed {max(disarmed_s - time_s, 0):.1f} s later{cause}", is_sure
     return "", False
 
 
-def _mode_change_text(change: ModeChange, before: str, time_s: float) -> str:
-    after = change.time_s - time_s
-    when = "immediately" if after < 0.5 else f"{after:.1f} s later"
+def _mode_change_text(change: ModeChange, previous_mode: str, time_s: float) -> str:
+    delay_s = change.time_s - time_s
+    when = "immediately" if delay_s < 0.5 else f"{delay_s:.1f} s later"
     reason = f" ({change.reason})" if change.reason else ""
-    return f"mode {before} → {change.name} {when}{reason}"
+    return f"mode {previous_mode} → {change.name} {when}{reason}"
 
 
 def _location(flight: FlightLog, time_s: float) -> list[str]:
-    track, facts = flight.track, []
-    height = track.at("altitude_relative_m", time_s)
-    if height == height:
+    """Return height, distance and mode as one text, in a list that is empty if all are unknown."""
+    facts = []
+    height = flight.track.at("altitude_relative_m", time_s)
+    if not math.isnan(height):
         facts.append(f"{height:.1f} m above home")
     distance = distance_from_home_m(flight, time_s)
     if distance is not None:
         facts.append(f"{distance:.0f} m from home")
     mode = flight.mode_at(time_s - 0.5)
-    return [", ".join([*facts, *([f"in {mode}"] if mode else [])])] if facts or mode else []
+    if mode:
+        facts.append(f"in {mode}")
+    return [", ".join(facts)] if facts else []
 
 
 def distance_from_home_m(flight: FlightLog, time_s: float) -> float | None:
     """Return the horizontal distance from home at this time; None if unknown."""
-    position = flight.track.at("latitude_deg", time_s), flight.track.at("longitude_deg", time_s)
-    if flight.home is None or math.isnan(position[0]):
+    latitude, longitude = flight.track.at("latitude_deg", time_s), flight.track.at("longitude_deg", time_s)
+    if flight.home is None or math.isnan(latitude):
         return None
-    return math.hypot(*TangentPlane(flight.home.latitude_deg, flight.home.longitude_deg).metres(*position))
+    plane = TangentPlane(flight.home.latitude_deg, flight.home.longitude_deg)
+    return math.hypot(*plane.metres(latitude, longitude))
 
 
 def _battery_context(flight: FlightLog, time_s: float) -> list[str]:
     facts = []
     for number, battery in sorted(flight.batteries.items()):
-        now, before = battery.at("voltage_v", time_s), battery.at("voltage_v", time_s - 60, not_older_s=30)
-        if now != now:
+        voltage, earlier = battery.at("voltage_v", time_s), battery.at("voltage_v", time_s - 60, not_older_s=30)
+        if math.isnan(voltage):
             continue
-        text = f"{battery_name(number)}: {now:.2f} V"
-        if before == before:
-            text += f", {before:.2f} V one minute before"
-        for name, form in (
+        text = f"{battery_name(number)}: {voltage:.2f} V"
+        if not math.isnan(earlier):
+            text += f", {earlier:.2f} V one minute before"
+        for name, template in (
             ("current_a", "{:.1f} A"),
             ("remaining_percent", "{:.0f} % left"),
             ("used_mah", "{:.0f} mAh used"),
         ):
             value = battery.at(name, time_s)
-            text += f", {form.format(value)}" if value == value else ""
+            if not math.isnan(value):
+                text += f", {template.format(value)}"
         facts.append(text)
     return facts
 
 
 def _fence_context(flight: FlightLog, time_s: float) -> list[str]:
-    track = flight.velocity
-    climb = -track.at("down_m_s", time_s)
-    speed = math.hypot(track.at("north_m_s", time_s), track.at("east_m_s", time_s))
-    return [f"moving at {speed:.1f} m/s, climbing at {climb:.1f} m/s"] if speed == speed else []
+    velocity = flight.velocity
+    climb = -velocity.at("down_m_s", time_s)
+    speed = math.hypot(velocity.at("north_m_s", time_s), velocity.at("east_m_s", time_s))
+    return [] if math.isnan(speed) else [f"moving at {speed:.1f} m/s, climbing at {climb:.1f} m/s"]
 
 
 def _estimator_context(flight: FlightLog, time_s: float) -> list[str]:
     maxima = {name: _max_before(flight.estimator, name, time_s) for name in flight.estimator}
-    known = [f"{name.replace('_', ' ')} {value:.2f}" for name, value in maxima.items() if value is not None]
-    facts = (
-        [f"highest ratios in the {_CONTEXT_S:.0f} s before (above 1: rejected): {', '.join(known)}"] if known else []
-    )
+    ratios = [f"{name.replace('_', ' ')} {value:.2f}" for name, value in maxima.items() if value is not None]
+    facts = []
+    if ratios:
+        facts.append(f"highest ratios in the {_BEFORE_S:.0f} s before (above 1: rejected): {', '.join(ratios)}")
     return facts + _gps_context(flight, time_s) + _vibration_context(flight, time_s)
 
 
 def _gps_context(flight: FlightLog, time_s: float) -> list[str]:
     facts = []
     for number, gps in sorted(flight.gps.items()):
-        satellites, fix = gps.at("satellites", time_s), gps.at("fix_type", time_s)
-        before = gps.at("satellites", time_s - _CONTEXT_S)
-        if satellites == satellites or fix == fix:
-            text = f"receiver {number + 1}: {satellites:.0f} satellites, fix type {fix:.0f}"
-            hdop = gps.at("hdop", time_s)
-            text += f", HDOP {hdop:.1f}" if hdop == hdop else ""
-            text += f"; {before:.0f} satellites {_CONTEXT_S:.0f} s before" if before == before else ""
-            facts.append(text)
+        satellites, fix_type = gps.at("satellites", time_s), gps.at("fix_type", time_s)
+        if math.isnan(satellites) and math.isnan(fix_type):
+            continue
+        text = f"receiver {number + 1}: {satellites:.0f} satellites, fix type {fix_type:.0f}"
+        hdop, earlier = gps.at("hdop", time_s), gps.at("satellites", time_s - _BEFORE_S)
+        if not math.isnan(hdop):
+            text += f", HDOP {hdop:.1f}"
+        if not math.isnan(earlier):
+            text += f"; {earlier:.0f} satellites {_BEFORE_S:.0f} s before"
+        facts.append(text)
     return facts
 
 
 def _vibration_context(flight: FlightLog, time_s: float) -> list[str]:
-    levels = [_max_before(flight.vibration, f"{axis}_m_s2", time_s) for axis in "xyz"]
-    known = [level for level in levels if level is not None]
-    return [f"vibration up to {max(known):.0f} m/s² in the {_CONTEXT_S:.0f} s before"] if known else []
+    maxima = [_max_before(flight.vibration, f"{axis}_m_s2", time_s) for axis in "xyz"]
+    levels = [level for level in maxima if level is not None]
+    return [f"vibration up to {max(levels):.0f} m/s² in the {_BEFORE_S:.0f} s before"] if levels else []
 
 
 def _link_context(flight: FlightLog, time_s: float) -> list[str]:
-    lost, facts = _max_before(flight.link, "lost_percent", time_s), []
-    if lost is not None:
-        facts.append(f"up to {lost:.0f} % of the messages lost in the {_CONTEXT_S:.0f} s before")
+    facts = []
+    lost_percent = _max_before(flight.link, "lost_percent", time_s)
+    if lost_percent is not None:
+        facts.append(f"up to {lost_percent:.0f} % of the messages lost in the {_BEFORE_S:.0f} s before")
     for name in ("rssi", "remote_rssi"):
         value = flight.radio.at(name, time_s)
-        if value == value:
+        if not math.isnan(value):
             facts.append(f"radio: {name.replace('_', ' ')} {value:.0f}")
     return facts
 
@@ -308,17 +321,19 @@ def _attitude_context(flight: FlightLog, time_s: float) -> list[str]:
         if len(angles):
             maximum = max(angles, key=abs)
             setpoint = flight.attitude_target.at(name, time_s, not_older_s=2)
-            text = f"{name[:-4]} up to {maximum:.0f}° in the 3 s before"
-            facts.append(text + (f", set-point {setpoint:.0f}°" if setpoint == setpoint else ""))
+            text = f"{name.removesuffix('_deg')} up to {maximum:.0f}° in the 3 s before"
+            if not math.isnan(setpoint):
+                text += f", set-point {setpoint:.0f}°"
+            facts.append(text)
     return facts + _vibration_context(flight, time_s)
 
 
 def _offboard_context(flight: FlightLog, time_s: float) -> list[str]:
-    ages = [
-        time_s - columns.times[row]
-        for columns in (flight.position_target, flight.velocity_target)
-        if (row := columns.index_at(time_s)) >= 0
-    ]
+    ages = []
+    for columns in (flight.position_target, flight.velocity_target):
+        last_row = columns.index_at(time_s)
+        if last_row >= 0:
+            ages.append(time_s - columns.times[last_row])
     return [f"last logged set-point {min(ages):.1f} s before"] if ages else []
 
 
@@ -344,14 +359,14 @@ _CONTEXTS: dict[str, Callable[[FlightLog, float], list[str]]] = {
 
 
 def _max_before(columns: TimeSeries, name: str, time_s: float) -> float | None:
-    values = columns.between(name, time_s - _CONTEXT_S, time_s)
+    values = columns.between(name, time_s - _BEFORE_S, time_s)
     return max(values) if len(values) else None
 
 
-def _limits(flight: FlightLog, kind: str, time_s: float) -> list[str]:
+def _limit_parameters(flight: FlightLog, kind: str, time_s: float) -> list[str]:
     names = configured_by(flight, kind)
     values = ((name, flight.parameter_at(name, time_s)) for name in names)
-    known = [f"{name} = {value:g}" for name, value in values if value == value]
+    known = [f"{name} = {value:g}" for name, value in values if not math.isnan(value)]
     if known:
         return [f"parameters: {', '.join(known)}"]
     return [f"parameters to look at, which the log does not contain: {', '.join(names)}"] if names else []
@@ -360,7 +375,7 @@ def _limits(flight: FlightLog, kind: str, time_s: float) -> list[str]:
 def configured_by(flight: FlightLog, kind: str) -> list[str]:
     """Return the names of the autopilot's parameters that configure this kind of failsafe; empty if none are known."""
     is_px4 = {"PX4": True, "ArduPilot": False}.get(flight.autopilot)
-    return [name for name in _LIMITS.get(kind, ()) if is_px4 in (None, name.startswith(_PX4_PREFIXES))]
+    return [name for name in _LIMIT_PARAMETERS.get(kind, ()) if is_px4 in (None, name.startswith(_PX4_PREFIXES))]
 
 
 def _texts_before(flight: FlightLog, time_s: float) -> list[str]:

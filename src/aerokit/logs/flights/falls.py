@@ -22,7 +22,7 @@ _FALL_SINK_M_S = 6.0
 _IMPACT_S = 0.6
 _SAME_HEIGHT_M = 1.5
 _DISARM_TIMEOUT_S = 30.0
-_NEAR_HOME_HEIGHT_M = 3.0
+_NEAR_HOME_HEIGHT_M = 3.0  # higher up, an armed vehicle that keeps its height may hover
 
 
 class Fall(Snapshot):
@@ -67,36 +67,40 @@ def falls(flight: FlightLog) -> list[Fall]:
 
 def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
     """Yield start, end and last sink rate of each fast descent, and True if it was stopped."""
-    begin_s = before_s = fast_s = -math.inf
-    sink_m_s = 0.0
+    begin_s = previous_s = last_fast_s = -math.inf
+    sink_m_s = 0.0  # highest sink rate just before the end
     for time_s, down_m_s in zip(flight.velocity.times, flight.velocity["down_m_s"], strict=True):
-        if down_m_s != down_m_s:
+        if math.isnan(down_m_s):
             continue
         if down_m_s >= _MIN_SINK_M_S:
-            is_recent = time_s - fast_s <= _IMPACT_S
-            fast_s, sink_m_s = time_s, max(down_m_s, sink_m_s if is_recent else 0.0)
+            is_recent = time_s - last_fast_s <= _IMPACT_S
+            last_fast_s, sink_m_s = time_s, max(down_m_s, sink_m_s if is_recent else 0.0)
         elif down_m_s < _STOPPED_M_S:
-            if fast_s > begin_s and time_s - fast_s <= max(_IMPACT_S, 1.5 * (time_s - before_s)):
+            max_stop_s = max(_IMPACT_S, 1.5 * (time_s - previous_s))  # longer if values are rare
+            if last_fast_s > begin_s and time_s - last_fast_s <= max_stop_s:
                 yield begin_s, time_s, sink_m_s, True
             begin_s, sink_m_s = time_s, 0.0
-        before_s = time_s
-    if fast_s > begin_s and fast_s == before_s:
-        yield begin_s, fast_s, sink_m_s, False
+        previous_s = time_s
+    if last_fast_s > begin_s and last_fast_s == previous_s:
+        yield begin_s, last_fast_s, sink_m_s, False
 
 
 def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_impact: bool) -> Fall | None:
-    above, below = (flight.track.at("altitude_relative_m", time_s) for time_s in (begin_s, end_s))
-    if not above - below >= _MIN_HEIGHT_M:  # also true if a height is NaN
+    begin_height_m = flight.track.at("altitude_relative_m", begin_s)
+    end_height_m = flight.track.at("altitude_relative_m", end_s)
+    lost_height_m = begin_height_m - end_height_m
+    if not lost_height_m >= _MIN_HEIGHT_M:  # also true if a height is NaN
         return None
     reasons = _reasons(flight, begin_s, end_s)
-    is_on_ground = _stays(flight, end_s, below) if has_impact else below < 2 * sink_m_s
+    # If the log ends in the descent: the vehicle would be on the ground within two seconds.
+    is_on_ground = _stays_at_height(flight, end_s, end_height_m) if has_impact else end_height_m < 2 * sink_m_s
     if not (is_on_ground or reasons):
         return None
     is_hard_landing = sink_m_s < _FALL_SINK_M_S and not reasons
-    return Fall(end_s, begin_s, above - below, sink_m_s, is_hard_landing, has_impact, tuple(reasons))
+    return Fall(end_s, begin_s, lost_height_m, sink_m_s, is_hard_landing, has_impact, tuple(reasons))
 
 
-def _stays(flight: FlightLog, time_s: float, height_m: float) -> bool:
+def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
     """Return True if the vehicle stays at this height until it is disarmed, or stays armed near home's height."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
@@ -109,9 +113,12 @@ def _stays(flight: FlightLog, time_s: float, height_m: float) -> bool:
 
 def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
     """Return the log's evidence of a fall: disarming in the air, and texts."""
+    # Only disarming that may have caused the descent counts; at its end, the impact disarms.
     reasons = [
-        "disarmed in the air" for begin, end in flight.armed if begin < begin_s and begin_s - 3 <= end <= end_s - 0.3
+        "disarmed in the air"
+        for armed_s, disarmed_s in flight.armed
+        if armed_s < begin_s and begin_s - 3 <= disarmed_s <= end_s - 0.3
     ]
     texts = [text for text in flight.texts if begin_s - 3 <= text.time_s <= end_s + 5]
-    reported = [item for item in evidence_in_texts(texts) if item.kind in CRASH_KINDS]
-    return reasons + list(dict.fromkeys(item.text for item in reported))[:3]
+    crash_texts = dict.fromkeys(item.text for item in evidence_in_texts(texts) if item.kind in CRASH_KINDS)
+    return reasons + list(crash_texts)[:3]

@@ -31,7 +31,7 @@ class TimeSeries:
         self.times: array[float] = array("d")
         """Seconds since the start of the log."""
         self._values = {name: array("d") for name in names}
-        self._rows = tuple(self._values.values())
+        self._column_arrays = tuple(self._values.values())
 
     def __len__(self) -> int:
         return len(self.times)
@@ -51,7 +51,7 @@ class TimeSeries:
         if times and time_s < times[-1]:
             time_s = times[-1]
         times.append(time_s)
-        for column, value in zip(self._rows, values):  # noqa: B905 - equal lengths; strict= is slow, and this runs millions of times
+        for column, value in zip(self._column_arrays, values):  # noqa: B905 - equal lengths; strict= is slow, and this runs millions of times
             column.append(value)
 
     def extend(self, times: Sequence[float], **columns: Sequence[float]) -> None:
@@ -63,6 +63,7 @@ class TimeSeries:
 
     def has(self, *names: str) -> bool:
         """Return True if any of these columns (without names: any column) has a known value."""
+        # NaN is unequal to itself; calling math.isnan for each of millions of values would be slow.
         return any(value == value for name in names or self.names for value in self._values[name])
 
     def index_at(self, time_s: float) -> int:
@@ -73,19 +74,19 @@ class TimeSeries:
         """Return the last known value at this time; NaN if the value is older than ``not_older_s``."""
         column, index = self._values[name], self.index_at(time_s)
         while index >= 0 and self.times[index] >= time_s - not_older_s:
-            if column[index] == column[index]:
+            if not math.isnan(column[index]):
                 return column[index]
             index -= 1
         return _NAN
 
     def known(self, name: str) -> array[float]:
         """Return the known values of a column."""
-        return array("d", (value for value in self._values[name] if value == value))
+        return array("d", (value for value in self._values[name] if value == value))  # NaN is unequal to itself
 
     def between(self, name: str, start_s: float, end_s: float) -> array[float]:
         """Return the known values of a column in a time span, both ends included."""
         part = self._values[name][bisect_left(self.times, start_s) : self.index_at(end_s) + 1]
-        return array("d", (value for value in part if value == value))
+        return array("d", (value for value in part if value == value))  # NaN is unequal to itself
 
 
 class TangentPlane:
@@ -94,18 +95,18 @@ class TangentPlane:
     def __init__(self, latitude_deg: float, longitude_deg: float) -> None:
         self.latitude_deg: float = latitude_deg
         self.longitude_deg: float = longitude_deg
-        middle = max(-89.9, min(89.9, latitude_deg))
-        north = geo.distance_m(middle - 0.005, longitude_deg, middle + 0.005, longitude_deg)
-        east = geo.distance_m(middle, longitude_deg - 0.005, middle, longitude_deg + 0.005)
-        self.north_m_per_deg: float = north * 100
-        self.east_m_per_deg: float = east * 100
+        latitude = max(-89.9, min(89.9, latitude_deg))  # so that the points north and south of it are valid
+        north_m = geo.distance_m(latitude - 0.005, longitude_deg, latitude + 0.005, longitude_deg)
+        east_m = geo.distance_m(latitude, longitude_deg - 0.005, latitude, longitude_deg + 0.005)
+        self.north_m_per_deg: float = north_m * 100  # the distances are those of 0.01 degrees
+        self.east_m_per_deg: float = east_m * 100
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         """Return metres north and east of the origin; NaN for NaN."""
-        east = longitude_deg - self.longitude_deg
-        if not -180.0 <= east < 180.0 and math.isfinite(east):
-            east = geo.wrap_longitude(east)
-        return (latitude_deg - self.latitude_deg) * self.north_m_per_deg, east * self.east_m_per_deg
+        east_deg = longitude_deg - self.longitude_deg
+        if not -180.0 <= east_deg < 180.0 and math.isfinite(east_deg):
+            east_deg = geo.wrap_longitude(east_deg)
+        return (latitude_deg - self.latitude_deg) * self.north_m_per_deg, east_deg * self.east_m_per_deg
 
     def degrees(self, north_m: float, east_m: float) -> tuple[float, float]:
         """Return latitude and longitude at an offset from the origin."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _MAGIC = b"\xa3\x95"
-_TAIL = 4096  # after power-off, rows in the last bytes may be incomplete
+_MAX_UNREADABLE_TAIL = 4096  # after power-off, rows in the last bytes may be incomplete
 _NO_UTC = "no GNSS time in the log: times count from power-on, which is shown as 1970-01-01"
 _A_YEAR_S = 365 * 86_400.0
 _MAX_UNIX_S = 4_102_444_800.0  # the year 2100; `aerokit.mavlink.tlog` has the same limit
@@ -49,8 +49,8 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
             )
         if not head.startswith(_MAGIC):
             raise FileFormatError(f"{path} is not an ArduPilot log: it does not begin with A3 95")
-    kind = import_module("pymavlink.DFReader").DFReader_binary
-    reader = kind.__new__(kind)  # call __init__ separately, so that the file can be closed if __init__ raises
+    reader_class = import_module("pymavlink.DFReader").DFReader_binary
+    reader = reader_class.__new__(reader_class)  # __init__ is called below, so that the file can be closed if it raises
     try:
         with redirect_stdout(sys.stderr):  # pymavlink reports damage on stdout, where aerokit may print JSON
             reader.__init__(str(path), progress_callback=on_percent)
@@ -61,6 +61,7 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
 
 
 def close_bin(reader: Any) -> None:
+    """Close the files of a ``DFReader_binary``, even if its constructor has failed."""
     for name in ("data_map", "filehandle"):
         with suppress(AttributeError, BufferError):  # the file was never opened, or is still referenced by a traceback
             getattr(reader, name).close()
@@ -75,7 +76,7 @@ class _RowReader(LogReader):
     def columns(self, entry: LogRecord) -> list[TableColumn]:
         """Return the fields of the first record of a table, with units if the log has them."""
         return [
-            TableColumn(unit_suffix(name, self._unit(entry.table, name)), name, _kind(value))
+            TableColumn(unit_suffix(name, self._unit(entry.table, name)), name, _column_kind(value))
             for name, value in entry.fields.items()
         ]
 
@@ -99,23 +100,23 @@ class _RowReader(LogReader):
             self.notes.append(_NO_UTC)
 
 
-def _kind(value: object) -> str:
-    if isinstance(value, (float, int)):
-        return "float" if isinstance(value, float) else "int"
-    return "str"  # texts, bytes, arrays
+def _column_kind(value: object) -> str:
+    if isinstance(value, float):
+        return "float"
+    return "int" if isinstance(value, int) else "str"  # "str" also for bytes and arrays
 
 
 def _position(latitude: float, longitude: float, amsl_m: float, relative_m: float | None) -> Position | None:
     """Create a position. Return None if the estimator has diverged or has not started yet."""
     try:
         check_place(latitude, longitude)
-        place = Position(latitude, longitude, float(amsl_m), relative_m)
+        position = Position(latitude, longitude, float(amsl_m), relative_m)
     except ValueError:
         return None
-    return None if latitude == longitude == 0 else place
+    return None if latitude == longitude == 0 else position
 
 
-def _state(name: str, value: object) -> States:
+def _optional_state(name: str, value: object) -> States:
     return () if value is None else ((name, value),)
 
 
@@ -136,7 +137,7 @@ class BinReader(_RowReader):
         count = 0
         while (message := self._next(reader)) is not None:
             count += 1
-            if not count & 0x3FF:
+            if count % 1024 == 0:
                 on_bytes(reader.offset)
             table, fields = message.get_type(), message.to_dict()
             fields.pop("mavpackettype", None)
@@ -145,23 +146,24 @@ class BinReader(_RowReader):
                 yield LogRecord(message._timestamp, 1, 1, table, fields, _ardupilot_states(table, fields, reader))
         if not count:
             raise FileFormatError(f"{self.path} is not an ArduPilot log: it contains no message")
-        if reader.data_len - reader.offset > _TAIL:
+        if reader.data_len - reader.offset > _MAX_UNREADABLE_TAIL:
             self.notes.append(f"unreadable after byte {reader.offset} of {reader.data_len}")
         self._note_skipped()
         on_bytes(reader.data_len)
 
     def _next(self, reader: Any) -> Any:
         try:
-            with redirect_stdout(sys.stderr):  # see opened_bin
+            with redirect_stdout(sys.stderr):  # pymavlink prints there; stdout is for JSON
                 return reader.recv_msg()
         except Exception as error:  # pymavlink raises arbitrary errors for a damaged row
             self.notes.append(f"damaged at byte {reader.offset}; the rest was skipped: {error}")
             return None
 
     def _unit(self, table: str, field: str) -> str:
-        number = self._reader.name_to_id.get(table)
-        found = self._reader.formats.get(number)
-        return str(found.get_unit(field) or "") if found is not None and found.units is not None else ""
+        row_format = self._reader.formats.get(self._reader.name_to_id.get(table))
+        if row_format is None or row_format.units is None:
+            return ""
+        return str(row_format.get_unit(field) or "")
 
 
 def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> States:
@@ -180,7 +182,7 @@ def _ardupilot_attitude(fields: Mapping[str, Any], _: Any) -> States:
     )
 
 
-def _known(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     """Convert NaN, the value of batteries without a sensor, to None."""
     return value if math.isfinite(value) else None
 
@@ -189,16 +191,16 @@ def _ardupilot_battery(fields: Mapping[str, Any]) -> States:
     number = fields.get("Instance", fields.get("Inst", 0))
     if number != 0:  # the state lists all batteries, but a row has a single battery
         return ()
-    return (("batteries", (Battery(number, _known(fields["Volt"]), _known(fields["Curr"])),)),)
+    return (("batteries", (Battery(number, _finite_or_none(fields["Volt"]), _finite_or_none(fields["Curr"])),)),)
 
 
 _ARDUPILOT: dict[str, Callable[[Mapping[str, Any], Any], States]] = {
-    "POS": lambda f, _: _state("position", _position(f["Lat"], f["Lng"], f["Alt"], f["RelHomeAlt"])),
+    "POS": lambda f, _: _optional_state("position", _position(f["Lat"], f["Lng"], f["Alt"], f["RelHomeAlt"])),
     "ATT": _ardupilot_attitude,
-    "MSG": lambda f, _: _state("status_text", _BinText(text=clean_text(f["Message"]))),
+    "MSG": lambda f, _: _optional_state("status_text", _BinText(text=clean_text(f["Message"]))),
     "BAT": lambda f, _: _ardupilot_battery(f),
-    "ARM": lambda f, _: _state("armed", bool(f["ArmState"])),
-    "MODE": lambda f, reader: _state("mode", _Mode(reader.flightmode, f["ModeNum"])),
+    "ARM": lambda f, _: _optional_state("armed", bool(f["ArmState"])),
+    "MODE": lambda f, reader: _optional_state("mode", _Mode(reader.flightmode, f["ModeNum"])),
 }
 
 
@@ -224,7 +226,10 @@ class UlogReader(_RowReader):
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         """Yield all rows of all topics, ordered by time."""
         try:
-            with self.path.open("rb") as file, redirect_stdout(sys.stderr):  # see opened_bin
+            with (
+                self.path.open("rb") as file,
+                redirect_stdout(sys.stderr),
+            ):  # pymavlink prints there; stdout is for JSON
                 log = import_module("pyulog").ULog(file)
         except Exception as error:  # pyulog raises arbitrary errors for other files
             raise FileFormatError(f"{self.path} is not a PX4 log: {error}") from error
@@ -239,27 +244,29 @@ class UlogReader(_RowReader):
         decoder = _Px4States()
         rows = heapq.merge(*(_rows(data) for data in log.data_list), _texts(log), key=lambda row: row[0])
         size, total = self.path.stat().st_size, sum(len(data.data["timestamp"]) for data in log.data_list)
-        for count, (at, table, fields) in enumerate(rows):
-            if not count & 0x3FF:
+        for count, (time_us, table, fields) in enumerate(rows):
+            if count % 1024 == 0:
                 on_bytes(size * count // max(total, 1))
-            if self._is_plausible_time(begins_s + at / 1e6):
-                yield LogRecord(begins_s + at / 1e6, system_id, 1, table, fields, decoder.states(table, fields))
+            unix_s = begins_s + time_us / 1e6
+            if self._is_plausible_time(unix_s):
+                yield LogRecord(unix_s, system_id, 1, table, fields, decoder.states(table, fields))
         self._note_skipped()
         on_bytes(size)
 
 
 def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
-    name = f"{data.name}_{data.multi_id}" if data.multi_id else data.name
-    fields = list(data.data)
-    for row in zip(*(data.data[field].tolist() for field in fields), strict=True):
-        found = dict(zip(fields, row, strict=True))
-        yield found["timestamp"], name, found
+    """Yield time in microseconds, table and fields of each row of a topic."""
+    table = f"{data.name}_{data.multi_id}" if data.multi_id else data.name
+    names = list(data.data)
+    for values in zip(*(data.data[name].tolist() for name in names), strict=True):
+        fields = dict(zip(names, values, strict=True))
+        yield fields["timestamp"], table, fields
 
 
 def _texts(log: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
     for text in log.logged_messages:
-        # The kernel's level as a character: "6" is info. MAV_SEVERITY has the same numbers.
-        severity = max(0, min(7, int(text.log_level) - 48))
+        # The level is a character as in the Linux kernel: "6" is info. MAV_SEVERITY has the same numbers.
+        severity = max(0, min(7, int(text.log_level) - ord("0")))
         yield text.timestamp, "logged_messages", {"severity": severity, "message": text.message}
 
 
@@ -279,7 +286,7 @@ class _Px4States:
         elif table == "vehicle_global_position" and row.get("lat_lon_valid", 1):
             home = self._home_amsl_m
             relative = None if home is None else row["alt"] - home
-            return _state("position", _position(row["lat"], row["lon"], row["alt"], relative))
+            return _optional_state("position", _position(row["lat"], row["lon"], row["alt"], relative))
         elif table == "vehicle_attitude":
             quaternion = (row["q[0]"], row["q[1]"], row["q[2]"], row["q[3]"])
             return (("attitude", Attitude.from_quaternion(*quaternion, (None, None, None))),)
@@ -290,8 +297,8 @@ class _Px4States:
         elif table == "battery_status":
             remaining = row["remaining"]
             percent = round(remaining * 100) if math.isfinite(remaining) and remaining >= 0 else None
-            current_a = _known(row["current_a"]) if row["current_a"] >= 0 else None  # -1: unknown
-            voltage_v = _known(row["voltage_v"]) if row["voltage_v"] > 0 else None  # 0: unknown
+            current_a = _finite_or_none(row["current_a"]) if row["current_a"] >= 0 else None  # -1: unknown
+            voltage_v = _finite_or_none(row["voltage_v"]) if row["voltage_v"] > 0 else None  # 0: unknown
             return (("batteries", (Battery(0, voltage_v, current_a, percent),)),)
         elif table == "logged_messages":
             return (("status_text", StatusText(row["severity"], clean_text(row["message"]))),)

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.flight import FlightLog
 
 NAN = math.nan
-_CHUNK = 1 << 9  # rows unpacked at once; more rows would take the garbage collector longer to traverse
+_CHUNK_ROWS = 1 << 9  # rows unpacked at once; more rows would take the garbage collector longer to traverse
+_HEADER_SIZE = 3  # bytes of a row before its fields: A3 95 and the number of the table
 # Unknown charge: AP_BattMonitor_Logging.cpp writes -1 as a byte.
 _NO_PERCENT = 255
 _FIRMWARES = {
@@ -56,6 +57,8 @@ def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable
 
 
 class _Tables:
+    """The tables of a log, by pymavlink's index of their rows."""
+
     def __init__(self, reader: Any) -> None:
         self._reader = reader
         self.began_us = self._first_time()
@@ -82,37 +85,41 @@ class _Tables:
 
     def columns(self, table: str, *columns: str) -> list[list[Any]]:
         """Like :meth:`rows`, but return one list for each column."""
-        found: list[list[Any]] = [[] for _ in range(len(columns) + 1)]
+        times_and_columns: list[list[Any]] = [[] for _ in range(len(columns) + 1)]
         for chunk in self._chunks(table, columns):
-            for whole, part in zip(found, chunk, strict=True):
-                whole.extend(part)
-        return found
+            for column, part in zip(times_and_columns, chunk, strict=True):
+                column.extend(part)
+        return times_and_columns
 
     def _chunks(self, table: str, columns: Sequence[str]) -> Iterator[list[list[Any]]]:
+        """Yield the times and the columns of some hundred rows at once; nothing if a column is missing."""
         if not self.has(table, *columns):
             return
         reader = self._reader
         row_format = reader.formats[reader.name_to_id[table]]
-        wanted = ("TimeUS", *columns)
-        indices = [row_format.columns.index(name) for name in wanted]
-        unpack = struct.Struct(_pattern(row_format, indices)).unpack_from
-        order = [sorted(indices).index(index) for index in indices]
+        indices = [row_format.columns.index(name) for name in ("TimeUS", *columns)]
+        unpack = struct.Struct(_struct_pattern(row_format, indices)).unpack_from
+        # A row is unpacked in the order of the file; these are the positions of the columns in that order.
+        positions = [sorted(indices).index(index) for index in indices]
         scales = [row_format.msg_mults[index] for index in indices]
         data, offsets = reader.data_map, reader.offsets[row_format.type]
-        last, began = len(data) - row_format.len, self.began_us
-        for begin in range(0, len(offsets), _CHUNK):
-            rows = [unpack(data, at + 3) for at in offsets[begin : begin + _CHUNK] if at <= last]
+        last_offset, began_us = len(data) - row_format.len, self.began_us
+        for begin in range(0, len(offsets), _CHUNK_ROWS):
+            rows = [
+                unpack(data, offset + _HEADER_SIZE)
+                for offset in offsets[begin : begin + _CHUNK_ROWS]
+                if offset <= last_offset
+            ]
             if not rows:
                 continue
-            parts = list(zip(*rows, strict=True))
-            chunk = [_scaled(parts[i], scale) for i, scale in zip(order, scales, strict=True)]
-            chunk[0] = [(time - began) / 1e6 for time in chunk[0]]
+            unpacked = list(zip(*rows, strict=True))
+            chunk = [_scaled(unpacked[position], scale) for position, scale in zip(positions, scales, strict=True)]
+            chunk[0] = [(time_us - began_us) / 1e6 for time_us in chunk[0]]
             yield chunk
 
     def _first_time(self) -> int:
         """Return the time of the first row in the file, which may be in any table."""
-        self.began_us = 0
-        reader, found = self._reader, []
+        reader, first_rows = self._reader, []  # offset and time of the first row of each table
         for number in reader.name_to_id.values():
             offsets = reader.offsets[number]
             if not len(offsets) or "TimeUS" not in reader.formats[number].columns:
@@ -120,35 +127,38 @@ class _Tables:
             row_format = reader.formats[number]
             index = row_format.columns.index("TimeUS")
             if row_format.format[index] == "Q" and offsets[0] + row_format.len <= len(reader.data_map):
-                pattern = _pattern(row_format, [index])
-                found.append((offsets[0], struct.unpack_from(pattern, reader.data_map, offsets[0] + 3)[0]))
-        if not found:
+                pattern = _struct_pattern(row_format, [index])
+                (time_us,) = struct.unpack_from(pattern, reader.data_map, offsets[0] + _HEADER_SIZE)
+                first_rows.append((offsets[0], time_us))
+        if not first_rows:
             raise FileFormatError(
                 f"{reader.filehandle.name} has no row with a time (TimeUS): it is empty, or from before 2015"
             )
-        return int(min(found)[1])  # the minimum of all times could be that of a damaged row
+        _, time_us = min(first_rows)  # not the lowest time, which could be from a damaged row
+        return int(time_us)
 
 
-def _pattern(row_format: Any, indices: Sequence[int]) -> str:
+def _struct_pattern(row_format: Any, indices: Sequence[int]) -> str:
     """Return the struct layout of rows, with unneeded columns as padding."""
-    codes, at = [], 1  # after "<"
-    text = row_format.msg_struct
-    while at < len(text):
-        end = at
-        while text[end].isdigit():
+    codes, begin = [], 1  # after "<"
+    layout = row_format.msg_struct
+    while begin < len(layout):
+        end = begin
+        while layout[end].isdigit():
             end += 1
-        codes.append(text[at : end + 1])
-        at = end + 1
+        codes.append(layout[begin : end + 1])
+        begin = end + 1
     padded = [code if index in indices else f"{struct.calcsize('<' + code)}x" for index, code in enumerate(codes)]
     return "<" + "".join(padded)
 
 
 def _scaled(values: Sequence[Any], scale: float | None) -> list[Any]:
+    """Decode texts, and convert numbers to the unit of the table."""
     if values and isinstance(values[0], bytes):
         return [value.split(b"\0", 1)[0].decode("utf-8", "replace") for value in values]
     if scale is None:
         return list(values)
-    if 0 < scale < 1:
+    if 0 < scale < 1:  # divide, because 0.01 is not an exact binary number and 100 is
         divisor = round(1 / scale)
         return [value / divisor for value in values]
     return [value * scale for value in values]
@@ -172,12 +182,13 @@ class _Reader:
             *(self._track, self._velocity, self._attitude, self._targets, self._air, self._batteries),
             *(self._gps, self._vibration, self._estimator, self._radio, self._errors),
         )
-        for number, step in enumerate(steps):
+        for done, step in enumerate(steps, 1):
             step()
-            on_share((number + 1) / len(steps))
-        columns = (flight.track, flight.attitude, flight.vibration, *flight.batteries.values())
-        ends = [series.times[-1] for series in columns if len(series)]
-        ends += [flight.texts[-1].time_s] if flight.texts else []
+            on_share(done / len(steps))
+        all_series = (flight.track, flight.attitude, flight.vibration, *flight.batteries.values())
+        ends = [series.times[-1] for series in all_series if len(series)]
+        if flight.texts:
+            ends.append(flight.texts[-1].time_s)
         flight.ends_at = flight.begins_at + max(ends, default=0.0)
         if not tables.unix_at_0:
             flight.notes.append("no GNSS time in the log: times count from power-on")
@@ -186,20 +197,22 @@ class _Reader:
         flight = self._flight
         rows = self._tables.rows("MSG", "Message")
         flight.texts = [LoggedText(time, None, clean_text(text)) for time, text in rows]
-        names = (text.text for text in flight.texts if text.text.split(" ")[0] in _FIRMWARES)
-        banner = next(names, "")
+        banners = (text.text for text in flight.texts if text.text.split(" ")[0] in _FIRMWARES)
+        banner = next(banners, "")  # "ArduCopter V4.5.7 (2a3dc4b7)"
         flight.vehicle = " ".join(banner.split(" ")[:2]) or "ArduPilot"
 
     def _modes(self) -> None:
-        kind = _FIRMWARES.get(self._flight.vehicle.split(" ")[0], MavType.GENERIC)
-        table = ardupilot_for(kind).modes
+        vehicle_type = _FIRMWARES.get(self._flight.vehicle.split(" ")[0], MavType.GENERIC)
+        modes = ardupilot_for(vehicle_type).modes
         has_reason = self._tables.has("MODE", "ModeNum", "Rsn")
-        for row in self._tables.rows("MODE", "ModeNum", *(("Rsn",) if has_reason else ())):
-            reason, failsafe, by_itself = MODE_REASONS.get(row[2] if has_reason else None, ("", None, None))
-            name = table.name_of(row[1])
-            if self._flight.add_mode(row[0], name, reason, by_itself) and failsafe:
+        columns = ("ModeNum", "Rsn") if has_reason else ("ModeNum",)
+        for time_s, mode_number, *reason_number in self._tables.rows("MODE", *columns):
+            key = reason_number[0] if has_reason else None
+            reason, failsafe, by_autopilot = MODE_REASONS.get(key, ("", None, None))
+            name = modes.name_of(mode_number)
+            if self._flight.add_mode(time_s, name, reason, by_autopilot) and failsafe:
                 self._flight.failsafe_evidence.append(
-                    FailsafeEvidence(row[0], failsafe, f"mode {name}, reason: {reason} (MODE)", True)
+                    FailsafeEvidence(time_s, failsafe, f"mode {name}, reason: {reason} (MODE)", True)
                 )
 
     def _armed(self) -> None:
@@ -242,11 +255,11 @@ class _Reader:
                 track.add(time, latitude, longitude, amsl, NAN)
 
     def _velocity(self) -> None:
-        name = next((table for table in ("XKF1", "NKF1") if self._tables.has(table, "VN", "VE", "VD")), "XKF1")
-        several = self._tables.has(name, "C")
-        for row in self._tables.rows(name, "VN", "VE", "VD", *(("C",) if several else ())):
-            if not several or row[4] == 0:
-                self._flight.velocity.add(*row[:4])
+        table = next((table for table in ("XKF1", "NKF1") if self._tables.has(table, "VN", "VE", "VD")), "XKF1")
+        core_columns = ("C",) if self._tables.has(table, "C") else ()
+        for time_s, north, east, down, *core in self._tables.rows(table, "VN", "VE", "VD", *core_columns):
+            if not core or core[0] == 0:  # of several estimators, the first
+                self._flight.velocity.add(time_s, north, east, down)
 
     def _attitude(self) -> None:
         times, roll, pitch, yaw = self._tables.columns("ATT", "Roll", "Pitch", "Yaw")
@@ -256,11 +269,11 @@ class _Reader:
 
     def _targets(self) -> None:
         origin = self._origin()
-        north = list(self._tables.rows("PSCN", "TPN", "TVN"))
-        east = list(self._tables.rows("PSCE", "TPE", "TVE"))
+        north_rows = list(self._tables.rows("PSCN", "TPN", "TVN"))
+        east_rows = list(self._tables.rows("PSCE", "TPE", "TVE"))
         if origin is not None:
             plane = TangentPlane(*origin)
-            for (time, north_m, north_m_s), (_, east_m, east_m_s) in zip(north, east):  # noqa: B905 - one may be cut off at the end
+            for (time, north_m, north_m_s), (_, east_m, east_m_s) in zip(north_rows, east_rows):  # noqa: B905 - one may be cut off at the end
                 self._flight.position_target.add(time, *plane.degrees(north_m, east_m), NAN, NAN)
                 self._flight.velocity_target.add(time, north_m_s, east_m_s, NAN)
         self._add_heights(self._tables.rows("CTUN", "DAlt"))
@@ -268,17 +281,20 @@ class _Reader:
     def _add_heights(self, heights: Iterator[tuple[Any, ...]]) -> None:
         """Add height set-points to the position set-points, which have the same rate."""
         target = self._flight.position_target
-        has_places = len(target) > 0
+        has_positions = len(target) > 0
         relative = target["altitude_relative_m"]
         for time, height in heights:
-            if has_places:
+            if has_positions:
                 relative[max(target.index_at(time), 0)] = height
             else:
                 target.add(time, NAN, NAN, NAN, height)
 
     def _origin(self) -> tuple[float, float] | None:
-        places = self._tables.rows("ORGN", "Type", "Lat", "Lng")
-        return next(((lat, lon) for _, kind, lat, lon in places if kind != _HOME and (lat or lon)), None)
+        """Return latitude and longitude of the estimator's origin; None if unknown."""
+        for _, kind, latitude, longitude in self._tables.rows("ORGN", "Type", "Lat", "Lng"):
+            if kind != _HOME and (latitude or longitude):
+                return latitude, longitude
+        return None
 
     def _air(self) -> None:
         for time, speed in self._tables.rows("ARSP", "Airspeed"):
@@ -286,13 +302,17 @@ class _Reader:
 
     def _batteries(self) -> None:
         instance = "Inst" if self._tables.has("BAT", "Inst") else "Instance"
-        percent = ("RemPct",) if self._tables.has("BAT", "RemPct") else ()
-        for row in self._tables.rows("BAT", instance, "Volt", "Curr", "CurrTot", *percent):
-            is_known = percent and row[5] != _NO_PERCENT
-            self._flight.battery(row[1]).add(row[0], *row[2:5], row[5] if is_known else NAN)
+        percent_columns = ("RemPct",) if self._tables.has("BAT", "RemPct") else ()
+        rows = self._tables.rows("BAT", instance, "Volt", "Curr", "CurrTot", *percent_columns)
+        for time_s, number, voltage, current, used, *percent in rows:
+            is_known = percent and percent[0] != _NO_PERCENT
+            self._flight.battery(number).add(time_s, voltage, current, used, percent[0] if is_known else NAN)
 
     def _gps(self) -> None:
-        accuracy = defaultdict(lambda: NAN, {(at, i): m for at, i, m in self._tables.rows("GPA", "I", "HAcc")})
+        # The tables GPA and GPS have rows with the same times and receivers.
+        accuracy: defaultdict[tuple[float, int], float] = defaultdict(lambda: NAN)
+        for time, number, accuracy_m in self._tables.rows("GPA", "I", "HAcc"):
+            accuracy[time, number] = accuracy_m
         for time, number, status, satellites, hdop in self._tables.rows("GPS", "I", "Status", "NSats", "HDop"):
             self._flight.receiver(number).add(time, status, satellites, hdop, accuracy[time, number])
 
@@ -303,12 +323,14 @@ class _Reader:
                 self._flight.vibration.add(time, x, y, z, clips)
 
     def _estimator(self) -> None:
-        several = self._tables.has("XKF4", "C", "PI")
-        extra = ("C", "PI") if several else ()
-        name = "XKF4" if self._tables.has("XKF4", "SV") else "NKF4"
-        for row in self._tables.rows(name, "SV", "SP", "SH", "SM", "SVT", *extra):
-            if not several or row[6] == max(row[7], 0):
-                self._flight.estimator.add(*row[:6])
+        has_cores = self._tables.has("XKF4", "C", "PI")
+        columns = ("SV", "SP", "SH", "SM", "SVT")
+        table = "XKF4" if self._tables.has("XKF4", "SV") else "NKF4"
+        for time_s, *values in self._tables.rows(table, *columns, *(("C", "PI") if has_cores else ())):
+            ratios, core_and_primary = values[:5], values[5:]
+            # Of several estimators, the primary one (PI); a negative number counts as 0.
+            if not has_cores or core_and_primary[0] == max(core_and_primary[1], 0):
+                self._flight.estimator.add(time_s, *ratios)
 
     def _radio(self) -> None:
         for row in self._tables.rows("RAD", "RSSI", "RemRSSI", "Noise", "RemNoise"):

@@ -13,7 +13,7 @@ from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TimeSeries
 from aerokit.logs.flights.recording import MIN_SILENCE_S, ClockComparison, LinkCounter, use_simulated_time
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
-from aerokit.mavlink.enums import MavCmd, MavState, MavType
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavState, MavType
 from aerokit.mavlink.frame import MAGIC_V2, Frame, x25
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.parameters.encoding import value_of
@@ -31,11 +31,11 @@ NAN = math.nan
 _U16, _E7, _METRES_PER_DEGREE = 0xFFFF, 1e7, 111_319.5
 # A position closer to 0° N 0° E means that the estimator has no position yet.
 _NULL_ISLAND_E7 = 100_000
-_HEARTBEAT = b"\0\0\0"
+_HEARTBEAT_ID = b"\0\0\0"
 # A mode change within this time after a command is attributed to the command.
 _COMMAND_MAX_AGE_S = 5.0
-# Bits of a type mask that mark position and velocity as ignored.
-_NO_POSITION, _NO_VELOCITY = 0x7, 0x38
+# Bits of a type mask that mark position, velocity and attitude as ignored.
+_NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
 _MODE_COMMANDS = frozenset(
     (
         MavCmd.DO_SET_MODE,
@@ -47,7 +47,7 @@ _MODE_COMMANDS = frozenset(
         MavCmd.NAV_LOITER_UNLIM,
     )
 )
-_ALARM = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
+_ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
 
 def read_tlog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
@@ -65,14 +65,15 @@ def _first_autopilot(flight: FlightLog, system_id: int | None) -> tuple[m.Heartb
     records = 0
     for _, raw in read_tlog(flight.path):
         records += 1
-        if (raw[7:10] == b"\0\0\0" if raw[0] == MAGIC_V2 else raw[5] == 0) and _is_valid(raw):
+        message_id = raw[7:10] if raw[0] == MAGIC_V2 else raw[5:6] + b"\0\0"
+        if message_id == _HEARTBEAT_ID and _is_valid(raw):
             frame = Frame.parse(raw)
             message = m.Heartbeat.decode_body(frame.body, frame)
             if is_autopilot(message) and system_id in (None, frame.system_id):
                 return message, frame
-    what = "no MAVLink messages" if not records else "no heartbeat of an autopilot"
-    which = "" if system_id is None else f" with system id {system_id}"
-    raise FileFormatError(f"{flight.path} contains {what}{which}, so there is no flight")
+    missing = "no MAVLink messages" if not records else "no heartbeat of an autopilot"
+    restriction = "" if system_id is None else f" with system id {system_id}"
+    raise FileFormatError(f"{flight.path} contains {missing}{restriction}, so there is no flight")
 
 
 def _is_valid(raw: bytes) -> bool:
@@ -90,70 +91,69 @@ class _Reader:
         self._autopilot: Autopilot = autopilot_for(heartbeat)
         flight.autopilot, flight.vehicle = self._autopilot.name, self._autopilot.firmware
         self._texts = StatusTextAssembler()
-        self._others: set[int] = set()
+        self._other_vehicles: set[int] = set()
         self._capabilities: int | None = None
-        self._commanded_at, self._has_commands = -math.inf, False
-        self._status = 0
+        self._mode_commanded_at, self._has_commands = -math.inf, False
+        self._system_status = 0
         self._has_battery_status = False
-        self._position = self._local = (NAN, NAN, NAN)
+        self._position = (NAN, NAN, NAN)  # latitude, longitude and altitude above sea level
+        self._local_position = (NAN, NAN, NAN)  # metres north, east and down of the estimator's origin
         self._relative_m = NAN
         self._clocks = ClockComparison()
         self._is_breached = False
         self._destinations = TimeSeries(*flight.position_target.names)
         self._link = LinkCounter(flight)
-        self._items: dict[int, Waypoint] = {}
-        from_any: dict[type[Message], Callable[[float, Any], None]] = {
+        self._mission_items: dict[int, Waypoint] = {}
+        handlers: dict[type[Message], Callable[[float, Any], None]] = {
             m.CommandLong: self._on_command,
             m.CommandInt: self._on_command,
-            m.SetMode: self._set_mode,
-            m.MissionItemInt: self._mission_item,
-            m.MissionItem: self._mission_item,
-            m.MissionCount: self._mission_count,
+            m.SetMode: self._on_set_mode,
+            m.MissionItemInt: self._on_mission_item,
+            m.MissionItem: self._on_mission_item,
+            m.MissionCount: self._on_mission_count,
         }
-        self._from_any = {_key(kind): handler for kind, handler in from_any.items()}
-        self._from_vehicle = {
-            **self._from_any,
-            **{_key(kind): handler for kind, handler in self._handlers().items()},
-        }
+        self._handlers_of_any_sender = {_message_id_bytes(kind): handler for kind, handler in handlers.items()}
+        handlers.update(self._vehicle_handlers())
+        self._handlers_of_vehicle = {_message_id_bytes(kind): handler for kind, handler in handlers.items()}
 
     def read(self, on_bytes: Callable[[int], object]) -> None:
         # Hot loop: a log has millions of messages, and most are not decoded.
         flight, source, link = self._flight, self._source, self._link
-        from_vehicle, from_any = self._from_vehicle, self._from_any
-        damaged = count = received = 0
-        expected, next_second = -1, 0.0
-        received_at, received_count = math.nan, 0
+        handlers_of_vehicle, handlers_of_any_sender = self._handlers_of_vehicle, self._handlers_of_any_sender
+        damaged = count = received = 0  # `received` counts frames since the last call of link.count
+        expected_sequence, next_second = -1, 0.0
+        received_at, received_count = math.nan, 0  # of the vehicle's last frame
         begins_at = ends_at = 0.0
         with flight.path.open("rb") as file:
             for unix_s, raw in read_tlog(file):
                 if not count:
                     begins_at = unix_s
                 count += 1
-                if not count & 0x3FFF:
+                if count % 16_384 == 0:
                     on_bytes(file.tell())
                 if unix_s > ends_at:
                     ends_at = unix_s
                 if raw[0] == MAGIC_V2:
-                    kind, sender, sequence = raw[7:10], raw[5:7], raw[4]
+                    message_id, sender, sequence = raw[7:10], raw[5:7], raw[4]
                 else:
-                    kind, sender, sequence = raw[5:6] + b"\0\0", raw[3:5], raw[2]
+                    message_id, sender, sequence = raw[5:6] + b"\0\0", raw[3:5], raw[2]
                 if sender == source:
                     received += 1
-                    if sequence != expected or unix_s >= next_second:
+                    if sequence != expected_sequence or unix_s >= next_second:
                         if unix_s - received_at >= MIN_SILENCE_S:
                             link.add_silence(received_at - begins_at, unix_s - begins_at, count - received_count - 1)
-                        next_second = begins_at + link.count(unix_s - begins_at, sequence, expected, received)
-                        received = 0
+                        next_s = link.count(unix_s - begins_at, sequence, expected_sequence, received)
+                        next_second, received = begins_at + next_s, 0
                     received_at, received_count = unix_s, count
-                    expected = (sequence + 1) & 0xFF
-                    if kind not in from_vehicle:
+                    expected_sequence = (sequence + 1) & 0xFF
+                    if message_id not in handlers_of_vehicle:
                         continue
-                    handle = from_vehicle[kind]
-                elif kind in from_any:
-                    handle = from_any[kind]
+                    handle = handlers_of_vehicle[message_id]
+                elif message_id in handlers_of_any_sender:
+                    handle = handlers_of_any_sender[message_id]
                 else:
-                    if kind == _HEARTBEAT:
-                        self._other(unix_s - begins_at, sender[0], raw)
+                    if message_id == _HEARTBEAT_ID:
+                        self._count_other_heartbeat(unix_s - begins_at, sender[0], raw)
                     continue
                 message = _decoded(raw, unix_s)
                 if message is None:
@@ -163,17 +163,17 @@ class _Reader:
             on_bytes(file.tell())
         flight.begins_at, flight.ends_at = begins_at, ends_at
         link.end(received, received_at - begins_at, flight.duration_s, count - received_count)
-        self._end(damaged)
+        self._finish(damaged)
 
-    def _end(self, damaged: int) -> None:
+    def _finish(self, damaged: int) -> None:
         flight = self._flight
         self._add_texts(flight.duration_s, self._texts.expire(math.inf))
-        self._use_destinations()
-        flight.mission = [self._items[number] for number in sorted(self._items)]
+        self._add_destinations()
+        flight.mission = [self._mission_items[number] for number in sorted(self._mission_items)]
         if damaged:
             flight.notes.append(f"{damaged} messages are damaged and were skipped")
-        if self._others:
-            others = ", ".join(map(str, sorted(self._others)))
+        if self._other_vehicles:
+            others = ", ".join(map(str, sorted(self._other_vehicles)))
             flight.notes.append(
                 f"this is system {flight.system_id}; the log contains other vehicles too: system {others}"
             )
@@ -183,70 +183,79 @@ class _Reader:
             )
         use_simulated_time(flight, self._clocks.speed)
 
-    def _use_destinations(self) -> None:
+    def _add_destinations(self) -> None:
         """Use destinations (POSITION_TARGET_GLOBAL_INT) as set-points, if there are no continuous set-points."""
-        target, destinations = self._flight.position_target, self._destinations
-        if target.has("latitude_deg"):
+        setpoints, destinations = self._flight.position_target, self._destinations
+        if setpoints.has("latitude_deg"):
             return
-        has_heights = target.has()
-        rows = [(time, *values) for time, *values in zip(target.times, *map(target.__getitem__, target), strict=True)]
-        for time, latitude, longitude, amsl, relative in zip(
-            destinations.times, *map(destinations.__getitem__, destinations), strict=True
-        ):
+        has_heights = setpoints.has()
+        rows = list(zip(setpoints.times, *(setpoints[name] for name in setpoints), strict=True))
+        columns = (destinations[name] for name in destinations)
+        for time, latitude, longitude, amsl, relative in zip(destinations.times, *columns, strict=True):
             heights = (NAN, NAN) if has_heights else (amsl, relative)
             rows.append((time, latitude, longitude, *heights))
-        self._flight.position_target = merged = TimeSeries(*target.names)
+        self._flight.position_target = merged = TimeSeries(*setpoints.names)
         for row in sorted(rows, key=lambda row: row[0]):
             merged.add(*row)
 
-    def _handlers(self) -> dict[type[Message], Callable[[float, Any], None]]:
-        flight = self._flight
+    def _vehicle_handlers(self) -> dict[type[Message], Callable[[float, Any], None]]:
         return {
-            m.Heartbeat: self._heartbeat,
-            m.GlobalPositionInt: self._global_position,
-            m.LocalPositionNed: self._local_position,
-            m.Attitude: self._attitude,
-            m.VfrHud: lambda t, x: flight.air.add(t, x.airspeed, x.throttle),
-            m.Statustext: lambda t, x: self._add_texts(t, self._texts.receive(x, t)),
-            m.SysStatus: self._sys_status,
-            m.BatteryStatus: self._battery_status,
-            m.GpsRawInt: lambda t, x: self._gps(t, x, 0),
-            m.Gps2Raw: lambda t, x: self._gps(t, x, 1),
-            m.Vibration: lambda t, x: flight.vibration.add(
-                t, x.vibration_x, x.vibration_y, x.vibration_z, x.clipping_0 + x.clipping_1 + x.clipping_2
-            ),
-            m.EkfStatusReport: lambda t, x: flight.estimator.add(
-                t,
-                x.velocity_variance,
-                x.pos_horiz_variance,
-                x.pos_vert_variance,
-                x.compass_variance,
-                max(x.terrain_alt_variance, x.airspeed_variance),
-            ),
-            m.EstimatorStatus: lambda t, x: flight.estimator.add(
-                t,
-                x.vel_ratio,
-                x.pos_horiz_ratio,
-                x.pos_vert_ratio,
-                x.mag_ratio,
-                max(x.hagl_ratio, x.tas_ratio),
-            ),
-            m.NavControllerOutput: self._navigation,
-            m.AttitudeTarget: self._attitude_target,
-            m.PositionTargetGlobalInt: self._global_target,
-            m.PositionTargetLocalNed: self._local_target,
-            m.RadioStatus: self._radio,
-            m.Radio: self._radio,
-            m.ParamValue: self._parameter,
-            m.AutopilotVersion: self._version,
-            m.HomePosition: self._home,
-            m.FenceStatus: self._fence,
-            m.ServoOutputRaw: self._outputs,
+            m.Heartbeat: self._on_heartbeat,
+            m.GlobalPositionInt: self._on_global_position,
+            m.LocalPositionNed: self._on_local_position,
+            m.Attitude: self._on_attitude,
+            m.VfrHud: self._on_vfr_hud,
+            m.Statustext: lambda time_s, message: self._add_texts(time_s, self._texts.receive(message, time_s)),
+            m.SysStatus: self._on_sys_status,
+            m.BatteryStatus: self._on_battery_status,
+            m.GpsRawInt: lambda time_s, message: self._on_gps(time_s, message, 0),
+            m.Gps2Raw: lambda time_s, message: self._on_gps(time_s, message, 1),
+            m.Vibration: self._on_vibration,
+            m.EkfStatusReport: self._on_ekf_status_report,
+            m.EstimatorStatus: self._on_estimator_status,
+            m.NavControllerOutput: self._on_nav_controller_output,
+            m.AttitudeTarget: self._on_attitude_target,
+            m.PositionTargetGlobalInt: self._on_global_target,
+            m.PositionTargetLocalNed: self._on_local_target,
+            m.RadioStatus: self._on_radio,
+            m.Radio: self._on_radio,
+            m.ParamValue: self._on_parameter,
+            m.AutopilotVersion: self._on_version,
+            m.HomePosition: self._on_home,
+            m.FenceStatus: self._on_fence,
+            m.ServoOutputRaw: self._on_servo_output,
         }
 
-    def _heartbeat(self, time_s: float, message: m.Heartbeat) -> None:
+    def _on_vfr_hud(self, time_s: float, message: m.VfrHud) -> None:
+        self._flight.air.add(time_s, message.airspeed, message.throttle)
+
+    def _on_vibration(self, time_s: float, message: m.Vibration) -> None:
+        clips = message.clipping_0 + message.clipping_1 + message.clipping_2
+        self._flight.vibration.add(time_s, message.vibration_x, message.vibration_y, message.vibration_z, clips)
+
+    def _on_ekf_status_report(self, time_s: float, message: m.EkfStatusReport) -> None:
+        self._flight.estimator.add(
+            time_s,
+            message.velocity_variance,
+            message.pos_horiz_variance,
+            message.pos_vert_variance,
+            message.compass_variance,
+            max(message.terrain_alt_variance, message.airspeed_variance),
+        )
+
+    def _on_estimator_status(self, time_s: float, message: m.EstimatorStatus) -> None:
+        self._flight.estimator.add(
+            time_s,
+            message.vel_ratio,
+            message.pos_horiz_ratio,
+            message.pos_vert_ratio,
+            message.mag_ratio,
+            max(message.hagl_ratio, message.tas_ratio),
+        )
+
+    def _on_heartbeat(self, time_s: float, message: m.Heartbeat) -> None:
         flight = self._flight
-        was_commanded = time_s - self._commanded_at < _COMMAND_MAX_AGE_S
+        was_commanded = time_s - self._mode_commanded_at < _COMMAND_MAX_AGE_S
         flight.add_mode(
             time_s,
             self._autopilot.mode_of(message).name,
@@ -256,21 +265,21 @@ class _Reader:
         armed = is_armed(message.base_mode)
         flight.set_armed(time_s, armed)
         status = message.system_status
-        if armed and status in _ALARM and status != self._status:
-            name = _ALARM[MavState(status)]
+        if armed and status in _ALARM_STATES and status != self._system_status:
+            name = _ALARM_STATES[MavState(status)]
             text = f"system status {name} (HEARTBEAT)"
             flight.failsafe_evidence.append(FailsafeEvidence(time_s, "general", text))
-        self._status = status
+        self._system_status = status
 
-    def _other(self, time_s: float, system_id: int, raw: bytes) -> None:
-        kind = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]  # may be empty in a damaged frame
-        if kind == bytes((MavType.GCS,)):
+    def _count_other_heartbeat(self, time_s: float, system_id: int, raw: bytes) -> None:
+        vehicle_type = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]  # may be empty in a damaged frame
+        if vehicle_type == bytes((MavType.GCS,)):
             self._flight.gcs_heartbeats.append(time_s)
             return
-        if system_id != self._flight.system_id and system_id not in self._others and _is_valid(raw):
+        if system_id != self._flight.system_id and system_id not in self._other_vehicles and _is_valid(raw):
             frame = Frame.parse(raw)
             if is_autopilot(m.Heartbeat.decode_body(frame.body, frame)):
-                self._others.add(system_id)
+                self._other_vehicles.add(system_id)
 
     def _on_command(self, time_s: float, message: m.CommandLong | m.CommandInt) -> None:
         if message.target_system in (0, self._flight.system_id):
@@ -278,68 +287,70 @@ class _Reader:
             if message.command in _MODE_COMMANDS:
                 self._record_mode_command(time_s)
 
-    def _set_mode(self, time_s: float, message: m.SetMode) -> None:
+    def _on_set_mode(self, time_s: float, message: m.SetMode) -> None:
         if message.target_system in (0, self._flight.system_id):
             self._record_mode_command(time_s)
 
     def _record_mode_command(self, time_s: float) -> None:
-        self._commanded_at, self._has_commands = time_s, True
+        self._mode_commanded_at, self._has_commands = time_s, True
 
     def _add_texts(self, time_s: float, texts: list[Any]) -> None:
         self._flight.texts += [LoggedText(time_s, text.severity, clean_text(text.text)) for text in texts]
 
-    def _parameter(self, time_s: float, message: m.ParamValue) -> None:
+    def _on_parameter(self, time_s: float, message: m.ParamValue) -> None:
         bytewise = self._autopilot.encodes_parameters_bytewise(self._capabilities)
-        if message.param_id and not message.param_id.startswith("_HASH"):
+        if message.param_id and not message.param_id.startswith("_HASH"):  # PX4's _HASH_CHECK is no parameter
             self._flight.set_parameter(time_s, message.param_id, float(value_of(message, bytewise)))
 
-    def _version(self, time_s: float, message: m.AutopilotVersion) -> None:
+    def _on_version(self, time_s: float, message: m.AutopilotVersion) -> None:
         self._capabilities = message.capabilities
         number = message.flight_sw_version
         if number:
             parts = ".".join(str(number >> shift & 0xFF) for shift in (24, 16, 8))
             self._flight.vehicle = f"{self._autopilot.firmware} {parts}"
 
-    def _home(self, time_s: float, message: m.HomePosition) -> None:
+    def _on_home(self, time_s: float, message: m.HomePosition) -> None:
         self._flight.set_home(time_s, message.latitude / _E7, message.longitude / _E7, message.altitude / 1e3)
 
-    def _mission_item(self, time_s: float, message: m.MissionItemInt | m.MissionItem) -> None:
+    def _on_mission_item(self, time_s: float, message: m.MissionItemInt | m.MissionItem) -> None:
         if not self._is_our_mission(message):
             return
         scale = _E7 if isinstance(message, m.MissionItemInt) else 1.0
-        has_place = bool(message.x or message.y)
-        self._items[message.seq] = Waypoint(
+        has_position = bool(message.x or message.y)
+        self._mission_items[message.seq] = Waypoint(
             message.seq,
             message.command,
-            message.x / scale if has_place else NAN,
-            message.y / scale if has_place else NAN,
+            message.x / scale if has_position else NAN,
+            message.y / scale if has_position else NAN,
             message.z,
             message.frame,
         )
 
-    def _mission_count(self, time_s: float, message: m.MissionCount) -> None:
+    def _on_mission_count(self, time_s: float, message: m.MissionCount) -> None:
         """Drop items beyond the new count, because they belong to an earlier mission."""
         if self._is_our_mission(message):
-            self._items = {number: item for number, item in self._items.items() if number < message.count}
+            self._mission_items = {
+                number: item for number, item in self._mission_items.items() if number < message.count
+            }
 
     def _is_our_mission(self, message: m.MissionItemInt | m.MissionItem | m.MissionCount) -> bool:
         """Return True for missions of this vehicle. Fences, rally points and missions of other vehicles are ignored."""
-        frame, ours = message.received_frame, self._flight.system_id
+        frame, vehicle_id = message.received_frame, self._flight.system_id
         sender = None if frame is None else frame.system_id
-        return message.mission_type == 0 and ours in (sender, message.target_system)
+        return message.mission_type == 0 and vehicle_id in (sender, message.target_system)
 
-    def _fence(self, time_s: float, message: m.FenceStatus) -> None:
+    def _on_fence(self, time_s: float, message: m.FenceStatus) -> None:
         if message.breach_status and not self._is_breached:
             self._flight.failsafe_evidence.append(FailsafeEvidence(time_s, "fence", "outside the fence (FENCE_STATUS)"))
         self._is_breached = bool(message.breach_status)
 
-    def _attitude(self, time_s: float, message: m.Attitude) -> None:
+    def _on_attitude(self, time_s: float, message: m.Attitude) -> None:
         self._clocks.compare(time_s, message.time_boot_ms)
         self._flight.attitude.add(
             time_s, math.degrees(message.roll), math.degrees(message.pitch), math.degrees(message.yaw)
         )
 
-    def _global_position(self, time_s: float, message: m.GlobalPositionInt) -> None:
+    def _on_global_position(self, time_s: float, message: m.GlobalPositionInt) -> None:
         self._clocks.compare(time_s, message.time_boot_ms)
         if abs(message.lat) < _NULL_ISLAND_E7 and abs(message.lon) < _NULL_ISLAND_E7:
             return
@@ -350,25 +361,25 @@ class _Reader:
         self._flight.track.add(time_s, *self._position, self._relative_m)
         self._flight.velocity.add(time_s, message.vx / 100, message.vy / 100, message.vz / 100)
 
-    def _local_position(self, time_s: float, message: m.LocalPositionNed) -> None:
-        self._local = message.x, message.y, message.z
+    def _on_local_position(self, time_s: float, message: m.LocalPositionNed) -> None:
+        self._local_position = message.x, message.y, message.z
 
-    def _navigation(self, time_s: float, message: m.NavControllerOutput) -> None:
+    def _on_nav_controller_output(self, time_s: float, message: m.NavControllerOutput) -> None:
         if self._autopilot.name == "ArduPilot":
             bearing = message.nav_bearing  # nav_bearing has a meaning for fixed wings only
             self._flight.attitude_target.add(time_s, message.nav_roll, message.nav_pitch, NAN)
-            if -180 <= bearing <= 360 and self._relative_m == self._relative_m:
+            if -180 <= bearing <= 360 and not math.isnan(self._relative_m):
                 self._flight.position_target.add(time_s, NAN, NAN, NAN, self._relative_m + message.alt_error)
 
-    def _attitude_target(self, time_s: float, message: m.AttitudeTarget) -> None:
-        if not message.type_mask & 0x80 and all(math.isfinite(part) for part in message.q):
+    def _on_attitude_target(self, time_s: float, message: m.AttitudeTarget) -> None:
+        if not message.type_mask & _NO_ATTITUDE and all(math.isfinite(part) for part in message.q):
             w, x, y, z = message.q
-            wanted = Attitude.from_quaternion(w, x, y, z, (None, None, None))
-            self._flight.attitude_target.add(time_s, wanted.roll_deg, wanted.pitch_deg, wanted.yaw_deg)
+            target = Attitude.from_quaternion(w, x, y, z, (None, None, None))
+            self._flight.attitude_target.add(time_s, target.roll_deg, target.pitch_deg, target.yaw_deg)
 
-    def _global_target(self, time_s: float, message: m.PositionTargetGlobalInt) -> None:
+    def _on_global_target(self, time_s: float, message: m.PositionTargetGlobalInt) -> None:
         if message.type_mask & _NO_POSITION != _NO_POSITION and (message.lat_int or message.lon_int):
-            is_amsl = message.coordinate_frame in (0, 5)
+            is_amsl = message.coordinate_frame in (MavFrame.GLOBAL, MavFrame.GLOBAL_INT)
             self._destinations.add(
                 time_s,
                 message.lat_int / _E7,
@@ -376,12 +387,12 @@ class _Reader:
                 message.alt if is_amsl else NAN,
                 NAN if is_amsl else message.alt,
             )
-        self._velocity_target(time_s, message)
+        self._add_velocity_target(time_s, message)
 
-    def _local_target(self, time_s: float, message: m.PositionTargetLocalNed) -> None:
-        target, here = (message.x, message.y, message.z), self._local
+    def _on_local_target(self, time_s: float, message: m.PositionTargetLocalNed) -> None:
         if message.type_mask & _NO_POSITION != _NO_POSITION:
-            north, east, down = (there - mine for there, mine in zip(target, here, strict=True))
+            local_north, local_east, local_down = self._local_position
+            north, east, down = message.x - local_north, message.y - local_east, message.z - local_down
             latitude, longitude, amsl = self._position
             east_per_degree = _METRES_PER_DEGREE * math.cos(math.radians(latitude))
             self._flight.position_target.add(
@@ -391,34 +402,41 @@ class _Reader:
                 amsl - down,
                 self._relative_m - down,
             )
-        self._velocity_target(time_s, message)
+        self._add_velocity_target(time_s, message)
 
-    def _velocity_target(self, time_s: float, message: m.PositionTargetLocalNed | m.PositionTargetGlobalInt) -> None:
+    def _add_velocity_target(
+        self, time_s: float, message: m.PositionTargetLocalNed | m.PositionTargetGlobalInt
+    ) -> None:
         if message.type_mask & _NO_VELOCITY != _NO_VELOCITY:
             self._flight.velocity_target.add(time_s, message.vx, message.vy, message.vz)
 
-    def _sys_status(self, time_s: float, message: m.SysStatus) -> None:
+    def _on_sys_status(self, time_s: float, message: m.SysStatus) -> None:
         if self._has_battery_status or message.voltage_battery in (0, _U16):
             return
-        ampere = current(message.current_battery, self._autopilot)
-        left = NAN if message.battery_remaining < 0 else message.battery_remaining
-        self._flight.battery(0).add(time_s, message.voltage_battery / 1e3, NAN if ampere is None else ampere, NAN, left)
+        current_a = current(message.current_battery, self._autopilot)
+        self._flight.battery(0).add(
+            time_s,
+            message.voltage_battery / 1e3,
+            NAN if current_a is None else current_a,
+            NAN,
+            NAN if message.battery_remaining < 0 else message.battery_remaining,
+        )
 
-    def _battery_status(self, time_s: float, message: m.BatteryStatus) -> None:
-        cells = [mv for mv in message.voltages if mv != _U16]
-        cells += [mv for mv in message.voltages_ext if mv not in (0, _U16)]
-        if message.id == 0 and cells and not self._has_battery_status:
+    def _on_battery_status(self, time_s: float, message: m.BatteryStatus) -> None:
+        cells_mv = [mv for mv in message.voltages if mv != _U16]
+        cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]
+        if message.id == 0 and cells_mv:
             self._has_battery_status = True
-        ampere = current(message.current_battery, self._autopilot)
+        current_a = current(message.current_battery, self._autopilot)
         self._flight.battery(message.id).add(
             time_s,
-            sum(cells) / 1e3 if cells else NAN,
-            NAN if ampere is None else ampere,
+            sum(cells_mv) / 1e3 if cells_mv else NAN,
+            NAN if current_a is None else current_a,
             message.current_consumed if message.current_consumed >= 0 else NAN,
             message.battery_remaining if message.battery_remaining >= 0 else NAN,
         )
 
-    def _gps(self, time_s: float, message: m.GpsRawInt | m.Gps2Raw, number: int) -> None:
+    def _on_gps(self, time_s: float, message: m.GpsRawInt | m.Gps2Raw, number: int) -> None:
         self._flight.receiver(number).add(
             time_s,
             message.fix_type,
@@ -427,16 +445,16 @@ class _Reader:
             message.h_acc / 1e3 if message.h_acc else NAN,
         )
 
-    def _outputs(self, time_s: float, message: m.ServoOutputRaw) -> None:
+    def _on_servo_output(self, time_s: float, message: m.ServoOutputRaw) -> None:
         if message.port == 0:
             pulses = (getattr(message, f"servo{number}_raw") for number in range(1, 9))
             self._flight.outputs.add(time_s, *(pulse or NAN for pulse in pulses))
 
-    def _radio(self, time_s: float, message: m.RadioStatus | m.Radio) -> None:
+    def _on_radio(self, time_s: float, message: m.RadioStatus | m.Radio) -> None:
         self._flight.radio.add(time_s, message.rssi, message.remrssi, message.noise, message.remnoise)
 
 
-def _key(kind: type[Message]) -> bytes:
+def _message_id_bytes(kind: type[Message]) -> bytes:
     """Return the bytes of a message id in a frame."""
     return kind.ID.to_bytes(3, "little")
 

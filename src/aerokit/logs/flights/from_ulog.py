@@ -28,7 +28,7 @@ _TOPICS = (
     *("vehicle_gps_position", "sensor_gps", "estimator_status", "vehicle_imu_status", "telemetry_status"),
     *("home_position", "airspeed_validated", "radio_status"),
 )
-_ARMED = 2
+_ARMING_STATE_ARMED = 2
 # ``nav_state`` of vehicle_status → mode name (VehicleStatus.msg).
 _NAV_STATES = {
     0: "MANUAL",
@@ -52,7 +52,7 @@ _NAV_STATES = {
     **{22 + number: f"EXTERNAL{number}" for number in range(1, 9)},
 }
 # Flag of failsafe_flags → kind, description (FailsafeFlags.msg).
-_FLAGS = {
+_FAILSAFE_FLAGS = {
     "manual_control_signal_lost": ("radio", "RC signal lost"),
     "gcs_connection_lost": ("ground station", "ground station connection lost"),
     "offboard_control_signal_lost": ("offboard", "no offboard set-points"),
@@ -70,7 +70,7 @@ _FLAGS = {
     "fd_motor_failure": ("motor", "motor failed"),
     "vtol_fixed_wing_system_failure": ("transition", "fixed-wing system failure"),
 }
-_WARNINGS = {1: "low", 2: "critical", 3: "emergency", 4: "failed"}
+_BATTERY_WARNINGS = {1: "low", 2: "critical", 3: "emergency", 4: "failed"}
 _LOADING_SHARE = 0.9  # share of the total time that loading takes, for the progress
 _BUFFER = 1 << 20
 
@@ -82,14 +82,14 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
         FileFormatError: the file is not a PX4 log.
         ModuleNotFoundError: pyulog is not installed.
     """
-    core = import_module("pyulog")
+    pyulog = import_module("pyulog")
     try:
         # pyulog reports damage on stdout, where aerokit may print JSON.
         with (
             io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file,
             redirect_stdout(sys.stderr),
         ):
-            log = core.ULog(file, list(_TOPICS))
+            log = pyulog.ULog(file, list(_TOPICS))
     except Exception as error:  # pyulog raises arbitrary errors for other files
         raise FileFormatError(f"{flight.path} is not a PX4 log: {error}") from error
     if not log.data_list and not log.logged_messages:
@@ -138,19 +138,19 @@ class _Topic:
 
     def changes(self, field: str) -> Iterator[tuple[float, float]]:
         """Yield the first value, and each change."""
-        before = None
+        previous = None
         for time_s, value in self.rows(field):
-            if value != before:
+            if value != previous:
                 yield time_s, value
-                before = value
+                previous = value
 
 
 class _Reader:
     def __init__(self, flight: FlightLog, log: Any) -> None:
         self._flight, self._log = flight, log
         self._data = [data for data in log.data_list if len(data.data.get("timestamp", ()))]
-        firsts = [int(data.data["timestamp"][0]) for data in self._data]
-        self._began_us = min([int(log.start_timestamp), *firsts]) if firsts else int(log.start_timestamp)
+        first_times = [int(data.data["timestamp"][0]) for data in self._data]
+        self._began_us = min(int(log.start_timestamp), *first_times) if first_times else int(log.start_timestamp)
 
     def read(self) -> None:
         flight, log = self._flight, self._log
@@ -162,29 +162,28 @@ class _Reader:
         if not utc:
             flight.notes.append("no GNSS time in the log: times count from power-on")
         flight.system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
-        for severity, at, text in (
-            (int(text.log_level) - 48, text.timestamp, text.message) for text in log.logged_messages
-        ):
-            # The kernel's level as a character; MAV_SEVERITY has the same numbers.
-            flight.texts.append(LoggedText(self._time(at), max(0, min(7, severity)), clean_text(str(text))))
-        parameters = [(log.start_timestamp, *item) for item in log.initial_parameters.items()]
-        for at, name, value in (*parameters, *log.changed_parameters):
+        for text in log.logged_messages:
+            # The level is a character as in the Linux kernel; MAV_SEVERITY has the same numbers.
+            severity = max(0, min(7, int(text.log_level) - ord("0")))
+            flight.texts.append(LoggedText(self._time(text.timestamp), severity, clean_text(str(text.message))))
+        initial = [(log.start_timestamp, *item) for item in log.initial_parameters.items()]
+        for time_us, name, value in (*initial, *log.changed_parameters):
             if isinstance(value, (int, float)):
-                flight.set_parameter(self._time(at), str(name), float(value))
+                flight.set_parameter(self._time(time_us), str(name), float(value))
         self._status()
         self._movement()
         self._targets()
         self._equipment()
 
-    def _time(self, at_us: int) -> float:
-        return max((int(at_us) - self._began_us) / 1e6, 0.0)
+    def _time(self, time_us: int) -> float:
+        return max((int(time_us) - self._began_us) / 1e6, 0.0)
 
     def _topics(self, *names: str) -> list[tuple[int, _Topic]]:
         """Return the numbered instances of the first of these topics that exists."""
         for name in names:
-            found = [topic for topic in self._data if topic.name == name]
-            if found:
-                return [(topic.multi_id, _Topic(topic.data, self._began_us)) for topic in found]
+            instances = [data for data in self._data if data.name == name]
+            if instances:
+                return [(data.multi_id, _Topic(data.data, self._began_us)) for data in instances]
         return []
 
     def _topic(self, *names: str) -> _Topic | None:
@@ -195,7 +194,7 @@ class _Reader:
         if status is not None:
             self._modes(status)
             for time_s, state in status.changes("arming_state"):
-                flight.set_armed(time_s, state == _ARMED)
+                flight.set_armed(time_s, state == _ARMING_STATE_ARMED)
             for time_s, failsafe in status.changes("failsafe"):
                 if failsafe == 1:
                     flight.failsafe_evidence.append(
@@ -205,22 +204,25 @@ class _Reader:
 
     def _modes(self, status: _Topic) -> None:
         fields = ("nav_state", "nav_state_user_intention", "failsafe")
-        for time_s, state, wanted, failsafe in status.rows(*fields):
+        for time_s, state, intended_state, failsafe in status.rows(*fields):
             name = _NAV_STATES.get(int(state), f"MODE {int(state)}")
-            by_itself = bool(state != wanted) if wanted == wanted else None
-            reason = "failsafe" if failsafe == 1 else "autopilot" if by_itself else ""
-            self._flight.add_mode(time_s, name, reason, by_itself)
+            by_autopilot = None if math.isnan(intended_state) else bool(state != intended_state)
+            reason = ""
+            if failsafe == 1:
+                reason = "failsafe"
+            elif by_autopilot:
+                reason = "autopilot"
+            self._flight.add_mode(time_s, name, reason, by_autopilot)
 
     def _failsafe_flags(self) -> None:
-        # Ignore the flags while disarmed, because many flags are set without meaning on the ground.
         flight, flags = self._flight, self._topic("failsafe_flags")
         if flags is None:
             return
 
-        def is_armed(at: float) -> bool:
-            return any(begin + 1 < at <= end for begin, end in flight.armed)
+        def is_armed(time_s: float) -> bool:  # on the ground, many flags are set without meaning
+            return any(begin + 1 < time_s <= end for begin, end in flight.armed)
 
-        for name, (kind, text) in _FLAGS.items():
+        for name, (kind, text) in _FAILSAFE_FLAGS.items():
             if name in flags:
                 flight.failsafe_evidence += [
                     FailsafeEvidence(time_s, kind, f"{text} ({name})")
@@ -228,9 +230,9 @@ class _Reader:
                     if value == 1 and is_armed(time_s)
                 ]
         for time_s, warning in flags.changes("battery_warning"):
-            if warning in _WARNINGS and is_armed(time_s):
+            if warning in _BATTERY_WARNINGS and is_armed(time_s):
                 flight.failsafe_evidence.append(
-                    FailsafeEvidence(time_s, "battery", f"battery {_WARNINGS[int(warning)]} (battery_warning)")
+                    FailsafeEvidence(time_s, "battery", f"battery {_BATTERY_WARNINGS[int(warning)]} (battery_warning)")
                 )
 
     def _movement(self) -> None:
@@ -239,15 +241,15 @@ class _Reader:
         if home is not None:
             for row in home.rows("lat", "lon", "alt"):
                 flight.set_home(*row)
-        place = self._topic("vehicle_global_position")
-        if place is not None:
-            latitude, longitude, amsl = place.array("lat"), place.array("lon"), place.array("alt")
-            if "lat_lon_valid" in place:
-                latitude[place.array("lat_lon_valid") == 0] = NAN
-                longitude[place.array("lat_lon_valid") == 0] = NAN
+        position = self._topic("vehicle_global_position")
+        if position is not None:
+            latitude, longitude, amsl = position.array("lat"), position.array("lon"), position.array("alt")
+            if "lat_lon_valid" in position:
+                latitude[position.array("lat_lon_valid") == 0] = NAN
+                longitude[position.array("lat_lon_valid") == 0] = NAN
             _extend(
                 flight.track,
-                place.times,
+                position.times,
                 latitude_deg=latitude,
                 longitude_deg=longitude,
                 altitude_amsl_m=amsl,
@@ -267,14 +269,15 @@ class _Reader:
     def _track_of_receiver(self) -> None:
         receiver = self._topic("vehicle_gps_position", "sensor_gps")
         if receiver is not None:
-            old = "lat" in receiver
-            rows = receiver.rows("fix_type", *(("lat", "lon", "alt") if old else _GPS_FIELDS))
-            for time_s, fix, latitude, longitude, amsl in rows:
-                if fix >= 3:
-                    scale, metres = (1e7, 1e3) if old else (1, 1)
-                    self._flight.track.add(time_s, latitude / scale, longitude / scale, amsl / metres, NAN)
+            has_integers = "lat" in receiver  # old versions: 1e-7 degrees and millimetres
+            fields = ("lat", "lon", "alt") if has_integers else ("latitude_deg", "longitude_deg", "altitude_msl_m")
+            per_degree, per_metre = (1e7, 1e3) if has_integers else (1, 1)
+            for time_s, fix_type, latitude, longitude, amsl in receiver.rows("fix_type", *fields):
+                if fix_type >= 3:
+                    self._flight.track.add(time_s, latitude / per_degree, longitude / per_degree, amsl / per_metre, NAN)
 
     def _angles(self, columns: TimeSeries, topic: _Topic | None, field: str) -> None:
+        """Add the angles of the quaternions in a field."""
         if topic is None or f"{field}[0]" not in topic:
             return
         numpy = import_module("numpy")
@@ -288,35 +291,37 @@ class _Reader:
     def _targets(self) -> None:
         flight = self._flight
         self._angles(flight.attitude_target, self._topic("vehicle_attitude_setpoint"), "q_d")
-        wanted, local = self._topic("vehicle_local_position_setpoint"), self._topic("vehicle_local_position")
-        if wanted is None:
+        setpoint = self._topic("vehicle_local_position_setpoint")
+        if setpoint is None:
             return
         _extend(
             flight.velocity_target,
-            wanted.times,
-            north_m_s=wanted.array("vx"),
-            east_m_s=wanted.array("vy"),
-            down_m_s=wanted.array("vz"),
+            setpoint.times,
+            north_m_s=setpoint.array("vx"),
+            east_m_s=setpoint.array("vy"),
+            down_m_s=setpoint.array("vz"),
         )
-        origin = self._origin(local)
+        origin = self._origin(self._topic("vehicle_local_position"))
         if origin is None:
             return
         latitude, longitude, amsl = origin
         plane = TangentPlane(latitude, longitude)
         _extend(
             flight.position_target,
-            wanted.times,
-            latitude_deg=latitude + wanted.array("x") / plane.north_m_per_deg,
-            longitude_deg=longitude + wanted.array("y") / plane.east_m_per_deg,
-            altitude_amsl_m=amsl - wanted.array("z"),
+            setpoint.times,
+            latitude_deg=latitude + setpoint.array("x") / plane.north_m_per_deg,
+            longitude_deg=longitude + setpoint.array("y") / plane.east_m_per_deg,
+            altitude_amsl_m=amsl - setpoint.array("z"),
         )
 
     def _origin(self, local: _Topic | None) -> tuple[float, float, float] | None:
         """Return the last origin of the local frame; PX4 moves it on the ground, before the flight."""
-        if local is None:
-            return None
-        rows = [row[1:4] for row in local.rows("ref_lat", "ref_lon", "ref_alt") if row[1] == row[1] and row[1]]
-        return rows[-1] if rows else None
+        origin = None
+        if local is not None:
+            for _, latitude, longitude, altitude in local.rows("ref_lat", "ref_lon", "ref_alt"):
+                if latitude and not math.isnan(latitude):
+                    origin = latitude, longitude, altitude
+        return origin
 
     def _equipment(self) -> None:
         flight = self._flight
@@ -366,9 +371,9 @@ class _Reader:
         # If there are several links, use the link that received the most messages.
         links = [topic for _, topic in self._topics("telemetry_status") if "rx_message_lost_rate" in topic]
         if links:
-            best = max(links, key=lambda topic: float(topic.array("rx_message_count")[-1]))
-            lost = best.array("rx_message_lost_rate") * 100
-            _extend(self._flight.link, best.times, lost_percent=lost)
+            busiest = max(links, key=lambda topic: float(topic.array("rx_message_count")[-1]))
+            lost = busiest.array("rx_message_lost_rate") * 100
+            _extend(self._flight.link, busiest.times, lost_percent=lost)
         radio = self._topic("radio_status")
         if radio is not None:
             _extend(
@@ -379,9 +384,6 @@ class _Reader:
                 noise=radio.array("noise"),
                 remote_noise=radio.array("remote_noise"),
             )
-
-
-_GPS_FIELDS = ("latitude_deg", "longitude_deg", "altitude_msl_m")
 
 
 def _extend(columns: TimeSeries, times: Sequence[float], **values: Any) -> None:
@@ -400,8 +402,9 @@ def utc_at_boot(log: Any) -> float:
     for data in log.data_list:
         is_gps = data.name in ("vehicle_gps_position", "sensor_gps")
         if is_gps and {"time_utc_usec", "timestamp"} <= data.data.keys():
-            utc, at = data.data["time_utc_usec"], data.data["timestamp"]
-            rows = utc.nonzero()[0]
-            if len(rows):
-                return (int(utc[rows[0]]) - int(at[rows[0]])) / 1e6
+            utc_us, boot_us = data.data["time_utc_usec"], data.data["timestamp"]
+            rows_with_utc = utc_us.nonzero()[0]
+            if len(rows_with_utc):
+                row = rows_with_utc[0]
+                return (int(utc_us[row]) - int(boot_us[row])) / 1e6
     return 0.0

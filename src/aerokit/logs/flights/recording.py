@@ -25,16 +25,16 @@ class ClockComparison:
     """Compares the vehicle's time since boot with the time of the recording."""
 
     def __init__(self) -> None:
-        self._before: tuple[float, int] = (-math.inf, 0)
+        self._previous: tuple[float, int] = (-math.inf, 0)
         self._recorded_s = self._vehicle_s = 0.0
 
     def compare(self, time_s: float, boot_ms: int) -> None:
-        before_s, before_ms = self._before
-        self._before = time_s, boot_ms
-        # This condition skips reboots, and pauses of the recording or of its clock.
-        if boot_ms >= before_ms and 0 <= time_s - before_s < _MAX_CLOCK_GAP_S:
-            self._recorded_s += time_s - before_s
-            self._vehicle_s += (boot_ms - before_ms) / 1e3
+        previous_s, previous_ms = self._previous
+        self._previous = time_s, boot_ms
+        # Reboots, and pauses of the recording or of its clock, do not count.
+        if boot_ms >= previous_ms and 0 <= time_s - previous_s < _MAX_CLOCK_GAP_S:
+            self._recorded_s += time_s - previous_s
+            self._vehicle_s += (boot_ms - previous_ms) / 1e3
 
     @property
     def speed(self) -> float:
@@ -53,11 +53,14 @@ class LinkCounter:
         self._received = self._lost = 0
 
     def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
-        """Count frames after a gap, or at the start of a second. Return the start of the next second."""
+        """Count frames after a gap, or at the start of a second. Return the start of the next second.
+
+        ``received`` frames arrived since the last call, of which the last has this time and sequence number.
+        """
         missing = (sequence - expected) & 0xFF if expected >= 0 else 0
         if missing > _MAX_SEQUENCE_GAP:  # a delayed frame, or a frame from a second link, is not a loss
             missing = 0
-        if time_s >= self._second + 1:
+        if time_s >= self._second + 1:  # only the last frame belongs to the new second
             self._received += received - 1
             received = 1
             if int(time_s) - self._second > 1:  # silence is recorded as 100 % loss

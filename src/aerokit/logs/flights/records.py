@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
 
 
-_KINDS = {"float": "float", "double": "float", "uint64_t": "uint"}
+_COLUMN_KINDS = {"float": "float", "double": "float", "uint64_t": "uint"}
 _UNITS = {"%": "percent", "c%": "centipercent", "d%": "decipercent", "m/s/s": "m_s2", "m/s^2": "m_s2"}
 
 
@@ -88,7 +88,7 @@ class TlogReader(LogReader):
         with self.path.open("rb") as file:
             for unix_s, raw in read_tlog(file):
                 count += 1
-                if not count & 0xFFF:
+                if count % 4096 == 0:
                     on_bytes(file.tell())
                 for frame in framer.receive(raw, unix_s):
                     message = decode(frame)
@@ -96,23 +96,23 @@ class TlogReader(LogReader):
                         states = self._states(frame.system_id, frame.component_id, unix_s, message)
                     yield LogRecord(unix_s, frame.system_id, frame.component_id, message.NAME, {}, states, message)
             on_bytes(file.tell())
-        self._note(count)
+        self._check_and_note(count)
 
     def columns(self, entry: LogRecord) -> list[TableColumn]:
         """Return the fields in the standard's order and units; an array has one column for each element."""
         assert entry.message is not None
-        found = []
+        columns = []
         for field in entry.message.FIELDS:
             name = unit_suffix(field.name, field.units)
-            kind = _KINDS.get(field.type, "int")
+            kind = _COLUMN_KINDS.get(field.type, "int")
             if field.is_text or (field.array_length and field.type in ("uint8_t", "char")):
-                found.append(TableColumn(name, field.name, "str"))
+                columns.append(TableColumn(name, field.name, "str"))
             elif field.array_length:
                 indices = range(field.array_length)
-                found += [TableColumn(f"{name}_{i}", f"{field.name}.{i}", kind) for i in indices]
+                columns += [TableColumn(f"{name}_{i}", f"{field.name}.{i}", kind) for i in indices]
             else:
-                found.append(TableColumn(name, field.name, kind))
-        return found
+                columns.append(TableColumn(name, field.name, kind))
+        return columns
 
     def _states(
         self, system_id: int, component_id: int, unix_s: float, message: Message
@@ -124,16 +124,16 @@ class TlogReader(LogReader):
             vehicle = self._vehicles[system_id] = _VehicleStates(system_id, component_id)
         return vehicle.update(unix_s, message) if vehicle.component_id == component_id else ()
 
-    def _note(self, records: int) -> None:
+    def _check_and_note(self, records: int) -> None:
         if not records:
             raise FileFormatError(f"{self.path} contains no MAVLink messages: it is not a .tlog, or it is empty")
-        counted = self._framer.statistics
-        if not counted.frames:
+        statistics = self._framer.statistics
+        if not statistics.frames:
             raise FileFormatError(f"{self.path} contains no MAVLink message with a valid checksum")
-        if counted.bad_crcs:
-            self.notes.append(f"{counted.bad_crcs} of {records} messages are damaged and were skipped")
-        if counted.unknown_ids:
-            self.notes.append(f"{counted.unknown_ids} messages of an unknown dialect were skipped")
+        if statistics.bad_crcs:
+            self.notes.append(f"{statistics.bad_crcs} of {records} messages are damaged and were skipped")
+        if statistics.unknown_ids:
+            self.notes.append(f"{statistics.unknown_ids} messages of an unknown dialect were skipped")
 
 
 class _VehicleStates:
@@ -157,7 +157,7 @@ class _VehicleStates:
                 message.received_frame.received_at = now
             telemetry.receive(message)
         if now - self._expired_at > 1.0:
-            telemetry.expire(now)
+            telemetry.expire(now)  # yields status texts whose last parts are missing
             self._expired_at, names = now, (*names, "status_text")
         cells = telemetry.cells
         return tuple((name, cells[name].latest) for name in names if cells[name].updated_at == now)

@@ -70,21 +70,21 @@ def write_report(
         OSError: a file cannot be read or written.
         ModuleNotFoundError: a package of the extra ``report`` is not installed.
     """
-    to = Path(target)
-    if to.suffix.lower() not in (".html", ".htm"):
-        raise InvalidArgument(f"target = {str(to)!r} is not allowed: the name of a report must end in .html")
+    target_path = Path(target)
+    if target_path.suffix.lower() not in (".html", ".htm"):
+        raise InvalidArgument(f"target = {str(target_path)!r} is not allowed: the name of a report must end in .html")
     logs = [log] if compare_with is None else [log, compare_with]
     for path in logs:
         check_log_name(Path(path))  # checked first, because the default target is derived from this name
-    if to.exists() and not force:
-        raise InvalidArgument(f"{to} exists; use force (--force) to replace it")
+    if target_path.exists() and not force:
+        raise InvalidArgument(f"{target_path} exists; use force (--force) to replace it")
     flights = [read_flight(path, system_id=system_id, on_progress=on_progress) for path in logs]
     statistics = [statistics_of(flight) for flight in flights]
-    summaries = [summary(*pair) for pair in zip(flights, statistics, strict=True)]
-    write_atomically(to, _render(flights, statistics, summaries))
+    summaries = [summary(flight, values) for flight, values in zip(flights, statistics, strict=True)]
+    write_atomically(target_path, _render(flights, statistics, summaries))
     return Report(
-        to,
-        to.stat().st_size,
+        target_path,
+        target_path.stat().st_size,
         tuple(map(tuple, summaries)),
         tuple(statistics),
         tuple(tuple(failsafes(flight)) for flight in flights),
@@ -101,7 +101,8 @@ def report_html(flight: FlightLog) -> str:
 def _render(flights: list[FlightLog], statistics: list[FlightStatistics], summaries: list[list[str]]) -> str:
     if len(flights) == 1:
         flight = flights[0]
-        sections = [section for make in SECTIONS if (section := make(flight)) is not None]
+        optional_sections = [make_section(flight) for make_section in SECTIONS]
+        sections = [section for section in optional_sections if section is not None]
         return page(
             flight.path.name,
             [(_heading(flight), summaries[0], findings(flight))],
@@ -109,13 +110,13 @@ def _render(flights: list[FlightLog], statistics: list[FlightStatistics], summar
             COLOURS,
             timeline_shapes(flight),
         )
-    one, other = flights
-    headed = [
+    first, second = flights
+    headed_summaries = [
         (f"{name}: {flight.path.name}, {_heading(flight)}", sentences, findings(flight))
         for name, flight, sentences in zip(NAMES, flights, summaries, strict=True)
     ]
-    sections = comparison((one, other), (statistics[0], statistics[1]))
-    return page(f"{one.path.name} and {other.path.name}", headed, sections, COLOURS)
+    sections = comparison((first, second), (statistics[0], statistics[1]))
+    return page(f"{first.path.name} and {second.path.name}", headed_summaries, sections, COLOURS)
 
 
 def _heading(flight: FlightLog) -> str:

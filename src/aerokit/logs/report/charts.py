@@ -31,15 +31,15 @@ _ROUNDING_M = 0.01
 _MAX_FENCE_M = 1e6
 
 # Each palette has a contrast of 3:1 to its background, and is distinguishable with each kind of colour blindness.
-_MODES = {
+_MODE_COLOURS = {
     "light": ("#4477aa", "#cb6471", "#4b7700", "#aa2f71", "#b8860b", "#0d9ba5", "#6a3d25", "#7a5add"),
     "dark": ("#77aadd", "#f98c53", "#00ce98", "#d262a1", "#eedd88", "#69ddee", "#b07d5c", "#9685ff"),
 }
-_SERIES = {
+_SERIES_COLOURS = {
     "light": ("#0072b2", "#b94900", "#0d9f7a", "#882255", "#bc8300", "#222288"),
     "dark": ("#39cdfd", "#e69f00", "#2cc295", "#c767ac", "#f0e442", "#8888ee"),
 }
-_OTHERS = {
+_NAMED_COLOURS = {
     "light": {
         "ink": "#222222",
         "paper": "#ffffff",
@@ -63,18 +63,18 @@ _OTHERS = {
 }
 COLOURS = {
     theme: {
-        **others,
-        **{f"mode{number}": colour for number, colour in enumerate(_MODES[theme])},
-        **{f"series{number}": colour for number, colour in enumerate(_SERIES[theme])},
+        **named_colours,
+        **{f"mode{number}": colour for number, colour in enumerate(_MODE_COLOURS[theme])},
+        **{f"series{number}": colour for number, colour in enumerate(_SERIES_COLOURS[theme])},
     }
-    for theme, others in _OTHERS.items()
+    for theme, named_colours in _NAMED_COLOURS.items()
 }
 """Maps a theme to its colours by name. Charts refer to a colour as ``colour:NAME``."""
 _SETPOINT, _FAILSAFE = "colour:set-point", "colour:failsafe"
 
 
 def series_colour(number: int) -> str:
-    return f"colour:series{number % len(_SERIES['light'])}"
+    return f"colour:series{number % len(_SERIES_COLOURS['light'])}"
 
 
 def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float], list[float | None]]:
@@ -83,7 +83,7 @@ def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float]
     rows = rows_to_draw(values)
     return (
         [round(times[row], 2) for row in rows],
-        [round(value, digits) if math.isfinite(value := values[row]) else None for row in rows],
+        [round(values[row], digits) if math.isfinite(values[row]) else None for row in rows],
     )
 
 
@@ -93,25 +93,25 @@ def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[in
     if count <= max_rows:
         return list(range(count))
     pieces = max(max_rows // 2, 1)
-    found = {0, count - 1}
+    selected = {0, count - 1}
     for piece in range(pieces):
         begin, end = count * piece // pieces, count * (piece + 1) // pieces
         part = values[begin:end]
         known = part
-        if math.isnan(sum(part)):
-            known = [value for value in part if value == value]
+        if math.isnan(sum(part)):  # at least one value is unknown
+            known = [value for value in part if not math.isnan(value)]
             # A part in which only a few values are unknown is drawn without a gap.
             if len(known) * 2 < len(part):
-                found.add(next(row for row in range(begin, end) if values[row] != values[row]))
+                selected.add(next(row for row in range(begin, end) if math.isnan(values[row])))
         if known:
-            found.add(begin + part.index(min(known)))
-            found.add(begin + part.index(max(known)))
-    return sorted(found)
+            selected.add(begin + part.index(min(known)))
+            selected.add(begin + part.index(max(known)))
+    return sorted(selected)
 
 
 def mode_colours(flight: FlightLog) -> dict[str, str]:
     names = dict.fromkeys(change.name for change in flight.modes)
-    return {name: f"colour:mode{number % len(_MODES['light'])}" for number, name in enumerate(names)}
+    return {name: f"colour:mode{number % len(_MODE_COLOURS['light'])}" for number, name in enumerate(names)}
 
 
 def line(name: str, columns: TimeSeries, column: str, digits: int = 3, **style: Any) -> dict[str, Any] | None:
@@ -124,10 +124,10 @@ def line(name: str, columns: TimeSeries, column: str, digits: int = 3, **style: 
 
 def setpoint_line(name: str, columns: TimeSeries, column: str, digits: int = 3) -> dict[str, Any] | None:
     """Return a line of set-points, in the style that distinguishes them from measured values."""
-    found = line(name, columns, column, digits, line={"color": _SETPOINT, "dash": "dot", "width": 1.5})
-    if found is not None:
-        found["connectgaps"] = True
-    return found
+    trace = line(name, columns, column, digits, line={"color": _SETPOINT, "dash": "dot", "width": 1.5})
+    if trace is not None:
+        trace["connectgaps"] = True
+    return trace
 
 
 def over_time(
@@ -145,7 +145,7 @@ def over_time(
     full_layout = {"xaxis": times, "yaxis": {"title": {"text": unit}, **layout.pop("yaxis", {})}, **layout}
     for number, trace in enumerate(trace for trace in drawn if "line" not in trace):
         trace["line"] = {"color": series_colour(number), "width": 1.6}
-    label = f"{unit} over time: {', '.join(t['name'] for t in drawn)}"
+    label = f"{unit} over time: {', '.join(trace['name'] for trace in drawn)}"
     return Chart(name, drawn, full_layout, height, label, is_timeline=True)
 
 
@@ -162,21 +162,21 @@ def timeline_shapes(flight: FlightLog) -> list[dict[str, Any]]:
         band = f"M{change.time_s:.2f},0H{end:.2f}V1H{change.time_s:.2f}Z"
         spans.setdefault(change.name, []).append(band)
     colours = mode_colours(flight)
-    bands = [
-        _path(paths, fillcolor=colours[name], opacity=0.16, line={"width": 0}, layer="below")
+    shapes = [
+        _path_shape(paths, fillcolor=colours[name], opacity=0.16, line={"width": 0}, layer="below")
         for name, paths in spans.items()
     ]
-    found = failsafes(flight)
-    acted: list[Failsafe | Fall] = [*(failsafe for failsafe in found if failsafe.acted), *falls(flight)]
-    others = [failsafe for failsafe in found if not failsafe.acted]
-    for events, dash in ((acted, "solid"), (others, "dot")):
+    all_failsafes = failsafes(flight)
+    serious: list[Failsafe | Fall] = [*(failsafe for failsafe in all_failsafes if failsafe.acted), *falls(flight)]
+    warnings = [failsafe for failsafe in all_failsafes if not failsafe.acted]
+    for events, dash in ((serious, "solid"), (warnings, "dot")):
         if events:
             paths = [f"M{event.time_s:.2f},0V1" for event in events]
-            bands.append(_path(paths, line={"color": _FAILSAFE, "width": 1.5, "dash": dash}))
-    return bands
+            shapes.append(_path_shape(paths, line={"color": _FAILSAFE, "width": 1.5, "dash": dash}))
+    return shapes
 
 
-def _path(paths: Sequence[str], **style: Any) -> dict[str, Any]:
+def _path_shape(paths: Sequence[str], **style: Any) -> dict[str, Any]:
     return {"type": "path", "xref": "x", "yref": "paper", "path": "".join(paths), **style}
 
 
@@ -190,7 +190,7 @@ def track_parts(flight: FlightLog) -> list[Part]:
     traces = [
         *_setpoint_path(flight, plane),
         *_mission(flight, plane),
-        *_fence(flight),
+        *_circular_fence(flight),
         *lines,
         _marker("home", [(0.0, 0.0)], "circle", "colour:home", 11),
         *_failsafe_markers(flight, places),
@@ -213,9 +213,12 @@ def drawn_track(
     """Return the rows of a track to draw, and the largest distance of any row from the drawn line."""
     if len(places) <= MAX_POINTS:
         has_known = any(rounded(north) is not None and rounded(east) is not None for north, east in places)
-        return list(range(len(places))) if has_known else [], 0.0
+        rows = list(range(len(places))) if has_known else []
+        return rows, 0.0
     rows, deviation_m = simplify(places, max_points, _TRACK_TOLERANCE_M, keep)
-    return rows, math.ceil((deviation_m + _ROUNDING_M) * 100) / 100 if deviation_m else 0.0
+    if deviation_m:
+        deviation_m = math.ceil((deviation_m + _ROUNDING_M) * 100) / 100
+    return rows, deviation_m
 
 
 def map_layout(traces: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -239,24 +242,24 @@ def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tu
     changes = flight.modes or [ModeChange(0.0, "")]
     starts = [0, *(bisect_left(times, change.time_s) for change in changes[1:]), len(places)]
     rows, deviation_m = drawn_track(places, keep=(row for row in starts if row < len(places)))
-    drawn: dict[str, list[int | None]] = {}
+    rows_by_mode: dict[str, list[int | None]] = {}  # None is a gap
     for (start, end), change in zip(pairwise(starts), changes, strict=True):
         # The line continues to the first position of the next mode.
         part = rows[bisect_left(rows, start) : bisect_left(rows, end) + 1] if start < end else []
         if part:
-            of_mode = drawn.setdefault(change.name, [])
-            of_mode += [None, *part] if of_mode else part
+            mode_rows = rows_by_mode.setdefault(change.name, [])
+            mode_rows += [None, *part] if mode_rows else part
     colours = mode_colours(flight)
     lines = [
         {
-            **_coordinates(None if row is None else places[row] for row in of_mode),
-            "text": ["" if row is None else _here(times[row], heights[row]) for row in of_mode],
+            **_coordinates(None if row is None else places[row] for row in mode_rows),
+            "text": ["" if row is None else _hover_text(times[row], heights[row]) for row in mode_rows],
             "mode": "lines",
             "name": name or "track",
             "line": {"color": colours.get(name, "colour:mode0"), "width": 2.5},
             "hovertemplate": "%{text}<br>%{x:.1f} m east, %{y:.1f} m north",
         }
-        for name, of_mode in drawn.items()
+        for name, mode_rows in rows_by_mode.items()
     ]
     return lines, deviation_m
 
@@ -267,8 +270,8 @@ def _coordinates(places: Iterable[tuple[float, float] | None]) -> dict[str, list
     return {"x": [rounded(east) for _, east in pairs], "y": [rounded(north) for north, _ in pairs]}
 
 
-def _here(time_s: float, height_m: float) -> str:
-    return clock(time_s) + (f", {height_m:.1f} m up" if height_m == height_m else "")
+def _hover_text(time_s: float, height_m: float) -> str:
+    return clock(time_s) if math.isnan(height_m) else f"{clock(time_s)}, {height_m:.1f} m up"
 
 
 def rounded(value: float) -> float | None:
@@ -279,9 +282,9 @@ def rounded(value: float) -> float | None:
 def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
     target = flight.position_target
     places = [
-        plane.metres(*place)
-        for place in zip(target["latitude_deg"], target["longitude_deg"], strict=True)
-        if place[0] == place[0] and abs(place[0]) <= 90
+        plane.metres(latitude, longitude)
+        for latitude, longitude in zip(target["latitude_deg"], target["longitude_deg"], strict=True)
+        if abs(latitude) <= 90  # not for NaN
     ]
     if not places:
         return []
@@ -298,10 +301,10 @@ def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any
 
 
 def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
-    items = [item for item in flight.mission if item.latitude_deg == item.latitude_deg and item.number > 0]
+    items = [item for item in flight.mission if not math.isnan(item.latitude_deg) and item.number > 0]
     if not items:
         return []
-    found = _marker(
+    markers = _marker(
         "mission",
         [plane.metres(item.latitude_deg, item.longitude_deg) for item in items],
         "diamond-open",
@@ -309,16 +312,16 @@ def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
         9,
         [f"{item.number} {command_name(item.command)}" for item in items],
     )
-    return [{**found, "mode": "markers+lines", "line": {"color": "colour:mission", "width": 1, "dash": "dash"}}]
+    return [{**markers, "mode": "markers+lines", "line": {"color": "colour:mission", "width": 1, "dash": "dash"}}]
 
 
-def _fence(flight: FlightLog) -> list[dict[str, Any]]:
+def _circular_fence(flight: FlightLog) -> list[dict[str, Any]]:
     """Return the circular fence from the parameters. Logs do not contain polygons."""
-    end, value = flight.duration_s, flight.parameter_at
-    radius = value("GF_MAX_HOR_DIST", end)
-    kinds = value("FENCE_TYPE", end)
-    if value("FENCE_ENABLE", end) >= 1 and math.isfinite(kinds) and int(kinds) & 2:
-        radius = value("FENCE_RADIUS", end)
+    end_s, parameter_at = flight.duration_s, flight.parameter_at
+    radius = parameter_at("GF_MAX_HOR_DIST", end_s)  # PX4
+    fence_type = parameter_at("FENCE_TYPE", end_s)  # ArduPilot; bit 1 is the circle
+    if parameter_at("FENCE_ENABLE", end_s) >= 1 and math.isfinite(fence_type) and int(fence_type) & 2:
+        radius = parameter_at("FENCE_RADIUS", end_s)
     if not 0 < radius < _MAX_FENCE_M:
         return []
     angles = [math.tau * number / 90 for number in range(91)]
@@ -335,20 +338,20 @@ def _fence(flight: FlightLog) -> list[dict[str, Any]]:
 
 
 def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
-    kinds: tuple[tuple[str, str, Sequence[Failsafe | Fall]], ...] = (
+    events_by_legend: tuple[tuple[str, str, Sequence[Failsafe | Fall]], ...] = (
         ("failsafe", "x", failsafes(flight)),
         ("fall", "triangle-down", falls(flight)),
     )
     markers = []
-    for legend, symbol, events in kinds:
-        found, names = [], []
+    for legend, symbol, events in events_by_legend:
+        event_places, names = [], []
         for event in events:
             row = flight.track.index_at(event.time_s)
-            if row >= 0 and places[row][0] == places[row][0]:
-                found.append(places[row])
+            if row >= 0 and not math.isnan(places[row][0]):
+                event_places.append(places[row])
                 names.append(f"{event.title}, {clock(event.time_s)}")
-        if found:
-            markers.append(_marker(legend, found, symbol, _FAILSAFE, 12, names))
+        if event_places:
+            markers.append(_marker(legend, event_places, symbol, _FAILSAFE, 12, names))
     return markers
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.report.charts import (
@@ -66,17 +67,20 @@ _CHARTS: tuple[tuple[str, str, Callable[[FlightLog], TimeSeries | None], str], .
 )
 
 
-def comparison(flights: tuple[FlightLog, FlightLog], found: tuple[FlightStatistics, FlightStatistics]) -> list[Section]:
-    failed = [failsafe_section(flight) for flight in flights]
+def comparison(
+    flights: tuple[FlightLog, FlightLog], statistics: tuple[FlightStatistics, FlightStatistics]
+) -> list[Section]:
+    """Return all sections of the comparison."""
+    failsafe_sections = [failsafe_section(flight) for flight in flights]
     return [
-        _differences(found),
+        _differences(statistics),
         _maps(flights),
-        *(_overlaid(flights, *row) for row in _CHARTS),
+        *(_overlay_section(flights, *chart) for chart in _CHARTS),
         _modes(flights),
         _parameters(flights),
         *(
             Section(f"{section.title} of {name}", section.parts, section.explanation, section.missing)
-            for name, section in zip(NAMES, failed, strict=True)
+            for name, section in zip(NAMES, failsafe_sections, strict=True)
         ),
     ]
 
@@ -89,14 +93,17 @@ def _armed_at(flight: FlightLog) -> float:
     return flight.armed[0][0] if flight.armed else 0.0
 
 
-def _differences(found: tuple[FlightStatistics, FlightStatistics]) -> Section:
+def _differences(statistics: tuple[FlightStatistics, FlightStatistics]) -> Section:
     rows = []
     for field, (name, digits) in _STATISTICS.items():
-        values = [getattr(statistics, field) for statistics in found]
-        if any(value is not None for value in values):
-            one, other = values
-            change = "" if one is None or other is None else f"{round(other - one, digits) + 0.0:+.{digits}f}"
-            rows.append((name, *("unknown" if v is None else f"{v:.{digits}f}" for v in values), change))
+        value_a, value_b = (getattr(of_flight, field) for of_flight in statistics)
+        if value_a is None and value_b is None:
+            continue
+        difference = ""
+        if value_a is not None and value_b is not None:
+            difference = f"{round(value_b - value_a, digits) + 0.0:+.{digits}f}"  # + 0.0 turns -0.0 into 0.0
+        texts = ("unknown" if value is None else f"{value:.{digits}f}" for value in (value_a, value_b))
+        rows.append((name, *texts, difference))
     return Section("Differences", [Table(("statistic", *NAMES, "B − A"), rows)])
 
 
@@ -108,8 +115,8 @@ def _maps(flights: Sequence[FlightLog]) -> Section:
         rows, deviation_m = drawn_track(places)
         deviations.append(deviation_m)
         if rows:
-            x, y = ([rounded(places[row][axis]) for row in rows] for axis in (1, 0))
-            traces.append({"x": x, "y": y, **_look(number)})
+            north, east = ([rounded(places[row][axis]) for row in rows] for axis in (0, 1))
+            traces.append({"x": east, "y": north, **_line_style(number)})
     title, missing = "Tracks", "Neither log has positions."
     if not traces:
         return Section(title, missing=missing)
@@ -121,26 +128,26 @@ def _maps(flights: Sequence[FlightLog]) -> Section:
     )
 
 
-def _look(number: int) -> dict[str, Any]:
+def _line_style(number: int) -> dict[str, Any]:
     return {"mode": "lines", "name": NAMES[number], "line": {"color": series_colour(number), "width": 1.8}}
 
 
-def _overlaid(
+def _overlay_section(
     flights: Sequence[FlightLog],
     title: str,
     unit: str,
-    where: Callable[[FlightLog], TimeSeries | None],
+    get_series: Callable[[FlightLog], TimeSeries | None],
     column: str,
 ) -> Section:
-    traces, lacking = [], []
+    traces, names_without_data = [], []
     for number, flight in enumerate(flights):
-        columns = where(flight)
+        columns = get_series(flight)
         if columns is None or not columns.has(column):
-            lacking.append(NAMES[number])
+            names_without_data.append(NAMES[number])
             continue
         times, values = points(columns, column)
         begin = _armed_at(flight)
-        traces.append({"x": [round(time - begin, 2) for time in times], "y": values, **_look(number)})
+        traces.append({"x": [round(time - begin, 2) for time in times], "y": values, **_line_style(number)})
     if not traces:
         return Section(title, missing="Neither log contains this.")
     begin = min(-_armed_at(flight) for flight in flights)
@@ -149,41 +156,44 @@ def _overlaid(
     layout = {"xaxis": axis, "yaxis": {"title": {"text": unit}}}
     name = "both-" + title.lower().replace(" ", "-")
     chart = Chart(name, traces, layout, 240, f"{unit}, both flights", is_timeline=True)
-    missing = [Paragraphs([f"The log of {lacking[0]} does not contain this."])] if lacking else []
-    return Section(title, [chart, *missing])
+    parts: list[Part] = [chart]
+    if names_without_data:
+        parts.append(Paragraphs([f"The log of {names_without_data[0]} does not contain this."]))
+    return Section(title, parts)
 
 
 def _modes(flights: Sequence[FlightLog]) -> Section:
     parts: list[Part] = []
     for name, flight in zip(NAMES, flights, strict=True):
-        known = bool(flight.modes)
-        parts += [Paragraphs([f"{name}:"]), mode_table(flight)] if known else [Paragraphs([f"{name}: not logged"])]
+        if flight.modes:
+            parts += [Paragraphs([f"{name}:"]), mode_table(flight)]
+        else:
+            parts.append(Paragraphs([f"{name}: not logged"]))
     return Section("Modes", parts)
 
 
 def _parameters(flights: Sequence[FlightLog]) -> Section:
-    one, other = (flight.parameters for flight in flights)
-    if not one or not other:
-        lacking = [name for name, parameters in zip(NAMES, (one, other), strict=True) if not parameters]
-        return Section("Parameters that differ", missing=f"The log of {' and of '.join(lacking)} has no parameters.")
+    title = "Parameters that differ"
+    parameters_a, parameters_b = (flight.parameters for flight in flights)
+    if not parameters_a or not parameters_b:
+        names = [name for name, flight in zip(NAMES, flights, strict=True) if not flight.parameters]
+        return Section(title, missing=f"The log of {' and of '.join(names)} has no parameters.")
     rows = [
-        (name, _value(one.get(name)), _value(other.get(name)))
-        for name in sorted(one.keys() | other.keys())
-        if not _same(one.get(name), other.get(name))
+        (name, _value(parameters_a.get(name)), _value(parameters_b.get(name)))
+        for name in sorted(parameters_a.keys() | parameters_b.keys())
+        if not _is_same_value(parameters_a.get(name), parameters_b.get(name))
     ]
-    parts: list[Part] = [
-        Table(("parameter", *NAMES), rows, f"{len(rows)} differ")
-        if rows
-        else Paragraphs([f"None: all {len(one)} are the same."])
-    ]
-    return Section("Parameters that differ", parts, "Values at the start of each log.")
+    part: Part = Paragraphs([f"None: all {len(parameters_a)} are the same."])
+    if rows:
+        part = Table(("parameter", *NAMES), rows, f"{len(rows)} differ")
+    return Section(title, [part], "Values at the start of each log.")
 
 
 def _value(value: float | None) -> str:
     return "missing" if value is None else f"{value:.9g}"
 
 
-def _same(one: float | None, other: float | None) -> bool:
-    if one is None or other is None:
-        return one is other
-    return one == other or (one != one and other != other)
+def _is_same_value(value_a: float | None, value_b: float | None) -> bool:
+    if value_a is None or value_b is None:
+        return value_a is value_b
+    return value_a == value_b or (math.isnan(value_a) and math.isnan(value_b))

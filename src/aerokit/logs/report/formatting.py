@@ -9,8 +9,8 @@ _A_YEAR_S = 365 * 86_400.0
 
 def clock(seconds: float) -> str:
     """Format minutes and seconds since the start of the log: ``3:07.5``."""
-    minutes, rest = divmod(round(max(seconds, 0.0), 1), 60)
-    return f"{minutes:.0f}:{rest:04.1f}"
+    minutes, remaining_s = divmod(round(max(seconds, 0.0), 1), 60)
+    return f"{minutes:.0f}:{remaining_s:04.1f}"
 
 
 def span(seconds: float) -> str:

@@ -194,8 +194,8 @@ def _part(part: Part) -> Iterator[str]:
         yield from (f"<{tag}>{_escape(line)}</{tag}>" for line in part.lines)
     elif isinstance(part, Collapsed):
         yield f'<details data-print="no"><summary>{_escape(part.title)}</summary>'
-        for inner in part.parts:
-            yield from _part(inner)
+        for collapsed_part in part.parts:
+            yield from _part(collapsed_part)
         yield "</details>"
     else:
         yield from _table(part)
@@ -204,8 +204,8 @@ def _part(part: Part) -> Iterator[str]:
 def _table(table: Table) -> Iterator[str]:
     count = len(table.rows)
     if count > MAX_OPEN_ROWS:
-        is_long = ' data-print="no"' if count > MAX_PRINTED_ROWS else ""
-        yield f"<details{is_long}><summary>{_escape(table.title or f'{count} rows')}</summary>"
+        print_attribute = ' data-print="no"' if count > MAX_PRINTED_ROWS else ""
+        yield f"<details{print_attribute}><summary>{_escape(table.title or f'{count} rows')}</summary>"
     yield '<div class="wide"><table><thead><tr>'
     yield "".join(f"<th>{_escape(name)}</th>" for name in table.header)
     yield "</tr></thead><tbody>"

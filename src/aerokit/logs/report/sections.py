@@ -11,6 +11,7 @@ from aerokit.logs.report.charts import line, over_time, setpoint_line, track_par
 from aerokit.logs.report.formatting import clock, date, span
 from aerokit.logs.report.page import Collapsed, Paragraphs, Section, Table
 from aerokit.logs.report.silences import silence_sentences
+from aerokit.mavlink.enums import MavSeverity
 from aerokit.missions.item import command_name
 
 if TYPE_CHECKING:
@@ -22,11 +23,11 @@ if TYPE_CHECKING:
 
 _SEVERITIES = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
 # Names of GPS_FIX_TYPE values, as far as MAVLink, ArduPilot's logs and PX4's logs give them the same meaning.
-_FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed")
+_FIX_NAMES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed")
 _MAX_TEXTS, _MAX_CHANGES, _MAX_PARAMETERS = 2000, 2000, 5000
 _MAX_OPEN_FAILSAFES = 10
 # Parts of the names of parameters that the autopilot writes itself.
-_AUTOPILOT_WRITTEN = (
+_WRITTEN_BY_AUTOPILOT = (
     "STAT_",
     "_GND_PRESS",
     "_GND_TEMP",
@@ -45,13 +46,13 @@ def _with_parts(section: Section, *charts: Part | None) -> Section:
 
 
 def _map(flight: FlightLog) -> Section:
-    title = Section(
+    section = Section(
         "Track",
         explanation="From above, north is up. Colours are modes, dotted lines are set-points. There are no map tiles,"
         " because they would need network access.",
         missing="The log contains no positions.",
     )
-    return _with_parts(title, *track_parts(flight))
+    return _with_parts(section, *track_parts(flight))
 
 
 def _heights(flight: FlightLog) -> Section:
@@ -87,17 +88,17 @@ def mode_table(flight: FlightLog) -> Table:
 
 def failsafe_section(flight: FlightLog) -> Section:
     """Return the section with each failsafe and its context."""
-    found = failsafes(flight)
-    if not found:
+    all_failsafes = failsafes(flight)
+    if not all_failsafes:
         return Section(
             "Failsafes",
             [Paragraphs(["No failsafe was reported: no text, mode change, error or flag in the log indicates one."])],
         )
-    tables = [_failsafe(failsafe) for failsafe in found]
+    tables = [_failsafe(failsafe) for failsafe in all_failsafes]
     parts: list[Part] = [*tables[:_MAX_OPEN_FAILSAFES]]
-    if len(tables) > len(parts):
-        more = tables[len(parts) :]
-        parts.append(Collapsed(f"{len(more)} more", more))
+    collapsed = tables[_MAX_OPEN_FAILSAFES:]
+    if collapsed:
+        parts.append(Collapsed(f"{len(collapsed)} more", collapsed))
     explanation = "Each failsafe has its evidence, the values measured before it, and "
     explanation += (
         "the parameters that configure it."
@@ -117,54 +118,56 @@ def _failsafe(failsafe: Failsafe) -> Table:
 
 
 def _attitude(flight: FlightLog) -> Section:
-    title = Section(
+    section = Section(
         "Attitude, actual and set-point",
         explanation="Where the lines stay apart, the vehicle could not follow the set-points.",
         missing="The log contains no attitude.",
     )
     columns = {name: f"{name}_deg" for name in ("roll", "pitch", "yaw")}
     return _with_parts(
-        title,
+        section,
         *_actual_and_setpoint(flight, "attitude", "degrees", flight.attitude_target, flight.attitude, columns),
     )
 
 
 def _velocity(flight: FlightLog) -> Section:
-    title = Section("Velocity, actual and set-point", missing="The log contains no velocity.")
+    section = Section("Velocity, actual and set-point", missing="The log contains no velocity.")
     columns = {name: f"{name}_m_s" for name in ("north", "east", "down")}
-    air = over_time(flight, "air", "air speed, m/s", [_positive(flight)], height=220)
+    air = over_time(flight, "air", "air speed, m/s", [_air_speed_line(flight)], height=220)
     return _with_parts(
-        title,
+        section,
         *_actual_and_setpoint(flight, "velocity", "m/s", flight.velocity_target, flight.velocity, columns),
         air,
     )
 
 
 def _actual_and_setpoint(
-    flight: FlightLog, what: str, unit: str, target: TimeSeries, flown: TimeSeries, columns: Mapping[str, str]
+    flight: FlightLog, quantity: str, unit: str, setpoints: TimeSeries, actual: TimeSeries, columns: Mapping[str, str]
 ) -> list[Part | None]:
     """Return a chart for each of ``columns`` (label → column), and a note if there are no set-points."""
     charts = [
         over_time(
             flight,
-            f"{what}-{name}",
+            f"{quantity}-{name}",
             f"{name}, {unit}",
-            [setpoint_line("set-point", target, column, 2), line("actual", flown, column, 2)],
+            [setpoint_line("set-point", setpoints, column, 2), line("actual", actual, column, 2)],
             height=220,
         )
         for name, column in columns.items()
     ]
-    is_unknown = any(charts) and not target.has()
-    return [*charts, Paragraphs([f"The log contains no {what} set-points."]) if is_unknown else None]
+    if any(charts) and not setpoints.has():
+        return [*charts, Paragraphs([f"The log contains no {quantity} set-points."])]
+    return [*charts]
 
 
-def _positive(flight: FlightLog) -> dict[str, Any] | None:
+def _air_speed_line(flight: FlightLog) -> dict[str, Any] | None:
+    """Return the line of air speeds; None if all are 0, as without a sensor."""
     has_speed = flight.air.has("air_speed_m_s") and max(flight.air.known("air_speed_m_s")) > 0
     return line("air speed", flight.air, "air_speed_m_s", 2) if has_speed else None
 
 
 def _batteries(flight: FlightLog) -> Section:
-    title = Section("Battery", missing="The log contains no battery data.")
+    section = Section("Battery", missing="The log contains no battery data.")
     charts: list[Part | None] = []
     for name, unit, digits in (
         ("voltage_v", "volts", 3),
@@ -175,11 +178,11 @@ def _batteries(flight: FlightLog) -> Section:
             line(battery_name(number), battery, name, digits) for number, battery in sorted(flight.batteries.items())
         ]
         charts.append(over_time(flight, f"battery-{name}", unit, lines, height=220))
-    return _with_parts(title, *charts)
+    return _with_parts(section, *charts)
 
 
 def _vibration(flight: FlightLog) -> Section:
-    title = Section(
+    section = Section(
         "Vibration",
         explanation="Normal is below 30 m/s²; above 60 m/s² the estimator degrades. Clips count how often an"
         " accelerometer reached its limit; they should not increase in flight.",
@@ -192,11 +195,11 @@ def _vibration(flight: FlightLog) -> Section:
         flight, "vibration", "m/s²", [line(label, flight.vibration, name, 2) for name, label in names.items()]
     )
     clips = over_time(flight, "clips", "clips", [line("clips", flight.vibration, "clips", 0)], height=180)
-    return _with_parts(title, levels, clips)
+    return _with_parts(section, levels, clips)
 
 
 def _estimator(flight: FlightLog) -> Section:
-    title = Section(
+    section = Section(
         "Estimator",
         explanation="Innovation test ratios: the difference of each measurement from the estimator's prediction,"
         " relative to the allowed one. Above 1 (the line) the estimator rejects the measurement.",
@@ -210,35 +213,35 @@ def _estimator(flight: FlightLog) -> Section:
         [line(name.replace("_", " "), flight.estimator, name) for name in flight.estimator],
         shapes=[{**limit, "line": {"color": "colour:failsafe", "width": 1}}],
     )
-    return _with_parts(title, chart)
+    return _with_parts(section, chart)
 
 
-def _axis_of_fixes(flight: FlightLog) -> dict[str, Any]:
+def _fix_type_axis(flight: FlightLog) -> dict[str, Any]:
     """Return an axis with the names of the fix types in the log."""
     values = sorted({value for gps in flight.gps.values() for value in gps.known("fix_type")})
-    names = [_FIXES[int(value)] if 0 <= value < len(_FIXES) else f"{value:g}" for value in values]
+    names = [_FIX_NAMES[int(value)] if 0 <= value < len(_FIX_NAMES) else f"{value:g}" for value in values]
     return {"tickmode": "array", "tickvals": values, "ticktext": names}
 
 
 def _gps(flight: FlightLog) -> Section:
-    title = Section("Satellites", missing="The log contains no GNSS data.")
+    section = Section("Satellites", missing="The log contains no GNSS data.")
     charts = []
     for name, unit in (("satellites", "satellites"), ("hdop", "HDOP"), ("fix_type", "fix type")):
-        lines = [line(f"receiver {n + 1}", gps, name, 2) for n, gps in sorted(flight.gps.items())]
-        axis = _axis_of_fixes(flight) if name == "fix_type" else {}
+        lines = [line(f"receiver {number + 1}", gps, name, 2) for number, gps in sorted(flight.gps.items())]
+        axis = _fix_type_axis(flight) if name == "fix_type" else {}
         charts.append(over_time(flight, f"gps-{name}", unit, lines, height=200, yaxis=axis))
-    return _with_parts(title, *charts)
+    return _with_parts(section, *charts)
 
 
 def _link(flight: FlightLog) -> Section:
-    counted = (
+    explanation = (
         "Messages that the autopilot did not receive, by its own count. With several links, those of the busiest one."
         if flight.path.suffix.lower() == ".ulg"
         else "Lost messages in each second, by gaps in the sequence numbers; 100 % during silence."
     )
-    title = Section(
+    section = Section(
         "Link",
-        explanation=counted,
+        explanation=explanation,
         missing="The log contains no link data. A .bin has the reports of a telemetry radio only, a .ulg also PX4's own"
         " counts.",
     )
@@ -258,7 +261,7 @@ def _link(flight: FlightLog) -> Section:
         height=220,
     )
     silences = silence_sentences(flight)
-    return _with_parts(title, Paragraphs(silences) if silences else None, lost, rate, radio)
+    return _with_parts(section, Paragraphs(silences) if silences else None, lost, rate, radio)
 
 
 def _texts(flight: FlightLog) -> Section:
@@ -269,7 +272,10 @@ def _texts(flight: FlightLog) -> Section:
         severity = text.severity
         name = "—" if severity is None else _SEVERITIES[min(max(severity, 0), 7)]
         rows.append((clock(text.time_s), name, text.text))
-        marks.append("" if severity is None or severity > 4 else "warning" if severity == 4 else "bad")
+        if severity is None or severity > MavSeverity.WARNING:
+            marks.append("")
+        else:
+            marks.append("warning" if severity == MavSeverity.WARNING else "bad")
     more = len(flight.texts) - len(rows)
     parts: list[Part] = [Table(("time", "severity", "text"), rows, f"{len(rows)} texts", marks)]
     if more:
@@ -282,27 +288,26 @@ def _texts(flight: FlightLog) -> Section:
 def _parameters(flight: FlightLog) -> Section:
     if not flight.parameters:
         return Section("Parameters", missing="The log contains no parameters.")
-    changed = [
-        change for change in flight.parameter_changes if not any(part in change.name for part in _AUTOPILOT_WRITTEN)
+    changes = [
+        change for change in flight.parameter_changes if not any(part in change.name for part in _WRITTEN_BY_AUTOPILOT)
     ]
     rows = [
         (clock(change.time_s), change.name, f"{change.before:g}", f"{change.after:g}")
-        for change in changed[:_MAX_CHANGES]
+        for change in changes[:_MAX_CHANGES]
     ]
-    parts: list[Part] = [
-        Table(("time", "parameter", "before", "after"), rows, f"{len(changed)} changes")
-        if rows
-        else Paragraphs(["No parameter changed during the log."])
-    ]
-    own = len(flight.parameter_changes) - len(changed)
-    if own:
-        parts.append(Paragraphs([f"{own} changes by the autopilot itself, of counters and the like, are not shown."]))
-    all_of_them = [(name, f"{value:.9g}") for name, value in sorted(flight.parameters.items())]
+    parts: list[Part] = [Paragraphs(["No parameter changed during the log."])]
+    if rows:
+        parts = [Table(("time", "parameter", "before", "after"), rows, f"{len(changes)} changes")]
+    by_autopilot = len(flight.parameter_changes) - len(changes)
+    if by_autopilot:
+        text = f"{by_autopilot} changes by the autopilot itself, of counters and the like, are not shown."
+        parts.append(Paragraphs([text]))
+    parameters = [(name, f"{value:.9g}") for name, value in sorted(flight.parameters.items())]
     parts.append(
         Table(
             ("parameter", "initial value"),
-            all_of_them[:_MAX_PARAMETERS],
-            f"all {len(all_of_them)} parameters",
+            parameters[:_MAX_PARAMETERS],
+            f"all {len(parameters)} parameters",
         )
     )
     return Section("Parameters", parts)

@@ -35,44 +35,45 @@ def simplify(
     known = [abs(x) <= MAX_COORDINATE and abs(y) <= MAX_COORDINATE for x, y in places]
     if not any(known):
         return [], 0.0
-    fixed = {index for index in keep if known[index]}
-    gaps, end = [], len(known) - 1
+    selected = {index for index in keep if known[index]}
+    gaps, last_index = [], len(known) - 1
     for index, is_known in enumerate(known):
-        is_edge = index in (0, end) or not (known[index - 1] and known[index + 1])
-        if is_known and (is_edge or not index % _MAX_SEGMENT):
-            fixed.add(index)
+        is_end_of_line = index in (0, last_index) or not (known[index - 1] and known[index + 1])
+        if is_known and (is_end_of_line or index % _MAX_SEGMENT == 0):
+            selected.add(index)
         elif not is_known and index and known[index - 1]:
             gaps.append(index)
     # Heap of (negative square of the largest deviation, its index, first and last index of the segment).
     segments = [
         (*_deviation(places, first, last), first, last)
-        for first, last in pairwise(sorted(fixed))
+        for first, last in pairwise(sorted(selected))
         if last - first > 1 and known[first + 1]
     ]
     heapq.heapify(segments)
     limit = -tolerance * tolerance
-    while segments and segments[0][0] < limit and len(fixed) < max_points:
+    while segments and segments[0][0] < limit and len(selected) < max_points:
         _, middle, first, last = heapq.heappop(segments)
-        fixed.add(middle)
-        for part in ((first, middle), (middle, last)):
-            if part[1] - part[0] > 1:
-                heapq.heappush(segments, (*_deviation(places, *part), *part))
-    return sorted({*fixed, *gaps}), math.sqrt(-segments[0][0]) if segments else 0.0
+        selected.add(middle)
+        for begin, end in ((first, middle), (middle, last)):
+            if end - begin > 1:
+                heapq.heappush(segments, (*_deviation(places, begin, end), begin, end))
+    largest_deviation = math.sqrt(-segments[0][0]) if segments else 0.0
+    return sorted({*selected, *gaps}), largest_deviation
 
 
 def _deviation(places: Sequence[tuple[float, float]], first: int, last: int) -> tuple[float, int]:
     """Return the negative square of the largest distance from the segment between two points, and its index."""
     x, y = places[first]
-    along_x, along_y = places[last][0] - x, places[last][1] - y
-    length = along_x * along_x + along_y * along_y
-    found, where = -1.0, first + 1
+    segment_x, segment_y = places[last][0] - x, places[last][1] - y
+    squared_length = segment_x * segment_x + segment_y * segment_y
+    largest, largest_index = -1.0, first + 1
     for index in range(first + 1, last):
-        right, up = places[index][0] - x, places[index][1] - y
-        if length:
-            share = (right * along_x + up * along_y) / length
-            share = 0.0 if share < 0.0 else min(share, 1.0)
-            right, up = right - share * along_x, up - share * along_y
-        distance = right * right + up * up
-        if distance > found:
-            found, where = distance, index
-    return -found, where
+        dx, dy = places[index][0] - x, places[index][1] - y
+        if squared_length:  # subtract the way to the nearest point of the segment
+            fraction = (dx * segment_x + dy * segment_y) / squared_length
+            fraction = 0.0 if fraction < 0.0 else min(fraction, 1.0)
+            dx, dy = dx - fraction * segment_x, dy - fraction * segment_y
+        squared_distance = dx * dx + dy * dy
+        if squared_distance > largest:
+            largest, largest_index = squared_distance, index
+    return -largest, largest_index

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.flight import FlightLog, TimeSeries
 
 # Shorter steps are ignored, because they are noise of a stationary vehicle.
-_STEP_M = 1.0
+_MIN_STEP_M = 1.0
 _MAX_LISTED = 5
 # A hovering multicopter needs 20 to 60 % throttle.
 _HIGH_THROTTLE_PERCENT, _HIGH_ATTITUDE_ERROR_DEG = 90.0, 20.0
 # Below this share of the throttle or current before a descent, the motors take less power than a controlled descent
 # needs.
-_LESS_POWER = 0.5
+_LOW_POWER_SHARE = 0.5
 _STOPPED = ", so look at what stopped the motors: ESCs, their supply, a command"
 # An output that was raised by this much by arming and flying drives a motor. Above this difference in the descent, the
 # autopilot tried to lift one side.
@@ -77,36 +77,38 @@ def statistics_of(flight: FlightLog) -> FlightStatistics:
     spans = _ArmedSpans(flight)
     north_east = metres_from_home(flight)
     rows = list(spans.rows(flight.track))
-    away = [math.hypot(*north_east[row]) for row in rows] if north_east else []
+    home_distances = [math.hypot(*north_east[row]) for row in rows] if north_east else []
     speeds = [
         math.hypot(flight.velocity["north_m_s"][row], flight.velocity["east_m_s"][row])
         for row in spans.rows(flight.velocity)
     ]
-    downs = spans.known(flight.velocity, "down_m_s")
-    tilts = [abs(x) for name in ("roll_deg", "pitch_deg") for x in spans.known(flight.attitude, name)]
-    volts, left, amps = (_battery(flight, spans, name) for name in ("voltage_v", "remaining_percent", "current_a"))
+    sink_rates = spans.known(flight.velocity, "down_m_s")
+    tilts = [abs(angle) for name in ("roll_deg", "pitch_deg") for angle in spans.known(flight.attitude, name)]
+    voltages = _first_battery(flight, spans, "voltage_v")
+    remaining = _first_battery(flight, spans, "remaining_percent")
+    currents = _first_battery(flight, spans, "current_a")
     first_gps = next((flight.gps[number] for number in sorted(flight.gps)), None)
     satellites = [] if first_gps is None else spans.known(first_gps, "satellites")
     hdops = [] if first_gps is None else spans.known(first_gps, "hdop")
-    levels = [x for axis in "xyz" for x in spans.known(flight.vibration, f"{axis}_m_s2")]
+    levels = [level for axis in "xyz" for level in spans.known(flight.vibration, f"{axis}_m_s2")]
     clips = spans.known(flight.vibration, "clips")
-    ratios = [x for name in flight.estimator for x in spans.known(flight.estimator, name)]
+    ratios = [ratio for name in flight.estimator for ratio in spans.known(flight.estimator, name)]
     return FlightStatistics(
         armed_s=sum(end - begin for begin, end in flight.armed) if flight.armed else None,
         distance_m=_path_length(north_east, rows) if north_east else None,
         max_height_m=_max(spans.known(flight.track, "altitude_relative_m")),
-        max_distance_m=_max(away),
+        max_distance_m=_max(home_distances),
         max_speed_m_s=_max(speeds),
-        max_climb_m_s=_max([-down for down in downs]),
-        max_descent_m_s=_max(downs),
+        max_climb_m_s=_max([-sink_rate for sink_rate in sink_rates]),
+        max_descent_m_s=_max(sink_rates),
         max_tilt_deg=_max(tilts),
-        end_distance_m=away[-1] if away and away[-1] == away[-1] else None,
-        start_voltage_v=volts[0] if volts else None,
-        end_voltage_v=volts[-1] if volts else None,
-        min_voltage_v=min(volts, default=None),
-        start_remaining_percent=left[0] if left else None,
-        end_remaining_percent=left[-1] if left else None,
-        max_current_a=_max(amps),
+        end_distance_m=home_distances[-1] if home_distances and not math.isnan(home_distances[-1]) else None,
+        start_voltage_v=voltages[0] if voltages else None,
+        end_voltage_v=voltages[-1] if voltages else None,
+        min_voltage_v=min(voltages, default=None),
+        start_remaining_percent=remaining[0] if remaining else None,
+        end_remaining_percent=remaining[-1] if remaining else None,
+        max_current_a=_max(currents),
         min_satellites=min(satellites, default=None),
         max_hdop=_max(hdops),
         max_vibration_m_s2=_max(levels),
@@ -127,16 +129,18 @@ def metres_from_home(flight: FlightLog) -> list[tuple[float, float]]:
 
 def time_in_modes(flight: FlightLog) -> dict[str, float]:
     """Return seconds in each mode while armed, in order of first use."""
-    found: dict[str, float] = {}
+    seconds_by_mode: dict[str, float] = {}
     for change, end in flight.mode_spans():
         for armed_from, armed_to in flight.armed or [(0.0, flight.duration_s)]:
             seconds = min(end, armed_to) - max(change.time_s, armed_from)
             if seconds > 0:
-                found[change.name] = found.get(change.name, 0.0) + seconds
-    return found
+                seconds_by_mode[change.name] = seconds_by_mode.get(change.name, 0.0) + seconds
+    return seconds_by_mode
 
 
 class _ArmedSpans:
+    """Selects rows of the armed time, or all rows if the vehicle was never armed."""
+
     def __init__(self, flight: FlightLog) -> None:
         self._spans = flight.armed or [(-math.inf, math.inf)]
 
@@ -162,7 +166,7 @@ class _ArmedSpans:
         return total / weight if weight else None
 
 
-def _battery(flight: FlightLog, spans: _ArmedSpans, name: str) -> list[float]:
+def _first_battery(flight: FlightLog, spans: _ArmedSpans, name: str) -> list[float]:
     first = next((flight.batteries[number] for number in sorted(flight.batteries)), None)
     return [] if first is None else spans.known(first, name)
 
@@ -172,17 +176,18 @@ def _max(values: list[float]) -> float | None:
 
 
 def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> float:
-    length_m, here = 0.0, (math.nan, math.nan)
-    for before, row in pairwise([-2, *rows]):
-        place = north_east[row]
-        if place[0] != place[0]:
+    length_m = 0.0
+    counted: tuple[float, float] | None = None  # the point up to which the length counts
+    for previous_row, row in pairwise([-2, *rows]):
+        point = north_east[row]
+        if math.isnan(point[0]):
             continue
-        if here[0] != here[0] or row != before + 1:
-            here = place
+        if counted is None or row != previous_row + 1:  # the start of an armed span
+            counted = point
             continue
-        step = math.hypot(place[0] - here[0], place[1] - here[1])
-        if step >= _STEP_M:
-            length_m, here = length_m + step, place
+        step = math.hypot(point[0] - counted[0], point[1] - counted[1])
+        if step >= _MIN_STEP_M:
+            length_m, counted = length_m + step, point
     return length_m
 
 
@@ -201,34 +206,38 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
 
     An unusual value is followed by advice on what to look at.
     """
-    span_s = fall.begins_s, fall.time_s - 0.2  # without the impact
-    currents = _currents(flight, *span_s)
-    found = []
-    if (throttle := _span_and_before(flight.air, "throttle_percent", *span_s)) is not None:
+    begin_s, end_s = fall.begins_s, fall.time_s - 0.2  # without the impact
+    angles = ("roll_deg", "pitch_deg")
+    texts = []
+    currents = _currents(flight, begin_s, end_s)
+    throttle = _span_and_before(flight.air, "throttle_percent", begin_s, end_s)
+    if throttle is not None:
         advice = ", so look at motors, propellers and battery" if throttle.high >= _HIGH_THROTTLE_PERCENT else ""
-        if throttle.is_less and not any(current.is_less for current in currents.values()):
+        if throttle.is_low and not any(current.is_low for current in currents.values()):
             advice = _STOPPED
-        found.append(f"throttle {throttle.text('%')}{advice}")
-    tilt = _max([abs(x) for name in ("roll_deg", "pitch_deg") for x in flight.attitude.between(name, *span_s)])
+        texts.append(f"throttle {throttle.text('%')}{advice}")
+    tilt = _max([abs(angle) for name in angles for angle in flight.attitude.between(name, begin_s, end_s)])
     if tilt is not None:
-        found.append(f"tilt up to {tilt:.0f}°")
-    error = _max([abs(x) for name in ("roll_deg", "pitch_deg") for x in _attitude_errors(flight, name, *span_s)])
+        texts.append(f"tilt up to {tilt:.0f}°")
+    error = _max([abs(error) for name in angles for error in _attitude_errors(flight, name, begin_s, end_s)])
     if error is not None:
         advice = ", so look at the attitude charts" if error >= _HIGH_ATTITUDE_ERROR_DEG else ""
-        found.append(f"attitude up to {error:.0f}° off its set-point{advice}")
-    if motors := _motor_outputs(flight, *span_s):
-        found.append(motors)
-    return found + [f"{name} {current.text('A')}{_STOPPED * current.is_less}" for name, current in currents.items()]
+        texts.append(f"attitude up to {error:.0f}° off its set-point{advice}")
+    motors = _motor_outputs(flight, begin_s, end_s)
+    if motors:
+        texts.append(motors)
+    return texts + [f"{name} {current.text('A')}{_STOPPED * current.is_low}" for name, current in currents.items()]
 
 
 def _currents(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _SpanAndBefore]:
     """Return the current of each battery in a descent, by a name for the text."""
-    found = {}
-    for battery, series in sorted(flight.batteries.items()):
-        name = battery_name(battery) if len(flight.batteries) > 1 else "battery"
-        if (current := _span_and_before(series, "current_a", begin_s, end_s)) is not None:
-            found[f"{name} current"] = current
-    return found
+    currents = {}
+    for index, battery in sorted(flight.batteries.items()):
+        current = _span_and_before(battery, "current_a", begin_s, end_s)
+        if current is not None:
+            name = battery_name(index) if len(flight.batteries) > 1 else "battery"
+            currents[f"{name} current"] = current
+    return currents
 
 
 class _SpanAndBefore(Snapshot):
@@ -240,9 +249,9 @@ class _SpanAndBefore(Snapshot):
     before: float
 
     @property
-    def is_less(self) -> bool:
+    def is_low(self) -> bool:
         """True if most of the descent had less than half of the value before it."""
-        return self.middle < _LESS_POWER * self.before
+        return self.middle < _LOW_POWER_SHARE * self.before
 
     def text(self, unit: str) -> str:
         low, high = f"{self.low:.0f}", f"{self.high:.0f}"
@@ -253,36 +262,39 @@ class _SpanAndBefore(Snapshot):
 def _span_and_before(series: TimeSeries, name: str, begin_s: float, end_s: float) -> _SpanAndBefore | None:
     """Return the values of a span and before it; None if the series has no known value in the span."""
     values = series.between(name, begin_s, end_s)
-    before = series.between(name, begin_s - _BEFORE_FALL_S, begin_s)
-    return (
-        _SpanAndBefore(min(values), median(values), max(values), median(before) if before else math.nan)
-        if values
-        else None
-    )
+    if not values:
+        return None
+    values_before = series.between(name, begin_s - _BEFORE_FALL_S, begin_s)
+    before = median(values_before) if values_before else math.nan
+    return _SpanAndBefore(min(values), median(values), max(values), before)
 
 
 def _motor_outputs(flight: FlightLog, begin_s: float, end_s: float) -> str:
     """Describe the outputs to the motors in a descent; empty if the log does not show which outputs drive motors."""
     armed_s = next((begin for begin, end in reversed(flight.armed) if begin < begin_s), math.nan)
-    found: dict[str, _SpanAndBefore] = {}
+    motors: dict[str, _SpanAndBefore] = {}
     for name in flight.outputs:
         idle_us = flight.outputs.at(name, armed_s - 0.1)
         pulses = _span_and_before(flight.outputs, name, begin_s, end_s)
         if pulses is not None and pulses.before - idle_us >= _MOTOR_RAISED_US:
-            found[name] = pulses
-    if not found:
+            motors[name.split("_")[1]] = pulses
+    if not motors:
         return ""
-    low, high = (min(found, key=lambda name: found[name].middle), max(found, key=lambda name: found[name].middle))
+    by_pulse = sorted(motors, key=lambda output: motors[output].middle)
+    lowest, highest = by_pulse[0], by_pulse[-1]
+    low_us, high_us = motors[lowest].middle, motors[highest].middle
     text = _SpanAndBefore(
-        min(pulses.low for pulses in found.values()),
-        0.0,
-        max(pulses.high for pulses in found.values()),
-        median(pulses.before for pulses in found.values()),
+        min(pulses.low for pulses in motors.values()),
+        median(pulses.middle for pulses in motors.values()),
+        max(pulses.high for pulses in motors.values()),
+        median(pulses.before for pulses in motors.values()),
     ).text("µs")
-    if found[high].middle - found[low].middle < _UNEQUAL_US:
+    if high_us - low_us < _UNEQUAL_US:
         return f"motor outputs {text}"
-    names = f"output {high[7]} at {found[high].middle:.0f} µs, output {low[7]} at {found[low].middle:.0f} µs"
-    return f"unequal motor outputs {text}: {names}, so look at the motor of output {high[7]}"
+    return (
+        f"unequal motor outputs {text}: output {highest} at {high_us:.0f} µs, output {lowest} at {low_us:.0f} µs, so"
+        f" look at the motor of output {highest}"
+    )
 
 
 def _attitude_errors(flight: FlightLog, name: str, begin_s: float, end_s: float) -> Iterator[float]:
@@ -295,9 +307,12 @@ def _attitude_errors(flight: FlightLog, name: str, begin_s: float, end_s: float)
 
 def fall_text(fall: Fall) -> str:
     """Describe a fall: ``Fall: from 28.7 m, 16.9 m/s at the ground, at 0:24.9; disarmed in the air``."""
-    at = f"at the ground, at {clock(fall.time_s)}" if fall.has_impact else f"when the log ends, at {clock(fall.time_s)}"
-    text = f"{fall.title}: from {fall.height_m:.1f} m, {fall.sink_m_s:.1f} m/s {at} (descent since"
-    return "; ".join([f"{text} {clock(fall.begins_s)})", *fall.reasons])
+    end = "at the ground" if fall.has_impact else "when the log ends"
+    text = (
+        f"{fall.title}: from {fall.height_m:.1f} m, {fall.sink_m_s:.1f} m/s {end}, at {clock(fall.time_s)}"
+        f" (descent since {clock(fall.begins_s)})"
+    )
+    return "; ".join([text, *fall.reasons])
 
 
 def summary(flight: FlightLog, statistics: FlightStatistics) -> list[str]:
@@ -311,9 +326,8 @@ def summary(flight: FlightLog, statistics: FlightStatistics) -> list[str]:
         _failsafes_sentence(flight),
         _warnings_sentence(statistics),
     ]
-    return [sentence for sentence in sentences if sentence] + [
-        f"{note[:1].upper()}{note[1:]}." for note in flight.notes
-    ]
+    notes = [f"{note[:1].upper()}{note[1:]}." for note in flight.notes]
+    return [sentence for sentence in sentences if sentence] + notes
 
 
 def _flight_sentence(flight: FlightLog, statistics: FlightStatistics) -> str:
@@ -334,14 +348,10 @@ def _flight_sentence(flight: FlightLog, statistics: FlightStatistics) -> str:
 
 
 def _modes_sentence(flight: FlightLog) -> str:
-    modes = time_in_modes(flight)
-    return (
-        ("Flown in " if flight.armed else "In ")
-        + ", ".join(f"{name} ({span(seconds)})" for name, seconds in modes.items())
-        + "."
-        if modes
-        else ""
-    )
+    modes = [f"{name} ({span(seconds)})" for name, seconds in time_in_modes(flight).items()]
+    if not modes:
+        return ""
+    return f"{'Flown in' if flight.armed else 'In'} {', '.join(modes)}."
 
 
 def _battery_sentence(statistics: FlightStatistics) -> str:
@@ -356,21 +366,19 @@ def _battery_sentence(statistics: FlightStatistics) -> str:
 
 
 def _failsafes_sentence(flight: FlightLog) -> str:
-    found = failsafes(flight)
-    acted = [failsafe for failsafe in found if failsafe.acted]
-    warnings = [failsafe for failsafe in found if not failsafe.acted]
+    acted, warnings = [], []
+    for failsafe in failsafes(flight):
+        if failsafe.acted:
+            acted.append(f"{failsafe.title} at {clock(failsafe.time_s)} ({failsafe.reaction})")
+        else:
+            warnings.append(_warning(flight, failsafe))
     sentences = []
     if acted:
-        sentences.append(
-            f"{len(acted)} failsafe{'' if len(acted) == 1 else 's'}: "
-            + _first_few([f"{failsafe.title} at {clock(failsafe.time_s)} ({failsafe.reaction})" for failsafe in acted])
-        )
+        sentences.append(f"{len(acted)} failsafe{'' if len(acted) == 1 else 's'}: {_first_few(acted)}.")
     if warnings:
-        sentences.append(
-            f"{len(warnings)} warning{'' if len(warnings) == 1 else 's'} without a recorded reaction: "
-            + _first_few([_warning(flight, failsafe) for failsafe in warnings])
-        )
-    return "".join(f"{sentence}. " for sentence in sentences or ["No failsafe was reported"]).rstrip()
+        plural = "" if len(warnings) == 1 else "s"
+        sentences.append(f"{len(warnings)} warning{plural} without a recorded reaction: {_first_few(warnings)}.")
+    return " ".join(sentences) or "No failsafe was reported."
 
 
 def _warning(flight: FlightLog, failsafe: Failsafe) -> str:

@@ -60,10 +60,10 @@ class Calibration(AsyncIterator["CalibrationStep"]):
     async def __anext__(self) -> CalibrationStep:
         if self._is_over:
             raise StopAsyncIteration
-        self._loop = asyncio.get_running_loop()
+        self._loop = asyncio.get_running_loop()  # for `__del__`, which may run on another thread
         try:
             return await self._steps.__anext__()
-        except BaseException:
+        except BaseException:  # The steps have ended, failed or were cancelled; a run that has ended ignores `abandon`.
             self._is_over = True
             self._run.abandon()
             raise
@@ -86,12 +86,14 @@ class Calibration(AsyncIterator["CalibrationStep"]):
     def __del__(self) -> None:
         # A loop that is left by ``break`` does not call the iterator, so the iterator cancels when it is deleted. The
         # blocking twin may delete it on another thread.
-        if getattr(self, "_loop", None) is not None and not self._is_over:
+        is_started = getattr(self, "_loop", None) is not None  # If `__init__` failed, there is no such attribute.
+        if is_started and not self._is_over:
             with suppress(RuntimeError):  # The event loop may be closed.
                 self._loop.call_soon_threadsafe(_abandon, self._run, self._steps)  # type: ignore[union-attr]
 
 
 def _abandon(run: CalibrationRun, steps: AsyncGenerator[CalibrationStep, None]) -> None:
+    """Cancel the calibration on the vehicle, and close the generator of its steps in the background."""
     run.abandon()
     run.session.background.start(steps.aclose, "aerokit calibration")
 
@@ -115,7 +117,7 @@ class CalibrationControl:
         ArduPilot reports progress and fitness of each compass, and must reboot afterwards. PX4 asks for up to six
         poses, and for a turn about the vertical axis in each.
         """
-        return self._start("compass", procedures.ardupilot_compass, 0, 1)
+        return self._start("compass", procedures.ardupilot_compass, param=2)
 
     def accelerometer(self) -> Calibration:
         """Calibrate the accelerometers in six poses.
@@ -123,25 +125,25 @@ class CalibrationControl:
         ArduPilot waits for a confirmation in each pose, and must reboot afterwards. PX4 detects the poses itself, in
         any order.
         """
-        return self._start("accelerometer", procedures.ardupilot_accelerometer, 0, 0, 0, 0, 1)
+        return self._start("accelerometer", procedures.ardupilot_accelerometer, param=5)
 
     def gyroscope(self) -> Calibration:
         """Calibrate the gyroscopes, while the vehicle stands still."""
-        return self._start("gyroscope", _acknowledged("keep the vehicle still"), 1)
+        return self._start("gyroscope", _acknowledged("keep the vehicle still"), param=1)
 
     def level(self) -> Calibration:
         """Calibrate the level attitude, while the vehicle stands level and still."""
-        return self._start("level", _acknowledged("place the vehicle level and keep it still"), 0, 0, 0, 0, 2)
+        return self._start("level", _acknowledged("place the vehicle level and keep it still"), param=5, value=2)
 
     def barometer(self) -> Calibration:
         """Calibrate the barometer: ArduPilot takes the present pressure for that of the ground, PX4 uses the GPS
         altitude.
         """
-        return self._start("barometer", _acknowledged("shelter the vehicle from wind"), 0, 0, 1)
+        return self._start("barometer", _acknowledged("shelter the vehicle from wind"), param=3)
 
     def airspeed(self) -> Calibration:
         """Calibrate the airspeed sensors, first sheltered from wind; PX4 then asks a person to blow into the tube."""
-        return self._start("airspeed", procedures.ardupilot_airspeed, 0, 0, 0, 0, 0, 2)
+        return self._start("airspeed", procedures.ardupilot_airspeed, param=6, value=2)
 
     def radio(self) -> Calibration:
         """Calibrate the remote control: write RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
@@ -163,17 +165,32 @@ class CalibrationControl:
         Raises:
             InvalidArgument: the intent is another text. Nothing was sent.
         """
-        return self._start("escs", procedures.ardupilot_escs, 0, 0, 0, 0, 0, 0, 1)
+        return self._start("escs", procedures.ardupilot_escs, param=7)
 
     def _start(
-        self, sensor: str, ardupilot: Procedure, *params: float, px4: Procedure = procedures.by_texts
+        self,
+        sensor: str,
+        ardupilot: Procedure,
+        *,
+        px4: Procedure = procedures.px4_by_status_texts,
+        param: int = 0,
+        value: float = 1,
     ) -> Calibration:
-        """Prepare a calibration. ``params`` are the parameters of the start command; some ArduPilot procedures ignore
-        them.
+        """Prepare a calibration.
+
+        Args:
+            sensor: name of the public method.
+            ardupilot: procedure for ArduPilot.
+            px4: procedure for PX4.
+            param: number of the parameter of MAV_CMD_PREFLIGHT_CALIBRATION that starts this calibration; 0 if the
+                procedure does not need it.
+            value: value of this parameter; those before are 0.
         """
         run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
         is_px4 = self._context.session.autopilot.calibration_protocol == "texts"
-        return Calibration(run, (px4 if is_px4 else ardupilot)(run, *params))
+        procedure = px4 if is_px4 else ardupilot
+        params = (0,) * (param - 1) + (value,) if param else ()
+        return Calibration(run, procedure(run, *params))
 
 
 def _acknowledged(instruction: str) -> Procedure:

@@ -38,22 +38,24 @@ POSES = {
     AccelcalVehiclePos.NOSEUP: CalibrationPose.NOSE_UP,
     AccelcalVehiclePos.BACK: CalibrationPose.BACK,
 }
-IS_NOT_CANCELLED = "ArduPilot cannot cancel it: it waits for the next pose, and cannot be armed, until it reboots"
+ACCELEROMETER_CANNOT_CANCEL = (
+    "ArduPilot cannot cancel it: it waits for the next pose, and cannot be armed, until it reboots"
+)
 
 
-async def by_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
+async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
     """PX4: yield a step for each ``[cal]`` status text. PX4 itself detects the poses."""
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
-    calibrating_at = math.inf
-    with ExitStack() as ends:
+    calibrating_at = math.inf  # when the vehicle last reported that it calibrates
+    with ExitStack() as cleanup:
 
         def on_text(text: str) -> None:
             if report := parse_report(text):
                 reports.append(report)
 
-        ends.callback(telemetry.status_text.observe(lambda _, text: on_text(text.text), every_arrival=True))
+        cleanup.callback(telemetry.status_text.observe(lambda _, text: on_text(text.text), every_arrival=True))
 
         def has_ended_silently() -> bool:
             nonlocal calibrating_at
@@ -69,8 +71,8 @@ async def by_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[Calibr
             if not reports:
                 run.finish()
                 raise OperationTimeout(
-                    f"{run.what}: the vehicle has ended the calibration, but its status text with the result was lost;"
-                    f" {run.session.describe_link()}"
+                    f"{run.call_name}: the vehicle has ended the calibration, but its status text with the result was"
+                    f" lost; {run.session.describe_link()}"
                 )
             report = reports.popleft()
             if report.kind in ("failed", "cancelled"):
@@ -79,11 +81,13 @@ async def by_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[Calibr
             if report.kind == "done":
                 yield run.result()
                 return
-            if (following := _after(step, report)) != step:
-                yield (step := following)
+            next_step = _step_after(step, report)
+            if next_step != step:
+                step = next_step
+                yield step
 
 
-def _after(step: CalibrationStep, report: CalibrationReport) -> CalibrationStep:
+def _step_after(step: CalibrationStep, report: CalibrationReport) -> CalibrationStep:
     """Return the step that a report of PX4 leads to."""
     if report.kind == "progress":
         return step.replace(progress=report.progress)
@@ -112,8 +116,9 @@ async def acknowledged(run: CalibrationRun, *params: float, instruction: str) ->
 async def ardupilot_airspeed(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
     """ArduPilot: calibrate the airspeed sensors and the barometer by one command."""
     run.check_ready()
-    if await _parameter(run, "ARSPD_TYPE") == 0:
+    if await _read_parameter(run, "ARSPD_TYPE") == 0:
         raise run.failure("no airspeed sensor is enabled (ARSPD_TYPE is 0); nothing was sent")
+    # param3 = 1 calibrates the barometer and, in the same step, the airspeed sensors.
     async for step in acknowledged(run, 0, 0, 1, instruction="cover the airspeed sensor against wind"):
         yield step
 
@@ -121,15 +126,15 @@ async def ardupilot_airspeed(run: CalibrationRun, *_: float) -> AsyncGenerator[C
 async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
     """ArduCopter: set ESC_CALIBRATION to 3, so that the vehicle calibrates the ESCs at its next boot."""
     run.check_ready()
-    before = await _parameter(run, "ESC_CALIBRATION")
+    old_value = await _read_parameter(run, "ESC_CALIBRATION")
     yield run.step(None, "remove the propellers, then continue", needs_confirmation=True)
     await run.begin(None)
     try:
         await run.parameters().set("ESC_CALIBRATION", 3)
-    except ParameterRejected:
+    except ParameterRejected:  # The vehicle refused, so there is nothing to restore.
         raise
-    except BaseException:
-        await _restore(run, "ESC_CALIBRATION", before)
+    except BaseException:  # Also if the call was cancelled: the value may have arrived, unconfirmed.
+        await _restore(run, "ESC_CALIBRATION", old_value)
         raise
     finally:
         run.finish()
@@ -139,51 +144,60 @@ async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[Calib
 async def _restore(run: CalibrationRun, name: str, value: float) -> None:
     """Restore the parameter that starts the calibration at boot; log a warning if this is not confirmed."""
     with anyio.CancelScope(shield=True), anyio.move_on_after(RESTORE_TIMEOUT_S), suppress(AerokitError):
-        if run.context.arbiter.is_known:
+        if run.context.arbiter.is_state_recent:  # Nothing is sent to a silent vehicle.
             await run.parameters().set(name, value)
             return
     logger.warning(
         "%s was left early; perhaps %s was not restored to %g: set it, or the motors get full throttle at boot",
-        *(run.what, name, value),
+        run.call_name,
+        name,
+        value,
     )
 
 
-async def _parameter(run: CalibrationRun, name: str) -> float:
+async def _read_parameter(run: CalibrationRun, name: str) -> float:
     try:
         return (await run.parameters().read(name)).value
     except ParameterRejected:
         firmware = run.session.autopilot.firmware
-        raise NotSupported(f"{run.what}: this {firmware} vehicle has no parameter {name}") from None
+        raise NotSupported(f"{run.call_name}: this {firmware} vehicle has no parameter {name}") from None
 
 
 async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
     """ArduPilot: yield the progress of all compasses, and accept the result if all have succeeded."""
     await run.begin((MavCmd.DO_CANCEL_MAG_CAL, 0))
-    percents: dict[int, int] = {}
-    reports: dict[int, MagCalReport] = {}
-    changes: deque[None] = deque(maxlen=1)
-    mask = 0
+    percents: dict[int, int] = {}  # progress by compass
+    reports: dict[int, MagCalReport] = {}  # result by compass
+    has_changed = False
+    compass_mask = 0  # Bit i is set if compass i is being calibrated.
 
     def on_message(message: MagCalProgress | MagCalReport) -> None:
-        nonlocal mask
-        mask |= message.cal_mask
+        nonlocal compass_mask, has_changed
+        compass_mask |= message.cal_mask
         if isinstance(message, MagCalReport):
             reports[message.compass_id] = message
         elif percents.get(message.compass_id) == message.completion_pct:
             return
         else:
             percents[message.compass_id] = message.completion_pct
-        changes.append(None)
+        has_changed = True
 
-    with ExitStack() as ends:
+    def has_news() -> bool:
+        return has_changed
+
+    def is_complete() -> bool:
+        compasses = [number for number in range(8) if compass_mask >> number & 1]
+        return bool(compasses) and all(number in reports for number in compasses)
+
+    with ExitStack() as cleanup:
         await run.start(0, 0, 0, 0, 0, command=MavCmd.DO_START_MAG_CAL)
         for kind in (MagCalProgress, MagCalReport):
-            ends.callback(run.session.connection.bus.attach(kind, on_message, system_id=run.session.system_id))
-            ends.callback(run.session.rates.request(kind, REPORT_HZ, is_optional=True))
+            cleanup.callback(run.session.connection.bus.attach(kind, on_message, system_id=run.session.system_id))
+            cleanup.callback(run.session.rates.request(kind, REPORT_HZ, is_optional=True))
         yield run.step(0.0, "turn the vehicle slowly in all directions, about each of its axes")
-        while not mask or any(mask >> compass & 1 and compass not in reports for compass in range(8)):
-            await run.wait(lambda: changes)
-            changes.clear()
+        while not is_complete():
+            await run.wait(has_news)
+            has_changed = False
             progress = min(percents.values(), default=0) / 100
             yield run.step(progress, "turn the vehicle slowly in all directions, about each of its axes")
     failures = [
@@ -210,7 +224,7 @@ def _status_name(status: int) -> str:
 
 async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
     """ArduPilot: yield the six poses that the vehicle requests one after the other, and confirm each."""
-    await run.begin(None, IS_NOT_CANCELLED)
+    await run.begin(None, ACCELEROMETER_CANNOT_CANCEL)
     requests: deque[int] = deque()
     confirmed, confirmed_at = 0, -math.inf
     now = run.session.connection.now
@@ -220,15 +234,15 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
         if message.command == MavCmd.ACCELCAL_VEHICLE_POS and not is_repeated:
             requests.append(int(message.param1))
 
-    with ExitStack() as ends:
+    with ExitStack() as cleanup:
         await run.start(*params)
         # The handler is attached only now: until this calibration starts, ArduPilot broadcasts the result of an earlier
         # one.
-        ends.callback(run.session.connection.bus.attach(CommandLong, on_request, system_id=run.session.system_id))
+        cleanup.callback(run.session.connection.bus.attach(CommandLong, on_request, system_id=run.session.system_id))
         while True:
             await run.wait(lambda: requests)
             request = requests.pop()
-            requests.clear()
+            requests.clear()  # Only the newest request counts.
             if request == AccelcalVehiclePos.SUCCESS:
                 yield run.result(reboot_due=True)
                 return
@@ -237,21 +251,21 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
                 raise run.failure("the calibration failed; keep the vehicle still in each pose")
             if request in POSES:
                 pose = POSES[AccelcalVehiclePos(request)]
-                left = tuple(POSES.values())[request - 1 :]
+                remaining = tuple(POSES.values())[request - 1 :]
                 text = f"place the vehicle {pose.value}, keep it still, then continue"
-                yield run.step((request - 1) / len(POSES), text, pose, left, needs_confirmation=True)
+                yield run.step((request - 1) / len(POSES), text, pose, remaining, needs_confirmation=True)
                 await run.command(MavCmd.ACCELCAL_VEHICLE_POS, request)
                 confirmed, confirmed_at = request, now()
-                requests.clear()
+                requests.clear()  # Until the confirmation, ArduPilot has repeated its request.
 
 
 MIN_CHANNELS, MIN_TRAVEL_US = 4, 300
 CHANNELS_TIMEOUT_S = 5.0
 # RCn_MIN must be between the first two values, RCn_MAX between the last two (RC_Channel.cpp, PX4 rc_params).
 LOWEST_US, MIDDLE_US, HIGHEST_US = 800, 1500, 2200
-ENDED_RC = (
-    MavResult.UNSUPPORTED,
-)  # ArduPilot answers UNSUPPORTED although it executes the command, which prevents arming meanwhile.
+# PREFLIGHT_CALIBRATION with param4 = 1 makes ArduPilot refuse to arm until the next such command has param4 = 0. It
+# executes both commands, but answers UNSUPPORTED (GCS_Common.cpp, _handle_command_preflight_calibration).
+RESULTS_OF_RC_COMMAND = (MavResult.UNSUPPORTED,)
 
 
 async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
@@ -260,23 +274,26 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     cell = run.session.telemetry.cells["rc_channels"]
     lows: dict[int, int] = {}
     highs: dict[int, int] = {}
-    with ExitStack() as ends:
-        ends.enter_context(run.session.streaming("rc_channels"))
-        seen = cell.updated_at
+    with ExitStack() as cleanup:
+        cleanup.enter_context(run.session.streaming("rc_channels"))
+        previous_update = cell.updated_at
         await run.wait(
-            lambda: cell.updated_at > seen, CHANNELS_TIMEOUT_S, "no RC_CHANNELS was received: is a receiver connected?"
+            lambda: cell.updated_at > previous_update,
+            CHANNELS_TIMEOUT_S,
+            "no RC_CHANNELS was received: is a receiver connected?",
         )
         if not _pulses(cell.latest):
             raise run.failure("the receiver reports no channels: is the transmitter on? nothing was sent")
         await run.begin(CANCEL_ALL)
-        await run.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 1, accepts=ENDED_RC)
+        await run.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 1, accepts=RESULTS_OF_RC_COMMAND)
 
         def on_channels(value: object) -> None:
             for number, pulse in _pulses(value).items():
                 lows[number] = min(pulse, lows.get(number, pulse))
                 highs[number] = max(pulse, highs.get(number, pulse))
 
-        ends.callback(cell.observe(lambda _, value: on_channels(value), every_arrival=True))
+        cleanup.callback(cell.observe(lambda _, value: on_channels(value), every_arrival=True))
+        # Execution continues behind each `yield` when the person has confirmed the step.
         yield run.step(0.0, "move all sticks and switches to all their ends, then continue", needs_confirmation=True)
         yield run.step(
             0.5, "centre the sticks, with the throttle at its lowest, then continue", needs_confirmation=True
@@ -293,7 +310,7 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         values |= {f"RC{number}_MIN": low, f"RC{number}_MAX": high, f"RC{number}_TRIM": trim}
     async with run.parameters().transaction() as transaction:
         await transaction.set_many(values)
-    await run.command(*CANCEL_ALL, accepts=ENDED_RC)
+    await run.command(*CANCEL_ALL, accepts=RESULTS_OF_RC_COMMAND)
     yield run.result(f"{len(moved)} channels were calibrated")
 
 

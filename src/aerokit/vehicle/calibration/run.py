@@ -55,15 +55,15 @@ class CalibrationRun:
         self.session: VehicleSession = context.session
         self.sensor: str = sensor
         self.parameters: Callable[[], Parameters] = parameters
-        self.what: str = f"calibrate.{sensor}"
+        self.call_name: str = f"calibrate.{sensor}"  # for error texts
         self._runs = runs  # all runs of this vehicle that may be in progress
         self.step: partial[CalibrationStep] = partial(CalibrationStep, sensor)
-        self._cancel: tuple[float, ...] | None = None
+        self._cancel_command: tuple[float, ...] | None = None  # MAV_CMD and its parameters
         self._why_not_cancelled = ""
         self._started_at = math.inf
         self._cancelled_at: float | None = None
-        self._watch = ExitStack()
-        self._sent: SentCommand | None = None
+        self._cancel_order_stack = ExitStack()
+        self._sent_cancel: SentCommand | None = None
         self._has_rebooted = self._is_abandoned = False
         self._ended = asyncio.Event()
 
@@ -76,9 +76,9 @@ class CalibrationRun:
         autopilot = self.session.autopilot
         if not autopilot.calibration_protocol:
             raise NotSupported(
-                f"{self.what}: aerokit does not know how to calibrate {autopilot.firmware}; nothing was sent"
+                f"{self.call_name}: aerokit does not know how to calibrate {autopilot.firmware}; nothing was sent"
             )
-        self.session.check_disarmed(self.what, is_current=self.context.arbiter.is_known)
+        self.session.check_disarmed(self.call_name, is_current=self.context.arbiter.is_state_recent)
 
     async def begin(self, cancel: tuple[float, ...] | None, why_not_cancelled: str = "") -> None:
         """Wait until no other calibration is being cancelled, then register this calibration as running.
@@ -88,15 +88,14 @@ class CalibrationRun:
             why_not_cancelled: text for the user about a calibration that cannot be cancelled.
         """
         self.check_ready()
-        await (
-            anyio.lowlevel.checkpoint()
-        )  # When an iterator is deleted, its run is abandoned only in the next iteration of the event loop.
+        # When an iterator is deleted, its run is abandoned only in the next iteration of the event loop.
+        await anyio.lowlevel.checkpoint()
         for run in tuple(self._runs):
             if not run._is_abandoned:
-                raise BusyError(f"{self.what}: {run.what} is in progress; nothing was sent")
+                raise BusyError(f"{self.call_name}: {run.call_name} is in progress; nothing was sent")
             await run.wait_cancelled()
         self.check_ready()
-        self._cancel, self._why_not_cancelled = cancel, why_not_cancelled
+        self._cancel_command, self._why_not_cancelled = cancel, why_not_cancelled
         self._started_at = self.session.connection.now()
         self._runs.append(self)
         self.context.on_finish.append(self.abandon)
@@ -123,7 +122,7 @@ class CalibrationRun:
         """Register that the calibration has ended on the vehicle."""
         if not self._ended.is_set():
             self._ended.set()
-            self._watch.close()
+            self._cancel_order_stack.close()
             if self.is_running:
                 self._runs.remove(self)
                 self.context.on_finish.remove(self.abandon)
@@ -145,15 +144,16 @@ class CalibrationRun:
             return
         self._is_abandoned = True
         if self._why_not_cancelled:
-            logger.warning("%s was left early: %s", self.what, self._why_not_cancelled)
-        if self._cancel is None or self._has_rebooted or self.session.is_closed:
+            logger.warning("%s was left early: %s", self.call_name, self._why_not_cancelled)
+        if self._cancel_command is None or self._has_rebooted or self.session.is_closed:
             self.finish()
             return
         arbiter = self.context.arbiter
         # The arbiter ends this order when another party takes over, and the cancel command is then not repeated.
-        self._sent = self._watch.enter_context(arbiter.sending(self._watch.enter_context(arbiter.auxiliary_order())))
-        if self.session.connection.is_open and arbiter.is_known:
-            self._send_cancel(*self._cancel)
+        order = self._cancel_order_stack.enter_context(arbiter.auxiliary_order())
+        self._sent_cancel = self._cancel_order_stack.enter_context(arbiter.sending(order))
+        if self.session.connection.is_open and arbiter.is_state_recent:
+            self._send_cancel(*self._cancel_command)
         self.session.background.start(self._confirm_cancel, "aerokit calibration")
 
     async def wait_cancelled(self) -> None:
@@ -166,10 +166,10 @@ class CalibrationRun:
         with anyio.move_on_after(MAX_CANCEL_ATTEMPTS * CANCEL_INTERVAL_S):
             await self._ended.wait()
         if self._why_not_cancelled:
-            raise NotSupported(f"{self.what}: {self._why_not_cancelled}")
+            raise NotSupported(f"{self.call_name}: {self._why_not_cancelled}")
         if not self._ended.is_set():
             raise OperationTimeout(
-                f"{self.what}: the vehicle did not confirm the cancellation; {self.session.describe_link()}"
+                f"{self.call_name}: the vehicle did not confirm the cancellation; {self.session.describe_link()}"
             )
 
     def _send_cancel(self, command: float, *params: float) -> None:
@@ -182,26 +182,27 @@ class CalibrationRun:
         """Send the cancel command unless it was already sent, and repeat it until the vehicle confirms the
         cancellation.
         """
-        assert self._cancel is not None
+        assert self._cancel_command is not None
         try:
             for _ in range(MAX_CANCEL_ATTEMPTS):
                 if self._cancelled_at is not None:
                     with anyio.move_on_after(CANCEL_INTERVAL_S):
-                        while not self._is_cancelled(self._cancel[0]):  # noqa: ASYNC110
+                        while not self._is_cancelled(self._cancel_command[0]):  # noqa: ASYNC110
                             await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
                         return
                 await self.session.wait_for_heartbeat(self._cancelled_at)
-                if self._has_rebooted or (self._sent is not None and self._sent.end):
+                is_taken_over = self._sent_cancel is not None and bool(self._sent_cancel.end)
+                if self._has_rebooted or is_taken_over:
                     return
-                if self.context.arbiter.is_known:
-                    self._send_cancel(*self._cancel)
-            logger.warning("%s: the vehicle did not confirm the cancellation", self.what)
-        except (ConnectionClosed, LinkLost):
+                if self.context.arbiter.is_state_recent:
+                    self._send_cancel(*self._cancel_command)
+            logger.warning("%s: the vehicle did not confirm the cancellation", self.call_name)
+        except (ConnectionClosed, LinkLost):  # The vehicle can no longer be reached.
             pass
         finally:
             self.finish()
 
-    def _is_cancelled(self, command: float) -> bool:
+    def _is_cancelled(self, cancel_command: float) -> bool:
         """Return True if the vehicle has confirmed the cancellation: ArduPilot by COMMAND_ACK, PX4 by HEARTBEAT.
 
         PX4's acknowledgements are no confirmation, because PX4 sends two with different results.
@@ -209,8 +210,9 @@ class CalibrationRun:
         if self._has_rebooted:
             return True
         assert self._cancelled_at is not None
-        if command != MavCmd.PREFLIGHT_CALIBRATION:
-            return self.session.commands.accepted_at(int(command)) >= self._cancelled_at
+        # PX4 is cancelled by PREFLIGHT_CALIBRATION with zeros, ArduPilot by commands of their own.
+        if cancel_command != MavCmd.PREFLIGHT_CALIBRATION:
+            return self.session.commands.accepted_at(int(cancel_command)) >= self._cancelled_at
         status = self.session.telemetry.system_status
         return status.updated_at > self._cancelled_at and status.latest != MavState.CALIBRATING
 
@@ -220,19 +222,19 @@ class CalibrationRun:
         self,
         is_ready: Callable[[], object],
         timeout: float = REPORT_TIMEOUT_S,
-        missing: str = "the vehicle reported nothing about the calibration",
+        timeout_text: str = "the vehicle reported nothing about the calibration",
     ) -> None:
         """Wait for the vehicle's next report. Raises as `await_progress`."""
         await await_progress(
             self.session,
-            self.what,
+            self.call_name,
             is_done=lambda: bool(is_ready()),
-            trouble=self._trouble,
-            describe=lambda: missing,
+            failure_reason=self._failure_reason,
+            describe=lambda: timeout_text,
             timeout=timeout,
         )
 
-    def _trouble(self) -> str | None:
+    def _failure_reason(self) -> str | None:
         if self._has_rebooted:
             return "the vehicle rebooted"
         return "the vehicle was armed" if self.session.telemetry.is_armed else None
@@ -242,9 +244,9 @@ class CalibrationRun:
     ) -> CalibrationStep:
         """Register the end of the calibration, and return the last step."""
         self.finish()
-        found = CalibrationResult(compasses, reboot_due, self.session.texts_since(self._started_at))
-        return self.step(1.0, instruction, result=found)
+        texts = self.session.texts_since(self._started_at)
+        return self.step(1.0, instruction, result=CalibrationResult(compasses, reboot_due, texts))
 
     def failure(self, reason: str) -> OperationRejected:
         """Return the error of a calibration that failed, with the vehicle's texts."""
-        return OperationRejected(f"{self.what}: {reason}", reasons=self.session.texts_since(self._started_at))
+        return OperationRejected(f"{self.call_name}: {reason}", reasons=self.session.texts_since(self._started_at))

@@ -110,8 +110,10 @@ def parse_report(status_text: str) -> CalibrationReport | None:
     text = status_text[len("[cal] ") :].strip()
     for kind, pattern in _FORMATS.items():
         if match := re.fullmatch(pattern, text):
-            found = match.groupdict()
-            progress = int(found["percent"]) / 100 if "percent" in found else None
-            poses = tuple(SIDES[side] for side in found.get("sides", "").split())
-            return CalibrationReport(kind, text, progress, poses) if progress is None or progress <= 1 else None
+            groups = match.groupdict()
+            progress = int(groups["percent"]) / 100 if "percent" in groups else None
+            if progress is not None and progress > 1:  # a damaged text
+                return None
+            poses = tuple(SIDES[side] for side in groups.get("sides", "").split())
+            return CalibrationReport(kind, text, progress, poses)
     return CalibrationReport("text", text)

@@ -10,7 +10,7 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.async_block import ReadOnly
 from aerokit.connection.cells import Source, StateCell
-from aerokit.errors import FileFormatError, InvalidArgument, NotSupported
+from aerokit.errors import InvalidArgument, NotSupported
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavType
 from aerokit.vehicle.camera.capture import Capture
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["Camera", "Cameras"]
 
 MAX_SERIES_LENGTH, MAX_CONSECUTIVE_MISSING = 32_767, 3
-MAVFTP = re.compile(r"(?:mftp|mavlinkftp)://.|/.", re.IGNORECASE)
+MAVFTP_URL = re.compile(r"(?:mftp|mavlinkftp)://.|/.", re.IGNORECASE)
 
 
 @checks_arguments
@@ -63,12 +63,12 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             CommandRejected: the camera refused to identify itself.
             OperationTimeout: no camera was found, or the camera did not identify itself. PX4's trigger never does.
         """
-        found: CameraInformation | None = None
+        information: CameraInformation | None = None
         with anyio.move_on_after(timeout):
-            found = await self._link.identify()
-        if found is None:
+            information = await self._link.identify()
+        if information is None:
             raise self._link.timeout_error(f"did not identify itself within {timeout:g} s")
-        return found
+        return information
 
     async def take_photo(self, *, timeout: float = 10.0) -> Capture:
         """Take one photo; returns when the camera has reported it.
@@ -89,7 +89,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             OperationTimeout: the camera reported no picture, or no camera was found.
         """
         await self._link.require_capability("take_photo", "capture_image")
-        return await self._shutter.take(timeout)
+        return await self._shutter.take_photo(timeout)
 
     def photo_interval(self, seconds: float, count: int = 0) -> PhotoInterval:
         """Take a photo every ``seconds`` for the duration of an ``async with`` block.
@@ -134,15 +134,15 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             if status is None:
                 raise self._link.timeout_error("did not report how many pictures it has taken")
             count = status.image_count
-            missing = 0
+            missing_in_succession = 0
             available = 1 if self._link.is_autopilot_attached else MAX_CAPTURES
             for index in range(max(0, count - available), count):
-                missing = 0 if await self._log.fetch(index) else missing + 1
-                if missing == MAX_CONSECUTIVE_MISSING:
+                missing_in_succession = 0 if await self._log.fetch(index) else missing_in_succession + 1
+                if missing_in_succession == MAX_CONSECUTIVE_MISSING:
                     break
             return self.captures()
-        what = "how many pictures it has taken" if count is None else f"all of its {count} pictures"
-        raise self._link.timeout_error(f"did not report {what} within {timeout:g} s")
+        not_reported = "how many pictures it has taken" if count is None else f"all of its {count} pictures"
+        raise self._link.timeout_error(f"did not report {not_reported} within {timeout:g} s")
 
     async def read_picture(self, capture: Capture) -> bytes:
         """Read the file of a picture by MAVFTP, if its ``file_url`` begins with ``mftp:`` or ``/``; at most 16 MB.
@@ -153,14 +153,12 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             OperationTimeout: the transfer stopped, or no camera was found.
         """
         url = capture.file_url
-        if not MAVFTP.match(url):
-            what = f"{url[:100]!r} is not a MAVFTP URL" if url else "the capture has no URL"
-            raise NotSupported(f"read_picture: {what}; nothing was sent")
+        if not MAVFTP_URL.match(url):
+            reason = f"{url[:100]!r} is not a MAVFTP URL" if url else "the capture has no URL"
+            raise NotSupported(f"read_picture: {reason}; nothing was sent")
         await self._link.identify()
         try:
             return await self._link.component.fetch(f"mftp://{url}" if url.startswith("/") else url)
-        except FileFormatError:
-            raise
         except InvalidArgument as error:
             raise NotSupported(f"read_picture: {error}; nothing was sent") from None
 
@@ -177,7 +175,7 @@ class Cameras:
 
     def __init__(self, context: VehicleContext, components: Components) -> None:
         self._context, self._session, self._components = context, context.session, components
-        self._made: dict[int, Camera] = {}
+        self._cameras: dict[int, Camera] = {}
         session = context.session
         self.cell: StateCell[tuple[int, ...]] = session.connection.new_cell(
             "cameras", "HEARTBEAT or CAMERA_INFORMATION of a camera"
@@ -188,7 +186,7 @@ class Cameras:
         self._first = Camera(self._first_link)
         # True once `first` has returned `_first`: from then on it always returns the same object.
         self._is_first_in_use = False
-        session.keep(self.cell)
+        session.register_cell(self.cell)
         bus = session.connection.bus
         for message_type, callback in (
             (m.Heartbeat, self._on_heartbeat),
@@ -208,8 +206,9 @@ class Cameras:
         """The camera that was found first. Low component ids take precedence; cameras attached to the autopilot come
         last.
         """
-        if not self._is_first_in_use and self._first_link.number in self._made:
-            return self._made[self._first_link.number]
+        if not self._is_first_in_use and self._first_link.number in self._cameras:
+            # `at` has already created an object for this camera.
+            return self._cameras[self._first_link.number]
         self._is_first_in_use = True
         self._first_link.start_polling()
         return self._first
@@ -220,13 +219,13 @@ class Cameras:
             raise InvalidArgument(
                 f"number = {number} is not allowed: 1 to 6 if attached to the autopilot, or a component id up to 255"
             )
-        if number not in self._made:
+        if number not in self._cameras:
             if number == self._first_link.number:
                 return self.first
             link = CameraLink(self._context, self._components.component, number)
             link.start_polling()
-            self._made[number] = Camera(link)
-        return self._made[number]
+            self._cameras[number] = Camera(link)
+        return self._cameras[number]
 
     def _on_heartbeat(self, heartbeat: m.Heartbeat) -> None:
         frame = heartbeat.received_frame
@@ -234,17 +233,18 @@ class Cameras:
             self._record(heartbeat, frame.component_id)
 
     def _on_information(self, message: m.CameraInformation) -> None:
+        # Without a device id, ArduPilot tells its cameras apart by lens_id, from 0 (AP_Camera_Backend.cpp).
         self._record(message, message.camera_device_id or message.lens_id + 1)
 
     def _on_first_bound(self, number: int) -> None:
-        # If two objects stand for the same camera, only one of them publishes its events.
-        self._first_link.is_muted = number in self._made
+        # `at` may have created another object for the same camera. Only one of the two publishes its events.
+        self._first_link.is_muted = number in self._cameras
 
     def _on_capture(self, message: Any, device: int) -> None:
         """Create the camera object if needed, so that its capture log also gets this first capture."""
         number = self._record(message, device)
-        if number in (0, self._first_link.number, *self._made):
-            return
+        if number in (0, self._first_link.number, *self._cameras):
+            return  # not a camera, or its object already listens to this message
         if self._first_link.number is None:
             if not self._early:
                 self._first_link.call_later(DISCOVERY_TIMEOUT_S, self._process_early)
@@ -261,22 +261,27 @@ class Cameras:
             self.at(number)._log.record(message)
 
     def _record(self, message: Any, device: int) -> int:
-        """Add the sender to the cell of cameras; return its number or 0. Only the autopilot's ``device`` counts."""
+        """Add the camera to the cell of cameras; return its number, or 0 if the message is not of a camera.
+
+        The number is ``device`` in a message of the autopilot, otherwise the component id of the sender.
+        """
         frame = message.received_frame
         if frame is None:
             return 0
         is_from_autopilot = frame.component_id == self._session.component_id
         number = device if is_from_autopilot else frame.component_id
-        if (number in AUTOPILOT_CAMERA_IDS) is not is_from_autopilot or number == 0:
+        # The numbers 1 to 6 belong to the autopilot's cameras, and no others do.
+        if (number in AUTOPILOT_CAMERA_IDS) != is_from_autopilot or number == 0:
             return 0
-        known = self.cell.latest or ()
-        if number not in known:
+        numbers = self.cell.latest or ()
+        if number not in numbers:
             source = Source(self._session.system_id, frame.component_id, message.NAME)
-            self.cell.set(tuple(sorted((*known, number), key=_sort_key)), source)
+            self.cell.set(tuple(sorted((*numbers, number), key=_sort_key)), source)
         if number not in AUTOPILOT_CAMERA_IDS and self._first_link.number is None:
             self._first_link.bind(number)
         return int(number)
 
 
 def _sort_key(number: int) -> tuple[bool, int]:
+    """Sort cameras by number, but those attached to the autopilot last."""
     return number in AUTOPILOT_CAMERA_IDS, number

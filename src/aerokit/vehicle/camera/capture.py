@@ -72,47 +72,52 @@ class Capture(Snapshot):
 
 
 def from_image(message: CameraImageCaptured, camera: int, received_at: float) -> Capture:
-    q = message.q
-    length = math.sqrt(sum(value * value for value in q))
-    quaternion = (q[0], q[1], q[2], q[3]) if math.isfinite(length) and length > 0 else None
+    """Decode CAMERA_IMAGE_CAPTURED."""
+    w, x, y, z = message.q
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    quaternion = (w, x, y, z) if math.isfinite(length) and length > 0 else None
     roll, pitch, yaw = (None, None, None) if quaternion is None else _euler(quaternion)
     return Capture(
-        camera,
-        message.image_index,
-        message.capture_result == 1,
-        received_at,
-        _utc(message.time_utc),
-        place_of(message.lat, message.lon, message.alt / 1000, message.relative_alt / 1000),
-        quaternion,
-        roll,
-        pitch,
-        yaw,
-        message.file_url,
+        camera=camera,
+        index=message.image_index,
+        success=message.capture_result == 1,
+        received_at=received_at,
+        taken_at=_utc(message.time_utc),
+        place=place_of(message.lat, message.lon, message.alt / 1000, message.relative_alt / 1000),
+        quaternion=quaternion,
+        roll_deg=roll,
+        pitch_deg=pitch,
+        yaw_deg=yaw,
+        file_url=message.file_url,
     )
 
 
 def from_feedback(message: CameraFeedback, camera: int, received_at: float) -> Capture:
     """Decode ArduPilot's CAMERA_FEEDBACK, which counts from 1."""
-    angles = _angles(message.roll, message.pitch, message.yaw)
+    roll, pitch, yaw = _angles(message.roll, message.pitch, message.yaw)
     return Capture(
-        camera,
-        (message.img_idx - 1) % FEEDBACK_INDEX_RANGE,
-        True,
-        received_at,
-        _utc(message.time_usec),
-        place_of(message.lat, message.lng, message.alt_msl, message.alt_rel),
-        _quaternion_of(*angles),
-        *angles,
-        "",
+        camera=camera,
+        index=(message.img_idx - 1) % FEEDBACK_INDEX_RANGE,
+        success=True,
+        received_at=received_at,
+        taken_at=_utc(message.time_usec),
+        place=place_of(message.lat, message.lng, message.alt_msl, message.alt_rel),
+        quaternion=_quaternion_of(roll, pitch, yaw),
+        roll_deg=roll,
+        pitch_deg=pitch,
+        yaw_deg=yaw,
+        file_url="",
     )
 
 
 def from_trigger(message: CameraTrigger, camera: int, received_at: float, telemetry: Telemetry) -> Capture:
     """Decode PX4's CAMERA_TRIGGER. It has no position, so position and attitude of the vehicle are used."""
     position, attitude = telemetry.position.latest, telemetry.attitude.latest
-    angles: tuple[float | None, float | None, float | None] = (None, None, None)
+    roll: float | None = None
+    pitch: float | None = None
+    yaw: float | None = None
     if attitude is not None:
-        angles = _angles(attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
+        roll, pitch, yaw = _angles(attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
     place = None
     if position is not None:
         place = Position(
@@ -122,15 +127,17 @@ def from_trigger(message: CameraTrigger, camera: int, received_at: float, teleme
             position.altitude_relative_m,
         )
     return Capture(
-        camera,
-        message.seq,
-        None,
-        received_at,
-        _utc(message.time_usec),
-        place,
-        _quaternion_of(*angles),
-        *angles,
-        "",
+        camera=camera,
+        index=message.seq,
+        success=None,
+        received_at=received_at,
+        taken_at=_utc(message.time_usec),
+        place=place,
+        quaternion=_quaternion_of(roll, pitch, yaw),
+        roll_deg=roll,
+        pitch_deg=pitch,
+        yaw_deg=yaw,
+        file_url="",
     )
 
 
@@ -154,7 +161,7 @@ def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
     length = math.sqrt(sum(value * value for value in quaternion))
     w, x, y, z = (value / length for value in quaternion)
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
-    if abs(sine) > MAX_PITCH_SINE:
+    if abs(sine) > MAX_PITCH_SINE:  # Roll and yaw turn about the same axis, so the whole turn counts as yaw.
         roll, yaw = 0.0, -2 * math.copysign(1, sine) * math.atan2(x, w)
     else:
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -225,14 +232,14 @@ def geotagged(jpeg: bytes, capture: Capture) -> bytes:
     """
     if capture.place is None:
         raise InvalidArgument(f"capture {capture.index} of camera {capture.camera} has no position")
-    segments, rest = _split(jpeg)
-    existing = next((segment for segment in segments if _is_exif(segment)), b"")
+    segments, image_data = _split(jpeg)
+    old_exif = next((segment for segment in segments if _is_exif(segment)), b"")
     image = _pillow("Image")
     exif = image.Exif()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # Pillow only warns when it drops tags that it cannot parse.
-            exif.load(existing[4:])
+            exif.load(old_exif[4:])  # without the marker and the length
             exif.get_ifd(EXIF_IFD).update(_exif_tags(capture))
             exif.get_ifd(GPS_IFD).update(_gps_tags(capture))
             body: bytes = exif.tobytes()
@@ -244,9 +251,9 @@ def geotagged(jpeg: bytes, capture: Capture) -> bytes:
         raise FileFormatError(
             f"cannot add the position: the EXIF would have {len(body)} bytes, more than {MAX_SEGMENT_SIZE}"
         )
-    tagged = bytes((0xFF, EXIF)) + (len(body) + 2).to_bytes(2, "big") + body
-    others = b"".join(segment for segment in segments if not _is_exif(segment))
-    return bytes((0xFF, START)) + tagged + others + rest
+    new_exif = bytes((0xFF, EXIF)) + (len(body) + 2).to_bytes(2, "big") + body  # The length includes its own 2 bytes.
+    other_segments = b"".join(segment for segment in segments if not _is_exif(segment))
+    return bytes((0xFF, START)) + new_exif + other_segments + image_data
 
 
 @checked
@@ -263,31 +270,32 @@ def geotag_file(path: str | os.PathLike[str], capture: Capture, *, to: str | os.
     source = Path(path)
     target = source if to is None else Path(to)
     data = geotagged(source.read_bytes(), capture)
-    part = target.with_name(target.name + ".part")
+    temporary = target.with_name(target.name + ".part")
     try:
-        part.write_bytes(data)
-        part.replace(target)
+        temporary.write_bytes(data)
+        temporary.replace(target)
     finally:
-        part.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def _split(jpeg: bytes) -> tuple[list[bytes], bytes]:
     """Return the segments in front of the image data, and the image data."""
     if jpeg[:3] != bytes((0xFF, START, 0xFF)):
         raise FileFormatError("not a JPEG: the bytes do not begin with its marker (FF D8 FF)")
-    segments = list(_walk(jpeg))
+    segments = list(_segments(jpeg))
     return segments, jpeg[2 + sum(map(len, segments)) :]
 
 
-def _walk(jpeg: bytes) -> Iterator[bytes]:
-    at = 2
-    while jpeg[at + 1 : at + 2] != bytes((SCAN,)):
-        length = int.from_bytes(jpeg[at + 2 : at + 4], "big")
-        segment = jpeg[at : at + 2 + length]
+def _segments(jpeg: bytes) -> Iterator[bytes]:
+    """Yield each segment before the image data: FF, marker, length in 2 bytes, content. The length includes these 2."""
+    start = 2
+    while jpeg[start + 1 : start + 2] != bytes((SCAN,)):
+        length = int.from_bytes(jpeg[start + 2 : start + 4], "big")
+        segment = jpeg[start : start + 2 + length]
         if segment[:1] != b"\xff" or length < 2 or len(segment) < 2 + length:
             raise FileFormatError("incomplete JPEG: it ends before the image data")
         yield segment
-        at += len(segment)
+        start += len(segment)
 
 
 def _is_exif(segment: bytes) -> bool:
@@ -337,16 +345,16 @@ def _gps_tags(capture: Capture) -> dict[int, Any]:
 
 def _sexagesimal(degrees: float) -> tuple[float, float, float]:
     """Convert to degrees, minutes and seconds, rounded to 0.0001 seconds (some millimetres)."""
-    units = round(abs(degrees) * 36_000_000)
-    minutes, seconds = divmod(units, 600_000)
-    whole, minutes = divmod(minutes, 60)
-    return float(whole), float(minutes), seconds / 10_000
+    ten_thousandths = round(abs(degrees) * 3600 * 10_000)  # of a second
+    total_minutes, rest = divmod(ten_thousandths, 60 * 10_000)
+    whole_degrees, minutes = divmod(total_minutes, 60)
+    return float(whole_degrees), float(minutes), rest / 10_000
 
 
 def _time_of(capture: Capture) -> datetime | None:
     if capture.taken_at is None or not 0 <= capture.taken_at < MAX_UTC_S:
         return None
-    # Rounded down, because EXIF has whole seconds: rounding up could change the second.
+    # Rounded down to milliseconds: rounding up could reach the next second, and EXIF stores whole seconds.
     return datetime.fromtimestamp(math.floor(capture.taken_at * 1000) / 1000, timezone.utc)
 
 

@@ -57,7 +57,7 @@ class _Entry:
             is_utc = stamp >= SECONDS_IN_1990 * 1_000_000
             self.utc_us, self.boot_us = (stamp, 0) if is_utc else (0, stamp)
 
-    def is_same(self, other: _Entry) -> bool:
+    def reports_same_picture(self, other: _Entry) -> bool:
         if self.kind is not other.kind:  # PX4 reports each picture by two messages in quick succession.
             return abs(self.capture.received_at - other.capture.received_at) <= DUPLICATE_WINDOW_S
         if self.utc_us and other.utc_us:
@@ -66,7 +66,8 @@ class _Entry:
             return self.boot_us == other.boot_us
         return self.capture.place == other.capture.place
 
-    def is_later(self, other: _Entry) -> bool:
+    def was_taken_later(self, other: _Entry) -> bool:
+        """Return True if the time stamps show that this picture is later; False also if they cannot be compared."""
         if self.utc_us and other.utc_us:
             return self.utc_us > other.utc_us
         return bool(self.boot_us and other.boot_us) and self.boot_us > other.boot_us
@@ -82,13 +83,16 @@ class CaptureLog:
         self._link = link
         self._by_index: dict[int, _Entry] = {}
         self._requested: set[int] = set()
+        # The entry with the highest plausible index, the last one far above it, and the last failed picture.
         self._highest: _Entry | None = None
         self._outlier: _Entry | None = None
         self._failed: _Entry | None = None
+        # Number of pictures, from CAMERA_CAPTURE_STATUS and indices. It is used once the camera has reported a number.
         self._count, self._is_count_used = 0, False
         self._count_boot_ms = 0
         # Loop time of the last reset: earlier captures belong to another log.
         self.reset_at: float = -math.inf
+        # True if the camera sends CAMERA_IMAGE_CAPTURED, which makes CAMERA_TRIGGER superfluous.
         self._has_images = False
         self.cell: StateCell[Capture] = link.new_cell(
             "camera.capture", "CAMERA_IMAGE_CAPTURED, CAMERA_FEEDBACK or CAMERA_TRIGGER"
@@ -116,8 +120,8 @@ class CaptureLog:
                     break
         finally:
             self._requested.discard(index)
-        found = self._by_index.get(index)
-        return None if found is None else found.capture
+        entry = self._by_index.get(index)
+        return None if entry is None else entry.capture
 
     async def _request(self, index: int) -> bool:
         """Request the capture once; return True if the camera answers that it has no such capture, or only newer
@@ -176,7 +180,7 @@ class CaptureLog:
         if 0 < self._count_boot_ms - boot_ms < REORDER_WINDOW_MS:
             return
         self._count_boot_ms = boot_ms
-        if count < self._count:
+        if count < self._count:  # The camera counts from 0 again.
             self._reset()
         self._count = count
         self._is_count_used = self._is_count_used or count > 0
@@ -188,12 +192,14 @@ class CaptureLog:
         self.reset_at = self._link.now()
 
     def _shows_reset(self, entry: _Entry, previous: _Entry | None) -> bool:
+        """Return True if the camera counts from 0 again. ``previous`` is the stored entry with the same index."""
         if previous is not None and previous.capture.success is not False:
-            return not entry.is_same(previous)
+            return not entry.reports_same_picture(previous)
         index, highest = entry.capture.index, self._highest
         if highest is None or index >= highest.capture.index or index in self._requested:
             return False
-        return highest.capture.index - index > HALF_RANGE or entry.is_later(highest)
+        has_wrapped = highest.capture.index - index > HALF_RANGE
+        return has_wrapped or entry.was_taken_later(highest)
 
     def _add(self, message: Message, capture: Capture) -> None:
         entry = _Entry(message, capture)
@@ -205,8 +211,9 @@ class CaptureLog:
             self._reset()
             previous = None
         is_new = previous is None or previous.capture.success is False
+        # A repeated message, or CAMERA_TRIGGER after the message with the position, has nothing to add.
         if previous is not None and not is_new and previous.kind in (entry.kind, m.CameraImageCaptured):
-            return  # a repeated message, or CAMERA_TRIGGER after the message with the position
+            return
         self._store(entry)
         self._update_highest(entry)
         if isinstance(message, m.CameraImageCaptured):
@@ -223,13 +230,15 @@ class CaptureLog:
         if highest is None or 0 <= index - highest.capture.index <= MAX_INDEX_GAP:
             self._highest = entry
         elif index > highest.capture.index:
-            is_confirmed = outlier is not None and 0 <= index - outlier.capture.index <= MAX_INDEX_GAP
-            self._highest, self._outlier = (entry, None) if is_confirmed else (highest, entry)
+            if outlier is not None and 0 <= index - outlier.capture.index <= MAX_INDEX_GAP:
+                self._highest = entry
+            else:
+                self._outlier = entry
 
     def _add_failed(self, message: Message, entry: _Entry) -> None:
-        # A later picture that succeeds may have the same index.
+        # The index of a failed picture may be used again, so such an entry never replaces a successful one.
         index, failed = entry.capture.index, self._failed
-        if failed is not None and failed.capture.index == index and failed.is_same(entry):
+        if failed is not None and failed.capture.index == index and failed.reports_same_picture(entry):
             return
         self._failed = entry
         previous = self._by_index.get(index)
@@ -238,6 +247,7 @@ class CaptureLog:
         self._publish(message, entry.capture, is_new=True)
 
     def _store(self, entry: _Entry) -> None:
+        # Removed before it is stored, so that the dictionary has the newest entry last, and the oldest can be dropped.
         self._by_index.pop(entry.capture.index, None)
         self._by_index[entry.capture.index] = entry
         if len(self._by_index) > MAX_CAPTURES:
@@ -268,7 +278,8 @@ class CaptureQueue:
         if self._detach is not None:
             self._detach()
 
-    def take(self) -> Capture | None:
+    def pop(self) -> Capture | None:
+        """Return the oldest capture in the queue and remove it; None if the queue is empty."""
         return self._queue.popleft() if self._queue else None
 
     async def wait(self, seconds: float) -> bool:

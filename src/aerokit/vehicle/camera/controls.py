@@ -76,7 +76,7 @@ class LensMixin(CameraMixin):
         await self._set("zoom_to", HAS_ZOOM, ZOOM, CameraZoomType.RANGE, percent)
 
     async def zoom_to_focal_length(self, millimetres: float) -> None:
-        """Zoom to a focal length, above 0 to 10,000 mm; errors as for :meth:`zoom_step`."""
+        """Zoom to a focal length, above 0 and at most 10,000 mm; errors as for :meth:`zoom_step`."""
         check_range("millimetres", millimetres, 0, 10_000, above=True)
         await self._set("zoom_to_focal_length", HAS_ZOOM, ZOOM, CameraZoomType.FOCAL_LENGTH, millimetres)
 
@@ -114,7 +114,7 @@ class LensMixin(CameraMixin):
         await self._set("focus_to", HAS_FOCUS, FOCUS, SetFocusType.RANGE, percent)
 
     async def focus_at(self, metres: float) -> None:
-        """Focus at a distance, above 0 to 100,000 m; errors as for :meth:`focus_step`."""
+        """Focus at a distance, above 0 and at most 100,000 m; errors as for :meth:`focus_step`."""
         check_range("metres", metres, 0, 100_000, above=True)
         await self._set("focus_at", HAS_FOCUS, FOCUS, SetFocusType.METERS, metres)
 
@@ -153,9 +153,9 @@ class LensMixin(CameraMixin):
         return CameraBlock(
             link,
             ORDER_SUBJECTS[command],
-            lambda: link.require_capability(action, capability),
-            lambda order: link.command(command, kind, speed, link.device, order=order),
-            lambda: (command, kind, 0, link.device),
+            check=lambda: link.require_capability(action, capability),
+            start=lambda order: link.command(command, kind, speed, link.device, order=order),
+            stop_command=lambda: (command, kind, 0, link.device),
         )
 
 
@@ -176,7 +176,7 @@ class TrackingMixin(CameraMixin):
         """Position of the tracked object on earth, if the camera reports it; requested at the same rate as
         ``tracking``.
         """
-        self._releases: list[Detach] = []
+        self._status_rates: list[Detach] = []  # functions that end the requests for the status messages
         link.listen(
             m.CameraTrackingImageStatus,
             lambda message: link.set_cell(self.tracking, tracking_of(message), message),
@@ -195,7 +195,7 @@ class TrackingMixin(CameraMixin):
             x: 0 (left) to 1 (right).
             y: 0 (top) to 1 (bottom).
             radius: radius of the object as a fraction of the image width, 0 (one pixel) to 1.
-            status_hz: rate of ``camera.tracking``, above 0 to 50.
+            status_hz: rate of ``camera.tracking``, above 0 and at most 50.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
@@ -223,7 +223,7 @@ class TrackingMixin(CameraMixin):
             top: 0 to 1.
             right: 0 to 1, right of ``left``.
             bottom: 0 to 1, below ``top``.
-            status_hz: rate of ``camera.tracking``, above 0 to 50.
+            status_hz: rate of ``camera.tracking``, above 0 and at most 50.
         """
         for name, value in zip(EDGE_NAMES, (left, top, right, bottom), strict=True):
             check_range(name, value, 0, 1)
@@ -246,23 +246,24 @@ class TrackingMixin(CameraMixin):
         try:
             await self._track(MavCmd.CAMERA_STOP_TRACKING)
         finally:
-            self._release()
+            self._release_status_rates()
 
     async def _track(self, command: int, *params: float) -> None:
         with self._link.new_order("tracking") as order:
             await self._link.command(command, *params, self._link.device, order=order)
 
     def _request_status(self, status_hz: float) -> None:
-        self._release()
+        self._release_status_rates()
         information = self._link.information.latest
         kinds: list[type[m.CameraTrackingImageStatus | m.CameraTrackingGeoStatus]] = [m.CameraTrackingImageStatus]
         if information is None or information.can("has_tracking_geo_status"):
             kinds.append(m.CameraTrackingGeoStatus)
-        self._releases = [self._link.request_rate(kind, status_hz) for kind in kinds]
+        self._status_rates = [self._link.request_rate(kind, status_hz) for kind in kinds]
 
-    def _release(self) -> None:
-        while self._releases:
-            self._releases.pop()()
+    def _release_status_rates(self) -> None:
+        while self._status_rates:
+            release = self._status_rates.pop()
+            release()
 
 
 SETTINGS_POLL_INTERVAL_S, STORAGE_POLL_INTERVAL_S = 5.0, 5.0
@@ -319,7 +320,8 @@ class StorageMixin(CameraMixin):
         with anyio.move_on_after(timeout):
             while reported != mode:
                 message = await self._link.request(m.CameraSettings, timeout=MODE_REQUEST_TIMEOUT_S)
-                reported = reported if message is None else mode_of(message)
+                if message is not None:
+                    reported = mode_of(message)
                 if m.CameraSettings in self._link.unavailable:
                     return
                 if reported != mode:
@@ -361,6 +363,7 @@ class StorageMixin(CameraMixin):
         """
         check_range("number", number, 1, 255)
         await self._link.identify()
+        # The second 1 also resets the image log of the camera.
         await self._link.command(
             MavCmd.STORAGE_FORMAT, number, 1, 1, attempts=1, progress_timeout=timeout, on_progress=on_progress
         )
@@ -388,7 +391,8 @@ class StorageMixin(CameraMixin):
 
     def _on_storage(self, message: m.StorageInformation) -> None:
         medium = storage_of(message)
-        self._media = {number: other for number, other in self._media.items() if number <= medium.count}
+        for number in range(medium.count + 1, max(self._media, default=0) + 1):
+            self._media.pop(number, None)  # This medium was removed.
         self._media[medium.number] = medium
         media = tuple(self._media[number] for number in sorted(self._media))
         self._link.set_cell(self.storage, media, message)

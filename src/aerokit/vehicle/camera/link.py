@@ -67,7 +67,7 @@ class CameraLink(CameraOrders):
         self._identifying = anyio.Lock()
         self._is_bound = anyio.Event()
         self._heartbeat_at = -math.inf
-        # After a silence, another camera or other firmware may use this id.
+        # True after a silence, until the camera has identified itself again: another camera may use this id now.
         self._was_silent = False
         self._session.on_reboot.append(self._on_reboot)
         self.information: StateCell[CameraInformation] = self.new_cell("camera.information", "CAMERA_INFORMATION")
@@ -107,8 +107,9 @@ class CameraLink(CameraOrders):
 
         self._session.background.start(wait, "aerokit camera timer")
 
-    def timeout_error(self, what: str) -> OperationTimeout:
-        return OperationTimeout(f"{self.describe()} {what}; {self._session.describe_link()}")
+    def timeout_error(self, predicate: str) -> OperationTimeout:
+        """Return the error ``camera 100 <predicate>; <state of the link>``, e.g. with "reported no storage"."""
+        return OperationTimeout(f"{self.describe()} {predicate}; {self._session.describe_link()}")
 
     def describe(self) -> str:
         """Return e.g. ``camera 100 (Acme Zoom)``, for error texts."""
@@ -140,13 +141,17 @@ class CameraLink(CameraOrders):
         """Find the camera and request its information once. None: a camera attached to the autopilot sends no
         information.
         """
-        if not self.information.is_known or self._was_silent:
+        if self._needs_information():
             async with self._identifying:
                 if self.number is None:
                     await self._find_first_camera()
-                if (not self.information.is_known or self._was_silent) and not self.is_trigger:
+                # Another call may have received the information while this call waited for the lock.
+                if self._needs_information() and not self.is_trigger:
                     await self._request_information()
         return self.information.latest
+
+    def _needs_information(self) -> bool:
+        return not self.information.is_known or self._was_silent
 
     async def _find_first_camera(self) -> None:
         # A camera with its own component id takes precedence over one attached to the autopilot.
@@ -158,8 +163,9 @@ class CameraLink(CameraOrders):
 
     async def _request_information(self) -> None:
         try:
-            await self.requests.request(m.CameraInformation, self.device, where=self._is_for_this_camera)
+            await self.requests.request(m.CameraInformation, self.device, where=self._is_from_this_camera)
         except CommandRejected:
+            # The autopilot need not have information about its camera, and information received before stays valid.
             if not self.is_autopilot_attached and not self.information.is_known:
                 raise
         if not self.information.is_known and not self.is_autopilot_attached:
@@ -185,11 +191,11 @@ class CameraLink(CameraOrders):
     ) -> MessageT | None:
         """Request one message; return None if it does not arrive or the camera does not support it."""
 
-        def is_meant(message: MessageT) -> bool:
-            return self._is_for_this_camera(message) and (where is None or where(message))
+        def is_answer(message: MessageT) -> bool:
+            return self._is_from_this_camera(message) and (where is None or where(message))
 
         try:
-            answer = await self.requests.request(message_type, *params, where=is_meant, timeout=timeout)
+            answer = await self.requests.request(message_type, *params, where=is_answer, timeout=timeout)
         except CommandRejected as error:
             if error.result in MAYBE_UNSUPPORTED:
                 self.unavailable.add(message_type)
@@ -203,7 +209,7 @@ class CameraLink(CameraOrders):
 
     def new_cell(self, name: str, waits_for: str) -> StateCell[Any]:
         cell: StateCell[Any] = self._session.connection.new_cell(name, waits_for)
-        self._session.keep(cell)
+        self._session.register_cell(cell)
         return cell
 
     def polled_cell(self, name: str, message_type: type[Message], period_s: float) -> StateCell[Any]:
@@ -225,25 +231,26 @@ class CameraLink(CameraOrders):
     def _attach(self, message_type: type[Message], callback: Callable[[Any], object]) -> None:
         bus, component_id = self._session.connection.bus, self.component.component_id
 
-        def filtered(message: Any) -> None:
+        def on_message(message: Any) -> None:
             frame = message.received_frame
-            if frame is not None and frame.component_id == component_id and self._is_for_this_camera(message):
+            if frame is not None and frame.component_id == component_id and self._is_from_this_camera(message):
                 callback(message)
 
         if bus.dialect.get(message_type.ID) is not None:
-            self._session.at_close(bus.attach(message_type, filtered, system_id=self._session.system_id))
+            self._session.at_close(bus.attach(message_type, on_message, system_id=self._session.system_id))
 
-    def _is_for_this_camera(self, message: Any) -> bool:
-        # Firmware that does not set this field sends 0, which stands for its first camera.
+    def _is_from_this_camera(self, message: Any) -> bool:
+        # Each type has only one or two of these fields. Firmware that does not set a field sends 0, which stands for
+        # its first camera.
         if not self.is_autopilot_attached:
             return True
-        device = getattr(message, "camera_device_id", 0) or getattr(message, "camera_id", 0)
-        counted_from_0 = getattr(message, "lens_id", 0) or getattr(message, "cam_idx", 0)
-        return bool((device or counted_from_0 + 1) == self.number)
+        number_from_1 = getattr(message, "camera_device_id", 0) or getattr(message, "camera_id", 0)
+        number_from_0 = getattr(message, "lens_id", 0) or getattr(message, "cam_idx", 0)
+        return bool((number_from_1 or number_from_0 + 1) == self.number)
 
     def _on_heartbeat(self, _: m.Heartbeat) -> None:
-        before, self._heartbeat_at = self._heartbeat_at, self.now()
-        if self._heartbeat_at - before > MAX_SILENCE_S and before > -math.inf:
+        previous_at, self._heartbeat_at = self._heartbeat_at, self.now()
+        if self._heartbeat_at - previous_at > MAX_SILENCE_S and previous_at > -math.inf:
             self._forget_refusals()
             self._was_silent = self.information._known
             if self._was_silent:
@@ -278,8 +285,8 @@ class CameraMixin:
 class ActiveOperation:
     """An operation of a camera that must be stopped when its block, or the block of the vehicle, ends."""
 
-    def __init__(self, link: CameraLink, subject: str, stop: Callable[[], tuple[float, ...]]) -> None:
-        self._link, self._stop = link, stop
+    def __init__(self, link: CameraLink, subject: str, stop_command: Callable[[], tuple[float, ...]]) -> None:
+        self._link, self._stop_command = link, stop_command
         self.order: Order = link.begin_order(subject)
         self._is_over = False
         link.on_finish.append(self._finish)
@@ -288,7 +295,10 @@ class ActiveOperation:
         """Record the result of the start; return True if the start failed but the operation may run, so that it must be
         stopped.
         """
-        if error is not None and (not self.order.may_move or isinstance(error, CommandRejected)):
+        is_surely_not_started = error is not None and (
+            not self.order.may_move or isinstance(error, CommandRejected)  # nothing was sent, or the camera refused
+        )
+        if is_surely_not_started:
             self.order.withdraw()
             self.discard()
             return False
@@ -305,14 +315,15 @@ class ActiveOperation:
         """Stop the operation, once. Does nothing if a newer order was given."""
         if not self._is_over:
             self.discard()
-            command, *params = self._stop()
+            command, *params = self._stop_command()
             await self._link.end_operation(self.order, int(command), *params, is_awaited=is_awaited)
 
     def _finish(self) -> None:
+        # The block of the vehicle ends: there is no time to wait for an answer.
         is_active = self.order.may_move and self.order.is_newest
         self.discard()
         if is_active:
-            command, *params = self._stop()
+            command, *params = self._stop_command()
             self._link.send_now(int(command), *params)
 
 
@@ -329,15 +340,15 @@ class CameraBlock:
         subject: str,
         check: Callable[[], Awaitable[None]],
         start: Callable[[Order], Awaitable[None]],
-        stop: Callable[[], tuple[float, ...]],
+        stop_command: Callable[[], tuple[float, ...]],
     ) -> None:
         self._link, self._subject = link, subject
-        self._check, self._start, self._stop = check, start, stop
+        self._check, self._start, self._stop_command = check, start, stop_command
         self._operation: ActiveOperation | None = None
 
     async def __aenter__(self) -> None:
         await self._check()
-        operation = self._operation = ActiveOperation(self._link, self._subject, self._stop)
+        operation = self._operation = ActiveOperation(self._link, self._subject, self._stop_command)
         try:
             await self._start(operation.order)
         except BaseException as error:

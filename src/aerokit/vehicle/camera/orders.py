@@ -54,7 +54,7 @@ class _ResendGuard:
 
 
 class CameraOrders:
-    """Base class of `CameraLink`: orders and commands to one camera."""
+    """Base class of `CameraLink`: sends commands to one camera, and withdraws them when a newer order replaces them."""
 
     _context: VehicleContext
     _session: VehicleSession
@@ -82,7 +82,7 @@ class CameraOrders:
     def heartbeat_at(self) -> float:
         """Loop time of the camera's last HEARTBEAT; -inf while the vehicle is silent."""
         received_at = self._session.connection.last_heartbeat_at(self._session.system_id, self.component.component_id)
-        return received_at if self._context.arbiter.is_known else -math.inf
+        return received_at if self._context.arbiter.is_state_recent else -math.inf
 
     @property
     def on_finish(self) -> list[Callable[[], None]]:
@@ -94,7 +94,8 @@ class CameraOrders:
         return ("camera", self.component.component_id, self.device, subject)
 
     def begin_order(self, subject: str) -> Order:
-        return self._context.arbiter.of_device(self.topic(subject), may_be_withdrawn=True)
+        """Begin an order, which ends the previous order about this subject."""
+        return self._context.arbiter.device_order(self.topic(subject), may_be_withdrawn=True)
 
     def latest_order(self, subject: str) -> Order | None:
         return self._context.arbiter.latest(self.topic(subject))
@@ -118,8 +119,8 @@ class CameraOrders:
         if order is not None and not order.is_newest:
             raise CommandTimeout(f"{command_name(command)} was not sent: {SUPERSEDED}")
         if order is not None and not self._session.is_closed:
-            order.may_move = True
-        session, started = self._session, self._session.connection.now()
+            order.may_move = True  # From here on, the camera may execute it.
+        session, started_at = self._session, self._session.connection.now()
         arbiter = self._context.arbiter
         with arbiter.auxiliary_order(order) as sent_order, arbiter.sending(sent_order) as sent:
             try:
@@ -132,17 +133,17 @@ class CameraOrders:
                 )
             except CommandRejected as error:
                 await session.wait_for_status_texts()
-                raise session.with_reasons(error, started) from None
+                raise session.with_reasons(error, started_at) from None
 
     async def order_once(
         self,
         order: Order,
         send: Callable[[], Awaitable[None]],
-        is_confirmed: Callable[[], Awaitable[bool | None]],
+        had_effect: Callable[[], Awaitable[bool | None]],
     ) -> None:
         """Send an order that must not be executed twice; retry only if the camera reports that the order had no effect.
 
-        ``is_confirmed`` asks the camera whether the order had an effect, and returns None without an answer. A newer
+        ``had_effect`` asks the camera whether the order had an effect, and returns None without an answer. A newer
         order ends the retries.
         """
         for attempt in range(1, MAX_ORDER_ATTEMPTS + 1):
@@ -150,8 +151,8 @@ class CameraOrders:
                 await send()
                 return
             except CommandTimeout as error:
-                worked = await is_confirmed() if order.is_newest else None
-                if not order.is_newest:
+                worked = await had_effect() if order.is_newest else None
+                if not order.is_newest:  # It may have been superseded while the camera was asked.
                     raise CommandTimeout(f"{error}; not sent again: {SUPERSEDED}") from None
                 if worked:
                     return
@@ -175,6 +176,7 @@ class CameraOrders:
         answered, errors = anyio.Event(), []
 
         async def confirm() -> None:
+            # `is_sent`: the first transmission is that of `send_now` below.
             try:
                 if order.is_newest:
                     await self.command(command, *params, order=order, is_sent=True)
@@ -227,7 +229,10 @@ DOUBTFUL_POLL_INTERVAL_S = 60.0
 
 
 class _PolledCell:
-    """Poll state of one cell, and whether the program reads or watches the cell. Implements ``Feed`` of the cell."""
+    """Poll state of one cell, and whether the program reads or watches the cell.
+
+    As the ``Feed`` of the cell, it has `pending`, `catch_up` and `watchers_changed`, which the cell calls.
+    """
 
     def __init__(
         self, now: Callable[[], float], cell: StateCell[Any], message_type: type[Message], period_s: float
@@ -240,7 +245,8 @@ class _PolledCell:
 
     @property
     def pending(self) -> bool:
-        # The cell reads this property on every access, so the program is using the cell now.
+        # The cell reads this property on every access, so the program is using the cell now. False: there is never an
+        # undecoded message.
         self.read_at = self._now()
         return False
 
@@ -252,10 +258,10 @@ class _PolledCell:
 
     def is_due(self) -> bool:
         now = self._now()
-        is_wanted = self._cell._is_watched or now - self.read_at <= INTEREST_TIMEOUT_S
+        is_used = self._cell._is_watched or now - self.read_at <= INTEREST_TIMEOUT_S
         period_s = max(DOUBTFUL_POLL_INTERVAL_S, self.period_s) if self.is_doubtful else self.period_s
-        newest = max(self.requested_at, self._cell._updated_at)
-        return is_wanted and not self.is_refused and now - newest >= period_s
+        requested_or_updated_at = max(self.requested_at, self._cell._updated_at)
+        return is_used and not self.is_refused and now - requested_or_updated_at >= period_s
 
 
 class MessageRequests:
@@ -283,19 +289,16 @@ class MessageRequests:
             except OperationTimeout:
                 return None
             except CommandRejected as error:
-                if (
-                    message_type not in LEGACY_REQUESTS
-                    or error.result not in MAYBE_UNSUPPORTED
-                    or self._link.is_autopilot_attached
-                ):
+                has_legacy_request = message_type in LEGACY_REQUESTS and not self._link.is_autopilot_attached
+                if not has_legacy_request or error.result not in MAYBE_UNSUPPORTED:
                     raise
                 refusal = error
         try:
-            found = await self._request_legacy(message_type, params, where, timeout)
+            answer = await self._request_legacy(message_type, params, where, timeout)
         except CommandRejected as error:
             raise refusal or error from None
         self._legacy_types.add(message_type)
-        return found
+        return answer
 
     async def _request_legacy(
         self,
@@ -304,12 +307,12 @@ class MessageRequests:
         where: Callable[[MessageT], bool],
         timeout: float,
     ) -> MessageT | None:
-        command, (first, *others) = LEGACY_REQUESTS[message_type]
+        command, legacy_params = LEGACY_REQUESTS[message_type]
         if message_type in NUMBERED_MESSAGES and params:
-            first = params[0]
+            legacy_params = (params[0], *legacy_params[1:])
         with self._link.component.subscribe(message_type, capacity=100) as answers:
-            with suppress(CommandTimeout):
-                await self._link.component.command(command, first, *others, retries=1)
+            with suppress(CommandTimeout):  # The message may arrive although the acknowledgement was lost.
+                await self._link.component.command(command, *legacy_params, retries=1)
             with anyio.move_on_after(timeout):
                 async for answer in answers:
                     if where(answer):

@@ -22,14 +22,12 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Order
 
 START, STOP = MavCmd.IMAGE_START_CAPTURE, MavCmd.IMAGE_STOP_CAPTURE
-CONTROL, TRIGGER = MavCmd.DO_DIGICAM_CONTROL, MavCmd.DO_TRIGGER_CONTROL
-TRIGGER_INTERVAL = MavCmd.DO_SET_CAM_TRIGG_INTERVAL
+TRIGGER, TRIGGER_INTERVAL = MavCmd.DO_TRIGGER_CONTROL, MavCmd.DO_SET_CAM_TRIGG_INTERVAL
 # Seconds without a capture after which the status of a series is requested, and seconds to wait for the status.
 CHECK_INTERVAL_S, STATUS_TIMEOUT_S = 1.0, 2.0
-# Number of status requests before an order: the first for a camera that has answered such a request before, the second
-# for all other cameras.
+# Number of status requests before an order, for a camera that has answered such a request before, and for all others.
 STATUS_ATTEMPTS, FIRST_STATUS_ATTEMPTS = 8, 3
-# Maximum number of checks without a result, after which a silent series has failed.
+# A series has failed after this many status checks in a row that showed no new capture.
 MAX_SILENT_CHECKS = 6
 # An index counts as plausible if the camera has taken at most twice as many pictures since the newest capture as its
 # interval allows, plus this many.
@@ -44,8 +42,9 @@ class Shutter:
     def __init__(self, link: CameraLink, log: CaptureLog) -> None:
         self.link: CameraLink = link
         self.log: CaptureLog = log
-        self._number = 0
+        self._sequence_number = 0  # of the last ordered photo
         self._lock = anyio.Lock()
+        # Whether the camera has ever sent CAMERA_CAPTURE_STATUS, and whether all requests of an order were in vain.
         self._reports_status = self._has_no_status = False
 
     async def status(self, timeout: float = CHECK_INTERVAL_S) -> CameraStatus | None:
@@ -56,9 +55,8 @@ class Shutter:
         self._reports_status = self._reports_status or message is not None
         return None if message is None else status_of(message)
 
-    async def baseline_status(self) -> CameraStatus | None:
-        # The status before an order is needed to see later whether the order was executed, so it is requested more
-        # often.
+    async def reliable_status(self) -> CameraStatus | None:
+        """Request the status repeatedly, because it decides whether an order was executed and may be sent again."""
         first_attempts = 1 if self._has_no_status else FIRST_STATUS_ATTEMPTS
         for _ in range(STATUS_ATTEMPTS if self._reports_status else first_attempts):
             status = await self.status(STATUS_TIMEOUT_S)
@@ -67,71 +65,76 @@ class Shutter:
         self._has_no_status = not self._reports_status
         return None
 
-    async def take(self, timeout: float) -> Capture:
+    async def take_photo(self, timeout: float) -> Capture:
+        """Take one photo and return its capture, which is requested if lost; errors as for `Camera.take_photo`."""
         async with self._lock:
             series = self.link.latest_order("series")
-            before = await self.baseline_status()
-            known = {capture.index for capture in self.log.captures()}
+            before = await self.reliable_status()
+            known_indices = {capture.index for capture in self.log.captures()}
             error: CommandTimeout | None = None
             with CaptureQueue(self.log.cell) as new_captures, anyio.move_on_after(timeout):
-                sent, error = 1, await self.order_photo(before)
+                attempts, error = 1, await self.order_photo(before)
                 while True:
-                    while capture := new_captures.take():
+                    while capture := new_captures.pop():
                         # The camera may use the index of a failed picture again.
                         is_old = before is not None and capture.index < before.image_count
-                        if not is_old or capture.index not in known:
-                            return self._done(capture)
+                        if not is_old or capture.index not in known_indices:
+                            return self._checked(capture)
                     round_trip_s = self.link.round_trip_s or 0.0
                     if await new_captures.wait(max(CHECK_INTERVAL_S, 2.0 * round_trip_s)):
                         continue
-                    now = await self.status()
-                    if now is None:
+                    status = await self.status()
+                    if status is None:
                         continue
-                    if before is None:
-                        # The order was accepted, so the newest picture is the one that was ordered.
-                        newest = now.image_count - 1
-                        is_missed = error is None and not now.is_capturing and newest >= 0 and newest not in known
-                        missed = await self.log.fetch(newest) if is_missed else None
-                    elif now.image_count > before.image_count:
-                        missed = await self.log.fetch(before.image_count)
-                    elif self.link.latest_order("series") is not series:
-                        continue  # A series was started or stopped, so the count of pictures proves nothing.
-                    elif error is not None and sent < MAX_ORDER_ATTEMPTS and not now.is_capturing:
-                        # The camera reported after the order that it had taken no picture, so the order was lost.
-                        sent, error = sent + 1, await self.order_photo(before, again=True)
-                        continue
-                    else:
-                        continue
+                    missed = await self._fetch_missed(before, status, known_indices, is_accepted=error is None)
                     if missed is not None:
-                        return self._done(missed)
+                        return self._checked(missed)
+                    # If a series was started or stopped meanwhile, the number of pictures proves nothing.
+                    is_series_unchanged = self.link.latest_order("series") is series
+                    was_lost = error is not None and is_series_unchanged and _has_taken_none(before, status)
+                    if was_lost and attempts < MAX_ORDER_ATTEMPTS:
+                        attempts, error = attempts + 1, await self.order_photo(before, is_repeated=True)
             raise error or self.link.timeout_error(
                 f"accepted the order, but reported no picture within {timeout:g} s; it may have taken one"
             )
 
-    def _done(self, capture: Capture) -> Capture:
+    async def _fetch_missed(
+        self, before: CameraStatus | None, status: CameraStatus, known_indices: set[int], *, is_accepted: bool
+    ) -> Capture | None:
+        """Request the capture of the ordered picture, if the status shows that it was taken."""
+        if before is not None:
+            was_taken = status.image_count > before.image_count
+            return await self.log.fetch(before.image_count) if was_taken else None
+        # Without a status from before an accepted order, the newest picture counts as the ordered one.
+        newest = status.image_count - 1
+        if is_accepted and not status.is_capturing and newest >= 0 and newest not in known_indices:
+            return await self.log.fetch(newest)
+        return None
+
+    def _checked(self, capture: Capture) -> Capture:
         if capture.success is False:
             raise OperationRejected(f"{self.link.describe()} could not take the picture")
         return capture
 
-    async def order_photo(self, before: CameraStatus | None, *, again: bool = False) -> CommandTimeout | None:
+    async def order_photo(self, before: CameraStatus | None, *, is_repeated: bool = False) -> CommandTimeout | None:
         """Send the order for a picture once; return the time-out if the order was not acknowledged.
 
-        With ``again`` the order has the same sequence number as before, so that a camera does not execute it twice.
+        A repeated order has the same sequence number as before, so that a camera does not execute it twice.
         """
-        if not again:
+        if not is_repeated:
             count = 0 if before is None else before.image_count
-            self._number = max(count + 1, self._number + 1)
+            self._sequence_number = max(count + 1, self._sequence_number + 1)
         try:
             if self.link.is_trigger:
                 await self._send_digicam_control()
             else:
-                await self.link.command(START, self.link.device, 0, 1, self._number, attempts=1)
+                await self.link.command(START, self.link.device, 0, 1, self._sequence_number, attempts=1)
         except CommandTimeout as error:
             return error
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED or self.link.is_trigger:
                 raise
-            try:
+            try:  # The camera may support the older command.
                 await self._send_digicam_control()
             except CommandRejected:
                 raise error from None
@@ -139,7 +142,7 @@ class Shutter:
 
     async def _send_digicam_control(self) -> None:
         # The older command, for PX4's trigger and for cameras that do not support MAV_CMD_IMAGE_START_CAPTURE.
-        await self.link.command(CONTROL, 0, 0, 0, 0, 1, 0, 0, attempts=1)
+        await self.link.command(MavCmd.DO_DIGICAM_CONTROL, 0, 0, 0, 0, 1, 0, 0, attempts=1)
 
     async def start_series(self, order: Order, seconds: float, count: int, before: CameraStatus | None) -> None:
         """Start a series; repeat the order only if the camera reports that it has not started."""
@@ -148,18 +151,23 @@ class Shutter:
             await self.link.command(TRIGGER, 1, -1, 0, 0, order=order)
             return
 
-        async def has_begun() -> bool | None:
-            now = await self.baseline_status()
-            if now is None or before is None:
+        async def has_started() -> bool | None:
+            status = await self.reliable_status()
+            if status is None or before is None:
                 return None
-            return now.is_in_series or now.is_capturing or now.image_count > before.image_count
+            return status.is_in_series or status.is_capturing or status.image_count > before.image_count
 
         command = (START, self.link.device, seconds, count, 0)
-        await self.link.order_once(order, lambda: self.link.command(*command, order=order, attempts=1), has_begun)
+        await self.link.order_once(order, lambda: self.link.command(*command, order=order, attempts=1), has_started)
 
     @property
     def stop_command(self) -> tuple[float, ...]:
         return (TRIGGER, 0, -1, 0, 0) if self.link.is_trigger else (STOP, self.link.device)
+
+
+def _has_taken_none(before: CameraStatus | None, status: CameraStatus) -> bool:
+    """Return True if the camera certainly has taken no picture between the two reports, and is taking none."""
+    return before is not None and status.image_count <= before.image_count and not status.is_capturing
 
 
 class PhotoInterval:
@@ -173,15 +181,19 @@ class PhotoInterval:
         self._shutter, self._seconds, self._count = shutter, seconds, count
         self._link, self._log = shutter.link, shutter.log
         self._new_captures = CaptureQueue(self._log.cell)
+        # Index of the capture to deliver next.
         self._next: int | None = None
-        self._began_at = self._log.reset_at
+        # `reset_at` of the log that the indices belong to.
+        self._known_reset_at = self._log.reset_at
         self._possible_first: Capture | None = None
         # True if no status was available, so that the index of the first capture counts as the start.
         self._is_start_guessed = False
-        # Time at which the highest plausible index so far was received.
-        self._newest_at = 0.0
+        # The highest plausible index so far, and when it was received.
         self._newest = 0
+        self._newest_at = 0.0
+        # Number of requests in a row that the camera did not answer.
         self._unanswered = 0
+        # Received captures that were not delivered yet: by index, and those that failed.
         self._waiting: dict[int, Capture] = {}
         self._failed: list[Capture] = []
         self._delivered = 0
@@ -207,15 +219,16 @@ class PhotoInterval:
         return self
 
     async def _begin(self, operation: ActiveOperation) -> None:
-        before = await self._shutter.baseline_status()
+        before = await self._shutter.reliable_status()
         self._next = None if before is None else before.image_count
         self._newest, self._newest_at = (self._next or 0) - 1, self._link.now()
-        self._began_at = self._log.reset_at
+        self._known_reset_at = self._log.reset_at
         self._new_captures.__enter__()
         await self._shutter.start_series(operation.order, self._seconds, self._count, before)
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         self._new_captures.__exit__()
+        # A camera ends the series after the requested number by itself; PX4's trigger does not know the number.
         has_ended = 0 < self._count <= self._delivered and not self._link.is_trigger
         if self._operation is not None and has_ended:
             self._operation.discard()
@@ -232,7 +245,7 @@ class PhotoInterval:
             OperationRejected: the camera ended the series early.
             OperationTimeout: the camera reports no more pictures.
         """
-        silent = 0
+        silent_checks = 0
         while True:
             if self._count and self._delivered + self._missed >= self._count:
                 raise StopAsyncIteration
@@ -250,28 +263,33 @@ class PhotoInterval:
                 await self._fetch_missing()
                 continue
             if await self._new_captures.wait(max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S):
-                silent = 0
+                silent_checks = 0
                 continue
-            silent += 1
-            await self._check_silence(silent)
+            silent_checks += 1
+            await self._check_silence(silent_checks)
 
     def _first_after_reset(self, capture: Capture) -> Capture | None:
-        # Two successive indices show that the camera counts from 0 again; a single index could be corrupt.
-        before, self._possible_first = self._possible_first, None
-        if self._log.reset_at > self._began_at and self._next is not None and capture.index < self._next:
+        """Return the first capture after the camera began to count from 0 again, once the second one is received.
+
+        Two successive indices show this; a single index could be corrupt.
+        """
+        previous, self._possible_first = self._possible_first, None
+        if self._log.reset_at > self._known_reset_at and self._next is not None and capture.index < self._next:
             self._possible_first = capture
-            if before is not None and capture.index == before.index + 1:
-                return before
+            if previous is not None and capture.index == previous.index + 1:
+                return previous
         return None
 
     def _collect(self) -> None:
-        while capture := self._new_captures.take():
+        """Sort the received captures into those to deliver and those that failed, and drop implausible indices."""
+        while capture := self._new_captures.pop():
             first = self._first_after_reset(capture)
-            if first is not None:
-                self._began_at = self._log.reset_at
+            if first is not None:  # The series goes on with the new indices.
+                self._known_reset_at = self._log.reset_at
                 self._next, self._is_start_guessed = first.index, False
                 self._newest, self._newest_at = first.index, self._link.now()
                 self._waiting = {first.index: first}
+            # Without a status, the first capture determines the start, unless a later one shows that it was corrupt.
             if self._next is None or self._contradicts_guess(capture.index):
                 self._next, self._is_start_guessed = capture.index, self._next is None
                 self._newest = capture.index - 1
@@ -298,17 +316,18 @@ class PhotoInterval:
         return self._is_start_guessed and self._next is not None and index < self._next - self._max_new_captures()
 
     async def _fetch_missing(self) -> None:
+        """Request the next capture; if it does not arrive, count it as missed and go on behind it or behind the gap."""
         assert self._next is not None
-        found = None
+        capture = None
         if not self._link.is_trigger and self._unanswered < MAX_UNANSWERED:
-            found = await self._log.fetch(self._next)
+            capture = await self._log.fetch(self._next)
         self._collect()
-        if found is not None:
+        if capture is not None:
             self._unanswered = 0
-        if found is not None and found.success is False:
-            self._next += 1
-        elif found is not None:
-            self._waiting[self._next] = found
+            if capture.success is False:
+                self._next += 1
+            else:
+                self._waiting[self._next] = capture
         elif self._next not in self._waiting:
             self._unanswered += 1
             can_fetch = not self._link.is_trigger and self._unanswered <= MAX_UNANSWERED
@@ -316,15 +335,16 @@ class PhotoInterval:
             self._missed += following - self._next
             self._next = following
 
-    async def _check_silence(self, silent: int) -> None:
-        now = await self._shutter.status(2.0 * CHECK_INTERVAL_S)
+    async def _check_silence(self, silent_checks: int) -> None:
+        """Request missed captures, or raise the error if the camera has ended the series or reports nothing more."""
+        status = await self._shutter.status(2.0 * CHECK_INTERVAL_S)
         self._collect()
-        is_ahead = now is not None and self._next is not None and now.image_count > self._next
-        if now is not None and is_ahead and self._is_plausible(now.image_count - 1):
+        is_ahead = status is not None and self._next is not None and status.image_count > self._next
+        if status is not None and is_ahead and self._is_plausible(status.image_count - 1):
             await self._fetch_missing()
-        elif now is not None and not (now.is_in_series or now.is_capturing or self._waiting or self._failed):
+        elif status is not None and not (status.is_in_series or status.is_capturing or self._waiting or self._failed):
             raise OperationRejected(
                 f"{self._link.describe()} ended the series after {self._delivered + self._missed} pictures"
             )
-        elif silent >= MAX_SILENT_CHECKS:
+        elif silent_checks >= MAX_SILENT_CHECKS:
             raise self._link.timeout_error("takes pictures, but reports no more of them")

@@ -181,7 +181,7 @@ class ThermalRange(Snapshot):
     min_at: tuple[float, float] | None
 
 
-# A position this close to 0, 0 means that the vehicle did not know its position.
+# A position closer to 0, 0 than this means that the vehicle did not know its position.
 MIN_COORDINATE_DEG = 0.01
 
 # Values of CAMERA_CAPTURE_STATUS.image_status.
@@ -200,20 +200,22 @@ def place_of(
 ) -> Position | None:
     """Decode a position; return None if it is invalid, or so close to 0, 0 that it stands for "unknown"."""
     latitude, longitude = latitude_e7 * 1e-7, longitude_e7 * 1e-7
-    is_somewhere = abs(latitude) > MIN_COORDINATE_DEG or abs(longitude) > MIN_COORDINATE_DEG
-    if not is_somewhere or abs(latitude) > 90.0 or abs(longitude) > 180.0:
+    is_unknown = abs(latitude) <= MIN_COORDINATE_DEG and abs(longitude) <= MIN_COORDINATE_DEG
+    if is_unknown or abs(latitude) > 90.0 or abs(longitude) > 180.0:
         return None
     relative = None if altitude_relative_m is None else finite_or_none(altitude_relative_m)
     return Position(latitude, longitude, finite_or_none(altitude_amsl_m), relative)
 
 
 def information_of(message: m.CameraInformation, number: int) -> CameraInformation:
+    # Major, minor, patch and dev version, one byte each, lowest byte first.
     version = message.firmware_version
+    firmware = ".".join(str(version >> shift & 0xFF) for shift in (0, 8, 16, 24)) if version else ""
     return CameraInformation(
         number=number,
         vendor=_text(message.vendor_name),
         model=_text(message.model_name),
-        firmware=".".join(str(version >> shift & 0xFF) for shift in (0, 8, 16, 24)) if version else "",
+        firmware=firmware,
         focal_length_mm=_positive(message.focal_length),
         sensor_width_mm=_positive(message.sensor_size_h),
         sensor_height_mm=_positive(message.sensor_size_v),
@@ -265,6 +267,7 @@ def storage_of(message: m.StorageInformation) -> CameraStorage:
 
 
 def stream_of(message: m.VideoStreamInformation) -> CameraStream:
+    """Decode VIDEO_STREAM_INFORMATION."""
     return CameraStream(
         number=message.stream_id or 1,  # MAVSDK's camera server sends 0.
         count=message.count,
@@ -293,10 +296,8 @@ def stream_state(message: m.VideoStreamInformation | m.VideoStreamStatus) -> dic
 
 def tracking_of(message: m.CameraTrackingImageStatus) -> TrackingStatus:
     corners = (message.rec_top_x, message.rec_top_y, message.rec_bottom_x, message.rec_bottom_y)
-    is_point, is_rectangle = (
-        message.tracking_mode == Tracking.POINT,
-        message.tracking_mode == Tracking.RECTANGLE,
-    )
+    is_point = message.tracking_mode == Tracking.POINT
+    is_rectangle = message.tracking_mode == Tracking.RECTANGLE
     return TrackingStatus(
         is_active=bool(message.tracking_status & TrackingFlags.ACTIVE),
         has_failed=bool(message.tracking_status & TrackingFlags.ERROR),
@@ -312,7 +313,7 @@ def tracked_place_of(message: m.CameraTrackingGeoStatus) -> TrackedPlace:
     heading = finite_or_none(message.hdg)
     return TrackedPlace(
         is_active=bool(message.tracking_status & TrackingFlags.ACTIVE),
-        place=place_of(message.lat, message.lon, message.alt, None),
+        place=place_of(message.lat, message.lon, message.alt, altitude_relative_m=None),
         horizontal_accuracy_m=finite_or_none(message.h_acc),
         vertical_accuracy_m=finite_or_none(message.v_acc),
         north_m_s=finite_or_none(message.vel_n),

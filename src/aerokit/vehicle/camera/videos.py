@@ -87,7 +87,7 @@ class VideoMixin(CameraMixin):
         await self._link.order_once(
             order, lambda: self._link.command(*command, order=order, attempts=1), self._is_recording
         )
-        await self._wait_recording(True, timeout)
+        await self._wait_recording(timeout, starts=True)
 
     async def stop_video(self, *, timeout: float = 5.0) -> None:
         """Stop recording (MAV_CMD_VIDEO_STOP_CAPTURE); returns when the camera reports that it has stopped.
@@ -102,7 +102,7 @@ class VideoMixin(CameraMixin):
         command, *params = self._stop_command()
         with self._link.new_order("video") as order:
             await self._link.command(int(command), *params, order=order)
-            await self._wait_recording(False, timeout)
+            await self._wait_recording(timeout, starts=False)
 
     def video(self, *, status_hz: float = 1.0) -> CameraBlock:
         """Record for the duration of an ``async with`` block. The end of the block stops recording, also under
@@ -117,9 +117,9 @@ class VideoMixin(CameraMixin):
         return CameraBlock(
             self._link,
             "video",
-            lambda: self._link.require_capability("video", "capture_video"),
-            lambda order: self._start(order, status_hz, START_TIMEOUT_S),
-            self._stop_command,
+            check=lambda: self._link.require_capability("video", "capture_video"),
+            start=lambda order: self._start(order, status_hz, START_TIMEOUT_S),
+            stop_command=self._stop_command,
         )
 
     def _stop_command(self) -> tuple[float, ...]:
@@ -131,13 +131,14 @@ class VideoMixin(CameraMixin):
         message = await self._link.request(m.CameraCaptureStatus, timeout=1.0)
         return None if message is None else message.video_status == 1
 
-    async def _wait_recording(self, wanted: bool, timeout: float) -> None:
+    async def _wait_recording(self, timeout: float, *, starts: bool) -> None:
+        """Wait until the camera reports that recording has started or stopped; return at once if it reports nothing."""
         with anyio.move_on_after(timeout):
-            now = await self._is_recording()
-            if now is not None and now is not wanted:
-                await self.status.wait_until(lambda status: status.is_recording is wanted)
+            is_recording = await self._is_recording()
+            if is_recording is not None and is_recording is not starts:
+                await self.status.wait_until(lambda status: status.is_recording is starts)
             return
-        outcome = "does not record" if wanted else "still records"
+        outcome = "does not record" if starts else "still records"
         raise self._link.timeout_error(f"accepted the order, but {outcome} after {timeout:g} s")
 
     async def load_streams(self) -> tuple[CameraStream, ...]:
@@ -149,7 +150,7 @@ class VideoMixin(CameraMixin):
             OperationTimeout: the information about some streams did not arrive, or no camera was found.
         """
         await self._link.require_capability("load_streams", "has_video_stream")
-        first = await self._link.request(m.VideoStreamInformation, 0)
+        first = await self._link.request(m.VideoStreamInformation, 0)  # 0 requests all streams.
         if first is None:
             first = await self._link.request(m.VideoStreamInformation, 1)
         if first is None or not self._streams:
@@ -160,10 +161,10 @@ class VideoMixin(CameraMixin):
         return self.streams.value
 
     async def _request_stream(self, number: int) -> bool:
-        found = await self._link.request(
+        message = await self._link.request(
             m.VideoStreamInformation, number, where=lambda message: message.stream_id == number
         )
-        return found is not None
+        return message is not None
 
     async def start_streaming(self, stream: int = 0) -> None:
         """Start a video stream (MAV_CMD_VIDEO_START_STREAMING).
@@ -191,9 +192,9 @@ class VideoMixin(CameraMixin):
             stream: number of the stream, 1 to 255.
         """
         check_range("stream", stream, 1, 255)
-        for other in await self.load_streams():
-            if other.number != stream and other.is_running:
-                await self.stop_streaming(other.number)
+        for available in await self.load_streams():
+            if available.number != stream and available.is_running:
+                await self.stop_streaming(available.number)
         await self.start_streaming(stream)
 
     async def _send_stream_command(self, action: str, command: int, stream: int) -> None:
@@ -227,9 +228,9 @@ class VideoMixin(CameraMixin):
             self._publish_streams(message)
 
     def _on_stream_status(self, message: m.VideoStreamStatus) -> None:
-        before = self._streams.get(message.stream_id)
-        if before is not None:
-            self._streams[message.stream_id] = before.replace(**stream_state(message))
+        stream = self._streams.get(message.stream_id)
+        if stream is not None:
+            self._streams[message.stream_id] = stream.replace(**stream_state(message))
             self._publish_streams(message)
 
     def _publish_streams(self, message: m.VideoStreamInformation | m.VideoStreamStatus) -> None:

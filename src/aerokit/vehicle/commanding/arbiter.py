@@ -36,7 +36,8 @@ STEERING, ACTION = "steering", "action"
 def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
     """Return True if the order that the vehicle accepted at ``accepted_at`` has armed it.
 
-    If the vehicle reported disarmed after it accepted the order, another party has armed it since.
+    ``disarmed_at`` is the time of the last report of disarmed. If it is later than an effect of the order can be, the
+    order did not arm the vehicle: another party did.
     """
     return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
 
@@ -63,18 +64,20 @@ class CommandArbiter:
         self.mode_settles_at: float = -math.inf
         """Time until which HEARTBEAT may report the mode of an abandoned order."""
         self._any_mode_until = self._arming_accepted_at = self._disarmed_at = -math.inf
+        # Time of the last change from disarmed to armed, and the order of the program that caused it, if one did.
         self._armed_at = -math.inf
         self._armed_by_program: Order | None = None
+        # The newest steering order with the auxiliary orders in progress; posted orders; commands without an answer.
         self._orders: list[Order] = []
         self._posted: list[Order] = []
         self._sent: list[SentCommand] = []
-        self._numbers = itertools.count(1)
+        self._order_numbers = itertools.count(1)
         self._latest: dict[Topic, Order] = {}
         self._ordered_since_disarmed: set[Topic] = set()
-        self._modes_ordered: deque[tuple[float, int]] = deque(maxlen=16)
+        self._ordered_modes: deque[tuple[float, int]] = deque(maxlen=16)
         self._on_steering: list[Callable[[], None]] = []
         telemetry.mode.observe(self._on_mode, every_arrival=True)
-        telemetry.system_status.observe(self._on_state, every_arrival=True)
+        telemetry.system_status.observe(self._on_system_status, every_arrival=True)
         telemetry.armed.observe(self._on_armed, every_arrival=True)
 
     # ---------------------------------------------------------------------------------- topics
@@ -83,12 +86,13 @@ class CommandArbiter:
         """Return the newest order about this topic that was not withdrawn."""
         order = self._latest.get(topic)
         while order is not None and order.is_withdrawn:
-            order = order.before
+            order = order.previous
         return order
 
     def _is_newest(self, order: Order) -> bool:
-        newest = (self.latest(topic) for topic in order.ended_by)
-        return not order.is_withdrawn and all(newer is None or newer.number <= order.number for newer in newest)
+        latest_orders = (self.latest(topic) for topic in order.ended_by)
+        is_superseded = any(latest is not None and latest.number > order.number for latest in latest_orders)
+        return not order.is_withdrawn and not is_superseded
 
     def _register(self, order: Order, topics: Iterable[Topic]) -> None:
         self._latest.update(dict.fromkeys(topics, order))
@@ -97,12 +101,12 @@ class CommandArbiter:
         """End the posted orders about these topics, because a newer order was given."""
         topics = tuple(topics)
         self._ordered_since_disarmed.update(topics)
-        self._register(Order(self._now(), next(self._numbers), self._is_newest), topics)
+        self._register(Order(self._now(), next(self._order_numbers), self._is_newest), topics)
 
-    def of_device(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
+    def device_order(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
         """Create an order about a device. It supersedes earlier orders; if it is withdrawn, they become valid again."""
-        order = Order(self._now(), next(self._numbers), self._is_newest, ended_by=(topic,))
-        order.before = self.latest(topic) if may_be_withdrawn else None
+        order = Order(self._now(), next(self._order_numbers), self._is_newest, ended_by=(topic,))
+        order.previous = self.latest(topic) if may_be_withdrawn else None
         self._register(order, (topic,))
         return order
 
@@ -115,17 +119,18 @@ class CommandArbiter:
         ``ends_flight``, a failsafe does not end the order.
         """
         self._notify_steering()
-        self._modes_ordered.extend((self._now(), mode.custom_mode) for mode in modes)
-        if self._posted_modes():
+        self._ordered_modes.extend((self._now(), mode.custom_mode) for mode in modes)
+        if self._posted_modes():  # A posted order may still change the mode after this order.
             self.doubt_mode()
         was_flown = self.is_flown_by_program
-        order = self._watching(modes, (STEERING,), ends_flight or self._end_flights(modes))
+        order = self._create_order(modes, (STEERING,), ends_flight or self._all_end_flight(modes))
         order.was_flown_before = was_flown
-        order.may_move = self._steers()
+        # An order that replaces one in progress gets a vehicle that may be moving.
+        order.may_move = self._is_steering()
         self._register(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
         self.newest = order
-        self._orders = [order]
+        self._orders = [order]  # All other actions have ended, so they need no more reports of the vehicle.
         return order
 
     def raw_order(self, subjects: Iterable[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()) -> Order:
@@ -149,27 +154,30 @@ class CommandArbiter:
         for order in (*self._orders, *self._posted):
             order.on_reboot()
         self._ordered_since_disarmed.clear()
+        # Until the vehicle arms again, no earlier order counts as its present one, see `current`.
         self._armed_by_program, self._armed_at = None, math.inf
 
     # ------------------------------------------------------------------ other orders, in blocks
 
     @contextmanager
-    def auxiliary_order(self, of: Order | None = None, *, ends_flight: bool = False) -> Iterator[Order]:
-        """Create an order that does not steer (speed, home, arming …), or a further order that belongs to the device
-        order ``of``.
+    def auxiliary_order(self, device_order: Order | None = None, *, ends_flight: bool = False) -> Iterator[Order]:
+        """Create an order that does not steer (speed, home, arming …).
+
+        With ``device_order``, the order is a part of that order about a device, and ends with it.
 
         Raises:
             OperationRejected: a newer order to the device was given.
         """
-        if of is not None and not of.is_newest:
+        if device_order is not None and not device_order.is_newest:
             raise OperationRejected(f"{SUPERSEDED}; the rest of the order was not sent")
         modes = () if self.newest is None else self.newest.modes
-        order = self._watching(modes, (ACTION, *(() if of is None else of.ended_by)), ends_flight)
+        device_topics = () if device_order is None else device_order.ended_by
+        order = self._create_order(modes, (ACTION, *device_topics), ends_flight)
         self._orders.append(order)
         try:
             yield order
         finally:
-            self._orders = [posted for posted in self._orders if posted is not order]
+            self._orders = [active for active in self._orders if active is not order]
 
     @contextmanager
     def post(
@@ -180,21 +188,22 @@ class CommandArbiter:
         A newer order about the first subject ends it. The posted order itself ends earlier posted orders about any of
         its subjects and, if it steers, the action in progress.
         """
-        is_steering = "arm" not in subjects[:1]
+        is_steering = subjects[0] != "arm"
         if is_steering:
             self._notify_steering()
-            if self.newest is not None:
+            if self.newest is not None:  # The mode of the posted order is no takeover by another party.
                 self.newest.expect(modes)
-        self._note_arming(armed)
+        self._supersede_arming(armed)
         now = self._now()
-        recent = {mode for at, mode in self._modes_ordered if at > now - OWN_MODES_MAX_AGE_S}
-        self._modes_ordered.extend((now, mode.custom_mode) for mode in modes)
-        order = self._new(
+        recent_modes = {mode for ordered_at, mode in self._ordered_modes if ordered_at > now - OWN_MODES_MAX_AGE_S}
+        self._ordered_modes.extend((now, mode.custom_mode) for mode in modes)
+        order = self._build_order(
             modes,
             subjects[:1],
-            recent,
+            recent_modes,
             armed=armed,
-            ends_flight=self._end_flights(modes) or armed is False,
+            # An order to disarm stays valid in every mode and during a failsafe.
+            ends_flight=self._all_end_flight(modes) or armed is False,
             ends_on_mode_change=armed is not False,
             ends_on_disarm=subjects[0] == "motion",
             requires_mode_change=True,
@@ -227,25 +236,26 @@ class CommandArbiter:
             is_done=is_done,
         )
         if order.armed is None:  # A posted order to arm has already ended earlier orders to arm.
-            self._note_arming(armed)
+            self._supersede_arming(armed)
         self._sent.append(sent)
         try:
             yield sent
-            self._note_accepted(armed)
+            self._record_accepted(armed)
         finally:
             self._sent.remove(sent)
 
-    def note_own_arming(self, armed: bool) -> None:
+    def record_own_arming(self, armed: bool) -> None:
         """Record that an arm or disarm command was sent without waiting for the acknowledgement."""
-        self._note_arming(armed)
-        self._note_accepted(armed)
+        self._supersede_arming(armed)
+        self._record_accepted(armed)
 
-    def _note_accepted(self, armed: bool | None) -> None:
-        """Record the time at which an arm command was accepted, because HEARTBEAT reports the effect later."""
+    def _record_accepted(self, armed: bool | None) -> None:
+        """Record when an arm command (``armed`` True) was accepted, because HEARTBEAT reports the effect later."""
         if armed:
             self._arming_accepted_at = self._now()
 
-    def _note_arming(self, armed: bool | None) -> None:
+    def _supersede_arming(self, armed: bool | None) -> None:
+        """End earlier orders to arm or disarm, before a command to do so is sent; None: the command does neither."""
         if armed is None:
             return
         self.arming_orders += 1
@@ -263,7 +273,7 @@ class CommandArbiter:
         no takeover.
         """
         order = self.current
-        if order is not None and order.was_refused:
+        if order is not None and order.was_refused:  # The vehicle continues its previous task.
             return order.was_flown_before
         return order is not None and not order.takeover_reason and not order.failsafe
 
@@ -271,6 +281,7 @@ class CommandArbiter:
     def current(self) -> Order | None:
         """The program's present order to the armed vehicle: the newest steering order, or the order that armed it."""
         newest = self.newest
+        # A steering order that was given before the vehicle armed belongs to an earlier flight.
         return newest if newest is not None and newest.given_at >= self._armed_at else self._armed_by_program
 
     def clear_failsafe(self) -> None:
@@ -286,13 +297,13 @@ class CommandArbiter:
         Either the program armed the vehicle, and it was not disarmed since. Or the program steers the vehicle, and
         there was no takeover.
         """
-        order, about = self.newest, self._ordered_since_disarmed
-        # The effect of an order without modes, such as a raw command, is unknown.
-        is_taken = order is not None and order.modes and order.takeover_reason and order.is_newest
-        return "arm" in about if is_taken else bool(about)
+        order, topics = self.newest, self._ordered_since_disarmed
+        # After an order without modes, such as a raw command, any mode may be its effect rather than a takeover.
+        was_taken_over = order is not None and order.modes and order.takeover_reason and order.is_newest
+        return "arm" in topics if was_taken_over else bool(topics)
 
     @property
-    def is_known(self) -> bool:
+    def is_state_recent(self) -> bool:
         """True while the last HEARTBEAT is recent enough to describe the vehicle's state."""
         return self._telemetry.armed.age <= MODE_MAX_AGE_S
 
@@ -321,12 +332,13 @@ class CommandArbiter:
 
     # ------------------------------------------------------------------------------- internals
 
-    def _watching(self, modes: Collection[Mode], ended_by: Sequence[Topic], ends_flight: bool = False) -> Order:
-        before, mode = self.newest, self._telemetry.mode.latest
-        is_under_way = before is not None and mode is not None and before.is_own(mode)
+    def _create_order(self, modes: Collection[Mode], ended_by: Sequence[Topic], ends_flight: bool = False) -> Order:
+        """Create an order that also accepts the modes that earlier orders may still lead to."""
+        newest, mode = self.newest, self._telemetry.mode.latest
+        is_under_way = newest is not None and mode is not None and newest.is_own(mode)
         is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at
-        expected = before.modes if is_unsettled and before is not None else ()
-        return self._new(
+        expected = newest.modes if is_unsettled and newest is not None else ()
+        return self._build_order(
             modes,
             ended_by,
             {mode.custom_mode for mode in (*expected, *self._posted_modes())},
@@ -335,13 +347,13 @@ class CommandArbiter:
             ends_flight=ends_flight,
         )
 
-    def _new(
+    def _build_order(
         self, modes: Collection[Mode], ended_by: Sequence[Topic], expected: Collection[int], **rules: Any
     ) -> Order:
-        """Create an order that processes all reports of the vehicle from now on."""
+        """Create an order with the vehicle's present state as the state before the order."""
         return Order(
             self._now(),
-            next(self._numbers),
+            next(self._order_numbers),
             self._is_newest,
             ended_by=ended_by,
             modes=modes,
@@ -352,18 +364,18 @@ class CommandArbiter:
             **rules,
         )
 
-    def _end_flights(self, modes: Collection[Mode]) -> bool:
+    def _all_end_flight(self, modes: Collection[Mode]) -> bool:
         """Return True if all these modes are for landing or returning."""
         autopilot, is_vtol = self._telemetry.autopilot, self._telemetry.is_vtol
-        ends = {autopilot.mode_for("land", is_vtol=is_vtol), autopilot.mode_for("return", is_vtol=is_vtol)}
-        numbers = {mode.custom_mode for mode in ends if mode is not None}
-        return bool(modes) and {mode.custom_mode for mode in modes} <= numbers
+        ending_modes = {autopilot.mode_for("land", is_vtol=is_vtol), autopilot.mode_for("return", is_vtol=is_vtol)}
+        ending_numbers = {mode.custom_mode for mode in ending_modes if mode is not None}
+        return bool(modes) and {mode.custom_mode for mode in modes} <= ending_numbers
 
     def _posted_modes(self) -> tuple[Mode, ...]:
         """Modes that posted orders, including superseded ones, may still lead to."""
         return tuple(mode for order in self._posted if not order.is_confirmed for mode in order.modes)
 
-    def _steers(self) -> bool:
+    def _is_steering(self) -> bool:
         """True while the vehicle is in a mode of the newest order and there was no takeover."""
         order, mode = self.newest, self._telemetry.mode.latest
         return (
@@ -375,35 +387,36 @@ class CommandArbiter:
         )
 
     def _on_mode(self, _: Mode | None, mode: Mode) -> None:
-        followers: tuple[Order | SentCommand, ...] = (*self._watched(), *self._sent)
-        for follower in followers:
-            follower.on_mode(mode, self._telemetry.mode.updated_at)
+        receivers: tuple[Order | SentCommand, ...] = (*self._active_orders(), *self._sent)
+        for receiver in receivers:
+            receiver.on_mode(mode, self._telemetry.mode.updated_at)
 
-    def _on_state(self, _: int | None, state: int) -> None:
-        for order in self._watched():
+    def _on_system_status(self, _: int | None, state: int) -> None:
+        for order in self._active_orders():
             order.on_system_status(state)
 
-    def _on_armed(self, before: bool | None, armed: bool) -> None:
-        if before and not armed:
+    def _on_armed(self, armed_before: bool | None, armed: bool) -> None:
+        if armed_before and not armed:
             self._ordered_since_disarmed.clear()
-        if armed and not before:
-            self._note_armed_anew()
+        if armed and not armed_before:
+            self._on_arming()
         if not armed:
             self._disarmed_at = self._telemetry.armed.updated_at
-        followers: tuple[Order | SentCommand, ...] = (*self._watched(), *self._sent)
-        for follower in followers:
-            follower.on_armed(armed, self._telemetry.armed.updated_at)
+        receivers: tuple[Order | SentCommand, ...] = (*self._active_orders(), *self._sent)
+        for receiver in receivers:
+            receiver.on_armed(armed, self._telemetry.armed.updated_at)
 
-    def _note_armed_anew(self) -> None:
+    def _on_arming(self) -> None:
+        """Decide whether the program or another party has armed the vehicle."""
         self._armed_at = self._telemetry.armed.updated_at
         is_under_way = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
-        is_accepted = math.isfinite(self._arming_accepted_at)
-        is_first = was_armed_by_order(self._disarmed_at, self._arming_accepted_at)
+        was_accepted = math.isfinite(self._arming_accepted_at)
+        is_effect = was_accepted and was_armed_by_order(self._disarmed_at, self._arming_accepted_at)
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
-        is_ordered = is_under_way or (is_accepted and is_first)
-        self._armed_by_program = self._watching(modes, ()) if is_ordered else None
+        self._armed_by_program = self._create_order(modes, ()) if is_under_way or is_effect else None
 
-    def _watched(self) -> tuple[Order, ...]:
-        own = () if self._armed_by_program is None else (self._armed_by_program,)
-        return (*own, *self._orders, *self._posted)
+    def _active_orders(self) -> tuple[Order, ...]:
+        """Orders that process the reports of the vehicle."""
+        arm_order = () if self._armed_by_program is None else (self._armed_by_program,)
+        return (*arm_order, *self._orders, *self._posted)

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Order
 
 FORCE_REBOOT = 20190226
+"""param6 of PREFLIGHT_REBOOT_SHUTDOWN that makes ArduPilot reboot even while armed (GCS_Common.cpp)."""
 PREARM_REPORT_INTERVAL_S = 35.0
 """Seconds in which ArduPilot surely repeats its pre-arm failures, which it does every 30 s."""
 REASONS_S = 3.0
@@ -40,6 +41,7 @@ POLL_INTERVAL_S = 0.1
 # MAV_STATE_BOOT and MAV_STATE_CALIBRATING.
 BOOTING = (1, 2)
 REBOOT_ANSWER_S = 3.0
+"""Seconds to wait for the acknowledgement of a reboot command."""
 MODE_READY_TIMEOUT_S = 3.0
 """Seconds to wait after a mode change until the vehicle can arm in the new mode."""
 
@@ -80,18 +82,20 @@ class ArmingActions(VehicleBase):
             ChangeSignal(self._session, *cells, every_arrival=True) as changes,
             anyio.move_on_after(timeout),
         ):
-            asks_at = self.connection.now() + timeout - REASONS_S
+            request_at = self.connection.now() + timeout - REASONS_S
             while self._health.missing_for_flight():
                 self.connection.raise_if_ended()
-                if self.connection.now() >= asks_at:
-                    asks_at = math.inf
+                if self.connection.now() >= request_at:
+                    request_at = math.inf
                     await self._health.request_reasons(self.connection.now() - PREARM_REPORT_INTERVAL_S)
                 else:
-                    await changes.next(min(timeout, asks_at - self.connection.now()))
+                    await changes.next(min(timeout, request_at - self.connection.now()))
             return
+        # ArduPilot repeats its texts, so duplicates are removed.
         recent_texts = dict.fromkeys(self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S))
-        still = [*self._health.missing_for_flight(), *recent_texts] or ["nothing"]
-        missing = "\n  - ".join([*still, *self._health.unarmable_mode()])
+        # Nothing is missing if the vehicle became ready just after the last check.
+        still_missing = [*self._health.missing_for_flight(), *recent_texts] or ["nothing"]
+        missing = "\n  - ".join([*still_missing, *self._health.unarmable_mode()])
         raise OperationTimeout(
             f"the vehicle was not ready within {timeout:g} s ({self._session.describe_link()}); still missing:\n"
             f"  - {missing}"
@@ -141,21 +145,21 @@ class ArmingActions(VehicleBase):
         """
         if len(reason.encode()) > CHUNK_LENGTH:
             raise InvalidArgument(f"reason = {short_repr(reason)} is not allowed: at most {CHUNK_LENGTH} bytes")
-        wanted = self._mode_to_arm_in(mode)
-        if wanted is not None:
-            await self._change_to_arming_mode(wanted)
+        arming_mode = self._mode_to_arm_in(mode)
+        if arming_mode is not None:
+            await self._change_to_arming_mode(arming_mode)
         self._arm_cleanup.stop()
         if reason:
             logger.info("arming vehicle %d: %s", self.system_id, reason)
             self.connection.send(Statustext(MavSeverity.INFO, reason, 0, 0))
         started = self.connection.now()
         try:
-            await self._arm_where_allowed(mode is None, force, timeout, max_silence_s)
+            await self._arm_with_fallback_mode(mode is None, force, timeout, max_silence_s)
         except CommandRejected as error:
             reasons = await self._health.arming_reasons(started)
             raise self._session.with_reasons(error, started, reasons) from None
 
-    async def _arm_where_allowed(
+    async def _arm_with_fallback_mode(
         self, may_change_mode: bool, force: bool, timeout: float, max_silence_s: float | None
     ) -> None:
         """Arm in the present mode; after a refusal there, change a mode that a parameter may exclude from arming."""
@@ -163,10 +167,10 @@ class ArmingActions(VehicleBase):
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
             is_excluded = may_change_mode and self._is_in_optional_mode()
-            better = self.autopilot.mode_to_arm_in() if is_excluded else None
-            if better is None:
+            other_mode = self.autopilot.mode_to_arm_in() if is_excluded else None
+            if other_mode is None:
                 raise
-            await self._change_to_arming_mode(better)
+            await self._change_to_arming_mode(other_mode)
             await self._arm_in_present_mode(force, timeout, max_silence_s)
 
     async def _arm_in_present_mode(self, force: bool, timeout: float, max_silence_s: float | None) -> None:
@@ -175,11 +179,11 @@ class ArmingActions(VehicleBase):
             try:
                 await self._sender.send_arm(order, True, force=force)
                 await self._await_armed(True, order, started, timeout, max_silence_s)
-            except CommandRejected:
+            except CommandRejected:  # The vehicle will not execute the command, so no cleanup is needed.
                 raise
             except CommandTimeout as error:
                 self._arm_cleanup.watch(order, was_armed)
-                raise CommandTimeout(f"{error}; {self._arm_cleanup.text()}") from None
+                raise CommandTimeout(f"{error}; {self._arm_cleanup.hint()}") from None
             except (anyio.get_cancelled_exc_class(), AerokitError):
                 self._arm_cleanup.watch(order, was_armed)
                 raise
@@ -211,10 +215,10 @@ class ArmingActions(VehicleBase):
                 await self._sender.send_arm(order, False, force=force)
             except CommandRejected as error:
                 # ArduCopter refuses to disarm in the air without a status text (AP_Arming_Copter.cpp, disarm).
-                raise self._session.with_reasons(error, started, self._in_flight()) from None
+                raise self._session.with_reasons(error, started, self._reason_if_flying()) from None
             await self._await_armed(False, order, started, timeout, max_silence_s)
 
-    def _in_flight(self) -> tuple[str, ...]:
+    def _reason_if_flying(self) -> tuple[str, ...]:
         """Return the landed state as a reason, if it shows that the vehicle is flying."""
         landed = self.telemetry.landed_state.latest
         if landed not in (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING):
@@ -224,12 +228,14 @@ class ArmingActions(VehicleBase):
     async def _await_armed(
         self, armed: bool, order: Order, started: float, timeout: float, max_silence_s: float | None
     ) -> None:
+        """Wait until a HEARTBEAT received after ``started`` reports the state."""
         cell = self.telemetry.armed
         await await_progress(
             self._session,
             "arm()" if armed else "disarm()",
             is_done=lambda: cell.latest is armed and cell.updated_at > started,
-            trouble=lambda: order.takeover_reason if armed else None,
+            # A mode change or a failsafe does not keep the vehicle from disarming.
+            failure_reason=lambda: order.takeover_reason if armed else None,
             describe=lambda: (
                 "; ".join(self._session.texts_since(started)) or "the vehicle sent no status text about it"
             ),
@@ -237,19 +243,20 @@ class ArmingActions(VehicleBase):
             max_silence_s=max_silence_s,
         )
 
-    # ------------------------------------------------------------------------ where it arms
+    # ------------------------------------------------------------------------ modes for arming
 
     def _mode_to_arm_in(self, mode: str | int | None) -> Mode | None:
         """Return the mode to change to before arming; None if the present mode allows arming."""
         if mode is not None:
-            wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
-            if wanted.name in self.autopilot.unarmable_modes:
-                raise InvalidArgument(f"mode = {mode!r} is not allowed: {self._health.unarmable_text(wanted)}")
-            if self.telemetry.is_armed and wanted != self.telemetry.mode.latest:
+            arming_mode = self.autopilot.find_mode(mode, self.telemetry.mode_names)
+            if arming_mode.name in self.autopilot.unarmable_modes:
+                raise InvalidArgument(f"mode = {mode!r} is not allowed: {self._health.unarmable_text(arming_mode)}")
+            if self.telemetry.is_armed and arming_mode != self.telemetry.mode.latest:
                 raise OperationRejected(
                     f"arm: the vehicle is armed already, in {self.telemetry.mode_name}; nothing was sent"
                 )
-            return wanted
+            return arming_mode
+        # A stream has its own mode, and the mode that a booting vehicle reports may still change.
         is_booting = self.telemetry.system_status.latest in BOOTING
         if (
             self._flight_cleanup.stop_stream is not None
@@ -267,19 +274,19 @@ class ArmingActions(VehicleBase):
         is_optional = mode is not None and mode.name in self.autopilot.armable_by_option
         return is_optional and self.telemetry.is_confirmed_disarmed and self._flight_cleanup.stop_stream is None
 
-    async def _change_to_arming_mode(self, wanted: Mode) -> None:
+    async def _change_to_arming_mode(self, mode: Mode) -> None:
         """Change the mode for arming; raise if the order to arm was superseded meanwhile."""
-        order, count = self._arbiter.order(wanted), self._arbiter.arming_orders
-        await self._sender.ensure_mode(wanted, order)
+        order, arming_orders_before = self._arbiter.order(mode), self._arbiter.arming_orders
+        await self._sender.ensure_mode(mode, order)
         await self._wait_until_armable()
         self._sender.raise_if_ended(order)
-        if self._arbiter.arming_orders != count:
+        if self._arbiter.arming_orders != arming_orders_before:
             raise OperationRejected("arm(): superseded by another arm or disarm command; the arm command was not sent")
-        if not self._arbiter.is_known:
+        if not self._arbiter.is_state_recent:
             raise HeartbeatTimeout(f"arm(): {self._session.describe_link()}; the arm command was not sent")
 
     async def _wait_until_armable(self) -> None:
-        """Wait until SYS_STATUS, a few times a second, reports whether the vehicle can arm in its new mode."""
+        """Wait briefly until SYS_STATUS no longer reports that the pre-arm checks fail, after a change of the mode."""
         sensors = self.telemetry.sensors
         with self._session.streaming("sensors"), anyio.move_on_after(MODE_READY_TIMEOUT_S):
             since = self.connection.now()
@@ -305,16 +312,18 @@ class ArmingActions(VehicleBase):
         """
         if not force:
             self._session.check_disarmed("reboot")
-        reboots = self._session.watch.reboots
-        self._session.link_watch.request_time()  # A reboot is recognised by the time since boot before it.
+        reboots_before = self._session.watch.reboots
+        # A reboot is recognised by a shorter time since boot, so the present one must be known.
+        self._session.link_watch.request_time()
         unanswered: CommandTimeout | None = None
         with self._session.watch.expecting_reboot():
             try:
                 await self._order_reboot(force)
             except CommandTimeout as error:
                 unanswered = error
+            # A command without an answer was probably lost, so the reboot is not awaited for the whole time-out.
             with anyio.move_on_after(timeout if unanswered is None else min(timeout, ARM_WATCH_S)):
-                await self._await_reboot(reboots)
+                await self._await_reboot(reboots_before)
                 return
         if unanswered is not None:
             raise CommandTimeout(f"{unanswered}; the command is sent only once, and may still be executed")
@@ -326,10 +335,10 @@ class ArmingActions(VehicleBase):
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ANSWER_S}
         await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
 
-    async def _await_reboot(self, reboots: int) -> None:
+    async def _await_reboot(self, reboots_before: int) -> None:
         """Poll the time since boot, frequently at first: a fast simulation soon exceeds its previous uptime."""
         accepted_at = request_at = self.connection.now()
-        while self._session.watch.reboots == reboots:
+        while self._session.watch.reboots == reboots_before:
             self.connection.raise_if_ended()
             now = self.connection.now()
             if now >= request_at:

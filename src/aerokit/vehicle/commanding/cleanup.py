@@ -31,14 +31,14 @@ logger: logging.Logger = logging.getLogger("aerokit")
 class BackgroundTask:
     """Runs one background task for a vehicle. A new task replaces the previous one.
 
-    Leaving the vehicle's block waits briefly for the task. ``name`` is the task's name; ``what_it_leaves`` completes
-    the warning if the block is left before the task is done.
+    Leaving the vehicle's block waits briefly for the task. ``name`` is the task's name; ``warning_clause`` completes
+    the warning "the block of this vehicle was left …" if the task is not done by then.
     """
 
-    def __init__(self, session: VehicleSession, name: str, what_it_leaves: str) -> None:
-        self._session, self._name, self._what_it_leaves = session, name, what_it_leaves
+    def __init__(self, session: VehicleSession, name: str, warning_clause: str) -> None:
+        self._session, self._name, self._warning_clause = session, name, warning_clause
         self._scope: Cancellation | None = None
-        self._is_over: asyncio.Event | None = None
+        self._done: asyncio.Event | None = None
 
     @property
     def is_open(self) -> bool:
@@ -47,27 +47,27 @@ class BackgroundTask:
 
     def start(self, work: Callable[[], Awaitable[None]]) -> None:
         """Run ``work`` in the background, as long as the connection is open."""
-        scope, is_over = Cancellation(), asyncio.Event()
-        self._scope, self._is_over = scope, is_over
+        scope, done = Cancellation(), asyncio.Event()
+        self._scope, self._done = scope, done
 
         async def run() -> None:
             with scope:
                 await work()
-            if self._scope is scope:
+            if self._scope is scope:  # No newer task has replaced this one.
                 self._scope = None
-            is_over.set()
+            done.set()
 
         self._session.background.start(run, self._name)
 
-    def drop(self) -> None:
+    def cancel(self) -> None:
         """Cancel the task. Code of the task that is shielded from cancellation still finishes."""
         if self._scope is not None:
             self._scope.cancel()
             self._scope = None
 
     @contextmanager
-    def spared(self) -> Iterator[None]:
-        """Ignore ``drop`` within the block, because orders that the task itself gives would cancel it."""
+    def protected(self) -> Iterator[None]:
+        """Ignore ``cancel`` within the block, because orders that the task itself gives would cancel it."""
         scope, self._scope = self._scope, None
         try:
             yield
@@ -76,15 +76,16 @@ class BackgroundTask:
 
     async def finish(self, within_s: float) -> None:
         """Wait at most ``within_s`` for the task when the vehicle's block is left; log a warning if it is not done."""
-        if self._scope is None or self._is_over is None or not self._session.connection.is_open:
+        if self._scope is None or self._done is None or not self._session.connection.is_open:
             return
         if within_s:
+            # Shielded, because a cancelled program leaves the block too.
             with anyio.CancelScope(shield=True), anyio.move_on_after(within_s):
-                await self._is_over.wait()
+                await self._done.wait()
         if self._scope is not None:
             logger.warning(
                 "the block of this vehicle was left %s: %s",
-                self._what_it_leaves,
+                self._warning_clause,
                 self._session.describe_link(),
             )
 
@@ -106,7 +107,7 @@ STOP_HERE = (MavCmd.DO_REPOSITION, -1, MavDoRepositionFlags.CHANGE_MODE, 0, *(ma
 class FlightCleanup:
     """Makes the vehicle hold when the program orders a hold, or after an order was abandoned.
 
-    ``stop_stream(reason)`` stops the active set-point stream.
+    ``stop_stream(reason)`` stops the active set-point stream; None while there is no such stream.
     """
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender) -> None:
@@ -115,7 +116,7 @@ class FlightCleanup:
         self._flight: Order | None = None
         self._task = BackgroundTask(session, "aerokit hold", "before a hold was confirmed")
         # A new steering order makes the confirmation of an earlier hold pointless.
-        arbiter.on_steering(self._task.drop)
+        arbiter.on_steering(self._task.cancel)
 
     async def hold(self) -> None:
         """Order the vehicle to hold, see :meth:`aerokit.Vehicle.hold`."""
@@ -134,8 +135,8 @@ class FlightCleanup:
 
     async def _confirm_hold(self, mode: Mode, order: Order) -> None:
         """Wait for the acknowledgement of :meth:`_send_hold`; resend the hold if none arrives."""
-        by_mode = (MavCmd.DO_SET_MODE, *self._session.autopilot.mode_order(mode).params)
-        command, *params = STOP_HERE if self._holds_by_reposition else by_mode
+        change_mode = (MavCmd.DO_SET_MODE, *self._session.autopilot.mode_order(mode).params)
+        command, *params = STOP_HERE if self._holds_by_reposition else change_mode
         await self._sender.send_long(
             order,
             int(command),
@@ -167,12 +168,12 @@ class FlightCleanup:
             or order.end
         ):
             return False
-        is_sent = self._arbiter.is_known
+        is_sent = self._arbiter.is_state_recent
         if is_sent:
             self._send_hold(mode)
             order = self._arbiter.order(*order.modes, mode)
             self._arbiter.doubt_mode()
-        self._task.start(partial(self._hold_when_known, mode, order, is_sent=is_sent))
+        self._task.start(partial(self._hold_after_heartbeat, mode, order, is_sent=is_sent))
         return True
 
     def _send_hold(self, mode: Mode) -> None:
@@ -183,7 +184,12 @@ class FlightCleanup:
                 MavCmd.DO_SET_MODE, *self._session.autopilot.mode_order(mode).params
             )
 
-    async def _hold_when_known(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
+    async def _hold_after_heartbeat(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
+        """Wait for the confirmation of a hold that was sent, or send it after the next HEARTBEAT.
+
+        Without a confirmation, the hold is sent again after the next HEARTBEAT, unless the order has ended by then, for
+        example because a pilot took over.
+        """
         for _ in range(MAX_HOLD_ATTEMPTS):
             try:
                 if is_sent:
@@ -191,13 +197,14 @@ class FlightCleanup:
                     return
                 await self._session.wait_for_heartbeat()
                 if not order.end and not self._session.telemetry.is_confirmed_disarmed:
-                    with self._task.spared():  # This task itself gives the newer order, which must not cancel the task.
+                    # A new steering order cancels the task, but not if the task itself gives it.
+                    with self._task.protected():
                         order = self._arbiter.order(*order.modes, mode)
                     await self.stop_in(mode, order)
                 return
             except OperationTimeout as error:
                 logger.warning("the hold after an abandoned flight is not confirmed yet: %s", error)
-                is_sent = False
+                is_sent = False  # The next attempt waits for a HEARTBEAT and sends the hold again.
             except AerokitError as error:
                 if not order.end:
                     logger.warning("the vehicle does not hold after an abandoned flight: %s", error)
@@ -212,7 +219,7 @@ class FlightCleanup:
         """Wait briefly for the acknowledgement of a hold when the vehicle's block is left. The hold is repeated
         meanwhile.
         """
-        await self._task.finish(HOLD_CLOSE_TIMEOUT_S if self._arbiter.is_known else 0)
+        await self._task.finish(HOLD_CLOSE_TIMEOUT_S if self._arbiter.is_state_recent else 0)
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
@@ -250,7 +257,7 @@ class FlightCleanup:
         try:
             yield order
             self._sender.raise_if_ended(order)
-            if not self._arbiter.is_known:
+            if not self._arbiter.is_state_recent:
                 raise HeartbeatTimeout(f"{self._session.describe_link()}; nothing was sent")
         except BaseException:
             self.hold_in_background(order)
@@ -265,14 +272,15 @@ class FlightCleanup:
 
     @property
     def _holds_by_reposition(self) -> bool:
+        """True if MAV_CMD_DO_REPOSITION changes to the hold mode, as on PX4."""
         return self._session.autopilot.reposition is not None and self._session.autopilot.reposition_purpose == "hold"
 
 
 ARM_WATCH_S = 15.0
 """Seconds for which aerokit monitors the vehicle after an abandoned arm order, and disarms it if the order arms it."""
 
-ACK_S = 3.0
-"""Seconds after a HEARTBEAT that reports armed in which the COMMAND_ACK of the arm order may still arrive."""
+ARM_ACK_WAIT_S = 3.0
+"""Seconds after a HEARTBEAT that reports armed, in which the COMMAND_ACK of the arm order may still arrive."""
 
 # Seconds that leaving the vehicle's block waits for the outcome of an abandoned arm order.
 ARM_CLOSE_TIMEOUT_S = 1.5
@@ -283,10 +291,10 @@ class ArmCleanup:
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender) -> None:
         self._session, self._arbiter, self._sender = session, arbiter, sender
-        unsure = "while an arm command may still be executed"
-        self._task = BackgroundTask(session, "aerokit late arming", unsure)
+        warning_clause = "while an arm command may still be executed"
+        self._task = BackgroundTask(session, "aerokit late arming", warning_clause)
 
-    def text(self) -> str:
+    def hint(self) -> str:
         """Return the hint for error texts that an arm command may still be executed."""
         unsent = self._session.connection.unsent_bytes
         hint = f"; {unsent} bytes are still in the send buffer" if unsent else ""
@@ -294,26 +302,33 @@ class ArmCleanup:
 
     def watch(self, order: Order, was_armed: bool) -> None:
         """Start monitoring: the abandoned arm command may have been received, or may still arrive."""
-        self._session.connection.discard_unsent()
+        self._session.connection.discard_unsent()  # An arm command that is still unsent must not be sent later.
         self._task.start(partial(self._watch_arming, order, was_armed, self._arbiter.arming_orders))
 
-    async def _watch_arming(self, order: Order, was_armed: bool, count: int) -> None:
+    async def _watch_arming(self, order: Order, was_armed: bool, arming_orders_before: int) -> None:
         armed = self._session.telemetry.armed
-        disarmed_at = [order.given_at]
-        stop = armed.observe(
-            lambda _, value: None if value else disarmed_at.append(armed.updated_at), every_arrival=True
-        )
+        last_disarmed_at = order.given_at
+
+        def on_armed(_: bool | None, is_armed: bool) -> None:
+            nonlocal last_disarmed_at
+            if not is_armed:
+                last_disarmed_at = armed.updated_at
+
+        detach = armed.observe(on_armed, every_arrival=True)
         has_armed = False
         try:
             with anyio.move_on_after(ARM_WATCH_S):
-                has_armed = await self._arms(was_armed)
+                has_armed = await self._wait_until_armed(was_armed)
         finally:
-            stop()
+            detach()
         if has_armed:
-            await self._disarm_again(order, count, disarmed_at[-1])
+            await self._disarm_again(order, arming_orders_before, last_disarmed_at)
 
-    async def _arms(self, was_armed: bool) -> bool:
-        """Wait until the vehicle arms; a vehicle that was armed before the order must disarm first."""
+    async def _wait_until_armed(self, was_armed: bool) -> bool:
+        """Return True once the vehicle arms, False if the link ends before.
+
+        A vehicle that was armed before the order must disarm first.
+        """
         armed, since = self._session.telemetry.armed, self._session.connection.now()
         try:
             if was_armed:
@@ -324,11 +339,11 @@ class ArmCleanup:
             return False
         return True
 
-    async def _disarm_again(self, order: Order, count: int, disarmed_at: float) -> None:
+    async def _disarm_again(self, order: Order, arming_orders_before: int, disarmed_at: float) -> None:
         """Disarm the vehicle, unless another party armed it."""
-        if self._arbiter.arming_orders != count:  # The program itself has sent a newer arm or disarm command.
+        if self._arbiter.arming_orders != arming_orders_before:  # The program has sent a newer arm or disarm command.
             return
-        if not await self._has_armed(order, disarmed_at):
+        if not await self._was_armed_by(order, disarmed_at):
             logger.warning(
                 "the vehicle armed after an arm command was abandoned: it stays armed, because another party may have"
                 " armed it"
@@ -337,22 +352,22 @@ class ArmCleanup:
         logger.warning("an abandoned arm command has armed the vehicle: aerokit disarms it again")
         with anyio.CancelScope(shield=True):
             try:
-                with self._arbiter.auxiliary_order(ends_flight=True) as order:
-                    await self._sender.send_arm(order, False)
+                with self._arbiter.auxiliary_order(ends_flight=True) as disarm_order:
+                    await self._sender.send_arm(disarm_order, False)
             except AerokitError as error:
                 logger.error("an abandoned arm command has armed the vehicle, and it could not be disarmed: %s", error)
 
-    async def _has_armed(self, order: Order, disarmed_at: float) -> bool:
+    async def _was_armed_by(self, order: Order, disarmed_at: float) -> bool:
         """Return True if this order, and not a pilot, has armed the vehicle.
 
-        That is so if the vehicle accepted the order and has not reported disarmed since. Without an acknowledgement, it
-        is so if the next HEARTBEAT reports armed and there was no takeover.
+        The order armed it if the vehicle accepted the order and has not reported disarmed since. Without an
+        acknowledgement, the order armed it if the next HEARTBEAT reports armed and there was no takeover.
         """
         reported_after_s = self._session.telemetry.armed.updated_at - order.given_at
         if not order.end and reported_after_s <= ARM_HEARTBEAT_DELAY_S:
             return True
         if not self._is_accepted(disarmed_at):
-            await anyio.sleep(ACK_S)
+            await anyio.sleep(ARM_ACK_WAIT_S)
         return self._is_accepted(disarmed_at)
 
     def _is_accepted(self, disarmed_at: float) -> bool:
@@ -361,7 +376,7 @@ class ArmCleanup:
 
     def stop(self) -> None:
         """Stop monitoring, because a newer order about arming was given."""
-        self._task.drop()
+        self._task.cancel()
 
     async def finish(self) -> None:
         """Wait briefly for the outcome of a cancelled arm order when the vehicle's block is left.

@@ -25,7 +25,7 @@ Vector = tuple[float, float]
 class ClosedPath:
     """A closed curve around a centre, with a phase that increases by 2π each round.
 
-    ``at(phase)`` returns a place and its first two derivatives.
+    ``at(phase)`` returns the place relative to the centre, and its first and second derivative by the phase.
     """
 
     first_phase: float = 0.0
@@ -38,30 +38,32 @@ class Circle(ClosedPath):
     """A circle; the phase is the bearing from its centre in radians."""
 
     def __init__(self, radius_m: float, *, clockwise: bool, first_phase: float) -> None:
-        self._radius_m, self._way = radius_m, 1 if clockwise else -1
+        self._radius_m, self._direction = radius_m, 1 if clockwise else -1
         self.first_phase: float = first_phase
 
     def at(self, phase: float) -> tuple[Vector, Vector, Vector]:
-        angle = self.first_phase + self._way * (phase - self.first_phase)
-        north, east = self._radius_m * math.cos(angle), self._radius_m * math.sin(angle)
-        return (north, east), (-self._way * east, self._way * north), (-north, -east)
+        bearing = self.first_phase + self._direction * (phase - self.first_phase)
+        north, east = self._radius_m * math.cos(bearing), self._radius_m * math.sin(bearing)
+        return (north, east), (-self._direction * east, self._direction * north), (-north, -east)
 
 
 class Eight(ClosedPath):
     """A lemniscate along an axis; it begins and ends at its centre."""
 
     def __init__(self, major_m: float, minor_m: float, axis_deg: float, *, clockwise: bool) -> None:
-        self._major_m, self._minor_m, self._axis = major_m, minor_m if clockwise else -minor_m, math.radians(axis_deg)
+        self._major_m, self._axis = major_m, math.radians(axis_deg)
+        self._minor_m = minor_m if clockwise else -minor_m
 
     def at(self, phase: float) -> tuple[Vector, Vector, Vector]:
-        a, b = self._major_m, self._minor_m
+        major_m, minor_m = self._major_m, self._minor_m
         return (
-            self._turned(a * math.sin(phase), -b * math.sin(2 * phase)),
-            self._turned(a * math.cos(phase), -2 * b * math.cos(2 * phase)),
-            self._turned(-a * math.sin(phase), 4 * b * math.sin(2 * phase)),
+            self._to_north_east(major_m * math.sin(phase), -minor_m * math.sin(2 * phase)),
+            self._to_north_east(major_m * math.cos(phase), -2 * minor_m * math.cos(2 * phase)),
+            self._to_north_east(-major_m * math.sin(phase), 4 * minor_m * math.sin(2 * phase)),
         )
 
-    def _turned(self, along: float, across: float) -> Vector:
+    def _to_north_east(self, along: float, across: float) -> Vector:
+        """Convert components along the axis, and to the right of it, to components north and east."""
         cos, sin = math.cos(self._axis), math.sin(self._axis)
         return along * cos - across * sin, along * sin + across * cos
 
@@ -70,7 +72,8 @@ class PathFlight:
     """Moves a set-point straight to the start of a path, stops it there, and moves it along the path to a stop.
 
     ``start`` is the vehicle's position relative to the centre of the path (north, east, down). ``centre`` is the
-    position of the centre in the local frame.
+    position of the centre in the local frame. ``heading`` returns the heading in degrees for a place relative to the
+    centre and a velocity; None leaves it to the autopilot.
     """
 
     def __init__(
@@ -83,9 +86,9 @@ class PathFlight:
         heading: Callable[[Vector, Vector], float | None],
     ) -> None:
         self._path, self._speed_m_s, self._centre, self._heading = path, speed_m_s, centre, heading
-        self._from = start
+        self._start = start
         self._phase, self._last_phase = path.first_phase, path.first_phase + 2 * math.pi * rounds
-        self._flown_m = self._speed = 0.0
+        self._flown_m = self._present_speed_m_s = 0.0
         self.is_on_path: bool = False
         """True once the set-point has reached the path."""
 
@@ -100,59 +103,73 @@ class PathFlight:
 
     def _advance_to_path(self, seconds: float) -> TrajectorySetpoint:
         (north, east), _, _ = self._path.at(self._path.first_phase)
-        way = (north - self._from[0], east - self._from[1], -self._from[2])
-        length = math.hypot(*way)
-        self._accelerate(seconds, length - self._flown_m)
-        self._flown_m += self._speed * seconds
-        if self._flown_m >= length:
-            self.is_on_path, self._speed, self._flown_m = True, 0.0, length
-        share = self._flown_m / length if length else 1.0
-        north, east, down = (begin + share * part for begin, part in zip(self._from, way, strict=True))
-        north_m_s, east_m_s, down_m_s = (self._speed * part / length if length else 0.0 for part in way)
+        to_path = (north - self._start[0], east - self._start[1], -self._start[2])
+        length_m = math.hypot(*to_path)
+        self._change_speed(seconds, length_m - self._flown_m)
+        self._flown_m += self._present_speed_m_s * seconds
+        if self._flown_m >= length_m:
+            self.is_on_path, self._present_speed_m_s, self._flown_m = True, 0.0, length_m
+        fraction = self._flown_m / length_m if length_m else 1.0
+        north, east, down = (
+            begin + fraction * component for begin, component in zip(self._start, to_path, strict=True)
+        )
+        speed = self._present_speed_m_s
+        north_m_s, east_m_s, down_m_s = (speed * component / length_m if length_m else 0.0 for component in to_path)
         return self._setpoint((north, east), down, (north_m_s, east_m_s, down_m_s), (0.0, 0.0))
 
     def _advance_on_path(self, seconds: float) -> TrajectorySetpoint:
         _, tangent, _ = self._path.at(self._phase)
         metres_per_radian = math.hypot(*tangent)
-        self._accelerate(seconds, (self._last_phase - self._phase) * metres_per_radian)
-        self._phase = min(self._phase + self._speed * seconds / metres_per_radian, self._last_phase)
+        self._change_speed(seconds, (self._last_phase - self._phase) * metres_per_radian)
+        self._phase = min(self._phase + self._present_speed_m_s * seconds / metres_per_radian, self._last_phase)
         if self.is_complete:
-            self._speed = 0.0
-        place, tangent, second = self._path.at(self._phase)
-        rate = self._speed / math.hypot(*tangent)
-        along = (second[0] * tangent[0] + second[1] * tangent[1]) / (tangent[0] ** 2 + tangent[1] ** 2)
-        centripetal = ((second[0] - along * tangent[0]) * rate**2, (second[1] - along * tangent[1]) * rate**2)
-        return self._setpoint(place, 0.0, (tangent[0] * rate, tangent[1] * rate, 0.0), centripetal)
+            self._present_speed_m_s = 0.0
+        place, tangent, curvature = self._path.at(self._phase)
+        phase_rate = self._present_speed_m_s / math.hypot(*tangent)
+        # The part of the second derivative that is parallel to the path would change the speed, so it is subtracted.
+        parallel = (curvature[0] * tangent[0] + curvature[1] * tangent[1]) / (tangent[0] ** 2 + tangent[1] ** 2)
+        centripetal = (
+            (curvature[0] - parallel * tangent[0]) * phase_rate**2,
+            (curvature[1] - parallel * tangent[1]) * phase_rate**2,
+        )
+        return self._setpoint(place, 0.0, (tangent[0] * phase_rate, tangent[1] * phase_rate, 0.0), centripetal)
 
-    def _accelerate(self, seconds: float, left_m: float) -> None:
-        braking = math.sqrt(2 * ACCELERATION_M_S2 * max(0.0, left_m))
-        self._speed = min(self._speed + ACCELERATION_M_S2 * seconds, self._speed_m_s, max(braking, MIN_SPEED_M_S))
+    def _change_speed(self, seconds: float, remaining_m: float) -> None:
+        """Accelerate to the ordered speed, or slow down so that the set-point can stop after ``remaining_m``."""
+        max_to_stop = math.sqrt(2 * ACCELERATION_M_S2 * max(0.0, remaining_m))
+        accelerated = self._present_speed_m_s + ACCELERATION_M_S2 * seconds
+        self._present_speed_m_s = min(accelerated, self._speed_m_s, max(max_to_stop, MIN_SPEED_M_S))
 
     def _setpoint(
         self, place: Vector, down: float, velocity: tuple[float, float, float], acceleration: Vector
     ) -> TrajectorySetpoint:
         north, east, centre_down = self._centre
-        where, yaw_deg = (north + place[0], east + place[1], centre_down + down), self._heading(place, velocity[:2])
-        return TrajectorySetpoint(*where, *velocity, *acceleration, yaw_deg=yaw_deg)
+        position = (north + place[0], east + place[1], centre_down + down)
+        yaw_deg = self._heading(place, velocity[:2])
+        return TrajectorySetpoint(*position, *velocity, *acceleration, yaw_deg=yaw_deg)
 
 
 class TurnCounter:
-    """Counts turns around a centre, while the vehicle is near the circle and flies in the right direction."""
+    """Counts turns around a centre while the vehicle is near the circle.
+
+    Turns in the wrong direction are subtracted.
+    """
 
     def __init__(self, radius_m: float, *, clockwise: bool) -> None:
-        self._radius_m, self._way = radius_m, 1 if clockwise else -1
+        self._radius_m, self._direction = radius_m, 1 if clockwise else -1
         self._tolerance_m = max(MIN_TOLERANCE_M, TOLERANCE_SHARE * radius_m)
-        self._bearing: float | None = None
+        self._bearing: float | None = None  # from the centre, while the vehicle is near the circle
         self.rounds: float = 0.0
-        self.is_there: bool = False
+        self.is_on_path: bool = False
         """True while the vehicle is near the circle."""
 
     def add(self, north_m: float, east_m: float) -> None:
         """Process a place relative to the centre."""
-        self.is_there = abs(math.hypot(north_m, east_m) - self._radius_m) <= self._tolerance_m
-        before, self._bearing = self._bearing, math.atan2(east_m, north_m) if self.is_there else None
-        if before is not None and self._bearing is not None:
-            self.rounds += self._way * math.remainder(self._bearing - before, 2 * math.pi) / (2 * math.pi)
+        self.is_on_path = abs(math.hypot(north_m, east_m) - self._radius_m) <= self._tolerance_m
+        bearing_before, self._bearing = self._bearing, math.atan2(east_m, north_m) if self.is_on_path else None
+        if bearing_before is not None and self._bearing is not None:
+            turned = math.remainder(self._bearing - bearing_before, 2 * math.pi)
+            self.rounds += self._direction * turned / (2 * math.pi)
 
 
 class LobeCounter:
@@ -160,16 +177,16 @@ class LobeCounter:
 
     def __init__(self, major_m: float, axis_deg: float) -> None:
         self._half_m, self._axis = major_m / 2, math.radians(axis_deg)
-        self._lobe = 0
+        self._lobe = 0  # the last lobe that the vehicle was in: 1 or -1; 0 before the first one
         self.rounds: float = 0.0
-        self.is_there: bool = False
+        self.is_on_path: bool = False
         """True while the vehicle is in one of the lobes."""
 
     def add(self, north_m: float, east_m: float) -> None:
         """Process a place relative to the centre."""
         along = north_m * math.cos(self._axis) + east_m * math.sin(self._axis)
-        self.is_there = abs(along) > self._half_m
-        lobe = int(math.copysign(1, along)) if self.is_there else 0
+        self.is_on_path = abs(along) > self._half_m
+        lobe = int(math.copysign(1, along)) if self.is_on_path else 0
         if lobe not in (0, self._lobe):
             self._lobe = lobe
             self.rounds += 0.5

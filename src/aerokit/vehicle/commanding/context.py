@@ -44,26 +44,28 @@ class VehicleContext:
         for callback in tuple(self.on_finish):
             callback()
         self.flight_cleanup.end_flights()
-        is_given_up = self.flight_cleanup.is_hold_pending
+        was_flight_abandoned = self.flight_cleanup.is_hold_pending
         await self.flight_cleanup.finish()
         await self.arm_cleanup.finish()
-        return is_given_up
+        return was_flight_abandoned
 
     def describe_now(self) -> str:
         """Return a clause about the vehicle's reported state, for warnings."""
         autopilot, telemetry = self.session.autopilot, self.session.telemetry
-        hold, mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol), telemetry.mode.latest
-        disarmed = "disarmed" if telemetry.is_confirmed_disarmed else "possibly armed"
-        height = height_above_home(telemetry)
-        # A copter in LAND disarms some seconds after the touchdown.
-        has_landed = telemetry.is_armed and telemetry.landed_state.latest == MavLandedState.ON_GROUND
-        where = "on the ground in" if has_landed else "in"
-        return (
-            f"{'holding in' if mode is not None and mode == hold else where} {telemetry.mode_name},"
-            f" {'still armed' if telemetry.is_armed else disarmed},"
-            f"{'' if height is None else f' {height:.1f} m above home,'}"
-            f" last heartbeat {self.session.heartbeat_age:.1f} s ago"
-        )
+        hold_mode, mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol), telemetry.mode.latest
+        if mode is not None and mode == hold_mode:
+            where = "holding in"
+        elif telemetry.is_armed and telemetry.landed_state.latest == MavLandedState.ON_GROUND:
+            where = "on the ground in"  # A copter in LAND stays armed for some seconds after the touchdown.
+        else:
+            where = "in"
+        if telemetry.is_armed:
+            armed = "still armed"
+        else:
+            armed = "disarmed" if telemetry.is_confirmed_disarmed else "possibly armed"
+        height_m = height_above_home(telemetry)
+        height = "" if height_m is None else f" {height_m:.1f} m above home,"
+        return f"{where} {telemetry.mode_name}, {armed},{height} last heartbeat {self.session.heartbeat_age:.1f} s ago"
 
 
 class VehicleBase(States):

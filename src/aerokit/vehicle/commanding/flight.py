@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots import TakeOff
     from aerokit.vehicle.commanding.order import Order
 
-# MAV_LANDED_STATE.
+# The values of MAV_LANDED_STATE for a flying vehicle, with their names in error texts.
 IN_THE_AIR: dict[int | None, str] = {
     MavLandedState.IN_AIR: "in the air",
     MavLandedState.TAKEOFF: "taking off",
@@ -40,6 +40,7 @@ MIN_FLYING_HEIGHT_M = 2.0
 # Metres of climb that show that the vehicle executes a take-off command.
 CLIMB_DETECTED_M = 0.5
 
+# Seconds for a mode change, as by default in `set_mode`.
 MODE_TIMEOUT_S = 6.0
 
 # A submarine that leaves the surfacing mode below this depth has not surfaced. Home is at the surface.
@@ -83,11 +84,12 @@ class FlightActions(VehicleBase):
         if not self.telemetry.is_armed:
             raise OperationRejected("take_off: the vehicle is not armed: call arm() first; nothing was sent")
         landed = self.telemetry.landed_state
-        flies = landed.latest in (MavLandedState.IN_AIR, MavLandedState.LANDING)
-        if flies and landed.age <= POSITION_MAX_AGE_S:  # A mode change would abort a landing.
+        is_flying = landed.latest in (MavLandedState.IN_AIR, MavLandedState.LANDING)
+        if is_flying and landed.age <= POSITION_MAX_AGE_S:  # A mode change would abort a landing.
             raise OperationRejected(
                 f"take_off: the vehicle is already {IN_THE_AIR[landed.latest]}: use go_to() to climb; nothing was sent"
             )
+        # The modes that the vehicle may report during the take-off.
         modes = (
             plan.mode,
             plan.mode_after,
@@ -98,28 +100,27 @@ class FlightActions(VehicleBase):
             await self._begin_take_off(plan, order)
             with self._flight_cleanup.flying(order):
                 await self._await_altitude(altitude_m, timeout, max_silence_s, order)
-        # The vehicle may have received the command.
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
+            # The vehicle may have received the command, so it is ordered to hold.
             self._flight_cleanup.hold_in_background(order)
             raise
         except CommandRejected as error:
-            raise self._with_state(error) from error
+            raise self._with_landed_state(error) from error
 
-    def _with_state(self, error: CommandRejected) -> CommandRejected:
+    def _with_landed_state(self, error: CommandRejected) -> CommandRejected:
         """Add the landed state to the error of a refused take-off, because the vehicle does not give this reason."""
-        state, altitude = (
-            IN_THE_AIR.get(self.telemetry.landed_state.latest),
-            self._position.altitude_relative(),
-        )
-        if state is None and not altitude > MIN_FLYING_HEIGHT_M:
+        state = IN_THE_AIR.get(self.telemetry.landed_state.latest)
+        altitude_m = self._position.altitude_relative()
+        if state is None and not altitude_m > MIN_FLYING_HEIGHT_M:
             return error
-        height = f", {altitude:.1f} m above home" if altitude > -math.inf else ""
-        why = (
+        height = f", {altitude_m:.1f} m above home" if altitude_m > -math.inf else ""
+        reason = (
             f"the vehicle is {state or 'probably in the air'}{height} and can only take off from the ground;"
             " go_to() climbs"
         )
-        explained = CommandRejected(f"{error}", command=error.command, result=error.result, reasons=(why,))
-        explained.reasons = (*error.reasons, why)
+        # The text of ``error`` already lists its own reasons.
+        explained = CommandRejected(f"{error}", command=error.command, result=error.result, reasons=(reason,))
+        explained.reasons = (*error.reasons, reason)
         return explained
 
     def _take_off_plan(self, altitude_m: float) -> TakeOff:
@@ -133,25 +134,24 @@ class FlightActions(VehicleBase):
         if plan.mode is not None:
             await self._sender.ensure_mode(plan.mode, order)
         if plan.command is not None:
-            is_rising = self._rises_from_here()
+            is_rising = self._climb_detector()
             with self._session.streaming("position", "landed_state"):
                 await self._sender.send_long(order, plan.command, *plan.params, modes=order.modes, is_done=is_rising)
 
-    def _rises_from_here(self) -> Callable[[], bool]:
+    def _climb_detector(self) -> Callable[[], bool]:
         """Return a function that returns True once new messages report a climb.
 
         Earlier messages may describe the previous flight.
         """
         here, landed = self.telemetry.position.latest, self.telemetry.landed_state
-        begins_at = math.nan if here is None else self._position.altitude_relative()
+        # No altitude is greater than NaN, so only the landed state counts while the position is unknown.
+        start_m = math.nan if here is None else self._position.altitude_relative()
         state_before = landed.latest
 
         def is_rising() -> bool:
-            is_reported = landed.latest != state_before and landed.latest in (
-                MavLandedState.IN_AIR,
-                MavLandedState.TAKEOFF,
-            )
-            return is_reported or self._position.altitude_relative() > begins_at + CLIMB_DETECTED_M
+            has_taken_off = landed.latest in (MavLandedState.IN_AIR, MavLandedState.TAKEOFF)
+            is_reported = has_taken_off and landed.latest != state_before
+            return is_reported or self._position.altitude_relative() > start_m + CLIMB_DETECTED_M
 
         return is_rising
 
@@ -159,23 +159,24 @@ class FlightActions(VehicleBase):
         self, altitude_m: float, timeout: float, max_silence_s: float | None, order: Order
     ) -> None:
         """Wait for the altitude. Fail if the vehicle leaves the mode of the take-off and the mode that follows it."""
-        enough_m = altitude_m - max(0.5, 0.05 * altitude_m)
+        # A vehicle that hovers at the altitude may be slightly below it.
+        min_altitude_m = altitude_m - max(0.5, 0.05 * altitude_m)
         started = self.connection.now()
 
         def is_up() -> bool:
-            is_high = self._position.is_known_since(started) and self._position.altitude_relative() >= enough_m
-            return is_high and not order.end
+            is_known = self._position.is_known_since(started)
+            return is_known and self._position.altitude_relative() >= min_altitude_m and not order.end
 
         with self._session.streaming("position"):
             await await_progress(
                 self._session,
                 f"take_off({altitude_m:g} m)",
                 is_done=is_up,
-                trouble=self._sender.stays_in(order, *order.modes),
+                failure_reason=self._sender.mode_failure(order, *order.modes),
                 describe=lambda: f"the vehicle is at {self._position.altitude_relative():.1f} m",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
-                stillness=StallDetector(self._session),
+                stall_reason=StallDetector(self._session),
             )
 
     async def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
@@ -203,7 +204,7 @@ class FlightActions(VehicleBase):
         else:
             order = self._arbiter.order(mode, self.autopilot.modes.find(self.autopilot.mode_when_landed))
             with self._arbiter.changing_mode():
-                # The landing may be over before HEARTBEAT reports its mode.
+                # A submarine at the surface may leave the mode before a HEARTBEAT reports it, so do not wait for it.
                 await self._sender.request_mode(mode, order, attempt_timeout=min(1.0, MODE_TIMEOUT_S / 4))
         await self._await_ground("land", order, timeout, max_silence_s)
 
@@ -222,10 +223,12 @@ class FlightActions(VehicleBase):
         else:
             await self._await_home(order, timeout, max_silence_s)
 
-    async def _await_ground(self, what: str, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
+    async def _await_ground(
+        self, operation: str, order: Order, timeout: float | None, max_silence_s: float | None
+    ) -> None:
         """Wait until messages received after the order report the vehicle on the ground.
 
-        Older messages may be outdated.
+        Older messages may be outdated. A submarine counts as landed when it leaves its surfacing mode near the surface.
         """
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
@@ -233,9 +236,9 @@ class FlightActions(VehicleBase):
         def is_down() -> bool:
             is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
             is_landed = landed.latest == MavLandedState.ON_GROUND and landed.updated_at > order.given_at
-            return ground.confirms(is_disarmed or is_landed or (is_over() and not is_deep()))
+            return ground.confirms(is_disarmed or is_landed or (has_left_surfacing_mode() and not is_deep()))
 
-        def is_over() -> bool:
+        def has_left_surfacing_mode() -> bool:
             return self.telemetry.mode_name == self.autopilot.mode_when_landed and mode.updated_at > accepted_at
 
         def is_deep() -> bool:
@@ -244,19 +247,19 @@ class FlightActions(VehicleBase):
                 and self._position.altitude_relative() < -MAX_SURFACE_DEPTH_M
             )
 
-        stays, ground = self._sender.stays_until_disarmed(order), GroundCheck(self._session)
+        landing_failure, ground = self._sender.landing_failure(order), GroundCheck(self._session)
 
-        def trouble() -> str | None:
-            if is_over() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
+        def failure_reason() -> str | None:
+            if has_left_surfacing_mode() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
                 return f"the mode changed to {self.telemetry.mode_name} at {self._position.altitude_relative():.1f} m"
-            return ground.trouble(stays)
+            return ground.failure_reason(landing_failure)
 
         with self._session.streaming("landed_state", "position"):
             await await_progress(
                 self._session,
-                what,
+                operation,
                 is_done=is_down,
-                trouble=trouble,
+                failure_reason=failure_reason,
                 describe=lambda: f"the vehicle is at {self._position.altitude_relative():.1f} m",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
@@ -265,11 +268,11 @@ class FlightActions(VehicleBase):
     async def _await_home(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
         home = self.telemetry.home.value
         place = Position(home.latitude_deg, home.longitude_deg)
-        near_m = self.autopilot.arrival_radius_m
+        arrival_radius_m = self.autopilot.arrival_radius_m
         started = self.connection.now()
 
         def is_back() -> bool:
-            is_near = self._position.is_known_since(started) and self._position.distance_to(place) <= near_m
+            is_near = self._position.is_known_since(started) and self._position.distance_to(place) <= arrival_radius_m
             return is_near and not order.end
 
         with self._session.streaming("position"):
@@ -277,7 +280,7 @@ class FlightActions(VehicleBase):
                 self._session,
                 "return_to_launch",
                 is_done=is_back,
-                trouble=self._sender.stays_in(order, *order.modes),
+                failure_reason=self._sender.mode_failure(order, *order.modes),
                 describe=lambda: f"the vehicle is {self._position.distance_to(place):.1f} m from home",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
@@ -305,8 +308,8 @@ class ModeActions(VehicleBase):
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
             OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another mode.
         """
-        wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
-        await self._sender.change_mode(wanted, self._arbiter.order(wanted), timeout)
+        found_mode = self.autopilot.find_mode(mode, self.telemetry.mode_names)
+        await self._sender.change_mode(found_mode, self._arbiter.order(found_mode), timeout)
 
     async def hold(self) -> None:
         """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's hold mode.
@@ -345,9 +348,12 @@ class ModeActions(VehicleBase):
         next action clears this text.
         """
         order = self._arbiter.current or self._arbiter.newest
-        if order is None or not order.has_lost_mode:
-            return "" if order is None else order.failsafe
+        if order is None:
+            return ""
+        if not order.has_lost_mode:
+            return order.failsafe
         may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR
         if may_have_landed and self.telemetry.armed.updated_at < order.mode_lost_at:
-            return ""  # PX4 leaves LAND on disarming, and CURRENT_MODE may arrive before HEARTBEAT.
+            # PX4 leaves LAND when it disarms. CURRENT_MODE may report this before HEARTBEAT reports disarmed.
+            return ""
         return order.takeover_reason

@@ -30,13 +30,15 @@ if TYPE_CHECKING:
 
 __all__ = ["FollowStream"]
 
+# The rate of set-points, and the delay of the event loop above which the stream stops.
 RATE_HZ, MAX_LAG_S = 10.0, 1.0
+# The maximum distance, and height above or below, that the vehicle can be ordered to keep.
 MAX_DISTANCE_M = 1000.0
 MIN_COURSE_SPEED_M_S = 0.5
 """Minimum ground speed at which the course of the target is used."""
 MIN_INTERVAL_S = 0.05
 """Minimum seconds between two positions to compute a velocity from them."""
-OVERDUE = 1.5
+OVERDUE_INTERVALS = 1.5
 """Multiple of the last interval between positions after which a target without a new position counts as stopped."""
 MAX_TARGET_SPEED_M_S = 100.0
 """A higher speed between two positions counts as a jump of the target's position."""
@@ -63,13 +65,13 @@ class FollowPlace(Snapshot):
 class TargetState(Snapshot):
     """Position of the target with its velocity (north, east, down in m/s).
 
-    ``since`` is the time at which this position was first reported, ``at`` the time of its last report.
+    ``reported_at`` is the time of the last report of this position, ``first_reported_at`` the time of its first report.
     """
 
     position: Position
     velocity: tuple[float, float, float]
-    at: float
-    since: float
+    reported_at: float
+    first_reported_at: float
 
 
 class FollowedTarget:
@@ -92,9 +94,12 @@ class FollowedTarget:
         position, velocity = telemetry.position, telemetry.velocity.latest
         if position.latest is None or not math.isfinite(position.age):
             return
-        at = self._now() - position.age
+        # The time is computed from the age, because the target's connection may have another clock.
+        received_at = self._now() - position.age
         speeds = ZERO if velocity is None else (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
-        self.latest = TargetState(position.latest.replace(altitude_relative_m=None), speeds, at, at)
+        # The target's altitude is relative to its own home, which may be higher or lower than the follower's.
+        place = position.latest.replace(altitude_relative_m=None)
+        self.latest = TargetState(place, speeds, received_at, received_at)
 
     def add(self, position: object) -> None:
         """Process a position that the program supplied. An unchanged position counts as a new report.
@@ -107,23 +112,26 @@ class FollowedTarget:
         """
         if not isinstance(position, Position):
             raise InvalidArgument(f"position = {short_repr(position)} is not allowed: a Position")
-        before, now = self.latest, self._now()
-        if before is not None and now - before.at < MIN_INTERVAL_S:
+        latest, now = self.latest, self._now()
+        if latest is not None and now - latest.reported_at < MIN_INTERVAL_S:
             return
-        if before is None:
+        if latest is None:
             self.latest = TargetState(position, ZERO, now, now)
-        elif position == before.position:
-            is_moving = now - before.since <= OVERDUE * self._interval_s
-            self.latest = TargetState(position, before.velocity if is_moving else ZERO, now, before.since)
+        elif position == latest.position:
+            is_moving = now - latest.first_reported_at <= OVERDUE_INTERVALS * self._interval_s
+            self.latest = TargetState(position, latest.velocity if is_moving else ZERO, now, latest.first_reported_at)
         else:
-            seconds = self._interval_s = now - before.since
-            there = before.position
-            distance, bearing = there.distance_to(position), math.radians(there.bearing_to(position))
-            down = VehiclePosition.height_above(there, position)
-            is_jump = math.hypot(distance, down) > MAX_TARGET_SPEED_M_S * seconds
-            north, east = distance * math.cos(bearing), distance * math.sin(bearing)
-            velocity = ZERO if is_jump else (north / seconds, east / seconds, down / seconds)
-            self.latest = TargetState(position, velocity, now, now)
+            self._interval_s = now - latest.first_reported_at
+            velocity = _mean_velocity(latest.position, position, self._interval_s)
+            is_jump = math.hypot(*velocity) > MAX_TARGET_SPEED_M_S
+            self.latest = TargetState(position, ZERO if is_jump else velocity, now, now)
+
+
+def _mean_velocity(start: Position, end: Position, seconds: float) -> tuple[float, float, float]:
+    """Return the velocity (north, east, down in m/s) of a target that moved from one position to the other."""
+    distance_m, bearing = start.distance_to(end), math.radians(start.bearing_to(end))
+    north_m, east_m = distance_m * math.cos(bearing), distance_m * math.sin(bearing)
+    return north_m / seconds, east_m / seconds, VehiclePosition.height_above(start, end) / seconds
 
 
 @checks_arguments
@@ -160,8 +168,8 @@ class FollowStream(SteeringStream[TargetState]):
             raise InvalidArgument("target is not allowed: a vehicle cannot follow itself")
         if not (autopilot.setpoints.global_position and autopilot.setpoints.velocity):
             raise NotSupported(f"follow: {autopilot.firmware} does not support position set-points; nothing was sent")
-        nowhere = TargetState(Position(0.0, 0.0), ZERO, -math.inf, -math.inf)
-        super().__init__(context, self._encode_place, nowhere, RATE_HZ, valid_for_s, MAX_LAG_S)
+        unknown = TargetState(Position(0.0, 0.0), ZERO, -math.inf, -math.inf)  # replaced when the block is entered
+        super().__init__(context, self._encode_place, unknown, RATE_HZ, valid_for_s, MAX_LAG_S)
         self._target, self._tracker = target, FollowedTarget(target, self._now)
         self._encode_position = SetpointEncoder(context).position
         self._place, self._max_distance_m = place, max_distance_m
@@ -188,9 +196,9 @@ class FollowStream(SteeringStream[TargetState]):
             SetpointStreamStopped: the stream has stopped; the error text has the reason.
         """
         until = math.inf if duration_s is None else self._now() + duration_s
-        while (left := until - self._now()) > 0:
+        while (remaining_s := until - self._now()) > 0:
             self._raise_if_stopped()
-            await anyio.sleep(min(left, POLL_INTERVAL_S))
+            await anyio.sleep(min(remaining_s, POLL_INTERVAL_S))
         self._raise_if_stopped()
 
     # ------------------------------------------------------------------------------- the block
@@ -198,13 +206,13 @@ class FollowStream(SteeringStream[TargetState]):
     async def __aenter__(self) -> Self:
         self._raise_if_entered()
         self._context.vehicle_position.check_flying("follow")
-        mode = self._wanted_mode()
+        mode = self._stream_mode()
         self._start_reading()
         try:
             with self._context.flight_cleanup.preparing(mode) as self._prepared_order:
                 self._value = await self._first_state()
                 self._choose_place(self._value.position)
-                self._take(self._value)  # Raises for an invalid place before the mode changes.
+                self._replace_value(self._value)  # Raises for an invalid place before the mode changes.
             return await super().__aenter__()
         except BaseException:
             self._stop_reading()
@@ -215,6 +223,7 @@ class FollowStream(SteeringStream[TargetState]):
         await super().__aexit__(exc_type, exc, traceback)
 
     def _start_reading(self) -> None:
+        """Read an asynchronous iterable in the background; other targets are read at each tick of the stream."""
         target = self._target
         if isinstance(target, HasTelemetry) or not isinstance(target, AsyncIterable):
             return
@@ -236,13 +245,16 @@ class FollowStream(SteeringStream[TargetState]):
             self._reading.cancel()
 
     async def _first_state(self) -> TargetState:
+        """Wait for a position of the target that is not too old."""
         until = self._now() + self._valid_for_s
-        while (state := self._tracker.read()) is None or self._now() - state.at > self._valid_for_s:
+        while True:
+            state = self._tracker.read()
+            if state is not None and self._now() - state.reported_at <= self._valid_for_s:
+                return state
             if self._now() > until or self._end_reason:
-                why = self._end_reason or f"no position of the target was known within {self._valid_for_s:g} s"
-                raise OperationTimeout(f"follow: {why}; a hold was ordered")
+                reason = self._end_reason or f"no position of the target was known within {self._valid_for_s:g} s"
+                raise OperationTimeout(f"follow: {reason}; a hold was ordered")
             await anyio.sleep(POLL_INTERVAL_S)
-        return state
 
     def _choose_place(self, target: Position) -> None:
         """Use the present bearing from the target and the present altitude where the caller gave none."""
@@ -254,48 +266,51 @@ class FollowStream(SteeringStream[TargetState]):
                 raise OperationRejected("follow: the vehicle's altitude above sea level is unknown; a hold was ordered")
             self._own_altitude_m = here.altitude_amsl_m
         elif target.altitude_amsl_m is None and target.altitude_relative_m is None:
-            raise InvalidArgument("height_m is not allowed: the target has no altitude; a hold was ordered")
+            raise InvalidArgument(
+                f"height_m = {self._place.height_m:g} is not allowed: the target has no altitude; a hold was ordered"
+            )
 
     # ------------------------------------------------------------------------------ the stream
 
-    def _wanted_mode(self) -> Mode:
+    def _stream_mode(self) -> Mode:
         return self._context.sender.mode_for("follow", "setpoint")
 
     def _tick(self, due: float) -> None:
         try:
             state = self._tracker.read()
             if state is not None:
-                self._take(state)
-                self._set_at = state.at
-        # The program's function raises CancelledError if it reads the result of a cancelled task.
+                self._replace_value(state)
+                self._set_at = state.reported_at  # The value expires by the age of the target's position.
         except (Exception, asyncio.CancelledError) as error:
+            # The program's function raises CancelledError if it reads the result of a cancelled task.
             self._end_reason = f"the position of the target raised {error!r}"
         super()._tick(due)
 
-    def _why_stop(self, lag: float) -> str | None:
+    def _stop_reason(self, lag: float) -> str | None:
         if self._end_reason:
             return self._end_reason
         if math.inf > self.distance_m > self._max_distance_m:
             return f"the target is {self.distance_m:.0f} m away (max_distance_m = {self._max_distance_m:g})"
-        return super()._why_stop(lag)
+        return super()._stop_reason(lag)
 
     def _encode_place(self, state: TargetState) -> Message:
         """Return the set-point for this moment, assuming that the target keeps its velocity between two positions."""
-        seconds = max(0.0, min(self._now() - state.since, self._valid_for_s))
+        moved_for_s = max(0.0, min(self._now() - state.first_reported_at, self._valid_for_s))
         north_m_s, east_m_s, down_m_s = state.velocity
         if math.hypot(north_m_s, east_m_s) >= MIN_COURSE_SPEED_M_S:
             self._course_deg = math.degrees(math.atan2(east_m_s, north_m_s))
         bearing = math.radians(self._bearing_deg + (self._course_deg if self._place.from_course else 0.0))
         distance_m = self._place.distance_m
         place = state.position.offset(
-            north_m=distance_m * math.cos(bearing) + north_m_s * seconds,
-            east_m=distance_m * math.sin(bearing) + east_m_s * seconds,
-            up_m=(self._place.height_m or 0.0) - down_m_s * seconds,
+            north_m=distance_m * math.cos(bearing) + north_m_s * moved_for_s,
+            east_m=distance_m * math.sin(bearing) + east_m_s * moved_for_s,
+            up_m=(self._place.height_m or 0.0) - down_m_s * moved_for_s,
         )
         if self._place.height_m is None:
             place = place.replace(altitude_amsl_m=self._own_altitude_m, altitude_relative_m=None)
             down_m_s = 0.0
         elif place.altitude_amsl_m is not None:  # The target's relative altitude may refer to another home.
             place = place.replace(altitude_relative_m=None)
-        yaw_deg = math.degrees(math.remainder(bearing + math.pi, 2 * math.pi)) if self._place.face_target else None
+        bearing_to_target = math.remainder(bearing + math.pi, 2 * math.pi)
+        yaw_deg = math.degrees(bearing_to_target) if self._place.face_target else None
         return self._encode_position(PositionSetpoint(place, yaw_deg), (north_m_s, east_m_s, down_m_s))

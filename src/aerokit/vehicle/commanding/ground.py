@@ -14,11 +14,12 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 SETTLING_S, SETTLED_M_S = 0.5, 2.0
-"""A vehicle on the ground moves up or down slower than this for this time, even on a ship. In the air, a vehicle whose
-motors stop while it climbs is so slow for 0.4 s at most."""
+"""A vehicle on the ground moves up or down slower than this for at least this time, even on a ship. A vehicle whose
+motors stop while it climbs is slower than this for 0.4 s at most."""
 
 UNSETTLED_S, UNSETTLED_M = 5.0, 2.0
-"""A vehicle whose height has not changed by this distance for this time is on the ground, whatever its velocity is."""
+"""A vehicle whose height has changed by less than this distance for this time is on the ground, whatever velocity it
+reports."""
 
 IMPACT_M_S = 6.0
 """Sink rate in m/s that no landing has right before touchdown. Autopilots descend at 5 m/s at most, and slow down."""
@@ -30,11 +31,13 @@ MAX_INTERVAL_S = 3.5
 """After a longer interval between two velocities, nothing is known about what happened in between."""
 
 STILL_M_S = 1.0
+"""A vehicle that moves up or down slower than this has stopped."""
 
 VELOCITY_MAX_AGE_S = 4.0
+"""Maximum age in seconds of a velocity that describes the present movement."""
 
 IMPACT_HEIGHT_M = 3.0
-"""After a change of height by this distance, an earlier stop was not on the ground."""
+"""If the height changes by this distance after a sudden stop, the stop was not on the ground."""
 
 MIN_DROP_M = 1.0
 """A vehicle that falls to ``IMPACT_M_S`` loses 1.8 m. If it lost less than this, its velocity jumped."""
@@ -51,10 +54,11 @@ class ImpactDetector:
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
-        self._updated_at = self._fast_at = -math.inf
+        self._updated_at = self._sank_fast_at = -math.inf
         self._max_sink_m_s = 0.0
+        # Sink rate before the impact, and height of the place of the impact.
         self._impact_m_s: float | None = None
-        self._height_m: float | None = None
+        self._impact_height_m: float | None = None
         # Height before the descent; None if it is unknown.
         self._top_m: float | None = None
         self._has_stopped = False
@@ -67,24 +71,24 @@ class ImpactDetector:
             return
         # Velocities may arrive less often than the time that an impact takes.
         interval_s = min(cell.updated_at - self._updated_at, MAX_INTERVAL_S)
-        limit_s = max(IMPACT_STOP_S, 1.5 * interval_s)
+        max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = cell.updated_at
         height_m = self._current_height()
         if velocity.down_m_s >= IMPACT_M_S:
-            is_new = cell.updated_at - self._fast_at > limit_s
-            self._max_sink_m_s = velocity.down_m_s if is_new else max(self._max_sink_m_s, velocity.down_m_s)
-            self._fast_at = cell.updated_at
-        elif abs(velocity.down_m_s) < STILL_M_S and cell.updated_at - self._fast_at <= limit_s:
+            is_new_descent = cell.updated_at - self._sank_fast_at > max_stop_s
+            self._max_sink_m_s = velocity.down_m_s if is_new_descent else max(self._max_sink_m_s, velocity.down_m_s)
+            self._sank_fast_at = cell.updated_at
+        elif abs(velocity.down_m_s) < STILL_M_S and cell.updated_at - self._sank_fast_at <= max_stop_s:
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
-                self._impact_m_s, self._height_m = self._max_sink_m_s, height_above_home(self._session.telemetry)
-        elif _has_changed(self._height_m, height_above_home(self._session.telemetry), IMPACT_HEIGHT_M):
-            self._impact_m_s = self._height_m = None
-        if velocity.down_m_s < STILL_M_S and cell.updated_at - self._fast_at > limit_s:
+                self._impact_m_s, self._impact_height_m = self._max_sink_m_s, height_above_home(self._session.telemetry)
+        elif _has_changed(self._impact_height_m, height_above_home(self._session.telemetry), IMPACT_HEIGHT_M):
+            self._impact_m_s = self._impact_height_m = None
+        if velocity.down_m_s < STILL_M_S and cell.updated_at - self._sank_fast_at > max_stop_s:
             self._top_m = height_m
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S
         self._has_stopped = self._impact_m_s is not None and (self._has_stopped or is_slow)
 
-    def text(self) -> str:
+    def describe(self) -> str:
         """Return the impact as a clause; empty if there was none, or the vehicle has left the place of the impact."""
         if self._impact_m_s is None or not self._has_stopped:
             return ""
@@ -127,11 +131,11 @@ class GroundCheck:
         if self._reported_at is None:
             self._reported_at, self._settled_since = now, math.inf
             self._reported_height_m = height_above_home(self._session.telemetry)
-        return self._has_settled(now, velocity.updated_at) and not self._impact.text()
+        return self._has_settled(now, velocity.updated_at) and not self._impact.describe()
 
-    def trouble(self, before: Callable[[], str | None]) -> str | None:
-        """Return a clause if a vehicle that is reported on the ground falls or fell; otherwise ``before()``."""
-        return self.fall() if self.is_pending else before()
+    def failure_reason(self, in_flight: Callable[[], str | None]) -> str | None:
+        """Return a clause if a vehicle that is reported on the ground falls or fell; before that, ``in_flight()``."""
+        return self.fall() if self.is_pending else in_flight()
 
     def fall(self) -> str | None:
         """Return a clause if the vehicle has hit the ground, or sinks fast although it is reported on the ground."""
@@ -139,15 +143,18 @@ class GroundCheck:
         is_newer = self._reported_at is not None and telemetry.velocity.updated_at > self._reported_at
         if is_newer and telemetry.is_confirmed_disarmed and self._down_m_s() >= FALL_SINK_M_S:
             return f"the vehicle was disarmed in the air and sinks at {self._down_m_s():.1f} m/s"
-        return self._impact.text() or None
+        return self._impact.describe() or None
 
     def _has_settled(self, now: float, updated_at: float) -> bool:
+        """Return True if the vehicle moves as on the ground; ``updated_at`` is the time of the last velocity."""
         reported_at = now if self._reported_at is None else self._reported_at
         if now - updated_at > VELOCITY_MAX_AGE_S:
+            # Without a recent velocity, it is enough that the vehicle reports to be on the ground.
             return True
         if abs(self._down_m_s()) >= SETTLED_M_S:
             self._settled_since = math.inf
             height_m = height_above_home(self._session.telemetry)
+            # The reported velocity may be wrong: a vehicle whose height does not change stands on the ground.
             is_known = height_m is not None and self._reported_height_m is not None
             is_still = is_known and not _has_changed(self._reported_height_m, height_m, UNSETTLED_M)
             return is_still and now - reported_at >= UNSETTLED_S
@@ -159,5 +166,5 @@ class GroundCheck:
         return 0.0 if velocity is None else velocity.down_m_s
 
 
-def _has_changed(before_m: float | None, now_m: float | None, by_m: float) -> bool:
-    return before_m is not None and now_m is not None and abs(now_m - before_m) > by_m
+def _has_changed(before_m: float | None, now_m: float | None, min_change_m: float) -> bool:
+    return before_m is not None and now_m is not None and abs(now_m - before_m) > min_change_m

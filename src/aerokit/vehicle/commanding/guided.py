@@ -177,11 +177,11 @@ class Guided:
             NotSupported: this firmware ignores the message, or its version is not known yet. Nothing was sent.
         """
         session = self._context.session
-        until, version = session.autopilot.actuators_until, session.telemetry.version.latest
-        if until is None or version is None or version.number[:2] >= until:
-            known = "of unknown version" if version is None else str(version.firmware)
+        version, supported_before = session.telemetry.version.latest, session.autopilot.actuators_until
+        if supported_before is None or version is None or version.number[:2] >= supported_before:
+            version_text = "of unknown version" if version is None else str(version.firmware)
             raise NotSupported(
-                f"{session.autopilot.firmware} {known} ignores SET_ACTUATOR_CONTROL_TARGET; only PX4 before 1.14"
+                f"{session.autopilot.firmware} {version_text} ignores SET_ACTUATOR_CONTROL_TARGET; only PX4 before 1.14"
                 " executes it. Use vehicle.guided.attitude_rate()"
             )
         return SetpointStream(self._context, self._encode.actuators, initial, rate_hz, valid_for_s, max_lag_s)
@@ -191,8 +191,8 @@ class Guided:
     ) -> SetpointStream[SetpointT]:
         autopilot = self._context.session.autopilot
         if kind not in autopilot.setpoints.names:
-            obeyed = ", ".join(autopilot.setpoints.names) or "none"
-            raise NotSupported(f"{autopilot.firmware} does not support {kind} set-points; supported: {obeyed}")
+            supported = ", ".join(autopilot.setpoints.names) or "none"
+            raise NotSupported(f"{autopilot.firmware} does not support {kind} set-points; supported: {supported}")
         return SetpointStream(self._context, encode, initial, *limits)
 
 
@@ -223,8 +223,8 @@ class SetpointStream(SteeringStream[SetpointT]):
     ) -> None:
         super().__init__(context, encode, initial, rate_hz, valid_for_s, max_lag_s)
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
-        self._is_costly = is_place and context.session.autopilot.setpoints.position_restarts_path
-        self._left, self._sent_at = INITIAL_REPEATS, -math.inf
+        self._restarts_path = is_place and context.session.autopilot.setpoints.position_restarts_path
+        self._repeats_left, self._sent_at = INITIAL_REPEATS, -math.inf
         self._stall = StallDetector(context.session)
         if isinstance(initial, BRAKED_BY_AUTOPILOT):
             self._impact = ImpactDetector(context.session)
@@ -246,23 +246,24 @@ class SetpointStream(SteeringStream[SetpointT]):
             SetpointStreamStopped: the stream ended meanwhile.
         """
         check_kind("setpoint", setpoint, type(self._value))
-        await self._feed(setpoint, duration_s)
+        await self._supply_for(setpoint, duration_s)
 
-    def _wanted_mode(self) -> Mode:
+    def _stream_mode(self) -> Mode:
         return self._context.sender.mode_for("a set-point stream", "setpoint")
 
-    def _take(self, value: SetpointT) -> None:
-        before = self._value
-        super()._take(value)
-        if value != before:
-            self._left = INITIAL_REPEATS
+    def _replace_value(self, value: SetpointT) -> None:
+        value_before = self._value
+        super()._replace_value(value)
+        if value != value_before:
+            self._repeats_left = INITIAL_REPEATS
 
     def _send(self) -> None:
-        if not self._is_costly or self._left > 0 or self._now() - self._sent_at >= REPEAT_INTERVAL_S:
+        is_due = self._repeats_left > 0 or self._now() - self._sent_at >= REPEAT_INTERVAL_S
+        if is_due or not self._restarts_path:
             super()._send()
-            self._left, self._sent_at = self._left - 1, self._now()
+            self._repeats_left, self._sent_at = self._repeats_left - 1, self._now()
 
-    def _why_stop(self, lag: float) -> str | None:
+    def _stop_reason(self, lag: float) -> str | None:
         if self._mode is None or not wants_motion(self._value, self._context):
-            self._stall = StallDetector(self._session)
-        return super()._why_stop(lag) or self._stall()
+            self._stall = StallDetector(self._session)  # Begin anew, because the vehicle need not move now.
+        return super()._stop_reason(lag) or self._stall()

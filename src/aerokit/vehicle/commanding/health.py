@@ -32,7 +32,7 @@ class Health:
         session.at_close(session.connection.bus.attach_event(LinkRestored, self._on_restored))
 
     def _on_restored(self, event: LinkRestored) -> None:
-        """Discard states received before a silence, because the vehicle may have rebooted."""
+        """Distrust states received before the link was restored, because the vehicle may have rebooted meanwhile."""
         self._restored_at = event.at
 
     def missing_for_flight(self) -> list[str]:
@@ -49,20 +49,21 @@ class Health:
         """Return the states that are too old to describe the present."""
         telemetry = self._telemetry
         is_lost = self._session.watch.link_state.latest is LinkState.LOST
-        why = f"the last one {self._session.heartbeat_age:.1f} s ago{', the link is lost' if is_lost else ''}"
-        heartbeats = [f"heartbeats ({why})"] if is_lost or self._session.watch.is_silent else []
+        lost_link = ", the link is lost" if is_lost else ""
+        last_heartbeat = f"the last one {self._session.heartbeat_age:.1f} s ago{lost_link}"
+        heartbeats = [f"heartbeats ({last_heartbeat})"] if is_lost or self._session.watch.is_silent else []
         cells = (telemetry.sensors, telemetry.estimator, telemetry.position)
-        old = [
+        too_old = [
             f"{cell.name} (no {cell.waits_for} for {cell.age:.0f} s)"
             for cell in cells
             if HEALTH_MAX_AGE_S < cell.age < math.inf
         ]
-        before = [
+        from_before_silence = [
             f"{cell.name} (no {cell.waits_for} since the link was restored)"
             for cell in cells
             if cell.is_known and cell.updated_at < self._restored_at and cell.age <= HEALTH_MAX_AGE_S
         ]
-        return [*heartbeats, *old, *before]
+        return [*heartbeats, *too_old, *from_before_silence]
 
     async def why_not_armable(self) -> list[str]:
         """Return why arming would be refused now. The vehicle is requested to run its checks if it supports that."""
@@ -77,33 +78,33 @@ class Health:
         """
         with self._session.streaming("sensors", "estimator"):
             await self._session.wait_for_status_texts()
-            await self._ask_for_texts(since)
+            await self._request_texts(since)
             await self._refresh()
         mode = self._telemetry.mode.latest
         needs_position = mode is None or mode.name not in self._autopilot.modes_without_position
         failing = self._failing() if needs_position else self._failing_sensors()
-        found = (self.arming_texts(since), self.unarmable_mode(), self._out_of_date(), failing)
-        return self._session.deduplicate_reasons(*(reason for reasons in found for reason in reasons))
+        reasons = [*self.arming_texts(since), *self.unarmable_mode(), *self._out_of_date(), *failing]
+        return self._session.deduplicate_reasons(*reasons)
 
     def unarmable_mode(self) -> list[str]:
         """Return a list with one text if the present mode does not allow arming, otherwise an empty list."""
         mode = self._telemetry.mode.latest
-        return [self.unarmable_text(mode)] if mode is not None and mode.name in self._left_modes() else []
+        return [self.unarmable_text(mode)] if mode is not None and mode.name in self._modes_to_leave() else []
 
     def unarmable_text(self, mode: Mode) -> str:
         """Return a sentence that names the modes that allow arming."""
         option = self._autopilot.armable_by_option.get(mode.name)
-        others = ", ".join(sorted({*self._autopilot.modes.names} - self._left_modes()))
+        armable_modes = ", ".join(sorted({*self._autopilot.modes.names} - self._modes_to_leave()))
         if option is None:
-            text = f"{self._autopilot.firmware} cannot arm in {mode.name}, only in {others}"
+            text = f"{self._autopilot.firmware} cannot arm in {mode.name}, only in {armable_modes}"
         else:
             text = f"{self._autopilot.firmware} cannot arm in {mode.name} unless {option} allows it"
-        better = self._autopilot.mode_to_arm_in()
+        arming_mode = self._autopilot.mode_to_arm_in()
         when = "first" if option is None else "after a refusal"
-        return text if better is None else f"{text}; arm() changes to {better.name} {when}"
+        return text if arming_mode is None else f"{text}; arm() changes to {arming_mode.name} {when}"
 
-    def _left_modes(self) -> frozenset[str]:
-        """Return the modes that `arm` leaves."""
+    def _modes_to_leave(self) -> frozenset[str]:
+        """Return the names of the modes that `arm` changes to another mode before arming, or after a refusal."""
         return self._autopilot.unarmable_modes.union(self._autopilot.armable_by_option)
 
     async def _refresh(self) -> None:
@@ -116,9 +117,10 @@ class Health:
         """Make the vehicle report why its pre-arm checks fail, unless it has done so since this time."""
         sensors = self._telemetry.sensors.latest
         if sensors is not None and sensors.prearm_checks_pass is False and not self._telemetry.is_armed:
-            await self._ask_for_texts(since)
+            await self._request_texts(since)
 
-    async def _ask_for_texts(self, since: float) -> None:
+    async def _request_texts(self, since: float) -> None:
+        """Request the vehicle to run its pre-arm checks, unless it has sent texts about arming since this time."""
         if self.arming_texts(since) or not self._autopilot.runs_prearm_checks:
             return
         try:
@@ -148,14 +150,14 @@ class Health:
         """Return failing sensors and failing pre-arm checks.
 
         If the vehicle reports that it can be armed, failing sensors are left out, because they are not required (for
-        example an RC receiver on PX4). In a mode that does not allow arming, PX4 evaluates the requirements of that
-        mode, which say nothing about arming. PX4 reports a missing RC receiver as failing even in modes that do not
-        require a receiver.
+        example an RC receiver on PX4). PX4 reports a missing RC receiver as failing even in modes that do not require a
+        receiver.
         """
         failing: list[str] = []
         sensors = self._telemetry.sensors.latest
-        says_nothing = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
-        if sensors is not None and sensors.prearm_checks_pass is not True and not says_nothing:
+        # PX4 then reports the requirements of the present mode, in which it cannot arm.
+        is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
+        if sensors is not None and sensors.prearm_checks_pass is not True and not is_meaningless:
             failing += [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing if self._is_required(name)]
             if sensors.prearm_checks_pass is False:
                 failing.append("the vehicle's pre-arm checks do not pass (SYS_STATUS)")
@@ -164,5 +166,5 @@ class Health:
     def _is_required(self, sensor: str) -> bool:
         """Return False for an RC receiver that the present mode does not require."""
         mode, modes_with_rc = self._telemetry.mode.latest, self._autopilot.modes_with_rc
-        is_other_mode = mode is not None and modes_with_rc is not None and mode.name not in modes_with_rc
-        return not (is_other_mode and sensor.startswith(RC_RECEIVER))
+        needs_rc = mode is None or modes_with_rc is None or mode.name in modes_with_rc
+        return needs_rc or not sensor.startswith(RC_RECEIVER)

@@ -30,7 +30,9 @@ YAW_BEHAVIOURS: dict[str, OrbitYawBehaviour] = {
 }
 VTOL_STATES: dict[str, MavVtolState] = {"fixed_wing": MavVtolState.FW, "multicopter": MavVtolState.MC}
 MAX_RADIUS_M, MAX_SPEED_M_S, MAX_ROUNDS = 10_000, 50, 1000
-MAX_SET_SPEED_M_S, KEEP_THROTTLE = 1000, -1.0
+MAX_SET_SPEED_M_S = 1000
+KEEP_THROTTLE = -1.0
+"""param3 of DO_CHANGE_SPEED that leaves the throttle unchanged."""
 
 
 @checks_arguments
@@ -91,11 +93,11 @@ class ManeuverActions(VehicleBase):
         if self.autopilot.circles_by == "setpoints":
             flight = RoundFlight(self._context, "orbit", place, counter, turns, limits)
             path = Circle(radius_m, clockwise=clockwise, first_phase=flight.bearing_rad)
-            await flight.by_setpoints(path, speed_m_s, facing)
+            await flight.fly_by_setpoints(path, speed_m_s, facing)
         else:
-            command, params, mode = self._circling("orbit", radius_m, speed_m_s, facing, clockwise=clockwise)
+            command, params, mode = self._circle_command("orbit", radius_m, speed_m_s, facing, clockwise=clockwise)
             flight = RoundFlight(self._context, "orbit", place, counter, turns, limits)
-            await flight.by_command(command, params, mode, is_held=not self._is_on_wings, circle_m=radius_m)
+            await flight.fly_by_command(command, params, mode, is_held=not self._is_on_wings, circle_m=radius_m)
 
     async def figure_eight(
         self,
@@ -151,10 +153,10 @@ class ManeuverActions(VehicleBase):
             major_m = major_radius_m if clockwise else -major_radius_m
             params = (major_m, minor_radius_m, 0, math.radians(axis_deg))
             mode = self._sender.mode_for("figure_eight", "hold")
-            await flight.by_command(MavCmd.DO_FIGURE_EIGHT, params, mode, is_held=False)
+            await flight.fly_by_command(MavCmd.DO_FIGURE_EIGHT, params, mode, is_held=False)
         else:
             path = Eight(major_radius_m, minor_radius_m, axis_deg, clockwise=clockwise)
-            await flight.by_setpoints(path, speed_m_s, "ahead")
+            await flight.fly_by_setpoints(path, speed_m_s, "ahead")
 
     async def loiter(
         self,
@@ -211,15 +213,16 @@ class ManeuverActions(VehicleBase):
         center = self.telemetry.position.fresh(POSITION_MAX_AGE_S) if target is None else travel_target(target)
         if radius_m is None:
             counter, command = None, int(MavCmd.DO_REPOSITION)
+            # The speed, the radius and the yaw are left to the vehicle.
             params: tuple[float, ...] = (-1.0, float(MavDoRepositionFlags.CHANGE_MODE), 0.0, math.nan)
             mode = self._sender.mode_for("loiter", self.autopilot.reposition_purpose)
         else:
             counter = TurnCounter(radius_m, clockwise=clockwise)
-            command, params, mode = self._circling("loiter", radius_m, math.nan, "free", clockwise=clockwise)
+            command, params, mode = self._circle_command("loiter", radius_m, math.nan, "free", clockwise=clockwise)
         limits = (max_distance_m, timeout, max_silence_s)
         flight = RoundFlight(self._context, "loiter", center, counter, turns or 0.0, limits)
         stay_s, circle_m = duration_s or 0.0, radius_m or 0.0
-        await flight.by_command(command, params, mode, is_held=False, stay_s=stay_s, circle_m=circle_m)
+        await flight.fly_by_command(command, params, mode, is_held=False, stay_s=stay_s, circle_m=circle_m)
 
     def follow(
         self,
@@ -266,26 +269,30 @@ class ManeuverActions(VehicleBase):
         place = FollowPlace(distance_m, bearing_deg, from_course, height_m, face_target)
         return FollowStream(self._context, target, place, valid_for_s, max_distance_m)
 
-    def _circling(
-        self, what: str, radius_m: float, speed_m_s: float, facing: Facing, *, clockwise: bool
+    def _circle_command(
+        self, operation: str, radius_m: float, speed_m_s: float, facing: Facing, *, clockwise: bool
     ) -> tuple[int, tuple[float, ...], Mode]:
         """Return the command that circles a place, its first four parameters, and the mode that it leads to."""
         if self.autopilot.circles_by == "orbit":
-            radius = radius_m if clockwise else -radius_m
-            params: tuple[float, ...] = (radius, speed_m_s, float(YAW_BEHAVIOURS[facing]), 0.0)
-            orbit = self.autopilot.modes.find("ORBIT")
-            mode = self._sender.mode_for(what, "hold") if self._is_on_wings else orbit
+            signed_radius_m = radius_m if clockwise else -radius_m
+            params: tuple[float, ...] = (signed_radius_m, speed_m_s, float(YAW_BEHAVIOURS[facing]), 0.0)
+            # PX4's multicopters have a mode for circles; its fixed wings circle in the hold mode.
+            orbit_mode = self.autopilot.modes.find("ORBIT")
+            mode = self._sender.mode_for(operation, "hold") if self._is_on_wings else orbit_mode
             return MavCmd.DO_ORBIT, params, mode
         if self.autopilot.circles_by == "reposition":
+            # The speed is left to the vehicle. param4 is the direction of the circle (GCS_MAVLink_Plane.cpp).
             params = (-1.0, float(MavDoRepositionFlags.CHANGE_MODE), radius_m, 0.0 if clockwise else 1.0)
-            return MavCmd.DO_REPOSITION, params, self._sender.mode_for(what, "setpoint")
-        raise NotSupported(f"{what}: {self.autopilot.firmware} cannot circle a place; nothing was sent")
+            return MavCmd.DO_REPOSITION, params, self._sender.mode_for(operation, "setpoint")
+        raise NotSupported(f"{operation}: {self.autopilot.firmware} cannot circle a place; nothing was sent")
 
     @property
     def _is_on_wings(self) -> bool:
         """True for a fixed wing and for a VTOL in forward flight, which cannot stop."""
-        state = self.telemetry.vtol_state.latest
-        return state == MavVtolState.FW if state else self.vehicle_type == MavType.FIXED_WING
+        vtol_state = self.telemetry.vtol_state.latest
+        if vtol_state:  # neither unknown nor MAV_VTOL_STATE_UNDEFINED (0), so the vehicle is a VTOL
+            return vtol_state == MavVtolState.FW
+        return self.vehicle_type == MavType.FIXED_WING
 
     async def transition_to(self, state: FlightState, *, timeout: float = 60.0) -> None:
         """Change a VTOL between hover and forward flight (MAV_CMD_DO_VTOL_TRANSITION).
@@ -308,17 +315,17 @@ class ManeuverActions(VehicleBase):
         """
         if MavCmd.DO_VTOL_TRANSITION in self.autopilot.unsupported_commands or not self.telemetry.is_vtol:
             raise NotSupported(f"transition_to: this {self.autopilot.firmware} vehicle is not a VTOL; nothing was sent")
-        wanted, cell = VTOL_STATES[state], self.telemetry.vtol_state
+        target_state, cell = VTOL_STATES[state], self.telemetry.vtol_state
         with self._arbiter.auxiliary_order() as order:
             started = self.connection.now()
-            await self._sender.send_long(order, MavCmd.DO_VTOL_TRANSITION, float(wanted))
-            hits_ground = self._sender.hits_ground(order)
+            await self._sender.send_long(order, MavCmd.DO_VTOL_TRANSITION, float(target_state))
+            impact = self._sender.impact_failure(order)
             with self._session.streaming("vtol_state"):
                 await await_progress(
                     self._session,
                     f"transition_to({state})",
-                    is_done=lambda: cell.latest == wanted and cell.updated_at > started,
-                    trouble=lambda: hits_ground() or order.takeover_reason,
+                    is_done=lambda: cell.latest == target_state and cell.updated_at > started,
+                    failure_reason=lambda: impact() or order.takeover_reason,
                     describe=lambda: f"MAV_VTOL_STATE is {cell.latest}",
                     timeout=timeout,
                 )
@@ -347,8 +354,9 @@ class ManeuverActions(VehicleBase):
         """
         await self._set_speed("set_climb_speed", SpeedType.CLIMB_SPEED, climb_m_s)
 
-    async def _set_speed(self, what: str, kind: SpeedType, speed_m_s: float) -> None:
-        check_range(SPEED_ARGUMENTS[kind], speed_m_s, 0, MAX_SET_SPEED_M_S, above=True)
-        if kind not in self.autopilot.speed_types:
-            raise NotSupported(f"{what}: {self.autopilot.firmware} has no SPEED_TYPE_{kind.name}; nothing was sent")
-        await self._sender.auxiliary_command(MavCmd.DO_CHANGE_SPEED, float(kind), speed_m_s, KEEP_THROTTLE)
+    async def _set_speed(self, operation: str, speed_type: SpeedType, speed_m_s: float) -> None:
+        check_range(SPEED_ARGUMENTS[speed_type], speed_m_s, 0, MAX_SET_SPEED_M_S, above=True)
+        if speed_type not in self.autopilot.speed_types:
+            firmware = self.autopilot.firmware
+            raise NotSupported(f"{operation}: {firmware} has no SPEED_TYPE_{speed_type.name}; nothing was sent")
+        await self._sender.auxiliary_command(MavCmd.DO_CHANGE_SPEED, float(speed_type), speed_m_s, KEEP_THROTTLE)

@@ -30,12 +30,16 @@ if TYPE_CHECKING:
     from aerokit.events import LinkState
     from aerokit.vehicle.session.session import VehicleSession
 
+# Values of ``req_stream_id`` and ``target_component`` in REQUEST_DATA_STREAM.
 ALL_GROUPS = ALL_COMPONENTS = 0
 
+# Seconds until the first streamed message must arrive after a request.
 FIRST_MESSAGE_TIMEOUT_S = 3.0
 
+# While no message arrives, the interval between requests doubles up to this many seconds.
 MAX_RETRY_INTERVAL_S = 60.0
 
+# The arrival of any of these messages shows that the vehicle streams.
 REQUESTED_STREAMS: tuple[type[Message], ...] = (
     m.Attitude,
     m.GlobalPositionInt,
@@ -62,12 +66,12 @@ def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
     """Implement ``Vehicle.streams``."""
     check_range("rate_hz", rate_hz, 0, 1000, above=True)
     tasks = BackgroundTasks(session.connection.fail)
-    with ExitStack() as ends:
+    with ExitStack() as cleanup:
         if session.autopilot.stream_groups:
-            monitor = _StreamMonitor(session, ends)
+            monitor = _StreamMonitor(session, cleanup)
             tasks.start(lambda: _request_repeatedly(session, rate_hz, monitor), "aerokit streams")
         else:
-            tasks.start(lambda: _request_missing(session, rate_hz, ends), "aerokit streams")
+            tasks.start(lambda: _request_missing(session, rate_hz, cleanup), "aerokit streams")
         try:
             yield
         finally:
@@ -75,45 +79,48 @@ def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
 
 
 async def _request_repeatedly(session: VehicleSession, rate_hz: float, monitor: _StreamMonitor) -> None:
+    """Request all streams by REQUEST_DATA_STREAM, again when none arrives or when an event requires it."""
     retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
     rate = max(1, round(rate_hz))
     while True:
         session.send(m.RequestDataStream(session.system_id, ALL_COMPONENTS, ALL_GROUPS, rate, 1))
-        monitor.forget()
+        monitor.reset()
         with anyio.move_on_after(retry_interval_s):
             await monitor.must_request.wait()
             retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
             continue
         retry_interval_s = min(2 * retry_interval_s, MAX_RETRY_INTERVAL_S)
-        if monitor.has_received:
+        if monitor.has_received:  # The vehicle streams, so only an event requires a new request.
             await monitor.must_request.wait()
             retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
 
 
-async def _request_missing(session: VehicleSession, rate_hz: float, ends: ExitStack) -> None:
+async def _request_missing(session: VehicleSession, rate_hz: float, cleanup: ExitStack) -> None:
+    """Request the states that a vehicle which streams by itself does not stream."""
     await anyio.sleep(FIRST_MESSAGE_TIMEOUT_S)
     telemetry = session.telemetry
     missing = [name for name in REQUIRED_STATES if not telemetry.cells[name].is_known]
     for message_type in dict.fromkeys(
         message_type for name in missing for message_type in telemetry.required_messages(name)
     ):
-        ends.callback(session.rates.request(message_type, rate_hz))
+        cleanup.callback(session.rates.request(message_type, rate_hz))
 
 
 class _StreamMonitor:
     """Tracks whether streamed messages arrive, and decides whether the streams must be requested again."""
 
-    def __init__(self, session: VehicleSession, ends: ExitStack) -> None:
+    def __init__(self, session: VehicleSession, cleanup: ExitStack) -> None:
         self.has_received = False
         self.must_request = asyncio.Event()
         self._system_id = session.system_id
         bus = session.connection.bus
         for message_type in REQUESTED_STREAMS:
-            ends.callback(bus.attach(message_type, self._on_message, system_id=session.system_id))
+            cleanup.callback(bus.attach(message_type, self._on_message, system_id=session.system_id))
         for event_type in (LinkSelected, LinkRestored, VehicleRecovered, VehicleRebooted):
-            ends.callback(bus.attach_event(event_type, self._on_event))
+            cleanup.callback(bus.attach_event(event_type, self._on_event))
 
-    def forget(self) -> None:
+    def reset(self) -> None:
+        """Forget what was received before a new request."""
         self.has_received, self.must_request = False, asyncio.Event()
 
     def _on_message(self, message: Message) -> None:
@@ -172,7 +179,7 @@ class MessagingActions(VehicleBase):
             CommandTimeout: there was no ack. The error text has the attempts, the seconds, the age of the last
                 heartbeat and the packet loss.
         """
-        return await self._sender.answered(
+        return await self._sender.send_raw(
             self._session.commands.send_long,
             command,
             *params,
@@ -205,13 +212,13 @@ class MessagingActions(VehicleBase):
         ``frame`` must then be 0. Other arguments and errors are those of :meth:`command`.
         """
         if or_long and frame != MavFrame.GLOBAL:
-            raise InvalidArgument(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
-        kind = {} if or_long else {"frame": frame}
-        return await self._sender.answered(
+            raise InvalidArgument(f"frame = {frame} is not allowed with or_long: it must be MAV_FRAME_GLOBAL (0)")
+        frame_option = {} if or_long else {"frame": frame}  # `send_place` has a fixed frame.
+        return await self._sender.send_raw(
             self._session.commands.send_place if or_long else self._session.commands.send_int,
             command,
             *params,
-            **kind,
+            **frame_option,
             x=x,
             y=y,
             z=z,
@@ -240,17 +247,17 @@ class MessagingActions(VehicleBase):
         target = getattr(message, "target_system", self.system_id)
         subjects = subjects_of(message) if target in (ALL_SYSTEMS, self.system_id) else ()
         if subjects == ARM_ALONE and isinstance(message, (CommandInt, CommandLong)):
-            self._arbiter.note_own_arming(message.param1 == 1)
+            self._arbiter.record_own_arming(message.param1 == 1)
         elif subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
             names = self.telemetry.mode_names
-            modes: tuple[Mode, ...] = ()
-            if not isinstance(message, SetMode):
+            modes: tuple[Mode, ...] = ()  # An empty tuple: any mode may be the effect of the message.
+            if isinstance(message, (CommandInt, CommandLong)):
                 params = (message.param1, message.param2, message.param3, message.param4)
                 modes = self.autopilot.modes_of_command(message.command, params, names)
             elif message.base_mode & CUSTOM_MODE_ENABLED:
                 modes = (self.autopilot.mode(message.custom_mode, message.base_mode, names),)
             self._arbiter.raw_order(subjects, modes=modes)
-        elif subjects:
+        elif subjects:  # A set-point ends posted orders, but not the action in progress.
             self._arbiter.supersede(subjects)
 
     @contextmanager
@@ -260,10 +267,10 @@ class MessagingActions(VehicleBase):
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         Within the block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged or
-        their effect is reported. A newer order about the same subject ends the retries. So does a mode that neither
-        this order nor another order of the last ten seconds explains, and disarming if the order is about motion. If a
-        posted order is abandoned, aerokit neither makes the vehicle hold nor monitors late arming; use the actions for
-        that.
+        their effect is reported. The retries also end when a newer order about the same subject is given, when the
+        vehicle changes to a mode that neither this order nor another order of the last ten seconds explains, and, if
+        the order is about motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
+        vehicle hold nor monitors late arming; use the actions for that.
 
         Args:
             subjects: ``"mode"``, ``"motion"`` or ``"arm"``. A newer order about the first subject ends this order. This

@@ -30,9 +30,11 @@ ROI: Topic = "region of interest"
 SUPERSEDED = "another order was given"
 """Reason for the end of an order that a newer order replaced."""
 
+# A new mode also changes how the vehicle moves.
 _MODE: tuple[Subject, ...] = ("mode", "motion")
 _MOTION: tuple[Subject, ...] = ("motion",)
 ARM_ALONE: tuple[Subject, ...] = ("arm",)
+"""Subjects of a command that only arms or disarms."""
 CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
     MavCmd.NAV_RETURN_TO_LAUNCH: _MODE,
     MavCmd.NAV_LAND: _MODE,
@@ -60,11 +62,13 @@ CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
     "SET_POSITION_TARGET_GLOBAL_INT": _MOTION,
     "MISSION_SET_CURRENT": _MOTION,
 }
+"""Maps the name of a message to the subjects that it changes. Commands and mission items are not in this table."""
 FAILSAFE_STATES = (MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMINATION)
 """Values of HEARTBEAT.system_status while a failsafe is active. PX4 reports them seconds before the failsafe changes
 the mode (COM_FAIL_ACT_T). An order that arrives in between cancels the failsafe.
 """
-# Values of MISSION_ITEM.current for an item that the vehicle flies to at once.
+# Values of MISSION_ITEM.current for an item that ArduPilot executes at once instead of storing it: 2 is a place to fly
+# to, 3 a new altitude (GCS_Common.cpp).
 GUIDED_ITEM = (2, 3)
 REQUEST_COMMANDS = frozenset(
     (
@@ -94,10 +98,11 @@ def subjects_of(message: Message) -> tuple[Subject, ...]:
     return CHANGED_BY_MESSAGE.get(message.NAME, ())
 
 
-def is_worse(state: int, before: int | None) -> bool:
+def is_worse_failsafe(state: int, state_before: int | None) -> bool:
     """Return True if this MAV_STATE reports a failsafe, and the previous MAV_STATE none or a less severe failsafe."""
-    is_first = before is None or before not in FAILSAFE_STATES
-    return state in FAILSAFE_STATES and (is_first or state > (before or 0))
+    if state not in FAILSAFE_STATES:
+        return False
+    return state_before is None or state_before not in FAILSAFE_STATES or state > state_before
 
 
 def failsafe_text(state: int) -> str:
@@ -118,8 +123,8 @@ class Order:
     - ``mode_before`` was active when the order was given.
     - ``modes`` are the order's own modes.
     - ``expected`` modes may appear in any sequence until ``settles_at``, because the program ordered them shortly
-    before. Once one of the order's own modes is reported, they are no longer accepted. With ``requires_mode_change``,
-    that own mode must differ from the previous mode.
+      before. They are no longer accepted once one of the order's own modes is reported; with ``requires_mode_change``,
+      once the mode changes to one of the order's own modes.
     - Until ``any_until`` every mode is accepted, because the program sent a raw command with an unknown effect.
     - Any other mode is attributed to the pilot or a failsafe.
     """
@@ -146,6 +151,7 @@ class Order:
     ) -> None:
         self.given_at: float = given_at
         self.number: int = number
+        """Sequence number: a newer order has a greater number."""
         self.ended_by: tuple[Topic, ...] = tuple(ended_by)
         self.modes: tuple[Mode, ...] = tuple(modes)
         self.armed = armed
@@ -158,7 +164,7 @@ class Order:
         """True if the vehicle refused the order, and therefore continues its previous task."""
         self.was_flown_before: bool = False
         """True if the vehicle was executing another order of this program before this order."""
-        self.before: Order | None = None
+        self.previous: Order | None = None
         """The previous order about the same device, which becomes valid again if this order is withdrawn."""
         self.is_withdrawn: bool = False
         self.takeover_reason: str = ""
@@ -174,22 +180,23 @@ class Order:
         self.has_lost_mode: bool = False
         """True if the vehicle has changed to a mode that the order does not explain."""
         self.mode_lost_at: float = -math.inf
-        """Time of this change of the mode. CURRENT_MODE may report it before HEARTBEAT, which may also report
-        disarming.
+        """Time at which the vehicle reported that mode. CURRENT_MODE may report it before the HEARTBEAT that reports
+        the mode and, after a landing, disarming.
         """
         self.is_confirmed: bool = False
         """True once a change to one of the order's modes, or to its armed state, was reported."""
-        self._before = set() if mode_before is None else {mode_before.custom_mode} - set(expected)
+        # Sets of modes, by their numbers in HEARTBEAT.custom_mode.
+        self._own_modes = {mode.custom_mode for mode in modes}
+        self._expected_modes = set(expected)
+        self._modes_before = set() if mode_before is None else {mode_before.custom_mode} - self._expected_modes
+        self._accepted_modes = self._modes_before | self._expected_modes
         self._mode_now = None if mode_before is None else mode_before.custom_mode
-        self._expected = set(expected)
-        self._allowed = self._before | self._expected
-        self._own = {mode.custom_mode for mode in modes}
         self._armed_now = armed_before
         self._state_before, self._ends_flight = state_before, ends_flight
-        self._minds_mode, self._minds_disarming = ends_on_mode_change, ends_on_disarm
+        self._ends_on_mode_change, self._ends_on_disarm = ends_on_mode_change, ends_on_disarm
         self._is_newest = is_newest
-        self._settles_at, self._any_until = settles_at, any_until
-        self._settles_by_change = requires_mode_change
+        self._settles_at, self._any_mode_until = settles_at, any_until
+        self._requires_mode_change = requires_mode_change
 
     @property
     def is_newest(self) -> bool:
@@ -205,11 +212,11 @@ class Order:
 
     def is_own(self, mode: Mode) -> bool:
         """Return True if this mode may be the effect of the order itself."""
-        return mode.custom_mode in self._own
+        return mode.custom_mode in self._own_modes
 
     def expect(self, modes: Collection[Mode]) -> None:
         """Also accept these modes, because they may be the effect of another order of the program."""
-        self._own |= {mode.custom_mode for mode in modes}
+        self._own_modes |= {mode.custom_mode for mode in modes}
 
     def withdraw(self) -> None:
         """Cancel the order after a refusal or a missing ack; the device's previous order becomes valid again."""
@@ -217,10 +224,10 @@ class Order:
 
     def commit(self) -> None:
         """Make the order final, so that it can no longer be withdrawn."""
-        self.before = None
+        self.previous = None
 
     def close(self) -> None:
-        """End the order because its block was left."""
+        """End the posted order because its block was left."""
         self.takeover_reason = self.takeover_reason or "its block was left"
 
     def clear_failsafe(self) -> None:
@@ -229,23 +236,32 @@ class Order:
 
     # -------------------------------------------------------------------- vehicle reports
 
-    def on_mode(self, mode: Mode, at: float) -> None:
-        """Process the mode reported at this time. After an own mode, a return to the previous mode is a takeover."""
-        number, is_known = mode.custom_mode, self._mode_now is not None
-        is_change = is_known and number != self._mode_now
-        self.is_confirmed = self.is_confirmed or (is_change and number in self._own)
-        if number in self._own:
-            if is_change or not self._settles_by_change:
-                self._allowed -= self._allowed if at >= self._settles_at else self._before
-        elif number in self._expected & self._allowed and at >= self._settles_at:
-            self._allowed -= self._before
-        elif not is_known or at < self._any_until:
-            if is_known and number not in self._allowed:
+    def on_mode(self, mode: Mode, reported_at: float) -> None:
+        """Process the mode reported at this time; the class describes the kinds of modes.
+
+        Once one of the order's own modes was reported, a return to the mode before the order is a takeover.
+        """
+        number, was_reported_before = mode.custom_mode, self._mode_now is not None
+        is_change = was_reported_before and number != self._mode_now
+        if number in self._own_modes:
+            self.is_confirmed = self.is_confirmed or is_change
+            has_taken_effect = is_change or not self._requires_mode_change
+            if has_taken_effect and reported_at >= self._settles_at:
+                self._accepted_modes.clear()
+            elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
+                self._accepted_modes -= self._modes_before
+        elif number in self._expected_modes & self._accepted_modes and reported_at >= self._settles_at:
+            # An earlier order of the program has taken effect, so only another party can restore the mode before it.
+            self._accepted_modes -= self._modes_before
+        elif not was_reported_before or reported_at < self._any_mode_until:
+            # The first report of a mode, or perhaps the effect of a raw command.
+            if was_reported_before and number not in self._accepted_modes:
                 self.unexplained = f"the mode changed to {mode}"
-            self._allowed.add(number)
-        elif number not in self._allowed and self._minds_mode:
+            self._accepted_modes.add(number)
+        elif number not in self._accepted_modes and self._ends_on_mode_change:
+            # The pilot or a failsafe has changed the mode.
             if not self.has_lost_mode:
-                self.mode_lost_at = at
+                self.mode_lost_at = reported_at
             self.has_lost_mode = True
             self.takeover_reason = self.takeover_reason or f"the mode changed to {mode}"
         self._mode_now = number
@@ -255,16 +271,16 @@ class Order:
 
         An order to land, to return or to disarm is not ended by any failsafe.
         """
-        if is_worse(state, self._state_before):
+        if is_worse_failsafe(state, self._state_before):
             self.failsafe = self.failsafe or failsafe_text(state)
         self._state_before = state
 
-    def on_armed(self, armed: bool, at: float) -> None:
+    def on_armed(self, armed: bool, reported_at: float) -> None:
         """Process the armed state reported by HEARTBEAT."""
-        before, self._armed_now = self._armed_now, armed
-        if before is not None and before is not armed and armed is self.armed:
+        armed_before, self._armed_now = self._armed_now, armed
+        if armed_before is not None and armed_before is not armed and armed is self.armed:
             self.is_confirmed = True
-        elif before and not armed and self._minds_disarming:
+        elif armed_before and not armed and self._ends_on_disarm:
             self.takeover_reason = self.takeover_reason or "the vehicle disarmed"
 
     def on_reboot(self) -> None:
@@ -319,13 +335,13 @@ class SentCommand:
         if armed is not None and self.arms is not None and armed is not self.arms:
             self._is_overruled = True
 
-    def on_mode(self, mode: Mode, at: float) -> None:
+    def on_mode(self, mode: Mode, reported_at: float) -> None:
         """Process the reported mode."""
-        before, self._mode_now = self._mode_now, mode.custom_mode
-        self._is_reported = self._is_reported or (self._mode_now != before and self._mode_now in self._modes)
+        mode_before, self._mode_now = self._mode_now, mode.custom_mode
+        self._is_reported = self._is_reported or (self._mode_now != mode_before and self._mode_now in self._modes)
 
-    def on_armed(self, armed: bool, at: float) -> None:
+    def on_armed(self, armed: bool, reported_at: float) -> None:
         """Process the reported armed state."""
-        before, self._armed_now = self._armed_now, armed
-        self._is_reported = self._is_reported or (armed is not before and armed is self.arms)
-        self.heartbeat_at = at
+        armed_before, self._armed_now = self._armed_now, armed
+        self._is_reported = self._is_reported or (armed is not armed_before and armed is self.arms)
+        self.heartbeat_at = reported_at

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["PostedOrder"]
 
 POLL_INTERVAL_S = 0.05
+# Attempts, and seconds between them, for a mode change that the vehicle rejects temporarily.
 MAX_MODE_ATTEMPTS, MODE_RETRY_INTERVAL_S = 4, 0.5
 
 
@@ -37,16 +38,17 @@ class PostedOrder:
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender, order: Order) -> None:
         self._session, self._arbiter, self._sender, self._order = session, arbiter, sender, order
-        self._ends = ExitStack()
+        # Collects refusals that follow the acceptance of the last command; closed by the next command or the block.
+        self._refusal_watch = ExitStack()
         self._refusals: list[CommandAck] = []
-        self._is_over = False
+        self._was_left = False
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._is_over = True
-        self._ends.close()
+        self._was_left = True
+        self._refusal_watch.close()
 
     @property
     def end(self) -> str:
@@ -70,7 +72,7 @@ class PostedOrder:
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
         """
-        await self._give(self._session.commands.send_long, command, *params, component_id=component_id)
+        await self._send(self._session.commands.send_long, command, *params, component_id=component_id)
 
     async def command_int(
         self,
@@ -87,7 +89,7 @@ class PostedOrder:
         Otherwise works like :meth:`command`.
         """
         place: dict[str, Any] = {"frame": frame, "x": x, "y": y, "z": z}
-        await self._give(self._session.commands.send_int, command, *params, component_id=component_id, **place)
+        await self._send(self._session.commands.send_int, command, *params, component_id=component_id, **place)
 
     async def set_mode(self, mode: Mode, *, timeout: float = 5.0, component_id: int | None = None) -> None:
         """Order a mode and wait until HEARTBEAT reports the order's effect.
@@ -132,7 +134,7 @@ class PostedOrder:
             ChangeSignal(self._session, armed, every_arrival=True) as changes,
             anyio.move_on_after(timeout),
         ):
-            while armed.updated_at <= answered_at or not self._arbiter.is_known:
+            while armed.updated_at <= answered_at or not self._arbiter.is_state_recent:
                 await changes.next(POLL_INTERVAL_S)
             return not self.end
         return False
@@ -148,19 +150,18 @@ class PostedOrder:
             "the order was accepted",
             self._refusals,
             is_done=self._is_done,
-            trouble=lambda: None,
+            failure_reason=lambda: None,
             timeout=timeout,
             max_silence_s=None,
         )
 
     def _is_done(self) -> bool:
         telemetry, order = self._session.telemetry, self._order
-        is_there = any(map(telemetry.is_in, order.modes)) or (
-            order.armed is not None and telemetry.armed.latest is order.armed
-        )
-        return is_there or order.is_confirmed
+        is_in_mode = any(map(telemetry.is_in, order.modes))
+        is_armed_as_ordered = order.armed is not None and telemetry.armed.latest is order.armed
+        return is_in_mode or is_armed_as_ordered or order.is_confirmed
 
-    async def _give(
+    async def _send(
         self, send: Callable[..., Awaitable[CommandAck]], command: int, *params: float, **options: Any
     ) -> None:
         self._prepare(command)
@@ -169,7 +170,7 @@ class PostedOrder:
 
     def _prepare(self, command: int) -> None:
         """Prepare to send a command: from now on, collect refusals that follow an acceptance of it."""
-        if self._is_over:
+        if self._was_left:
             raise InvalidArgument(f"the block of this order was left: {command_name(command)} was not sent")
-        self._ends.close()
-        self._refusals = self._ends.enter_context(self._session.refusals_of(command))
+        self._refusal_watch.close()
+        self._refusals = self._refusal_watch.enter_context(self._session.refusals_of(command))

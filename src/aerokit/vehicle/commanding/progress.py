@@ -25,10 +25,13 @@ POLL_INTERVAL_S = 0.25
 """Seconds between evaluations of the state when no message arrives, as during a silence of the vehicle."""
 
 MAX_SILENCE_S = 10.0
+"""Default number of seconds without a heartbeat after which an operation fails."""
 
 POSITION_MAX_AGE_S = 2.0
+"""Maximum age in seconds of a position that counts as the vehicle's present position."""
 
 STALL_TIMEOUT_S, STALL_DISTANCE_M = 12.0, 0.3
+"""A vehicle that moves less than this distance within this time counts as not moving."""
 
 FALL_SINK_M_S = 3.0
 """Speed from which a descent is considered a fall; autopilots descend at 1.5 m/s by default."""
@@ -45,28 +48,28 @@ FALL_STOP_S = 1.5
 
 async def await_progress(
     session: VehicleSession,
-    what: str,
+    operation: str,
     *,
     is_done: Callable[[], bool],
-    trouble: Callable[[], str | None],
+    failure_reason: Callable[[], str | None],
     describe: Callable[[], str],
     timeout: float | None,
     max_silence_s: float | None = MAX_SILENCE_S,
     held_for: float = 0.0,
-    stillness: Callable[[], str | None] | None = None,
+    stall_reason: Callable[[], str | None] | None = None,
 ) -> None:
     """Return when ``is_done()`` has been true for ``held_for`` seconds.
 
-    All functions are called whenever the vehicle's state changes.
+    All functions are called whenever the vehicle's state changes. ``operation`` is the name for error texts.
 
     Raises:
-        OperationRejected: ``trouble()`` returned a reason why the operation cannot succeed.
+        OperationRejected: ``failure_reason()`` returned a reason why the operation cannot succeed.
         HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds (None: silence is ignored).
-        OperationTimeout: ``timeout`` seconds have passed, or ``stillness()`` reports that the vehicle does not move;
+        OperationTimeout: ``timeout`` seconds have passed, or ``stall_reason()`` reports that the vehicle does not move;
             the error text includes ``describe()``.
         ConnectionClosed, LinkLost: the connection ended.
     """
-    started = reasons_from = session.connection.now()
+    started = session.connection.now()
     telemetry = session.telemetry
     cells = (telemetry.mode, telemetry.armed, telemetry.position, telemetry.landed_state)
     done_since: float | None = None
@@ -74,25 +77,28 @@ async def await_progress(
         while True:
             now = session.connection.now()
             session.connection.raise_if_ended()
-            done_since = (now if done_since is None else done_since) if is_done() else None
+            if not is_done():
+                done_since = None
+            elif done_since is None:
+                done_since = now
             if done_since is not None and now - done_since >= held_for:
                 return
-            if done_since is None and (reason := trouble()):
+            if done_since is None and (reason := failure_reason()):
                 reason += _height_when_disarmed(session)
-                raise OperationRejected(f"{what}: {reason}", reasons=_reasons(session, reason, reasons_from))
+                raise OperationRejected(f"{operation}: {reason}", reasons=_reasons(session, reason, started))
             if max_silence_s is not None and session.watch.silent_for_s > max_silence_s:
-                raise HeartbeatTimeout(f"{what}: {session.describe_link()}")
+                raise HeartbeatTimeout(f"{operation}: {session.describe_link()}")
             if timeout is not None and now - started >= timeout:
                 raise OperationTimeout(
-                    f"{what}: not done within {timeout:g} s; {describe()}; {session.describe_link()}"
+                    f"{operation}: not done within {timeout:g} s; {describe()}; {session.describe_link()}"
                 )
-            if stillness is not None and (still := stillness()):
-                raise OperationTimeout(f"{what}: {still}; {describe()}; {session.describe_link()}")
+            if stall_reason is not None and (stall := stall_reason()):
+                raise OperationTimeout(f"{operation}: {stall}; {describe()}; {session.describe_link()}")
             await changes.next(POLL_INTERVAL_S)
 
 
 def _reasons(session: VehicleSession, reason: str, since: float) -> tuple[str, ...]:
-    """Return the status texts that may explain the trouble. Texts about normal progress do not explain an impact."""
+    """Return the status texts that may explain a failure. Texts about normal progress do not explain an impact."""
     texts = session.telemetry.texts_since(since)
     is_impact = reason.startswith(HIT_GROUND)
     return tuple(text.text for text in texts if not is_impact or text.severity < MavSeverity.INFO)
@@ -111,28 +117,28 @@ class ChangeSignal:
     def __init__(self, session: VehicleSession, *cells: StateCell[Any], every_arrival: bool = False) -> None:
         self._session, self._cells, self._every_arrival = session, cells, every_arrival
         self._changed = asyncio.Event()
-        self._ends: list[Callable[[], None]] = []
+        self._detach_callbacks: list[Callable[[], None]] = []
 
     def __enter__(self) -> Self:
-        hear = self._changed.set
-        self._ends = [cell.observe(lambda *_: hear(), every_arrival=self._every_arrival) for cell in self._cells]
-        self._ends.append(self._session.connection.on_end(lambda _: hear()))
+        wake = self._changed.set
+        detach_cells = [cell.observe(lambda *_: wake(), every_arrival=self._every_arrival) for cell in self._cells]
+        self._detach_callbacks = [*detach_cells, self._session.connection.on_end(lambda _: wake())]
         return self
 
     def __exit__(self, *_: object) -> None:
-        for end in self._ends:
-            end()
+        for detach in self._detach_callbacks:
+            detach()
 
     async def next(self, at_most_s: float) -> None:
         """Wait for the next change, at most this many seconds."""
         self._changed.clear()
         # No cancel scope is used, because on Python 3.10 an expiring scope swallows a cancellation in the same
         # iteration of the event loop.
-        tick = asyncio.get_running_loop().call_later(at_most_s, self._changed.set)
+        timer = asyncio.get_running_loop().call_later(at_most_s, self._changed.set)
         try:
             await self._changed.wait()
         finally:
-            tick.cancel()
+            timer.cancel()
 
 
 class StallDetector:
@@ -142,19 +148,18 @@ class StallDetector:
     first turn or spool up.
     """
 
-    # Time at which _from was set.
-    _since: float
-
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
-        self._from: Position | None = None
-        self._top_m, self._max_sink_m_s = -math.inf, 0.0
-        self._fast_at = -math.inf
+        # The place that the vehicle has not left, and since when it has been there.
+        self._place: Position | None = None
+        self._there_since = -math.inf
+        self._max_height_m, self._max_sink_m_s = -math.inf, 0.0
+        self._sank_fast_at = -math.inf
 
     @property
     def follows_fast_descent(self) -> bool:
         """True if the vehicle stands still, and sank at ``FALL_SINK_M_S`` or faster right before that."""
-        return self._from is not None and self._since - self._fast_at <= FALL_STOP_S
+        return self._place is not None and self._there_since - self._sank_fast_at <= FALL_STOP_S
 
     def __call__(self, timeout_s: float = STALL_TIMEOUT_S) -> str | None:
         """Return a clause with the time for which the vehicle has not moved; None if it moves or its position is
@@ -163,41 +168,47 @@ class StallDetector:
         now, cell = self._session.connection.now(), self._session.telemetry.position
         here = cell.latest
         if here is None or cell.age > POSITION_MAX_AGE_S:
-            self._from = None
-        elif self._from is None or _metres(here, self._from) > STALL_DISTANCE_M:
-            self._from, self._since = here, now
+            self._place = None
+        elif self._place is None or _approximate_distance_m(here, self._place) > STALL_DISTANCE_M:
+            self._place, self._there_since = here, now
             self._record_descent(here)
-        elif now - self._since >= timeout_s:
-            return f"the vehicle accepted the order and has not moved for {now - self._since:.0f} s{self._reason(here)}"
+        elif now - self._there_since >= timeout_s:
+            still_for_s, descent = now - self._there_since, self._describe_descent(here)
+            return f"the vehicle accepted the order and has not moved for {still_for_s:.0f} s{descent}"
         return None
 
     def _record_descent(self, here: Position) -> None:
         velocity = self._session.telemetry.velocity.latest
-        self._top_m = max(self._top_m, here.altitude_relative_m if here.altitude_relative_m is not None else -math.inf)
+        if here.altitude_relative_m is not None:
+            self._max_height_m = max(self._max_height_m, here.altitude_relative_m)
         sink_m_s = 0.0 if velocity is None else velocity.down_m_s
         self._max_sink_m_s = max(self._max_sink_m_s, sink_m_s)
         if sink_m_s >= FALL_SINK_M_S:
-            self._fast_at = self._since
+            self._sank_fast_at = self._there_since
 
-    def _reason(self, here: Position) -> str:
+    def _describe_descent(self, here: Position) -> str:
         """Return a clause about a fast descent before the standstill; empty if there was none."""
         height_m = here.altitude_relative_m
-        if height_m is None or self._max_sink_m_s < FALL_SINK_M_S or self._top_m - height_m <= 1.0:
+        if height_m is None or self._max_sink_m_s < FALL_SINK_M_S or self._max_height_m - height_m <= 1.0:
             return ""
-        return f", after it descended {self._top_m - height_m:.1f} m at up to {self._max_sink_m_s:.1f} m/s"
+        return f", after it descended {self._max_height_m - height_m:.1f} m at up to {self._max_sink_m_s:.1f} m/s"
 
 
-def _metres(one: Position, other: Position) -> float:
-    """Return the distance within one per cent, in a tenth of the time that `Position.distance_to` takes."""
-    north = (one.latitude_deg - other.latitude_deg) * _METRES_PER_DEGREE
-    east = math.remainder(one.longitude_deg - other.longitude_deg, 360.0) * _METRES_PER_DEGREE
-    across = math.hypot(north, east * math.cos(math.radians(one.latitude_deg)))
-    return across + abs(VehiclePosition.height_above(one, other))
+def _approximate_distance_m(here: Position, place: Position) -> float:
+    """Return horizontal plus vertical distance, in a tenth of the time that an exact distance takes.
+
+    The horizontal distance is exact to one per cent.
+    """
+    north_m = (here.latitude_deg - place.latitude_deg) * _METRES_PER_DEGREE
+    east_at_equator_m = math.remainder(here.longitude_deg - place.longitude_deg, 360.0) * _METRES_PER_DEGREE
+    horizontal_m = math.hypot(north_m, east_at_equator_m * math.cos(math.radians(here.latitude_deg)))
+    return horizontal_m + abs(VehiclePosition.height_above(here, place))
 
 
 _METRES_PER_DEGREE = 111_132.0
+"""Mean length of one degree of latitude."""
 
-METRES_PER_DEGREE = 112_000
+MAX_METRES_PER_DEGREE = 112_000
 """Upper limit in metres for one degree of latitude, or of longitude at the equator."""
 
 MAX_DISTANCE_M = 100_000.0
@@ -207,7 +218,7 @@ the limit.
 
 
 CIRCLE_MARGIN = 1.3
-"""A vehicle that is within this multiple of the ordered radius counts as on its circle."""
+"""A vehicle that was ordered to circle counts as arrived within this multiple of the ordered radius."""
 
 
 class VehiclePosition:
@@ -216,9 +227,9 @@ class VehiclePosition:
     def __init__(self, session: VehicleSession) -> None:
         self._telemetry, self._autopilot = session.telemetry, session.autopilot
         self._circle_m = 0.0
-        session.telemetry.mode.observe(lambda *_: self.note_circle(0.0))
+        session.telemetry.mode.observe(lambda *_: self.record_circle(0.0))
 
-    def note_circle(self, radius_m: float) -> None:
+    def record_circle(self, radius_m: float) -> None:
         """Record the ordered radius. ArduPlane keeps this radius for further places until it leaves GUIDED."""
         self._circle_m = radius_m
 
@@ -237,8 +248,10 @@ class VehiclePosition:
         here = self._telemetry.position.latest
         if here is None:
             return math.inf
-        along = geo.distance_m(here.latitude_deg, here.longitude_deg, target.latitude_deg, target.longitude_deg)
-        return math.hypot(along, self.height_above(here, target))
+        along_ground_m = geo.distance_m(
+            here.latitude_deg, here.longitude_deg, target.latitude_deg, target.longitude_deg
+        )
+        return math.hypot(along_ground_m, self.height_above(here, target))
 
     def check_reach(
         self, name: str, places: Iterable[Position | None], max_distance_m: float, *, are_items: bool = False
@@ -256,8 +269,9 @@ class VehiclePosition:
             if place is None:
                 continue
             degrees = abs(place.latitude_deg - here.latitude_deg) + abs(place.longitude_deg - here.longitude_deg)
-            # A mission may have thousands of places, and the exact distance is slow to compute.
-            if degrees * METRES_PER_DEGREE < max_distance_m:
+            # The upper limit of the distance is compared first, because the exact distance is slow to compute and a
+            # mission may have thousands of places.
+            if degrees * MAX_METRES_PER_DEGREE < max_distance_m:
                 continue
             distance_m = self.distance_to(place)
             if distance_m > max_distance_m:
@@ -279,12 +293,12 @@ class VehiclePosition:
     @staticmethod
     def height_above(here: Position, target: Position) -> float:
         """Return how many metres ``here`` is above ``target``; 0 if that is unknown."""
-        for mine, its in (
+        for here_m, target_m in (
             (here.altitude_relative_m, target.altitude_relative_m),
             (here.altitude_amsl_m, target.altitude_amsl_m),
         ):
-            if mine is not None and its is not None:
-                return mine - its
+            if here_m is not None and target_m is not None:
+                return here_m - target_m
         return 0.0
 
     def is_known_since(self, started: float) -> bool:
@@ -304,19 +318,23 @@ class VehiclePosition:
     def global_target(self, target: Position) -> tuple[int, int, float, MavFrame]:
         """Return latitude and longitude in 1e-7 degrees, the altitude in metres, and the frame of the altitude.
 
-        The frame is MAV_FRAME_GLOBAL_RELATIVE_ALT_INT or MAV_FRAME_GLOBAL_INT.
+        The frame is MAV_FRAME_GLOBAL_RELATIVE_ALT_INT or MAV_FRAME_GLOBAL_INT. A target without an altitude gets the
+        vehicle's present one.
 
         PX4 accepts only altitudes above mean sea level, so an altitude relative to home requires a known home.
         """
-        relative, amsl = target.altitude_relative_m, target.altitude_amsl_m
-        if relative is None and amsl is None:
-            relative = self._telemetry.position.fresh(POSITION_MAX_AGE_S).altitude_relative_m
-        is_relative = relative is not None
-        altitude = relative if relative is not None else amsl
+        relative_m, amsl_m = target.altitude_relative_m, target.altitude_amsl_m
+        if relative_m is None and amsl_m is None:
+            relative_m = self._telemetry.position.fresh(POSITION_MAX_AGE_S).altitude_relative_m
+        is_relative = relative_m is not None
+        altitude = relative_m if relative_m is not None else amsl_m
         if altitude is None:
-            raise InvalidArgument("the target has no altitude, and the vehicle's own is not known")
+            raise InvalidArgument(
+                f"target = {target} is not allowed: it has no altitude, and the vehicle's own altitude is unknown; give"
+                " the target altitude_relative_m or altitude_amsl_m"
+            )
         check_range("altitude", altitude, -12_000, 100_000)
-        if is_relative and not self.takes_relative_altitude:
+        if is_relative and not self.accepts_relative_altitude:
             altitude, is_relative = altitude + self.home_altitude(), False
         frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
         return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, frame
@@ -329,17 +347,19 @@ class VehiclePosition:
     def is_on_ground(self) -> bool:
         """Return True if a vehicle that can fly was recently reported on the ground."""
         landed = self._telemetry.landed_state
-        flies = self._autopilot.mode_for("take_off", is_vtol=self._telemetry.is_vtol) is not None
-        return flies and landed.latest == MavLandedState.ON_GROUND and landed.age <= POSITION_MAX_AGE_S
+        can_fly = self._autopilot.mode_for("take_off", is_vtol=self._telemetry.is_vtol) is not None
+        return can_fly and landed.latest == MavLandedState.ON_GROUND and landed.age <= POSITION_MAX_AGE_S
 
-    def check_flying(self, what: str) -> None:
+    def check_flying(self, operation: str) -> None:
         """Raise OperationRejected if the vehicle is disarmed or on the ground."""
         if not self._telemetry.is_armed:
-            raise OperationRejected(f"{what}: the vehicle is not armed; nothing was sent")
+            raise OperationRejected(f"{operation}: the vehicle is not armed; nothing was sent")
         if self.is_on_ground():
-            raise OperationRejected(f"{what}: the vehicle is on the ground: call take_off() first; nothing was sent")
+            raise OperationRejected(
+                f"{operation}: the vehicle is on the ground: call take_off() first; nothing was sent"
+            )
 
     @property
-    def takes_relative_altitude(self) -> bool:
+    def accepts_relative_altitude(self) -> bool:
         """Return True if the autopilot supports altitudes relative to home."""
         return self._autopilot.reposition is None or self._autopilot.reposition.relative_altitude

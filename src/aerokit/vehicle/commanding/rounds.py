@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint
 
+# Interval at which set-points are computed; rate at which the latest is sent; seconds for which it may be sent.
 SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
 RADIUS_ERROR_M, CIRCLE_REPORT_S = 0.5, 2.0
 """Deviation in metres from which a reported radius counts as wrong, and seconds in which PX4 may still report the
@@ -48,21 +49,21 @@ class RoundFlight:
     def __init__(
         self,
         context: VehicleContext,
-        what: str,
+        operation: str,
         center: Position,
         counter: TurnCounter | LobeCounter | None,
         rounds: float | None,
         limits: tuple[float, float | None, float | None],
     ) -> None:
         self._context, self._session, self._telemetry = context, context.session, context.session.telemetry
-        self._what, self._center, self._counter = what, center, counter
+        self._operation, self._center, self._counter = operation, center, counter
         self._rounds = math.inf if rounds is None else rounds
         max_distance_m, self._timeout, self._max_silence_s = limits
         self._wrong_circle = ""
         position = context.vehicle_position
         self._place = position.command_place(center)
         position.check_reach("center", [center], max_distance_m)
-        position.check_flying(what)
+        position.check_flying(operation)
 
     @property
     def bearing_rad(self) -> float:
@@ -72,7 +73,7 @@ class RoundFlight:
 
     # ------------------------------------------------------------------- by a command of the firmware
 
-    async def by_command(
+    async def fly_by_command(
         self,
         command: int,
         params: tuple[float, ...],
@@ -87,8 +88,8 @@ class RoundFlight:
         At the end, the vehicle is ordered to hold if ``is_held``; otherwise it continues on a circle of ``circle_m``.
         """
         context, cleanup = self._context, self._context.flight_cleanup
-        hold = context.sender.mode_for(self._what, "hold")
-        order = context.arbiter.order(mode, hold)
+        hold_mode = context.sender.mode_for(self._operation, "hold")
+        order = context.arbiter.order(mode, hold_mode)
         try:
             with context.arbiter.changing_mode():
                 send = self._session.commands.send_int
@@ -96,11 +97,11 @@ class RoundFlight:
             with cleanup.flying(order), self._session.streaming("position"):
                 await self._await_rounds(order, mode, stay_s, circle_m)
             if is_held:
-                await cleanup.stop_in(hold, order)
+                await cleanup.stop_in(hold_mode, order)
             elif circle_m:
-                context.vehicle_position.note_circle(circle_m)
-        # The vehicle may have received the command.
+                context.vehicle_position.record_circle(circle_m)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
+            # The vehicle may have received the command, so it is ordered to hold.
             cleanup.hold_in_background(order)
             raise
         except OperationRejected:
@@ -109,8 +110,9 @@ class RoundFlight:
             raise
 
     async def _await_rounds(self, order: Order, mode: Mode, stay_s: float, circle_m: float) -> None:
+        """Wait until the rounds are flown; without rounds, until the vehicle is at the place."""
         session, started = self._session, self._session.connection.now()
-        stall, stays = StallDetector(session), self._context.sender.stays_in(order, mode)
+        detect_stall, mode_failure = StallDetector(session), self._context.sender.mode_failure(order, mode)
 
         def on_status(status: OrbitExecutionStatus) -> None:
             """Recognise a wrong radius: PX4 accepts a radius above its limit, but then flies another radius."""
@@ -120,41 +122,52 @@ class RoundFlight:
                 f"the vehicle flies a circle of {flown_m:.1f} m instead of {circle_m:g} m" if is_wrong else ""
             )
 
-        def trouble() -> str | None:
+        def failure_reason() -> str | None:
             refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
-            if refusal := next(refusals, ""):
-                self._wrong_circle = refusal
-            is_late = session.connection.now() > started + CIRCLE_REPORT_S
-            return stays() or refusal or (self._wrong_circle if is_late else None) or None
+            refusal = next(refusals, "")
+            if refusal:
+                self._wrong_circle = refusal  # so that the vehicle is ordered to hold
+            if reason := mode_failure() or refusal:
+                return reason
+            if session.connection.now() <= started + CIRCLE_REPORT_S:  # PX4 may still report the previous circle.
+                return None
+            return self._wrong_circle or None
+
+        def stall_reason() -> str | None:
+            is_staying = not self._rounds and self._is_in_place
+            return None if is_staying else detect_stall()
 
         detach = session.connection.bus.attach(OrbitExecutionStatus, on_status, system_id=session.system_id)
         try:
             await await_progress(
                 session,
-                self._what,
+                self._operation,
                 is_done=lambda: self._is_flown_since(started) and not order.end,
-                trouble=trouble,
+                failure_reason=failure_reason,
                 describe=self._describe,
                 timeout=self._timeout,
                 max_silence_s=self._max_silence_s,
                 held_for=stay_s,
-                stillness=lambda: None if not self._rounds and self._is_there else stall(),
+                stall_reason=stall_reason,
             )
         finally:
             detach()
 
     def _is_flown_since(self, started: float) -> bool:
+        """Return True if the rounds are flown; without rounds, if the vehicle is in place."""
         is_known = self._context.vehicle_position.is_known_since(started)
-        return is_known and self._count() >= self._rounds and (self._rounds > 0 or self._is_there)
+        return is_known and self._count() >= self._rounds and (self._rounds > 0 or self._is_in_place)
 
     @property
-    def _is_there(self) -> bool:
+    def _is_in_place(self) -> bool:
+        """True while the vehicle is on its path or, without a counter, at the place."""
         position = self._context.vehicle_position
         if self._counter is not None:
-            return self._counter.is_there
+            return self._counter.is_on_path
         return position.remaining_distance(self._center) <= position.arrival_radius_m
 
     def _count(self) -> float:
+        """Pass the present position to the counter, and return the rounds flown."""
         here = self._telemetry.position.latest
         if self._counter is None or here is None:
             return 0.0
@@ -162,72 +175,75 @@ class RoundFlight:
         return self._counter.rounds
 
     def _describe(self) -> str:
-        away_m = self._context.vehicle_position.remaining_distance(self._center)
-        done = "" if self._counter is None else f"{self._counter.rounds:.2f} of {self._rounds:g} rounds were flown, "
-        return f"{done}the vehicle is {away_m:.1f} m from the place"
+        distance_m = self._context.vehicle_position.remaining_distance(self._center)
+        flown = "" if self._counter is None else f"{self._counter.rounds:.2f} of {self._rounds:g} rounds were flown, "
+        return f"{flown}the vehicle is {distance_m:.1f} m from the place"
 
     def _offset(self, place: Position) -> Vector:
+        """Return how far the place is north and east of the center, in metres."""
         center = self._center
         return geo.north_east_m(center.latitude_deg, center.longitude_deg, place.latitude_deg, place.longitude_deg)
 
     # ------------------------------------------------------------------------------ by set-points
 
-    async def by_setpoints(self, path: ClosedPath, speed_m_s: float, facing: str) -> None:
+    async def fly_by_setpoints(self, path: ClosedPath, speed_m_s: float, facing: str) -> None:
         """Stream the set-points of a path; leaving the stream makes the vehicle hold."""
         try:
             with self._session.streaming("position", "local_position"), anyio.move_on_after(self._timeout) as scope:
-                mode = self._context.sender.mode_for(self._what, "setpoint")
+                mode = self._context.sender.mode_for(self._operation, "setpoint")
                 with self._context.flight_cleanup.preparing(mode) as order:
                     flight = await self._path_flight(path, speed_m_s, facing)
                 await self._stream(flight, order)
         except SetpointStreamStopped as error:
-            kind = HeartbeatTimeout if self._session.watch.is_silent else OperationRejected
-            raise kind(f"{self._what}: {error}") from error
+            error_class = HeartbeatTimeout if self._session.watch.is_silent else OperationRejected
+            raise error_class(f"{self._operation}: {error}") from error
         if scope.cancelled_caught:
-            raise OperationTimeout(f"{self._what}: not done within {self._timeout:g} s; {self._describe()}")
+            raise OperationTimeout(f"{self._operation}: not done within {self._timeout:g} s; {self._describe()}")
 
     async def _path_flight(self, path: ClosedPath, speed_m_s: float, facing: str) -> PathFlight:
-        """Return the flight along the path; the vehicle's position in both frames converts the center to the local
-        frame.
+        """Return the flight along the path.
+
+        The vehicle's positions in the global and in the local frame give the center in the local frame.
         """
-        local, since = self._telemetry.local_position, self._session.connection.now()
-        place = await local.wait_until(lambda _: local.updated_at >= since, timeout=FRAME_TIMEOUT_S)
+        local_position, since = self._telemetry.local_position, self._session.connection.now()
+        local = await local_position.wait_until(lambda _: local_position.updated_at >= since, timeout=FRAME_TIMEOUT_S)
         here = self._telemetry.position.fresh(POSITION_MAX_AGE_S)
         north, east = self._offset(here)
         up = self._context.vehicle_position.height_above(here, self._center)
-        centre = (place.north_m - north, place.east_m - east, place.down_m + up)
-        heading = self._heading(facing)
-        return PathFlight(path, self._rounds, speed_m_s, (north, east, -up), centre, heading)
+        centre = (local.north_m - north, local.east_m - east, local.down_m + up)
+        return PathFlight(path, self._rounds, speed_m_s, (north, east, -up), centre, self._heading_function(facing))
 
-    def _heading(self, facing: str) -> Callable[[Vector, Vector], float | None]:
-        initial = self._telemetry.heading_deg.latest
+    def _heading_function(self, facing: str) -> Callable[[Vector, Vector], float | None]:
+        """Return a function that returns the heading in degrees; None leaves the heading to the autopilot."""
+        initial_deg = self._telemetry.heading_deg.latest
 
         def heading(place: Vector, velocity: Vector) -> float | None:
             if facing == "center":
                 return math.degrees(math.atan2(-place[1], -place[0])) % 360
             if facing == "ahead" and math.hypot(*velocity) > 0:
                 return math.degrees(math.atan2(velocity[1], velocity[0])) % 360
-            return initial if facing == "initial" else None
+            return initial_deg if facing == "initial" else None
 
         return heading
 
     async def _stream(self, flight: PathFlight, order: Order) -> None:
-        first, limits = flight.advance(0.0), {"valid_for_s": VALID_FOR_S, "max_lag_s": VALID_FOR_S}
-        stream = Guided(self._context).trajectory(first, rate_hz=SETPOINT_RATE_HZ, **limits)
+        initial, limits = flight.advance(0.0), {"valid_for_s": VALID_FOR_S, "max_lag_s": VALID_FOR_S}
+        stream = Guided(self._context).trajectory(initial, rate_hz=SETPOINT_RATE_HZ, **limits)
         stream._prepared_order = order
         async with stream:
             while not flight.is_complete:
-                await self._next(stream, flight.advance(SETPOINT_INTERVAL_S))
+                await self._supply(stream, flight.advance(SETPOINT_INTERVAL_S))
                 if flight.is_on_path:
                     self._count()
-            ends_at = self._session.connection.now() + END_TIMEOUT_S
+            # The vehicle follows the set-point with a delay, so it reaches the end later.
+            give_up_at = self._session.connection.now() + END_TIMEOUT_S
             while self._count() < self._rounds - LAG_ROUNDS:
-                if self._session.connection.now() > ends_at:
+                if self._session.connection.now() > give_up_at:
                     raise OperationTimeout(
-                        f"{self._what}: the vehicle did not follow its set-points; {self._describe()}"
+                        f"{self._operation}: the vehicle did not follow its set-points; {self._describe()}"
                     )
-                await self._next(stream, flight.advance(0.0))
+                await self._supply(stream, flight.advance(0.0))
 
-    async def _next(self, stream: SetpointStream[TrajectorySetpoint], setpoint: TrajectorySetpoint) -> None:
+    async def _supply(self, stream: SetpointStream[TrajectorySetpoint], setpoint: TrajectorySetpoint) -> None:
         stream.set(setpoint)
         await anyio.sleep(SETPOINT_INTERVAL_S)

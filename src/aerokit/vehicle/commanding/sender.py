@@ -58,16 +58,17 @@ class OrderSender:
         self.raise_if_ended(order)
         order.may_move = order.may_move or command in CHANGED_BY_COMMAND
         started = self._session.connection.now()
-        with self._arbiter.sending(order, modes=modes, armed=armed, is_done=is_done) as sending:
+        with self._arbiter.sending(order, modes=modes, armed=armed, is_done=is_done) as sent:
             try:
-                await send(command, *params, order_status=sending, **options)
+                await send(command, *params, order_status=sent, **options)
             except CommandRejected as error:
-                if not sending.is_confirmed:
+                # The vehicle may refuse a repetition because the command has already taken effect.
+                if not sent.is_confirmed:
                     order.was_refused = True
                     await self._session.wait_for_status_texts()
                     raise self._session.with_reasons(error, started) from None
             except CommandTimeout as error:
-                if not sending.is_confirmed:
+                if not sent.is_confirmed:
                     raise self._unanswered(error, order) from None
 
     async def send_long(self, order: Order, command: int, *params: float, **options: Any) -> None:
@@ -87,6 +88,7 @@ class OrderSender:
 
     async def send_arm(self, order: Order, armed: bool, *, force: bool = False) -> None:
         """Send the command to arm or disarm."""
+        # `ArmCleanup` must not take the ack of an earlier command for the ack of this one.
         self._session.commands.forget_result(MavCmd.COMPONENT_ARM_DISARM)
         params = (float(armed), FORCE if force else 0)
         await self.send_long(order, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed)
@@ -94,21 +96,27 @@ class OrderSender:
     # ----------------------------------------------------------------------------------- modes
 
     async def change_mode(
-        self, wanted: Mode, order: Order, timeout: float = 6.0, *, reported_since: float = -math.inf
+        self, mode: Mode, order: Order, timeout: float = 6.0, *, reported_since: float = -math.inf
     ) -> None:
-        """Order the mode and wait until a message received after ``reported_since`` reports it."""
+        """Order the mode and wait until a message received after ``reported_since`` reports it.
+
+        While the mode is in doubt, only messages received after the acknowledgement count.
+        """
         started = self._session.connection.now()
         was_in_doubt = self._arbiter.mode_is_in_doubt
         with self._session.refusals_of(MavCmd.DO_SET_MODE) as refusals, self._arbiter.changing_mode():
-            await self.request_mode(wanted, order, attempt_timeout=min(1.0, timeout / 4))
-            reported_since = self._session.connection.now() if was_in_doubt else reported_since
-            left = timeout - (self._session.connection.now() - started)
-            await self.await_mode(wanted, order, refusals, left, reported_since)
+            # All four attempts must fit into the time-out.
+            await self.request_mode(mode, order, attempt_timeout=min(1.0, timeout / 4))
+            now = self._session.connection.now()
+            if was_in_doubt:
+                reported_since = now
+            await self.await_mode(mode, order, refusals, timeout - (now - started), reported_since)
+            # The mode is reported, so the modes of earlier orders cannot follow.
             self._arbiter.mode_settles_at = -math.inf
 
     async def request_mode(
         self,
-        wanted: Mode,
+        mode: Mode,
         order: Order,
         *,
         attempt_timeout: float | None = None,
@@ -119,7 +127,7 @@ class OrderSender:
 
         Firmware that does not support MAV_CMD_DO_SET_MODE gets one SET_MODE instead, if the order is still valid.
         """
-        request = self._session.autopilot.mode_order(wanted)
+        request = self._session.autopilot.mode_order(mode)
         if base_mode is not None:
             request = request.replace(base_mode=base_mode, params=(base_mode, *request.params[1:]))
         try:
@@ -127,7 +135,7 @@ class OrderSender:
                 order,
                 MavCmd.DO_SET_MODE,
                 *request.params,
-                modes=(wanted,),
+                modes=(mode,),
                 attempt_timeout=attempt_timeout,
                 component_id=component_id,
             )
@@ -135,41 +143,42 @@ class OrderSender:
             if error.result != MavResult.UNSUPPORTED:
                 raise
             self.raise_if_ended(order)
-            if not self._arbiter.is_known:
+            if not self._arbiter.is_state_recent:  # During a silence, a takeover may not have been reported yet.
                 raise
             self._session.send(request.legacy(self._session.system_id))
 
     async def await_mode(
-        self, wanted: Mode, order: Order, refusals: list[CommandAck], timeout: float, reported_since: float
+        self, mode: Mode, order: Order, refusals: list[CommandAck], timeout: float, reported_since: float
     ) -> None:
         """Wait until a message received after ``reported_since`` reports the mode."""
         telemetry = self._session.telemetry
         await self.await_effect(
-            f"set_mode({wanted.name})",
+            f"set_mode({mode.name})",
             refusals,
-            is_done=lambda: telemetry.is_in(wanted) and telemetry.mode.updated_at > reported_since,
-            trouble=lambda: order.end or None,
+            is_done=lambda: telemetry.is_in(mode) and telemetry.mode.updated_at > reported_since,
+            failure_reason=lambda: order.end or None,
             timeout=max(0.1, timeout),
         )
 
     async def await_effect(
         self,
-        what: str,
+        operation: str,
         refusals: list[CommandAck],
         *,
         is_done: Callable[[], bool],
-        trouble: Callable[[], str | None],
+        failure_reason: Callable[[], str | None],
         timeout: float,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
         """Wait until HEARTBEAT reports the effect of an accepted command.
 
-        PX4 acknowledges some commands twice: the first ack is always ACCEPTED, the second ack may be a refusal, which
-        ``refusals`` collects.
+        PX4 acknowledges some commands twice: the first ack is always ACCEPTED, the second may be a refusal.
+        ``refusals`` is a list to which such refusals are added; see ``VehicleSession.refusals_of``. ``operation`` is
+        the name for error texts.
 
         Raises:
             CommandRejected: the vehicle first accepted and then refused the command.
-            OperationRejected: ``trouble()`` returned a reason.
+            OperationRejected: ``failure_reason()`` returned a reason.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the effect was not reported within ``timeout`` seconds.
         """
@@ -177,9 +186,9 @@ class OrderSender:
         try:
             await await_progress(
                 self._session,
-                what,
+                operation,
                 is_done=is_done,
-                trouble=lambda: ACCEPTANCE_REVOKED if refusals else trouble(),
+                failure_reason=lambda: ACCEPTANCE_REVOKED if refusals else failure_reason(),
                 describe=lambda: (
                     f"the vehicle is in {telemetry.mode_name}, {'' if telemetry.is_armed else 'not '}armed"
                 ),
@@ -190,7 +199,7 @@ class OrderSender:
             if not refusals:
                 raise
             error = rejection(refusals[-1].command, refusals[-1].result)
-            error.args = (f"{what}: {ACCEPTANCE_REVOKED}: {error}",)
+            error.args = (f"{operation}: {ACCEPTANCE_REVOKED}: {error}",)
             raise self._session.with_reasons(error, started) from None
 
     async def ensure_mode(self, mode: Mode, order: Order) -> None:
@@ -208,51 +217,56 @@ class OrderSender:
             raise NotSupported(f"{action}: {self._session.autopilot.firmware} has no mode for it")
         return mode
 
-    def stays_in(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
-        """Return a function that reports why the order cannot succeed, as a clause.
+    def mode_failure(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
+        """Return a function that returns why the order cannot succeed, as a clause; None while it may succeed.
 
-        The reasons are: the order was superseded, or the vehicle has hit the ground, is disarmed or in another mode.
+        The reasons are: the order was superseded, or the vehicle has hit the ground, is disarmed or is not in one of
+        ``modes``. The vehicle has three seconds to report one of the modes.
         """
-        hits_ground = self.hits_ground(order)
+        impact = self.impact_failure(order)
         grace_until, settles_at = self._session.connection.now() + MODE_GRACE_S, self._arbiter.mode_settles_at
-        arrived = False
+        was_in_mode = False
 
-        def trouble() -> str | None:
-            nonlocal arrived
-            if reason := hits_ground() or order.end:
+        def failure_reason() -> str | None:
+            nonlocal was_in_mode
+            reason = impact() or order.end
+            if reason:
                 return reason
             if self._session.telemetry.is_confirmed_disarmed:
                 return "the vehicle disarmed"
-            if self._session.connection.now() < settles_at:
+            if self._session.connection.now() < settles_at:  # The mode of an abandoned order may still be reported.
                 return None
             mode = self._session.telemetry.mode.latest
-            arrived = arrived or mode in modes
-            if mode not in modes and (arrived or self._session.connection.now() > grace_until):
-                return f"the mode changed to {mode}" if arrived else f"the vehicle stayed in {mode}"
+            was_in_mode = was_in_mode or mode in modes
+            if mode not in modes and was_in_mode:
+                return f"the mode changed to {mode}"
+            if mode not in modes and self._session.connection.now() > grace_until:
+                return f"the vehicle stayed in {mode}"
             return None
 
-        return trouble
+        return failure_reason
 
-    def hits_ground(self, order: Order) -> Callable[[], str]:
+    def impact_failure(self, order: Order) -> Callable[[], str]:
         """Return a function that returns a clause once the vehicle has hit the ground during the newest order."""
-        impact = ImpactDetector(self._session)
+        detector = ImpactDetector(self._session)
 
-        def trouble() -> str:
-            impact.update()
-            order.impact = impact.text() if order.is_newest else ""
+        def failure_reason() -> str:
+            detector.update()
+            order.impact = detector.describe() if order.is_newest else ""
             return order.impact
 
-        return trouble
+        return failure_reason
 
-    def stays_until_disarmed(self, order: Order) -> Callable[[], str | None]:
-        """Like :meth:`stays_in` with the order's modes, for an order that ends by disarming."""
-        stays, armed = self.stays_in(order, *order.modes), self._session.telemetry.armed
+    def landing_failure(self, order: Order) -> Callable[[], str | None]:
+        """Like :meth:`mode_failure` with the order's modes, for an order that ends by disarming."""
+        mode_failure, armed = self.mode_failure(order, *order.modes), self._session.telemetry.armed
 
-        def trouble() -> str | None:
-            is_open = order.has_lost_mode and armed.updated_at < order.mode_lost_at
-            return None if is_open else stays()  # The next HEARTBEAT may report a landing and disarming.
+        def failure_reason() -> str | None:
+            if order.has_lost_mode and armed.updated_at < order.mode_lost_at:
+                return None  # CURRENT_MODE came first; the next HEARTBEAT may report a landing and disarming.
+            return mode_failure()
 
-        return trouble
+        return failure_reason
 
     async def auxiliary_command(self, command: int, *params: float, **options: Any) -> None:
         """Send a command that changes a setting and does not steer."""
@@ -261,7 +275,7 @@ class OrderSender:
 
     # ---------------------------------------------------------------------------- raw commands
 
-    async def answered(
+    async def send_raw(
         self,
         send: Callable[..., Awaitable[CommandAck]],
         command: int,
@@ -269,13 +283,15 @@ class OrderSender:
         retries: int | None,
         **options: Any,
     ) -> CommandAck:
-        """Send a raw command of the program by ``send``, which is a method of `CommandSender`."""
+        """Send a raw command of the program by ``send``, a method of `CommandSender`; return the acknowledgement."""
         started = self._session.connection.now()
         if retries is None:
+            # Only requests are repeated. A repetition would execute another command twice if just its ack was lost.
             retries = MAX_ATTEMPTS - 1 if command in REQUEST_COMMANDS else 0
         check_range("retries", retries, 0, 1000)
         options["attempts"] = 1 + retries
         if options["attempt_timeout"] is None and not retries:
+            # A command that is sent once gets as much time as one with all retries.
             options["attempt_timeout"] = MAX_ATTEMPTS * ATTEMPT_TIMEOUT_S
         try:
             if command in REQUEST_COMMANDS:
@@ -284,16 +300,16 @@ class OrderSender:
             modes = self._session.autopilot.modes_of_command(command, params, names)
             armed = params[0] == 1 if command == MavCmd.COMPONENT_ARM_DISARM and params else None
             with (
-                self._own_order(command, modes) as order,
-                self._arbiter.sending(order, modes=modes, armed=armed) as sending,
+                self._raw_order(command, modes) as order,
+                self._arbiter.sending(order, modes=modes, armed=armed) as sent,
             ):
-                return await send(command, *params, order_status=sending, **options)
+                return await send(command, *params, order_status=sent, **options)
         except CommandRejected as error:
             await self._session.wait_for_status_texts()
             raise self._session.with_reasons(error, started) from None
 
     @contextmanager
-    def _own_order(self, command: int, modes: Collection[Mode]) -> Iterator[Order]:
+    def _raw_order(self, command: int, modes: Collection[Mode]) -> Iterator[Order]:
         """Register a raw command as an order. A command that steers supersedes actions."""
         if CHANGED_BY_COMMAND.get(command, ARM_ALONE) != ARM_ALONE:
             yield self._arbiter.raw_order(CHANGED_BY_COMMAND[command], modes=modes)

@@ -39,6 +39,7 @@ __all__ = [
     "wants_motion",
 ]
 
+# Bits of POSITION_TARGET_TYPEMASK.
 IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION = 0x007, 0x038, 0x1C0
 IGNORE_YAW, IGNORE_YAW_RATE = 0x400, 0x800
 VECTORS = {
@@ -48,6 +49,7 @@ VECTORS = {
 }
 """Maps type-mask bits of SET_POSITION_TARGET_LOCAL_NED to the fields that they make the vehicle ignore."""
 ZERO = (0.0, 0.0, 0.0)
+# Bits of ATTITUDE_TARGET_TYPEMASK.
 IGNORE_BODY_RATES, IGNORE_ATTITUDE = 0x07, 0x80
 ACTUATORS_PER_GROUP, MAX_BODY_RATE_DEG_S = 8, 3600.0
 # A vehicle may stand still if its set-point is slower than this, or nearer than this many arrival radii.
@@ -162,13 +164,13 @@ def wants_motion(setpoint: object, context: VehicleContext) -> bool:
         return math.hypot(setpoint.north_m_s, setpoint.east_m_s, setpoint.down_m_s) >= SLOW_M_S
     if isinstance(setpoint, BodyVelocitySetpoint):
         return math.hypot(setpoint.forward_m_s, setpoint.right_m_s, setpoint.down_m_s) >= SLOW_M_S
-    far_m = MAX_RESTING_RADII * context.session.autopilot.arrival_radius_m
+    max_resting_m = MAX_RESTING_RADII * context.session.autopilot.arrival_radius_m
     if isinstance(setpoint, PositionSetpoint):
-        return far_m < context.vehicle_position.distance_to(setpoint.position) < math.inf
+        return max_resting_m < context.vehicle_position.distance_to(setpoint.position) < math.inf
     # The position is read only here, because reading decodes it and set-points are sent at up to 400 Hz.
     if isinstance(setpoint, LocalPositionSetpoint) and (here := context.session.telemetry.local_position.latest):
         north_m, east_m = setpoint.north_m - here.north_m, setpoint.east_m - here.east_m
-        return math.hypot(north_m, east_m, setpoint.down_m - here.down_m) > far_m
+        return math.hypot(north_m, east_m, setpoint.down_m - here.down_m) > max_resting_m
     return False
 
 
@@ -179,72 +181,78 @@ class SetpointEncoder:
         self._session, self._position = context.session, context.vehicle_position
         self._address = (self._session.system_id, self._session.component_id)
 
-    def local(self, s: LocalSetpoint, frame: int = MavFrame.LOCAL_NED) -> Message:
+    def local(self, setpoint: LocalSetpoint, frame: int = MavFrame.LOCAL_NED) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED with the vectors that the set-point has."""
-        mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
+        mask, yaw, yaw_rate = _yaw(setpoint.yaw_deg, setpoint.yaw_rate_deg_s)
         vectors: list[tuple[float, float, float]] = []
-        for ignored, (north, east, down) in VECTORS.items():
-            is_given = hasattr(s, north)
-            vectors.append((getattr(s, north), getattr(s, east), getattr(s, down)) if is_given else ZERO)
-            mask |= 0 if is_given else ignored
+        for ignore_bits, (north, east, down) in VECTORS.items():
+            if hasattr(setpoint, north):
+                vectors.append((getattr(setpoint, north), getattr(setpoint, east), getattr(setpoint, down)))
+            else:
+                vectors.append(ZERO)
+                mask |= ignore_bits
         position, velocity, acceleration = vectors
-        parts = (*position, *velocity, *acceleration)
-        check_finite("set-point", *parts)
-        return SetPositionTargetLocalNed(self._time_ms(), *self._address, frame, mask, *parts, yaw, yaw_rate)
+        vector_fields = (*position, *velocity, *acceleration)
+        check_finite("set-point", *vector_fields)
+        return SetPositionTargetLocalNed(self._time_ms(), *self._address, frame, mask, *vector_fields, yaw, yaw_rate)
 
-    def body_velocity(self, s: BodyVelocitySetpoint) -> Message:
+    def body_velocity(self, setpoint: BodyVelocitySetpoint) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
 
         For ArduPilot, a set-point with a heading is converted to MAV_FRAME_LOCAL_NED by the present heading. In
         MAV_FRAME_BODY_NED, ArduPilot adds each yaw to the previous target, and correcting for that by telemetry
         oscillates.
         """
-        forward, right, frame = s.forward_m_s, s.right_m_s, MavFrame.BODY_NED
-        if s.yaw_deg is not None and self._session.autopilot.setpoints.body_yaw_is_relative:
+        forward, right, frame = setpoint.forward_m_s, setpoint.right_m_s, MavFrame.BODY_NED
+        if setpoint.yaw_deg is not None and self._session.autopilot.setpoints.body_yaw_is_relative:
             heading, frame = math.radians(self._session.telemetry.heading_deg.value), MavFrame.LOCAL_NED
             forward, right = (
                 forward * math.cos(heading) - right * math.sin(heading),
                 forward * math.sin(heading) + right * math.cos(heading),
             )
-        return self.local(VelocitySetpoint(forward, right, s.down_m_s, s.yaw_deg, s.yaw_rate_deg_s), frame)
+        return self.local(
+            VelocitySetpoint(forward, right, setpoint.down_m_s, setpoint.yaw_deg, setpoint.yaw_rate_deg_s), frame
+        )
 
-    def position(self, s: PositionSetpoint, velocity: tuple[float, float, float] | None = None) -> Message:
+    def position(self, setpoint: PositionSetpoint, velocity: tuple[float, float, float] | None = None) -> Message:
         """Return SET_POSITION_TARGET_GLOBAL_INT, relative to home or above mean sea level.
 
         ``velocity`` is the velocity of the position itself, in m/s north, east, down.
         """
-        mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
+        mask, yaw, yaw_rate = _yaw(setpoint.yaw_deg, setpoint.yaw_rate_deg_s)
         mask |= IGNORE_ACCELERATION | (IGNORE_VELOCITY if velocity is None else 0)
-        latitude, longitude, altitude, frame = self._position.global_target(s.position)
+        latitude, longitude, altitude, frame = self._position.global_target(setpoint.position)
         now, speeds = self._time_ms(), velocity or ZERO
         return SetPositionTargetGlobalInt(
             now, *self._address, frame, mask, latitude, longitude, altitude, *speeds, *ZERO, yaw, yaw_rate
         )
 
-    def attitude(self, s: AttitudeSetpoint) -> Message:
+    def attitude(self, setpoint: AttitudeSetpoint) -> Message:
         """Return SET_ATTITUDE_TARGET with attitude and thrust."""
-        check_finite("attitude", s.roll_deg, s.pitch_deg, s.yaw_deg, s.thrust)
-        check_range("thrust", s.thrust, 0, 1)
-        q = Attitude(s.roll_deg, s.pitch_deg, s.yaw_deg).quaternion
-        return SetAttitudeTarget(self._time_ms(), *self._address, IGNORE_BODY_RATES, q, *ZERO, s.thrust)
+        check_finite("attitude", setpoint.roll_deg, setpoint.pitch_deg, setpoint.yaw_deg, setpoint.thrust)
+        check_range("thrust", setpoint.thrust, 0, 1)
+        quaternion = Attitude(setpoint.roll_deg, setpoint.pitch_deg, setpoint.yaw_deg).quaternion
+        return SetAttitudeTarget(self._time_ms(), *self._address, IGNORE_BODY_RATES, quaternion, *ZERO, setpoint.thrust)
 
-    def attitude_rate(self, s: AttitudeRateSetpoint) -> Message:
+    def attitude_rate(self, setpoint: AttitudeRateSetpoint) -> Message:
         """Return SET_ATTITUDE_TARGET with body rates and thrust."""
         for name in ("roll_deg_s", "pitch_deg_s", "yaw_deg_s"):
-            check_range(name, getattr(s, name), -MAX_BODY_RATE_DEG_S, MAX_BODY_RATE_DEG_S)
-        check_range("thrust", s.thrust, 0, 1)
-        q = (1.0, 0.0, 0.0, 0.0)
-        rates = (math.radians(s.roll_deg_s), math.radians(s.pitch_deg_s), math.radians(s.yaw_deg_s))
-        return SetAttitudeTarget(self._time_ms(), *self._address, IGNORE_ATTITUDE, q, *rates, s.thrust)
+            check_range(name, getattr(setpoint, name), -MAX_BODY_RATE_DEG_S, MAX_BODY_RATE_DEG_S)
+        check_range("thrust", setpoint.thrust, 0, 1)
+        no_rotation = (1.0, 0.0, 0.0, 0.0)  # The vehicle ignores the attitude.
+        roll, pitch, yaw = map(math.radians, (setpoint.roll_deg_s, setpoint.pitch_deg_s, setpoint.yaw_deg_s))
+        return SetAttitudeTarget(
+            self._time_ms(), *self._address, IGNORE_ATTITUDE, no_rotation, roll, pitch, yaw, setpoint.thrust
+        )
 
-    def actuators(self, s: ActuatorSetpoint) -> Message:
+    def actuators(self, setpoint: ActuatorSetpoint) -> Message:
         """Return SET_ACTUATOR_CONTROL_TARGET."""
-        check_range("group", s.group, 0, 3)
-        if len(s.controls) != ACTUATORS_PER_GROUP:
-            raise InvalidArgument(f"controls = {s.controls!r} is not allowed: {ACTUATORS_PER_GROUP} numbers")
-        for control in s.controls:
+        check_range("group", setpoint.group, 0, 3)
+        if len(setpoint.controls) != ACTUATORS_PER_GROUP:
+            raise InvalidArgument(f"controls = {setpoint.controls!r} is not allowed: {ACTUATORS_PER_GROUP} numbers")
+        for control in setpoint.controls:
             check_range("controls", control, -1, 1)
-        return SetActuatorControlTarget(self._time_ms() * 1000, s.group, *self._address, s.controls)
+        return SetActuatorControlTarget(self._time_ms() * 1000, setpoint.group, *self._address, setpoint.controls)
 
     def _time_ms(self) -> int:
         return int(self._session.connection.now() * 1000) & 0xFFFFFFFF

@@ -85,14 +85,16 @@ class SimpleOrder(Snapshot):
 
     def wire_params(self, *values: float) -> tuple[float, ...]:
         """Return the parameters of the command; raise InvalidArgument if a value is out of range."""
-        rest = iter(values)
-        return tuple(param.check(next(rest)) if isinstance(param, Argument) else param for param in self.params)
+        remaining_values = iter(values)
+        return tuple(
+            param.check(next(remaining_values)) if isinstance(param, Argument) else param for param in self.params
+        )
 
     async def send(
         self,
         context: VehicleContext,
         *values: float,
-        of: Order | None = None,
+        device_order: Order | None = None,
         topic: Topic | None = None,
         component_id: int | None = None,
         timeout: float = EFFECT_TIMEOUT_S,
@@ -102,7 +104,7 @@ class SimpleOrder(Snapshot):
         Args:
             context: the vehicle.
             values: one for each `Argument`, in order; they are also passed to `Effect.is_reported`.
-            of: an earlier order to the device, if this command belongs to that order.
+            device_order: an earlier order to the device, if this command belongs to that order.
             topic: key of the device that the command is for. A newer order with the same topic ends this call.
             component_id: the target component; None: the autopilot.
             timeout: seconds after the acknowledgement within which a message must report the effect.
@@ -119,13 +121,13 @@ class SimpleOrder(Snapshot):
         params = self.wire_params(*values)
         if component_id in (None, context.session.component_id):
             self.check_supported(context)
-        if topic is not None and of is None:
-            of = context.arbiter.of_device(topic)
-        with context.arbiter.auxiliary_order(of) as order:
+        if topic is not None and device_order is None:
+            device_order = context.arbiter.device_order(topic)
+        with context.arbiter.auxiliary_order(device_order) as order:
             await context.sender.send_long(order, self.command, *params, component_id=component_id)
         if self.effect is not None:
             target = context.session.component_id if component_id is None else component_id
-            await self._await_effect(context, self.effect, values, of, target, timeout)
+            await self._await_effect(context, self.effect, values, device_order, target, timeout)
 
     async def send_until_text(
         self,
@@ -140,24 +142,24 @@ class SimpleOrder(Snapshot):
 
         Raises as :meth:`send`; also OperationRejected if ``is_refusal(text)``.
         """
-        order, now = context.arbiter.of_device(topic), context.session.connection.now
+        order, now = context.arbiter.device_order(topic), context.session.connection.now
         texts: list[str] = []
         detach = context.session.telemetry.status_text.observe(
-            lambda _, text: texts.append(text.text), every_arrival=True
+            lambda _, status_text: texts.append(status_text.text), every_arrival=True
         )
 
-        def trouble() -> str | None:
+        def failure_reason() -> str | None:
             refusals = [text for text in texts if is_refusal(text)]
-            return f"the vehicle reports {refusals[0]!r}" if refusals else _superseded(order)
+            return f"the vehicle reports {refusals[0]!r}" if refusals else _supersession(order)
 
         try:
-            await self.send(context, *values, of=order)
+            await self.send(context, *values, device_order=order)
             acknowledged_at = now()
             await await_progress(
                 context.session,
                 self.name,
                 is_done=lambda: any(is_done(text, now() - acknowledged_at) for text in texts),
-                trouble=trouble,
+                failure_reason=failure_reason,
                 describe=lambda: "no status text reported it",
                 timeout=timeout,
             )
@@ -169,13 +171,16 @@ class SimpleOrder(Snapshot):
         context: VehicleContext,
         effect: Effect,
         values: tuple[float, ...],
-        order: Order | None,
+        device_order: Order | None,
         target: int,
         timeout: float,
     ) -> None:
-        """Request the message until it reports the effect; return early if the vehicle does not have this message."""
+        """Request the message until it reports the effect; return early if the vehicle does not have this message.
+
+        ``target`` is the id of the component that sends the message.
+        """
         session, message_type = context.session, getattr(m, effect.message)
-        reports: list[Message] = []
+        reports: list[Message] = []  # only the latest one
         is_reported = False
         requested_at = session.connection.now()
 
@@ -187,6 +192,7 @@ class SimpleOrder(Snapshot):
                 is_reported = is_reported or effect.is_reported(message, *values)
 
         def is_done() -> bool:
+            """Return True once the effect is reported; until then, request the message again and again."""
             nonlocal requested_at
             if not is_reported and session.connection.now() - requested_at >= EFFECT_POLL_S:
                 requested_at = session.connection.now()
@@ -195,12 +201,13 @@ class SimpleOrder(Snapshot):
 
         detach = session.connection.bus.attach(message_type, on_message, system_id=session.system_id)
         try:
+            # A vehicle that refuses requests for the message may still stream it.
             if await _has_message(context, message_type.ID, target) or reports:
                 await await_progress(
                     session,
                     self.name,
                     is_done=is_done,
-                    trouble=lambda: _superseded(order),
+                    failure_reason=lambda: _supersession(device_order),
                     describe=lambda: str(reports[0]) if reports else f"no {message_type.NAME} was received",
                     timeout=timeout,
                 )
@@ -208,7 +215,8 @@ class SimpleOrder(Snapshot):
             detach()
 
 
-def _superseded(order: Order | None) -> str | None:
+def _supersession(order: Order | None) -> str | None:
+    """Return a clause if a newer order has replaced this one."""
     return SUPERSEDED if order is not None and not order.is_newest else None
 
 
@@ -237,7 +245,7 @@ async def receive_once(
         await session.commands.send_long(
             MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=1.0
         )
-        while True:
+        while True:  # Other components may send this message, too.
             message = await messages.get(1.0)
             if message.received_frame is None or message.received_frame.component_id == target:
                 return message

@@ -93,7 +93,7 @@ class StickStream(SteeringStream[StickInput]):
         self._rules = context.session.autopilot.sticks
         self._probe, self._has_sent = probe, False
         telemetry = context.session.telemetry
-        self._given_mode = None if mode is None else self._session.autopilot.find_mode(mode, telemetry.mode_names)
+        self._chosen_mode = None if mode is None else self._session.autopilot.find_mode(mode, telemetry.mode_names)
 
     def set(self, sticks: StickInput) -> None:
         """Set the stick positions, which are sent at the next tick and repeated until ``valid_for_s`` has passed.
@@ -108,16 +108,16 @@ class StickStream(SteeringStream[StickInput]):
     async def move(self, sticks: StickInput, duration_s: float) -> None:
         """Keep the sticks in one position for ``duration_s`` seconds. Raises as :meth:`set`."""
         check_kind("sticks", sticks, StickInput)
-        await self._feed(sticks, duration_s)
+        await self._supply_for(sticks, duration_s)
 
     @property
-    def _is_stream_before_mode(self) -> bool:
+    def _needs_stream_before_mode(self) -> bool:
         return True  # Without the initial positions, the mode would start with the transmitter's throttle.
 
-    def _wanted_mode(self) -> Mode:
+    def _stream_mode(self) -> Mode:
         if self._rules is None:
             raise NotSupported(f"sticks: {self._session.autopilot.firmware} does not accept MANUAL_CONTROL")
-        return self._given_mode or self._context.sender.mode_for("sticks", "sticks")
+        return self._chosen_mode or self._context.sender.mode_for("sticks", "sticks")
 
     async def _check_support(self) -> None:
         if self._session.autopilot.name == "PX4":
@@ -130,15 +130,21 @@ class StickStream(SteeringStream[StickInput]):
             return
         values = await known_values(self._probe, "MAV_GCS_SYSID", "SYSID_MYGCS", "RC_OVERRIDE_TIME", "RC_OPTIONS")
         own_id = self._session.connection.source_system
+        # Older versions of ArduPilot call MAV_GCS_SYSID SYSID_MYGCS.
         ground_station = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS", own_id))
         if ground_station != own_id:
             raise OperationRejected(
                 f"sticks: ArduPilot accepts stick positions only from system {ground_station:g} (MAV_GCS_SYSID), and"
                 f" this program is system {own_id}: connect with source_system={ground_station:g}"
             )
-        if (seconds := values.get("RC_OVERRIDE_TIME", 3.0)) <= 0:
-            why = "never releases the sticks if this program dies" if seconds < 0 else "ignores stick positions"
-            raise OperationRejected(f"sticks: with RC_OVERRIDE_TIME = {seconds:g} ArduPilot {why}; set it to 3")
+        release_after_s = values.get("RC_OVERRIDE_TIME", 3.0)
+        if release_after_s <= 0:
+            effect = "ignores stick positions"
+            if release_after_s < 0:
+                effect = "never releases the sticks if this program dies"
+            raise OperationRejected(
+                f"sticks: with RC_OVERRIDE_TIME = {release_after_s:g} ArduPilot {effect}; set it to 3"
+            )
         if int(values.get("RC_OPTIONS", 0)) & IGNORE_OVERRIDES:
             raise OperationRejected("sticks: bit 1 of RC_OPTIONS makes ArduPilot ignore overrides; clear it")
 
@@ -164,6 +170,7 @@ class StickStream(SteeringStream[StickInput]):
         if self._rules.release == "axes":
             message = ManualControl(self._session.system_id, NO_VALUE, NO_VALUE, NO_VALUE, NO_VALUE, 0)
         elif self._rules.release == "channels":
+            # The message has 18 channels, of which those above 8 have another value for a release.
             upper = SUB_CHANNELS - 8
             values = [RELEASED] * 8 + [RELEASED_UPPER] * upper + [UNCHANGED] * (10 - upper)
             message = RcChannelsOverride(self._session.system_id, self._session.component_id, *values)

@@ -57,7 +57,8 @@ class ValueStream(Generic[ValueT]):
     Subclasses implement entering and leaving the block, and what happens when the stream stops by itself.
     """
 
-    _NAME, _VALUE = "stream", "value"  # Nouns for the stream and its value in error texts.
+    # Nouns for the stream and its value in error texts.
+    _NAME, _VALUE = "stream", "value"
 
     def __init__(
         self,
@@ -78,8 +79,8 @@ class ValueStream(Generic[ValueT]):
         self._message: Message | None = None
         self._set_at = -math.inf
         self._timer: asyncio.TimerHandle | None = None
-        self._stopped: AerokitError | None = None
-        self._is_reported = self._was_entered = self._is_entering = False
+        self._stop_error: AerokitError | None = None
+        self._has_raised_stop = self._was_entered = self._is_changing_mode = False
 
     @property
     def is_running(self) -> bool:
@@ -90,13 +91,14 @@ class ValueStream(Generic[ValueT]):
         self._raise_if_stopped()
         if self._timer is None:
             raise SetpointStreamStopped(f"this {self._NAME} is not running: use it inside its `async with` block")
-        self._take(value)
+        self._replace_value(value)
 
-    async def _feed(self, value: ValueT, duration_s: float) -> None:
+    async def _supply_for(self, value: ValueT, duration_s: float) -> None:
+        """Supply one value for ``duration_s`` seconds, often enough that it does not expire meanwhile."""
         until = self._now() + duration_s
-        while (left := until - self._now()) > 0:
+        while (remaining_s := until - self._now()) > 0:
             self._set(value)
-            await anyio.sleep(min(left, self._valid_for_s / 3))
+            await anyio.sleep(min(remaining_s, self._valid_for_s / 3))
         self._raise_if_stopped()
 
     def _raise_if_entered(self) -> None:
@@ -105,23 +107,23 @@ class ValueStream(Generic[ValueT]):
 
     # ---------------------------------------------------------------------------- the stream
 
-    def _take(self, value: ValueT) -> None:
-        """Encode the value completely, so that an invalid value is refused here and not when it is sent."""
+    def _replace_value(self, value: ValueT) -> None:
+        """Replace the value. It is encoded at once, so that an invalid value is refused here, not when it is sent."""
         message = self._encode(value)
         message.encode()
         self._value, self._message, self._set_at = value, message, self._now()
 
     def _begin_sending(self) -> None:
-        self._take(self._value)
+        self._replace_value(self._value)
         self._tick(self._now())
 
     def _tick(self, due: float) -> None:
-        """Send the value once more, or stop the stream."""
+        """Send the value once more, or stop the stream; ``due`` is the time for which this call was scheduled."""
         self._timer = None
-        if reason := self._takeover():
+        if reason := self._takeover_reason():
             self._stop(reason, hold=False)
             return
-        if reason := self._why_stop(self._now() - due):
+        if reason := self._stop_reason(self._now() - due):
             self._stop(reason)
             return
         try:
@@ -136,12 +138,14 @@ class ValueStream(Generic[ValueT]):
         assert self._message is not None
         self._session.connection.send(self._message)
 
-    def _takeover(self) -> str | None:
+    def _takeover_reason(self) -> str | None:
         """Return a clause if a pilot, a failsafe or another program took over, else None."""
         return None
 
-    def _why_stop(self, lag: float) -> str | None:
-        age = 0.0 if self._is_entering else self._now() - self._set_at
+    def _stop_reason(self, lag: float) -> str | None:
+        """Return why the stream must stop, as a clause, else None; ``lag`` is the delay of this tick in seconds."""
+        # A value does not expire while the mode is changed, because the program cannot supply values then.
+        age = 0.0 if self._is_changing_mode else self._now() - self._set_at
         if lag > self._max_lag_s:
             return f"the event loop was blocked for {lag:.1f} s"
         if age > self._valid_for_s:
@@ -154,10 +158,10 @@ class ValueStream(Generic[ValueT]):
     def _stop(self, reason: str, *, hold: bool = True) -> None:
         """Stop the stream by itself; order the vehicle to hold unless there was a takeover."""
         self._end()
-        is_confirmed = hold and self._hold()
+        is_hold_ordered = hold and self._hold()
         self._release()
-        self._stopped = SetpointStreamStopped(
-            f"the {self._NAME} has stopped: {reason}" + ("; a hold was ordered" if is_confirmed else "")
+        self._stop_error = SetpointStreamStopped(
+            f"the {self._NAME} has stopped: {reason}" + ("; a hold was ordered" if is_hold_ordered else "")
         )
 
     def _hold(self) -> bool:
@@ -174,9 +178,9 @@ class ValueStream(Generic[ValueT]):
             self._timer = None
 
     def _raise_if_stopped(self) -> None:
-        if self._stopped is not None:
-            self._is_reported = True
-            raise self._stopped
+        if self._stop_error is not None:
+            self._has_raised_stop = True
+            raise self._stop_error
 
     def _now(self) -> float:
         return self._session.connection.now()
@@ -201,11 +205,11 @@ class SteeringStream(ValueStream[ValueT]):
     """
 
     @property
-    def _is_stream_before_mode(self) -> bool:
+    def _needs_stream_before_mode(self) -> bool:
         """True if the autopilot enters the mode only while values arrive."""
         return self._session.autopilot.setpoints.stream_before_mode
 
-    def _wanted_mode(self) -> Mode:
+    def _stream_mode(self) -> Mode:
         """Return the mode in which the vehicle executes the values; raise NotSupported if there is no such mode."""
         raise NotImplementedError
 
@@ -214,20 +218,21 @@ class SteeringStream(ValueStream[ValueT]):
 
     async def __aenter__(self) -> Self:
         self._raise_if_entered()
-        self._take(self._value)  # Raises for an invalid value before anything is sent.
+        self._replace_value(self._value)  # Raises for an invalid value before anything is sent.
         cleanup = self._context.flight_cleanup
         cleanup.check_no_stream()
-        mode = self._wanted_mode()
+        mode = self._stream_mode()
         self._was_entered = True
-        cleanup.stop_stream = self._stop
-        check = TakeoverCheck(self._context, mode)
+        cleanup.stop_stream = self._stop  # Registered before the first await, so that there is only one stream.
+        takeover_check = TakeoverCheck(self._context, mode)
         try:
             await self._check_support()
-            check.raise_if_changed(self._NAME)
+            takeover_check.raise_if_changed(self._NAME)
         except BaseException:
             self._end()
             raise
         order = self._order = self._prepared_order or self._context.arbiter.order(mode)
+        # A vehicle that already is in the mode may execute the first value at once.
         order.may_move = order.may_move or self._session.telemetry.is_in(mode)
         try:
             await self._enter(mode, order)
@@ -240,31 +245,31 @@ class SteeringStream(ValueStream[ValueT]):
         return self
 
     async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
-        if self._stopped is None and (reason := self._takeover()):
+        if self._stop_error is None and (reason := self._takeover_reason()):
             self._stop(reason, hold=False)
-        if self._stopped is None:
+        if self._stop_error is None:
             try:
                 await self._leave(exc)
             finally:
                 self._release()
-        elif exc is None and not self._is_reported:
-            raise self._stopped
+        elif exc is None and not self._has_raised_stop:
+            raise self._stop_error
 
     async def _leave(self, exc: BaseException | None) -> None:
         """Leave the block while the stream is running."""
         self._end()
-        self._stopped = SetpointStreamStopped(f"the block of this {self._NAME} was left")
-        if exc is not None:
+        self._stop_error = SetpointStreamStopped(f"the block of this {self._NAME} was left")
+        if exc is not None:  # An exception leaves the block at once, without waiting for the confirmation of the hold.
             self._hold()
-        # There may have been a takeover whose report was not received yet.
-        elif not self._context.arbiter.is_known:
+        elif not self._context.arbiter.is_state_recent:
+            # There may have been a takeover whose report was not received yet.
             self._stop(f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s")
-            raise self._stopped
+            raise self._stop_error
         elif not self._session.telemetry.is_confirmed_disarmed:
-            cleanup, mode = self._context.flight_cleanup, self._context.sender.mode_for("hold", "hold")
-            order = self._context.arbiter.order(mode)
+            cleanup, hold_mode = self._context.flight_cleanup, self._context.sender.mode_for("hold", "hold")
+            order = self._context.arbiter.order(hold_mode)
             try:
-                await cleanup.stop_in(mode, order)
+                await cleanup.stop_in(hold_mode, order)
             except (anyio.get_cancelled_exc_class(), OperationTimeout):  # The hold may have been lost.
                 cleanup.hold_in_background(order)
                 raise
@@ -273,14 +278,14 @@ class SteeringStream(ValueStream[ValueT]):
         """Change the mode. ArduPilot accepts values once it is in the mode; PX4 enters the mode once it receives
         values.
         """
-        if self._is_stream_before_mode:
+        if self._needs_stream_before_mode:
             self._begin_sending()
-            await self._feed(self._value, LEAD_TIME_S)
-            self._is_entering = True
+            await self._supply_for(self._value, LEAD_TIME_S)
+            self._is_changing_mode = True
             try:
                 await self._context.sender.ensure_mode(mode, order)
             finally:
-                self._is_entering = False
+                self._is_changing_mode = False
                 self._set_at = self._now()
             self._raise_if_stopped()
         else:
@@ -288,7 +293,7 @@ class SteeringStream(ValueStream[ValueT]):
             self._begin_sending()
         self._mode = mode
 
-    def _takeover(self) -> str | None:
+    def _takeover_reason(self) -> str | None:
         mode = self._session.telemetry.mode.latest
         if self._mode is not None and mode is not None and mode != self._mode:
             return f"the vehicle left {self._mode} for {mode}"
@@ -296,12 +301,12 @@ class SteeringStream(ValueStream[ValueT]):
             return self._order.end
         return None
 
-    def _why_stop(self, lag: float) -> str | None:
+    def _stop_reason(self, lag: float) -> str | None:
         if self._impact is not None:
             self._impact.update()
-            if reason := self._impact.text():
+            if reason := self._impact.describe():
                 return reason
-        return super()._why_stop(lag)
+        return super()._stop_reason(lag)
 
     def _hold(self) -> bool:
         return self._order is not None and self._context.flight_cleanup.hold_in_background(self._order)
@@ -313,29 +318,27 @@ class SteeringStream(ValueStream[ValueT]):
 
 
 class TakeoverCheck:
-    """Refuses a mode change that a newer event has overtaken.
+    """Refuses a mode change if the mode was changed, or another order was given, since the creation of this object."""
 
-    Such events, since the creation of this object, are a mode change by another party and another order of the program.
-    """
+    def __init__(self, context: VehicleContext, next_mode: Mode) -> None:
+        telemetry, autopilot = context.session.telemetry, context.session.autopilot
+        self._telemetry, self._next_mode = telemetry, next_mode
+        self._mode_before = telemetry.mode.latest
+        self._arbiter, self._order_before = context.arbiter, context.arbiter.latest(STEERING)
+        take_off_mode = autopilot.mode_for("take_off", is_vtol=telemetry.is_vtol)
+        hold_mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol)
+        self._end_of_take_off = (take_off_mode, hold_mode)
 
-    def __init__(self, context: VehicleContext, wanted: Mode) -> None:
-        session = context.session
-        self._telemetry, self._wanted = session.telemetry, wanted
-        self._before = session.telemetry.mode.latest
-        self._arbiter, self._order = context.arbiter, context.arbiter.latest(STEERING)
-        is_vtol = session.telemetry.is_vtol
-        self._take_off, self._hold = (session.autopilot.mode_for(p, is_vtol=is_vtol) for p in ("take_off", "hold"))
-
-    def raise_if_changed(self, what: str) -> None:
+    def raise_if_changed(self, operation: str) -> None:
         """Raise OperationRejected if an order was given, or if the mode was changed other than by the end of a
         take-off.
         """
-        if self._arbiter.latest(STEERING) is not self._order:
-            raise OperationRejected(f"{what}: {SUPERSEDED} before anything was ordered")
-        before, mode = self._before, self._telemetry.mode.latest
-        if before is None or mode in (before, self._wanted) or (before, mode) == (self._take_off, self._hold):
+        if self._arbiter.latest(STEERING) is not self._order_before:
+            raise OperationRejected(f"{operation}: {SUPERSEDED} before anything was ordered")
+        before, mode = self._mode_before, self._telemetry.mode.latest
+        if before is None or mode in (before, self._next_mode) or (before, mode) == self._end_of_take_off:
             return
-        raise OperationRejected(f"{what}: the mode changed from {before} to {mode} before anything was ordered")
+        raise OperationRejected(f"{operation}: the mode changed from {before} to {mode} before anything was ordered")
 
 
 async def known_values(probe: Probe, *names: str) -> dict[str, float]:

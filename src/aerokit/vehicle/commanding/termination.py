@@ -16,8 +16,8 @@ ShutdownIntent = Literal["shut down"]
 
 ANSWER_TIMEOUT_S = 3.0
 SHUTDOWN = 2
-"""param1 of PREFLIGHT_REBOOT_SHUTDOWN."""
-ONCE: dict[str, Any] = {"attempts": 1, "attempt_timeout": ANSWER_TIMEOUT_S}
+"""param1 of PREFLIGHT_REBOOT_SHUTDOWN that switches the autopilot off."""
+SEND_ONCE: dict[str, Any] = {"attempts": 1, "attempt_timeout": ANSWER_TIMEOUT_S}
 
 
 @checks_arguments
@@ -48,7 +48,7 @@ class TerminationActions(VehicleBase):
         self._arm_cleanup.stop()
         order = self._arbiter.order(*modes, ends_flight=True)
         try:
-            await self._sender.send_long(order, MavCmd.DO_FLIGHTTERMINATION, 1.0, modes=modes, armed=False, **ONCE)
+            await self._sender.send_long(order, MavCmd.DO_FLIGHTTERMINATION, 1.0, modes=modes, armed=False, **SEND_ONCE)
         except CommandTimeout as error:
             raise CommandTimeout(f"{error}; the flight may have been terminated nevertheless") from None
         armed, state = self.telemetry.armed, self.telemetry.system_status
@@ -61,7 +61,7 @@ class TerminationActions(VehicleBase):
             self._session,
             "terminate",
             is_done=is_terminated,
-            trouble=lambda: None,
+            failure_reason=lambda: None,
             describe=lambda: f"the vehicle is in {self.telemetry.mode_name}, still armed",
             timeout=timeout,
             max_silence_s=MAX_SILENCE_S,
@@ -90,15 +90,15 @@ class TerminationActions(VehicleBase):
             raise NotSupported(f"shutdown: {self.autopilot.firmware} cannot be switched off; nothing was sent")
         self._session.check_disarmed("shutdown")
         try:
-            await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN, **ONCE)
+            await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN, **SEND_ONCE)
         except CommandTimeout as error:
             raise CommandTimeout(f"{error}; the autopilot may have switched off nevertheless") from None
-        with suppress(LinkLost):
+        with suppress(LinkLost):  # The link may go down with the autopilot.
             await await_progress(
                 self._session,
                 "shutdown",
                 is_done=lambda: self._session.watch.is_silent,
-                trouble=lambda: None,
+                failure_reason=lambda: None,
                 describe=lambda: "the autopilot still sends HEARTBEATs",
                 timeout=timeout,
                 max_silence_s=None,

@@ -30,8 +30,13 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.vehicle.commanding.order import Order
 
+# Bits of POSITION_TARGET_TYPEMASK that make the vehicle ignore all fields but the position.
 POSITION_ONLY = 0x0DF8
 
+# param1 and param3 of DO_CHANGE_SPEED.
+GROUND_SPEED, KEEP_THROTTLE = 1, -1
+
+# Interval at which a target that is not acknowledged is sent again.
 RESEND_S = 1.0
 
 
@@ -82,36 +87,42 @@ class TravelActions(VehicleBase):
         place = self._position.command_place(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
         self._position.check_reach("target", [target], max_distance_m)
-        near_m = self._position.arrival_radius_m if tolerance_m is None else tolerance_m
+        arrival_radius_m = self._position.arrival_radius_m if tolerance_m is None else tolerance_m
         self._check_can_turn(heading_deg)
         self._position.check_flying("go_to")
         mode = self._sender.mode_for("go_to", self.autopilot.reposition_purpose)
         order = self._arbiter.order(mode, self._sender.mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
-        under_way = False
+        is_under_way = False
         try:
-            resend = await self._send_there(order, place, yaw, speed_m_s)
-            under_way = True
+            unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
+            is_under_way = True
             if speed_m_s is not None and not self._speeds_by_reposition:
                 # ArduPilot applies the speed only once the vehicle is on its way.
-                await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
-            if heading_deg is not None and math.isnan(yaw):
+                await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, GROUND_SPEED, speed_m_s, KEEP_THROTTLE)
+            if heading_deg is not None and math.isnan(yaw):  # MAV_CMD_DO_REPOSITION cannot set the heading.
                 await self._sender.send_long(order, MavCmd.CONDITION_YAW, heading_deg % 360)
             with self._flight_cleanup.flying(order):
-                await self._await_arrival(target, near_m, timeout, max_silence_s, order, mode, resend)
-        # The vehicle may have received the command.
+                await self._await_arrival(
+                    target, arrival_radius_m, timeout, max_silence_s, order, mode, unacknowledged_target
+                )
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
+            # The vehicle may have received the command, so it is ordered to hold.
             self._flight_cleanup.hold_in_background(order)
             raise
         except CommandRejected:
-            if under_way:
+            if is_under_way:  # Only the speed or the heading was refused.
                 self._flight_cleanup.hold_in_background(order)
             raise
 
-    async def _send_there(
+    async def _send_target(
         self, order: Order, place: dict[str, Any], yaw: float, speed_m_s: float | None
     ) -> SetPositionTargetGlobalInt | None:
-        """Send the order; return the message to repeat on the way, or None if the order was acknowledged."""
+        """Send MAV_CMD_DO_REPOSITION; return None if it was acknowledged.
+
+        A vehicle that does not support the command gets a SET_POSITION_TARGET_GLOBAL_INT. This message is returned,
+        because it must be repeated on the way: the vehicle does not acknowledge it.
+        """
         speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
         params = (speed, MavDoRepositionFlags.CHANGE_MODE, 0, yaw)
         modes = (self._sender.mode_for("go_to", self.autopilot.reposition_purpose),)
@@ -124,45 +135,50 @@ class TravelActions(VehicleBase):
                 raise
             await self._sender.ensure_mode(self._sender.mode_for("go_to", "setpoint"), order)
             self._sender.raise_if_ended(order)
-            address, where = (self.system_id, self.component_id), (place["x"], place["y"], place["z"])
-            resend = SetPositionTargetGlobalInt(0, *address, place["frame"], POSITION_ONLY, *where, *(0.0,) * 8)
-            self.connection.send(resend)
-            return resend
+            address, position = (self.system_id, self.component_id), (place["x"], place["y"], place["z"])
+            message = SetPositionTargetGlobalInt(0, *address, place["frame"], POSITION_ONLY, *position, *(0.0,) * 8)
+            self.connection.send(message)
+            return message
         return None
 
     async def _await_arrival(
         self,
         target: Position,
-        near_m: float,
+        arrival_radius_m: float,
         timeout: float | None,
         max_silence_s: float | None,
         order: Order,
         mode: Mode,
-        resend: SetPositionTargetGlobalInt | None,
+        unacknowledged_target: SetPositionTargetGlobalInt | None,
     ) -> None:
-        """Wait for the arrival. Meanwhile repeat ``resend``: the message of the order, if it is not acknowledged."""
+        """Wait for the arrival. Meanwhile, repeat ``unacknowledged_target``, see :meth:`_send_target`."""
         started = sent_at = self.connection.now()
 
-        def is_there() -> bool:
+        def resend_if_due() -> None:
             nonlocal sent_at
             now = self.connection.now()
-            if resend is not None and now - sent_at >= RESEND_S and self._arbiter.is_known and not order.end:
+            if unacknowledged_target is None or now - sent_at < RESEND_S:
+                return
+            if self._arbiter.is_state_recent and not order.end:
                 sent_at = now
-                self.connection.send(resend)
-            is_near = self._position.is_known_since(started) and self._position.remaining_distance(target) <= near_m
-            return is_near and not order.end
+                self.connection.send(unacknowledged_target)
+
+        def has_arrived() -> bool:
+            resend_if_due()
+            is_known = self._position.is_known_since(started)
+            return is_known and self._position.remaining_distance(target) <= arrival_radius_m and not order.end
 
         with self._session.streaming("position"):
             await await_progress(
                 self._session,
                 f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
-                is_done=is_there,
-                trouble=self._sender.stays_in(order, mode),
+                is_done=has_arrived,
+                failure_reason=self._sender.mode_failure(order, mode),
                 describe=lambda: f"the vehicle is {self._position.remaining_distance(target):.1f} m away",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
                 held_for=0.5,
-                stillness=StallDetector(self._session),
+                stall_reason=StallDetector(self._session),
             )
 
     async def set_speed(self, speed_m_s: float) -> None:
@@ -176,7 +192,7 @@ class TravelActions(VehicleBase):
             CommandRejected: the vehicle refused.
         """
         check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
-        await self._sender.auxiliary_command(MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
+        await self._sender.auxiliary_command(MavCmd.DO_CHANGE_SPEED, GROUND_SPEED, speed_m_s, KEEP_THROTTLE)
 
     async def set_heading(
         self,
@@ -214,22 +230,24 @@ class TravelActions(VehicleBase):
         check_range("tolerance_deg", tolerance_deg, 0, 180, above=True)
         self._check_can_turn(heading_deg)
         mode = self._sender.mode_for("set_heading", self.autopilot.reposition_purpose)
-        goal = (heading_deg + (self.telemetry.heading_deg.value if relative else 0)) % 360
+        goal_deg = (heading_deg + (self.telemetry.heading_deg.value if relative else 0)) % 360
         order = self._arbiter.order(mode)
         if self._turns_by_reposition:
-            yaw = math.remainder(math.radians(goal), 2 * math.pi)
+            yaw = math.remainder(math.radians(goal_deg), 2 * math.pi)
             params = (-1, MavDoRepositionFlags.CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
             await self._sender.send_long(order, MavCmd.DO_REPOSITION, *params, modes=(mode,))
         else:
             await self._sender.ensure_mode(mode, order)
             # An absolute heading is sent instead of an angle, so that a repetition does not turn the vehicle further.
-            direction = (1 if heading_deg >= 0 else -1) if relative else 0
-            await self._sender.send_long(order, MavCmd.CONDITION_YAW, goal, rate_deg_s, direction, 0)
-        await self._await_heading(goal, tolerance_deg, timeout, max_silence_s, order, mode)
+            direction = 0  # the shorter way
+            if relative:
+                direction = 1 if heading_deg >= 0 else -1
+            await self._sender.send_long(order, MavCmd.CONDITION_YAW, goal_deg, rate_deg_s, direction, 0)
+        await self._await_heading(goal_deg, tolerance_deg, timeout, max_silence_s, order, mode)
 
     async def _await_heading(
         self,
-        goal: float,
+        goal_deg: float,
         tolerance_deg: float,
         timeout: float,
         max_silence_s: float | None,
@@ -239,16 +257,19 @@ class TravelActions(VehicleBase):
         started = self.connection.now()
         heading = self.telemetry.heading_deg
 
-        def off() -> float:
-            return abs(math.remainder(heading.value - goal, 360)) if heading.is_known else math.inf
+        def deviation_deg() -> float:
+            return abs(math.remainder(heading.value - goal_deg, 360)) if heading.is_known else math.inf
+
+        def is_done() -> bool:
+            return heading.updated_at >= started and deviation_deg() <= tolerance_deg and not order.end
 
         with self._session.streaming("heading_deg"):
             await await_progress(
                 self._session,
-                f"set_heading({goal:g}°)",
-                is_done=lambda: heading.updated_at >= started and off() <= tolerance_deg and not order.end,
-                trouble=self._sender.stays_in(order, mode),
-                describe=lambda: f"the heading is {off():.0f}° off",
+                f"set_heading({goal_deg:g}°)",
+                is_done=is_done,
+                failure_reason=self._sender.mode_failure(order, mode),
+                describe=lambda: f"the heading is {deviation_deg():.0f}° off",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )
@@ -271,17 +292,20 @@ class TravelActions(VehicleBase):
             OperationTimeout: the vehicle accepted the command, but HOME_POSITION does not report the new place.
         """
         if place is not None and place.altitude_amsl_m is None:
-            raise InvalidArgument("place has no altitude_amsl_m, which home requires")
+            raise InvalidArgument(
+                "place.altitude_amsl_m = None is not allowed: home needs an altitude above mean sea level"
+            )
         home = self.telemetry.home
         with self._arbiter.auxiliary_order() as order:
             if place is None:
-                await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)
+                await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)  # 1: the present position
             else:
                 # The command takes altitudes above mean sea level only.
-                amsl = point_at(place).replace(altitude_relative_m=None)
-                latitude, longitude, altitude, _ = self._position.global_target(amsl)
-                where: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
-                await self._sender.run_command(order, self._session.commands.send_place, MavCmd.DO_SET_HOME, 0, **where)
+                amsl_place = point_at(place).replace(altitude_relative_m=None)
+                latitude, longitude, altitude, _ = self._position.global_target(amsl_place)
+                position: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
+                send = self._session.commands.send_place
+                await self._sender.run_command(order, send, MavCmd.DO_SET_HOME, 0, **position)
         requested_at = self.connection.now()
         await self._session.commands.send_long(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
         await home.wait_until(lambda _: home.updated_at >= requested_at, timeout=timeout, description="set_home")
@@ -295,7 +319,7 @@ class TravelActions(VehicleBase):
 
     def _check_can_turn(self, heading_deg: float | None) -> None:
         if heading_deg is not None and not self._turns_by_reposition and not self.autopilot.condition_yaw:
-            raise NotSupported(f"{self.autopilot.firmware} has no command for a region of interest; nothing was sent")
+            raise NotSupported(f"{self.autopilot.firmware} has no command to turn to a heading; nothing was sent")
 
     @property
     def _speeds_by_reposition(self) -> bool:
@@ -322,7 +346,7 @@ def _check_travel(
         check_range("tolerance_m", tolerance_m, 0, 100_000, above=True)
 
 
-LOCATION = MavCmd.DO_SET_ROI_LOCATION
+ROI_LOCATION = MavCmd.DO_SET_ROI_LOCATION
 
 
 @checks_arguments
@@ -344,37 +368,38 @@ class LookActions(VehicleBase):
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
         place = self._position.command_place(point_at(target))
-        if not self._session.commands.is_unknown(LOCATION) and await self._set_roi_location(place):
+        if not self._session.commands.is_unsupported(ROI_LOCATION) and await self._set_roi_location(place):
             return
         is_relative = place["frame"] == MavFrame.GLOBAL_RELATIVE_ALT_INT
-        above_home = place["z"] if is_relative else place["z"] - self._position.home_altitude()
-        await self._give(MavCmd.DO_SET_ROI, 0, 0, 0, 0, place["x"] * 1e-7, place["y"] * 1e-7, above_home)
+        above_home_m = place["z"] if is_relative else place["z"] - self._position.home_altitude()
+        await self._send_roi(MavCmd.DO_SET_ROI, 0, 0, 0, 0, place["x"] * 1e-7, place["y"] * 1e-7, above_home_m)
 
     async def _set_roi_location(self, place: dict[str, Any]) -> bool:
         """Send MAV_CMD_DO_SET_ROI_LOCATION; return False if the firmware does not support it as COMMAND_INT."""
-        with self._newest() as order:
+        with self._new_roi_order() as order:
             try:
-                await self._sender.run_command(order, self._session.commands.send_int, LOCATION, **place)
+                await self._sender.run_command(order, self._session.commands.send_int, ROI_LOCATION, **place)
             except CommandTimeout:
-                knows_int = (self.telemetry.capabilities.latest or 0) & MavProtocolCapability.COMMAND_INT
-                if knows_int or not self._arbiter.is_known:
+                # Firmware that does not support COMMAND_INT does not answer it.
+                supports_int = (self.telemetry.capabilities.latest or 0) & MavProtocolCapability.COMMAND_INT
+                if supports_int or not self._arbiter.is_state_recent:
                     raise
                 self._raise_if_superseded(order)
                 return False
             except CommandRejected:
-                if not self._session.commands.is_unknown(LOCATION):
+                if not self._session.commands.is_unsupported(ROI_LOCATION):
                     raise
                 self._raise_if_superseded(order)
                 return False
         return True
 
-    async def _give(self, command: int, *params: float) -> None:
-        with self._newest() as order:
+    async def _send_roi(self, command: int, *params: float) -> None:
+        with self._new_roi_order() as order:
             await self._sender.send_long(order, command, *params)
 
     @contextmanager
-    def _newest(self) -> Iterator[Order]:
-        with self._arbiter.auxiliary_order(self._arbiter.of_device(ROI)) as order:
+    def _new_roi_order(self) -> Iterator[Order]:
+        with self._arbiter.auxiliary_order(self._arbiter.device_order(ROI)) as order:
             yield order
 
     @staticmethod
@@ -391,7 +416,7 @@ class LookActions(VehicleBase):
             CommandTimeout: there was no acknowledgement.
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
-        with self._newest() as order:
+        with self._new_roi_order() as order:
             try:
                 await self._sender.send_long(order, MavCmd.DO_SET_ROI_NONE)
                 return
@@ -399,4 +424,4 @@ class LookActions(VehicleBase):
                 if error.result != MavResult.UNSUPPORTED:
                     raise
                 self._raise_if_superseded(order)
-        await self._give(MavCmd.DO_SET_ROI)
+        await self._send_roi(MavCmd.DO_SET_ROI)

@@ -55,7 +55,7 @@ class TuningActions(VehicleBase):
             raise NotSupported(
                 f"autotune: {self.autopilot.firmware} needs a pilot for its mode AUTOTUNE; nothing was sent"
             )
-        started, percent = self.connection.now(), -1
+        started, percent = self.connection.now(), -1  # -1: no progress reported yet
         answers: list[CommandAck] = []
         detach = self.connection.bus.attach(CommandAck, answers.append, system_id=self.system_id)
         try:
@@ -65,7 +65,7 @@ class TuningActions(VehicleBase):
                         raise OperationTimeout(
                             f"autotune: not done within {timeout:g} s ({percent} %); PX4 may go on tuning"
                         )
-                    answer = await self._ask(answers)
+                    answer = await self._poll(answers)
                     if answer.result not in (MavResult.IN_PROGRESS, MavResult.ACCEPTED):
                         raise rejection(MavCmd.DO_AUTOTUNE_ENABLE, answer.result)
                     if answer.progress != percent and on_progress is not None:
@@ -80,8 +80,8 @@ class TuningActions(VehicleBase):
         finally:
             detach()
 
-    async def _ask(self, answers: list[CommandAck]) -> CommandAck:
-        """Poll PX4 by sending the command once; return the answer."""
+    async def _poll(self, answers: list[CommandAck]) -> CommandAck:
+        """Poll PX4 by sending the command once; return the answer. ``answers`` collects all received COMMAND_ACKs."""
         answers.clear()
         self._session.commands.send_unconfirmed(MavCmd.DO_AUTOTUNE_ENABLE, 1)
         until = self.connection.now() + ANSWER_TIMEOUT_S

@@ -77,11 +77,13 @@ class ComponentInformation(Snapshot):
 
 def kind_of(heartbeat: Heartbeat | None, component_id: int) -> str:
     """Return the kind of a component according to its MAV_TYPE, or to its component id if the type is generic."""
-    if heartbeat is not None and is_autopilot(heartbeat):
+    if heartbeat is None:
+        return "unknown"
+    if is_autopilot(heartbeat):
         return "autopilot"
-    if heartbeat is not None and heartbeat.type != MavType.GENERIC:
+    if heartbeat.type != MavType.GENERIC:
         return _name(MavType, heartbeat.type)
-    return _name(MavComponent, component_id) if heartbeat is not None else "unknown"
+    return _name(MavComponent, component_id)
 
 
 def _name(enum: type[MavType | MavComponent], number: int) -> str:
@@ -215,7 +217,7 @@ class Component(ReadOnly):
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack, like :meth:`aerokit.Vehicle.command`."""
-        return await self._sender.answered(
+        return await self._sender.send_raw(
             self._session.commands.send_long,
             command,
             *params,
@@ -245,10 +247,12 @@ class Component(ReadOnly):
             CommandRejected: the component refused.
             OperationTimeout: the message did not arrive.
         """
-        with self._session.subscriber.subscribe((message_type,), 100, "drop_oldest", None) as answers:
+        subscriber = self._session.subscriber
+        with subscriber.subscribe((message_type,), capacity=100, overflow="drop_oldest", rate_hz=None) as answers:
             refusal: CommandRejected | None = None
             with anyio.move_on_after(timeout):
                 for _ in range(REQUEST_ATTEMPTS):
+                    # After a refusal, only messages that have already arrived count.
                     try:
                         await self._session.commands.send_long(
                             MavCmd.REQUEST_MESSAGE,
@@ -257,7 +261,7 @@ class Component(ReadOnly):
                             component_id=self.component_id,
                             attempts=1,
                         )
-                    except CommandTimeout:
+                    except CommandTimeout:  # The message may arrive although the acknowledgement was lost.
                         pass
                     except CommandRejected as error:
                         refusal = error
@@ -326,7 +330,7 @@ async def _general_uri(component: Component, timeout: float) -> str:
     """Return the address of the general metadata, from COMPONENT_METADATA or the older COMPONENT_INFORMATION."""
     try:
         return (await component.request(m.ComponentMetadata, timeout=timeout)).uri
-    except CommandRejected:
+    except CommandRejected:  # perhaps older firmware
         pass
     except OperationTimeout as error:
         raise NotSupported(f"component {component.component_id} reports no metadata: {error}") from None
@@ -370,7 +374,7 @@ class Components:
         self._statuses: dict[tuple[int, int], ComponentStatus] = {}
         session = context.session
         self.cell: StateCell[tuple[ComponentStatus, ...]] = session.connection.new_cell("components", "HEARTBEAT")
-        session.keep(self.cell)
+        session.register_cell(self.cell)
         bus = session.connection.bus
         session.at_close(bus.attach(m.Heartbeat, self._on_heartbeat, system_id=session.system_id))
         for message_type, field, kind in DEVICE_MESSAGES:

@@ -18,7 +18,8 @@ from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import FileFormatError, FileTimeout, InvalidArgument, OperationRejected
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
-from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates
+from aerokit.vehicle.session.rates import MessageRates
+from aerokit.vehicle.session.subscriber import ComponentSubscriber
 from aerokit.vehicle.session.transfers import Transfers
 
 if TYPE_CHECKING:
@@ -52,13 +53,13 @@ class ComponentSession:
             session.system_id,
             component_id,
             self.rates,
-            keep=session.keep,
+            register_cell=session.register_cell,
             at_close=session.at_close,
         )
         version: StateCell[AutopilotVersion] = session.connection.new_cell(
             "version", f"AUTOPILOT_VERSION of component {component_id}"
         )
-        session.keep(version)
+        session.register_cell(version)
         self.transfers: Transfers = Transfers(
             session.connection,
             session.system_id,
@@ -70,10 +71,8 @@ class ComponentSession:
             round_trip_s=lambda: session.link_watch.round_trip_s,
             request_version=self._request_version,
         )
-        autopilot, source = (
-            self.transfers.autopilot,
-            Source(session.system_id, component_id, m.AutopilotVersion.NAME),
-        )
+        autopilot = self.transfers.autopilot
+        source = Source(session.system_id, component_id, m.AutopilotVersion.NAME)
         self.subscriber.listen(m.AutopilotVersion, lambda message: version.set(autopilot.version_of(message), source))
         for function in (self.rates.run, self.rates.watch):
             session.background.start(function, f"aerokit {function.__qualname__} of component {component_id}")
@@ -84,8 +83,8 @@ class ComponentSession:
         self._session.at_close(*functions)
 
     async def _request_version(self) -> None:
-        version = m.AutopilotVersion.ID
-        await self.commands.send_long(MavCmd.REQUEST_MESSAGE, version, component_id=self.component_id)
+        message_id = m.AutopilotVersion.ID
+        await self.commands.send_long(MavCmd.REQUEST_MESSAGE, message_id, component_id=self.component_id)
 
     def describe_link(self) -> str:
         received_at = self.connection.last_heartbeat_at(self.system_id, self.component_id)
@@ -115,19 +114,19 @@ SHUT_RDWR = 2
 
 async def fetch(uri: str, files_of: Callable[[int], Files], component_id: int, idle_timeout_s: float) -> bytes:
     """Return the content of a file, at most 16 MB; errors as for `Component.fetch`."""
-    found = _MAVFTP.fullmatch(uri)
-    if found is not None:
-        owner = int(found[1]) if found[1] else component_id
+    match = _MAVFTP.fullmatch(uri)
+    if match is not None:
+        owner = int(match[1]) if match[1] else component_id  # component that stores the file
         if not 1 <= owner <= 255:
             raise InvalidArgument(f"uri = {short_repr(uri)} is not allowed: component ids are 1 to 255")
-        return await _read_response(files_of(owner), unquote(found[2]), idle_timeout_s)
+        return await _read_limited(files_of(owner), unquote(match[2]), idle_timeout_s)
     if uri.lower().startswith(WEB_SCHEMES):
         return await _WebDownload(uri, idle_timeout_s).content()
     raise InvalidArgument(f"uri = {short_repr(uri)} is not allowed: mftp://…, http://… or https://…")
 
 
-async def _read_response(files: Files, path: str, idle_timeout_s: float) -> bytes:
-    # The download is cancelled as soon as the size is known to exceed the limit.
+async def _read_limited(files: Files, path: str, idle_timeout_s: float) -> bytes:
+    """Read a file by MAVFTP, but cancel the download as soon as the size is known to exceed MAX_FILE_SIZE."""
     with anyio.CancelScope() as scope:
 
         def check_size(progress: TransferProgress) -> None:
@@ -161,30 +160,33 @@ class _WebDownload:
                 with suppress(OSError):
                     connection.sock.shutdown(SHUT_RDWR)
 
-    def _connect(self, kind: type[HTTPConnection]) -> Callable[..., HTTPConnection]:
+    def _connect_with(self, connection_type: type[HTTPConnection]) -> Callable[..., HTTPConnection]:
+        """Return a factory like ``connection_type`` that records each connection, so that `_abort` can close it."""
+
         def connect(host: str, **options: Any) -> HTTPConnection:
             if self._is_aborted:
                 raise OSError("aborted")
-            connection = kind(host, **options)
+            connection = connection_type(host, **options)
             self._connections.append(connection)
             return connection
 
         return connect
 
     def _opener(self) -> OpenerDirector:
-        # Only web protocols are imported, so that an address cannot make aerokit read a local file.
+        # The default opener of urllib also has handlers for file: and ftp:. This one has only those of the web, so that
+        # an address cannot make aerokit read a local file.
         from http.client import HTTPConnection, HTTPSConnection
         from urllib import request
 
-        connect = self._connect
+        connect_with = self._connect_with
 
         class Plain(request.HTTPHandler):
             def http_open(self, req: request.Request) -> Any:
-                return self.do_open(connect(HTTPConnection), req)
+                return self.do_open(connect_with(HTTPConnection), req)
 
         class Secure(request.HTTPSHandler):
             def https_open(self, req: request.Request) -> Any:
-                return self.do_open(connect(HTTPSConnection), req)
+                return self.do_open(connect_with(HTTPSConnection), req)
 
         opener = request.OpenerDirector()
         for handler in (
@@ -214,9 +216,10 @@ class _WebDownload:
                 if answer.length:  # bytes that Content-Length announced but that did not arrive
                     raise OSError(f"{answer.length} bytes are missing")
                 return bytes(content)
-        except (InvalidArgument, FileFormatError):
+        except (InvalidArgument, FileFormatError):  # Both are ValueErrors, and must not be caught below.
             raise
         except (OSError, HTTPException, ValueError) as error:
+            # urllib wraps a time-out of the connection in a URLError, as its `reason`.
             if isinstance(getattr(error, "reason", error), TimeoutError):
                 raise FileTimeout(f"{self._uri} stalled: no data for {self._idle_timeout_s:g} s") from None
             raise OperationRejected(f"{self._uri} could not be fetched: {error}") from None

@@ -60,7 +60,7 @@ class Settings:
         self._transfers = session.transfers
         self._information, self._files_of = information, files_of
         self._known: dict[str, Setting] = {}
-        self._missing: dict[str, None] = {}
+        self._missing: set[str] = set()  # names of settings that the component does not have
         self._is_complete = False
         self._definition: CameraDefinition | None = None
         self._downloading, self._writing = asyncio.Lock(), asyncio.Lock()
@@ -156,8 +156,8 @@ class Settings:
         """
         if self._definition is None:
             return MappingProxyType({})
-        found = self._definition.options(name, self._values())
-        return MappingProxyType({option.name: option.value for option in found})
+        options = self._definition.options(name, self._values())
+        return MappingProxyType({option.name: option.value for option in options})
 
     def excluded_by(self, name: str) -> tuple[str, ...]:
         """Return the settings that make a setting ineffective now, e.g. ``("CAM_EXPMODE = Auto",)``."""
@@ -188,9 +188,10 @@ class Settings:
                         idle_timeout_s=idle_timeout_s,
                         on_progress=on_progress,
                     )
-                    found = await transfers.run(exchange)
-                    others = {name: setting for name, setting in self._known.items() if name not in found}
-                    self._known = {name: self._known.get(name, found[name]) for name in found} | others
+                    listed = await transfers.run(exchange)
+                    unlisted = {name: setting for name, setting in self._known.items() if name not in listed}
+                    # Values in `_known` are newer than those in the list, because `_store` has recorded every message.
+                    self._known = {name: self._known.get(name, listed[name]) for name in listed} | unlisted
                     self._is_complete = True
                 return self.table
 
@@ -210,7 +211,8 @@ class Settings:
         """
         check_name(name)
         with self._transfers.limit(timeout):
-            return self._with_definition(_found((await self._read([name], idle_timeout_s))[name]))
+            answers = await self._read([name], idle_timeout_s)
+            return self._with_definition(_setting_or_raise(answers[name]))
 
     async def set(
         self,
@@ -234,42 +236,49 @@ class Settings:
         check_name(name)
         with self._transfers.limit(timeout):
             async with self._writing:
-                own = None if self._definition is None else self._definition.settings.get(name)
-                confirmed = await (
-                    self._write_raw(name, value, idle_timeout_s)
-                    if own is None
-                    else self._write_defined(own, value, idle_timeout_s)
-                )
-                if own is not None and own.updates:
-                    await self._read_again(own.updates, idle_timeout_s)
+                defined = None if self._definition is None else self._definition.settings.get(name)
+                if defined is None:
+                    return self._with_definition(await self._write_undefined(name, value, idle_timeout_s))
+                confirmed = await self._write_defined(defined, value, idle_timeout_s)
+                if defined.updates:
+                    await self._read_again(defined.updates, idle_timeout_s)
                 return self._with_definition(confirmed)
 
-    async def _write_raw(self, name: str, value: object, idle_timeout_s: float) -> Setting:
+    async def _write_undefined(self, name: str, value: object, idle_timeout_s: float) -> Setting:
+        """Write a setting that no definition describes; its type on the wire is that of its present value."""
         known = self._known.get(name)
         if known is None:
-            known = _found((await self._read([name], idle_timeout_s))[name])
-        wanted = checked_setting(name, value, known.type)
-        return await self._write(name, wanted, known.type, known.value, idle_timeout_s)
+            known = _setting_or_raise((await self._read([name], idle_timeout_s))[name])
+        raw_value = checked_setting(name, value, known.type)
+        return await self._write(name, raw_value, known.type, known.value, idle_timeout_s)
 
-    async def _write_defined(self, own: SettingDefinition, value: object, idle_timeout_s: float) -> Setting:
-        definition = self._definition
+    async def _write_defined(self, defined: SettingDefinition, value: object, idle_timeout_s: float) -> Setting:
+        """Read the unknown settings that restrict this setting, then check the value against its definition and write
+        it.
+        """
+        definition, name = self._definition, defined.name
         assert definition is not None
-        definition.checked(own.name, value, self._values())
-        to_read = [name for name in definition.dependencies(own.name) if self._must_be_read(definition.settings[name])]
-        if own.name not in self._known and not own.write_only:
-            to_read.append(own.name)
+        # A value that is never allowed is refused before anything is sent.
+        definition.checked(name, value, self._values())
+        to_read = [
+            setting for setting in definition.dependencies(name) if self._must_be_read(definition.settings[setting])
+        ]
+        if name not in self._known and not defined.write_only:
+            to_read.append(name)
         answers = await self._read(to_read, idle_timeout_s) if to_read else {}
-        self._missing |= {name: None for name, answer in answers.items() if isinstance(answer, ParameterRejected)}
-        if own.name in answers:
-            _found(answers[own.name])
-        wanted = definition.checked(own.name, value, self._values())
-        known = self._known.get(own.name)
-        kind = own.wire_type if known is None else known.type
-        before = None if known is None else known.value
-        return await self._write(own.name, checked_setting(own.name, wanted, kind), kind, before, idle_timeout_s)
+        self._missing |= {read for read, answer in answers.items() if isinstance(answer, ParameterRejected)}
+        if name in answers:
+            _setting_or_raise(answers[name])  # The component may not have this setting.
+        # Checked again, because the values that were just read may exclude the setting or restrict it.
+        checked_value = definition.checked(name, value, self._values())
+        known = self._known.get(name)
+        kind = defined.wire_type if known is None else known.type
+        old_value = None if known is None else known.value
+        raw_value = checked_setting(name, checked_value, kind)
+        return await self._write(name, raw_value, kind, old_value, idle_timeout_s)
 
     async def _write(
-        self, name: str, value: SettingValue, kind: int, before: SettingValue | None, idle_timeout_s: float
+        self, name: str, value: SettingValue, kind: int, old_value: SettingValue | None, idle_timeout_s: float
     ) -> Setting:
         transfers = self._transfers
         exchange = SettingWrite(
@@ -278,7 +287,7 @@ class Settings:
             name,
             value,
             kind,
-            before=before,
+            before=old_value,
             round_trip=transfers.round_trip,
             idle_timeout_s=idle_timeout_s,
         )
@@ -299,8 +308,8 @@ class Settings:
         # A setting that cannot be read may have changed, so its previous value is discarded.
         assert self._definition is not None
         settings = self._definition.settings
-        wanted = [name for name in names if name in settings and not settings[name].write_only]
-        for name, answer in (await self._read(wanted, idle_timeout_s)).items():
+        readable = [name for name in names if name in settings and not settings[name].write_only]
+        for name, answer in (await self._read(readable, idle_timeout_s)).items():
             if not isinstance(answer, Setting):
                 self._known.pop(name, None)
 
@@ -308,12 +317,13 @@ class Settings:
         return {name: setting.value for name, setting in self._known.items()}
 
     def _must_be_read(self, setting: SettingDefinition) -> bool:
-        is_known = setting.name in self._known or setting.name in self._missing or self._is_complete
-        return not is_known and not setting.write_only
+        was_read = setting.name in self._known or setting.name in self._missing or self._is_complete
+        return not was_read and not setting.write_only
 
     def _with_definition(self, setting: Setting) -> Setting:
-        own = None if self._definition is None else self._definition.settings.get(setting.name)
-        return setting if own is None else setting.replace(value=own.convert(setting.value))
+        """Return the setting with its value in the type that the definition has, if there is one."""
+        defined = None if self._definition is None else self._definition.settings.get(setting.name)
+        return setting if defined is None else setting.replace(value=defined.convert(setting.value))
 
     def _on_ack(self, message: m.ParamExtAck) -> None:
         if message.param_result == ParamAck.ACCEPTED:
@@ -326,21 +336,22 @@ class Settings:
             self._store(known.replace(value=message.mode_id))
 
     def _store(self, setting: Setting) -> None:
-        before = self._known.get(setting.name)
-        if not setting.name or (before is None and len(self._known) >= MAX_PARAMETERS):
+        """Add a received setting to the table, and publish a change."""
+        old = self._known.get(setting.name)
+        if not setting.name or (old is None and len(self._known) >= MAX_PARAMETERS):
             return
-        if setting.index is None and before is not None:
-            setting = setting.replace(index=before.index)
-        after = self._known[setting.name] = self._with_definition(setting)
-        if before is not None and not settings_equal(before.value, after.value):
+        if setting.index is None and old is not None:  # PARAM_EXT_ACK has no index.
+            setting = setting.replace(index=old.index)
+        new = self._known[setting.name] = self._with_definition(setting)
+        if old is not None and not settings_equal(old.value, new.value):
             transfers = self._transfers
             transfers.connection.bus.publish(
                 SettingChanged(
                     transfers.connection.now(),
                     transfers.system_id,
-                    after.name,
-                    before.value,
-                    after.value,
+                    new.name,
+                    old.value,
+                    new.value,
                     transfers.component_id,
                 )
             )
@@ -351,7 +362,7 @@ class Settings:
         self._is_complete = False
 
 
-def _found(answer: SettingAnswer) -> Setting:
+def _setting_or_raise(answer: SettingAnswer) -> Setting:
     if isinstance(answer, Setting):
         return answer
     raise answer

@@ -108,8 +108,8 @@ class DeviceActions(VehicleBase):
             raise InvalidArgument(
                 f"tune = {short_repr(tune)} is not allowed: 1 to {MAX_TUNE} characters of QBASIC's PLAY statement"
             )
-        first, rest = tune[:TUNE_PART], tune[TUNE_PART:]
-        self._session.send(PlayTune(self.system_id, self.component_id, first, rest))
+        tune1, tune2 = tune[:TUNE_PART], tune[TUNE_PART:]  # the two fields of the message
+        self._session.send(PlayTune(self.system_id, self.component_id, tune1, tune2))
 
     def send_status_text(self, text: str, *, severity: Severity = "info") -> None:
         """Send a status text of your program to the vehicle and to other stations (STATUSTEXT); returns at once.
@@ -127,13 +127,12 @@ class DeviceActions(VehicleBase):
         data = text.encode()
         if not 1 <= len(data) <= MAX_TEXT_BYTES:
             raise InvalidArgument(f"text has {len(data)} bytes, allowed are 1 to {MAX_TEXT_BYTES}")
-        self._text_id = self._text_id % 0xFFFF + 1
-        number = MavSeverity[severity.upper()]
-        for chunk, part in enumerate(_chunks(text)):
-            is_single = len(data) <= CHUNK_LENGTH
-            self._session.send(Statustext(number, part, 0 if is_single else self._text_id, chunk))
+        self._last_text_id = self._last_text_id % 0xFFFF + 1  # 1 to 65535
+        text_id = 0 if len(data) <= CHUNK_LENGTH else self._last_text_id  # 0: the text has only one chunk.
+        for chunk_number, chunk in enumerate(_chunks(text)):
+            self._session.send(Statustext(MavSeverity[severity.upper()], chunk, text_id, chunk_number))
 
-    _text_id = 0
+    _last_text_id = 0  # initial value for each vehicle
 
     async def inject_failure(
         self, unit: FailingUnit, kind: FailureKind, *, instance: int = 0, intent: FailureIntent

@@ -55,6 +55,7 @@ SET_SERVO = SimpleOrder("set_servo", MavCmd.DO_SET_SERVO, (SERVO, PULSE), Effect
 REPEAT_SERVO = SimpleOrder("repeat_servo", MavCmd.DO_REPEAT_SERVO, (SERVO, PULSE, COUNT, PERIOD))
 SET_RELAY = SimpleOrder("set_relay", MavCmd.DO_SET_RELAY, (RELAY, ON), Effect("RelayStatus", _is_switched))
 REPEAT_RELAY = SimpleOrder("repeat_relay", MavCmd.DO_REPEAT_RELAY, (RELAY, COUNT, PERIOD))
+GEAR_DOWN, GEAR_UP = 0, 1
 LANDING_GEAR = SimpleOrder("landing_gear", MavCmd.AIRFRAME_CONFIGURATION, (ALL_GEARS, Argument("up", 0, 1)))
 LIGHTS = SimpleOrder("set_lights", MavCmd.ILLUMINATOR_ON_OFF, (ON,), Effect("IlluminatorStatus", _is_lit))
 PARACHUTE = SimpleOrder("parachute", MavCmd.DO_PARACHUTE, (Argument("action", 0, 2),))
@@ -155,9 +156,8 @@ class Actuators(ReadOnly):
             if value is not None:
                 check_range("values", value, -1, 1)
         params = [math.nan if value is None else float(value) for value in values]
-        order = SimpleOrder(
-            "set_actuators", MavCmd.DO_SET_ACTUATOR, (*params, *(math.nan,) * (ACTUATORS - len(params)), 0)
-        )
+        params += [math.nan] * (ACTUATORS - len(params))
+        order = SimpleOrder("set_actuators", MavCmd.DO_SET_ACTUATOR, (*params, 0))
         await order.send(self._context, topic="actuators")
 
     async def raise_landing_gear(self) -> None:
@@ -177,7 +177,7 @@ class Actuators(ReadOnly):
         # Old reports count too, because a vehicle on the ground stands on its gear until it reports a take-off.
         if telemetry.landed_state.latest == MavLandedState.ON_GROUND or telemetry.is_confirmed_disarmed:
             raise OperationRejected("raise_landing_gear: the vehicle is disarmed or on the ground; nothing was sent")
-        await LANDING_GEAR.send(self._context, 1, topic="landing gear")
+        await LANDING_GEAR.send(self._context, GEAR_UP, topic="landing gear")
 
     async def lower_landing_gear(self) -> None:
         """Deploy the landing gear; returns at the acknowledgement.
@@ -185,7 +185,7 @@ class Actuators(ReadOnly):
         Raises:
             NotSupported, CommandRejected, CommandTimeout: as for ``raise_landing_gear``.
         """
-        await LANDING_GEAR.send(self._context, 0, topic="landing gear")
+        await LANDING_GEAR.send(self._context, GEAR_DOWN, topic="landing gear")
 
     async def set_lights(self, on: bool, *, component_id: int = MavComponent.ILLUMINATOR) -> None:
         """Switch an illuminator, and return when ILLUMINATOR_STATUS reports it (MAV_CMD_ILLUMINATOR_ON_OFF).
@@ -238,29 +238,29 @@ class Actuators(ReadOnly):
         else:
             command, start = MavCmd.DO_MOTOR_TEST, (number, PERCENT, throttle_percent, duration_s, 1)
             stop = (number, PERCENT, 0, 0, 1)
-        session.check_disarmed("test_motor", is_current=arbiter.is_known)
+        session.check_disarmed("test_motor", is_current=arbiter.is_state_recent)
         # On ArduPilot, a new test ends the test of another motor.
-        order = arbiter.of_device("motor test" if command == MavCmd.DO_MOTOR_TEST else f"motor test {number}")
+        order = arbiter.device_order("motor test" if command == MavCmd.DO_MOTOR_TEST else f"motor test {number}")
         spins_until = order.given_at + duration_s
         try:
-            await SimpleOrder("test_motor", command, start).send(self._context, of=order)
+            await SimpleOrder("test_motor", command, start).send(self._context, device_order=order)
             await anyio.sleep(duration_s)
             armed, ended_at = session.telemetry.armed, session.connection.now()
             await await_progress(
                 session,
                 "test_motor",
                 is_done=lambda: armed.latest is False and armed.updated_at > ended_at,
-                trouble=lambda: None if order.is_newest else "another motor test was started",
+                failure_reason=lambda: None if order.is_newest else "another motor test was started",
                 describe=lambda: "the vehicle still reports armed",
                 timeout=TEST_END_TIMEOUT_S,
             )
-        except CommandRejected:
+        except CommandRejected:  # The motor does not turn.
             raise
         except BaseException:
             # After the end of the test, no stop command is sent, because it would start another test, which arms the
             # motors.
             is_spinning = session.connection.now() < spins_until
-            if is_spinning and order.is_newest and arbiter.is_known and session.connection.is_open:
+            if is_spinning and order.is_newest and arbiter.is_state_recent and session.connection.is_open:
                 session.commands.send_unconfirmed(command, *stop)
             raise
 

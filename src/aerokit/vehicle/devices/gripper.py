@@ -55,10 +55,9 @@ class Gripper(ReadOnly):
         if not context.session.autopilot.reports_gripper_by_text:
             await order.send(context, self._number, topic=topic)
             return
-        await order.send_until_text(
-            context,
-            self._number,
-            topic=topic,
-            is_done=lambda text, after_s: text == ENDS[action] or (text == BEGINS[action] and after_s >= EPM_WAIT_S),
-            timeout=GRIP_TIMEOUT_S,
-        )
+
+        def has_moved(text: str, since_acknowledgement_s: float) -> bool:
+            has_begun = text == BEGINS[action]
+            return text == ENDS[action] or (has_begun and since_acknowledgement_s >= EPM_WAIT_S)
+
+        await order.send_until_text(context, self._number, topic=topic, is_done=has_moved, timeout=GRIP_TIMEOUT_S)

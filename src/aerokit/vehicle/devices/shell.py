@@ -130,14 +130,15 @@ class Shell(ReadOnly):
             pass
         self.write(command)
         now = self._session.connection.now
-        until, text = now() + timeout, ""
+        deadline, text = now() + timeout, ""
         try:
             while not text.endswith(PROMPTS):
-                text += await self.read(timeout=max(0.0, until - now()))
+                text += await self.read(timeout=max(0.0, deadline - now()))
         except OperationTimeout:
             link = self._session.describe_link()
             raise OperationTimeout(
                 f"shell: {command!r} has not ended within {timeout:g} s; output: {text!r}; {link}"
             ) from None
+        # The output begins with an echo of the command, and its last line is the prompt.
         text = text.removeprefix(command).removeprefix("\n")
         return text.rpartition("\n")[0] if "\n" in text else ""

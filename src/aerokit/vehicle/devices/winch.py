@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Winch"]
 
-_A, _F = WinchActions, MavWinchStatusFlag
+
 LENGTH_TOLERANCE_M = 0.1
 RATE_TOLERANCE_M_S = 0.05
 ACTION_TIMEOUT_S = 120.0
@@ -60,7 +60,7 @@ class Winch(ReadOnly):
             CommandRejected: there is no winch (WINCH_TYPE).
             CommandTimeout: there was no acknowledgement.
         """
-        await self._send(_A.RELAXED)
+        await self._send(WinchActions.RELAXED)
 
     async def pay_out(self, length_m: float, *, rate_m_s: float = 0.5, timeout: float = ACTION_TIMEOUT_S) -> None:
         """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
@@ -84,19 +84,21 @@ class Winch(ReadOnly):
         """
         check_range("length_m", length_m, -MAX_LENGTH_M, MAX_LENGTH_M)
         check_range("rate_m_s", rate_m_s, 0, MAX_RATE_M_S, above=True)
-        self._check_supported(_A.RELATIVE_LENGTH_CONTROL)
-        order = self._context.arbiter.of_device(
-            self._topic
-        )  # A newer order that is given while the next line waits ends this order.
+        self._check_supported(WinchActions.RELATIVE_LENGTH_CONTROL)
+        # The order begins before the wait for a status, so that a newer order given during this wait ends it.
+        order = self._context.arbiter.device_order(self._topic)
         start = await receive_once(self._context, m.WinchStatus, self._component_id)
-        goal_m = None if start is None else start.line_length + length_m
+
+        def has_reached_length(status: m.WinchStatus) -> bool:
+            return start is not None and abs(status.line_length - start.line_length - length_m) <= LENGTH_TOLERANCE_M
+
         await self._send(
-            _A.RELATIVE_LENGTH_CONTROL,
+            WinchActions.RELATIVE_LENGTH_CONTROL,
             length_m,
             rate_m_s,
-            None if goal_m is None else lambda status: abs(status.line_length - goal_m) <= LENGTH_TOLERANCE_M,
+            None if start is None else has_reached_length,
             timeout=timeout,
-            of=order,
+            order=order,
         )
 
     async def set_rate(self, rate_m_s: float) -> None:
@@ -112,23 +114,23 @@ class Winch(ReadOnly):
         """
         check_range("rate_m_s", rate_m_s, -MAX_RATE_M_S, MAX_RATE_M_S)
         await self._send(
-            _A.RATE_CONTROL, 0, rate_m_s, lambda status: abs(status.speed - rate_m_s) <= RATE_TOLERANCE_M_S
+            WinchActions.RATE_CONTROL, 0, rate_m_s, lambda status: abs(status.speed - rate_m_s) <= RATE_TOLERANCE_M_S
         )
 
     async def lock(self) -> None:
         """Engage the brake, and return when WINCH_STATUS reports it locked. Raises as :meth:`retract`."""
-        await self._send_until(_F.LOCKED, _A.LOCK)
+        await self._send_until(MavWinchStatusFlag.LOCKED, WinchActions.LOCK)
 
     async def deliver(self) -> None:
         """Start the winch's automatic delivery: lower, release, retract. Returns at the acknowledgement.
 
         Raises as :meth:`relax`.
         """
-        await self._send(_A.DELIVER)
+        await self._send(WinchActions.DELIVER)
 
     async def hold(self) -> None:
         """Hold the line by the motor instead of the brake. Returns at the acknowledgement. Raises as :meth:`relax`."""
-        await self._send(_A.HOLD)
+        await self._send(WinchActions.HOLD)
 
     async def retract(self, *, timeout: float = ACTION_TIMEOUT_S) -> None:
         """Wind up all line, and return when WINCH_STATUS reports it fully retracted.
@@ -144,19 +146,19 @@ class Winch(ReadOnly):
             HeartbeatTimeout: the vehicle was silent for ten seconds.
             OperationTimeout: WINCH_STATUS did not report the end in time.
         """
-        await self._send_until(_F.FULLY_RETRACTED, _A.RETRACT, timeout)
+        await self._send_until(MavWinchStatusFlag.FULLY_RETRACTED, WinchActions.RETRACT, timeout)
 
     async def load_line(self) -> None:
         """Turn slowly to load new line. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
-        await self._send_until(_F.LOAD_LINE, _A.LOAD_LINE)
+        await self._send_until(MavWinchStatusFlag.LOAD_LINE, WinchActions.LOAD_LINE)
 
     async def abandon_line(self) -> None:
         """Spool out all line and drop it. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
-        await self._send_until(_F.ABANDON_LINE, _A.ABANDON_LINE)
+        await self._send_until(MavWinchStatusFlag.ABANDON_LINE, WinchActions.ABANDON_LINE)
 
     async def load_payload(self) -> None:
         """Run slowly to attach a payload. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
-        await self._send_until(_F.LOAD_PAYLOAD, _A.LOAD_PAYLOAD)
+        await self._send_until(MavWinchStatusFlag.LOAD_PAYLOAD, WinchActions.LOAD_PAYLOAD)
 
     async def _send_until(
         self, flag: MavWinchStatusFlag, action: WinchActions, timeout: float = ACTION_TIMEOUT_S
@@ -170,14 +172,14 @@ class Winch(ReadOnly):
         rate_m_s: float = 0.0,
         is_done: Callable[[m.WinchStatus], bool] | None = None,
         timeout: float = 5.0,
-        of: Order | None = None,
+        order: Order | None = None,
     ) -> None:
         self._check_supported(action)
         params = (self._number, action, length_m, rate_m_s)
         effect = None if is_done is None else Effect("WinchStatus", is_done)
         await SimpleOrder(f"winch {action.name.lower()}", MavCmd.DO_WINCH, params, effect).send(
             self._context,
-            of=of,
+            device_order=order,
             topic=self._topic,
             component_id=self._component_id,
             timeout=timeout,
@@ -185,7 +187,6 @@ class Winch(ReadOnly):
 
     def _check_supported(self, action: WinchActions) -> None:
         autopilot = self._context.session.autopilot
-        if self._component_id is None and (
-            MavCmd.DO_WINCH in autopilot.unsupported_commands or action not in autopilot.winch_actions
-        ):
+        is_supported = MavCmd.DO_WINCH not in autopilot.unsupported_commands and action in autopilot.winch_actions
+        if self._component_id is None and not is_supported:
             raise NotSupported(f"winch: {autopilot.firmware} has no action {action.name}; nothing was sent")

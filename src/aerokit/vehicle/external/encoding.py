@@ -29,13 +29,14 @@ MAX_CENTIMETRES = 0xFFFE
 # GPS time began on 1980-01-06 and is 18 leap seconds ahead of UTC since 2017.
 GPS_EPOCH_S, LEAP_SECONDS, SECONDS_PER_WEEK = 315_964_800, 18, 604_800
 GPS_NUMBERS = ("hdop", "vdop", "horizontal_accuracy_m", "vertical_accuracy_m", "speed_accuracy_m_s", "yaw_deg")
-# MAV_SENSOR_ORIENTATION.
+# Values of MAV_SENSOR_ORIENTATION.
 ORIENTATIONS: dict[RangeDirection, int] = {"forward": 0, "right": 2, "back": 4, "left": 6, "up": 24, "down": 25}
-# MAV_ESTIMATOR_TYPE, MAV_DISTANCE_SENSOR, and the covariance of DISTANCE_SENSOR that means "unknown".
-VISION, LASER, NO_COVARIANCE = 2, 0, 255
+# A value of MAV_ESTIMATOR_TYPE, one of MAV_DISTANCE_SENSOR, and the covariance of DISTANCE_SENSOR that means "unknown".
+VISION, LASER, UNKNOWN_COVARIANCE = 2, 0, 255
+LANDING_TARGET_TYPE_VISION_FIDUCIAL = 2
 # Rotations between the axes of ROS (east, north, up; forward, left, up) and the axes of MAVLink.
-HALF = math.sqrt(0.5)
-ENU_TO_NED: Quaternion = (0.0, HALF, HALF, 0.0)
+SQRT_HALF = math.sqrt(0.5)
+ENU_TO_NED: Quaternion = (0.0, SQRT_HALF, SQRT_HALF, 0.0)
 FLU_TO_FRD: Quaternion = (0.0, 1.0, 0.0, 0.0)
 
 
@@ -52,27 +53,28 @@ class MeasurementEncoder:
     def odometry(self, value: v.OdometryMeasurement) -> tuple[Message, ...]:
         """Return ODOMETRY in a frame that the autopilot reads."""
         check_range("quality", value.quality, -1, 100)
-        given = value.orientation
-        q = given.quaternion if isinstance(given, Attitude) else given
+        orientation = value.orientation
+        quaternion = orientation.quaternion if isinstance(orientation, Attitude) else orientation
         position, velocity = value.position_m, value.velocity_m_s
         check_finite("position_m", *position)
-        check_finite("orientation", *q)
+        check_finite("orientation", *quaternion)
         if velocity is not None:
             check_finite("velocity_m_s", *velocity)
-        is_north = value.frame in ("ned", "enu")
-        if value.frame in ("enu", "flu"):
-            q = multiply(multiply(ENU_TO_NED if is_north else FLU_TO_FRD, q), FLU_TO_FRD)
-            forward, left, up = position
-            position = (left, forward, -up) if is_north else (forward, -left, -up)
+        is_earth_frame = value.frame in ("ned", "enu")
+        if value.frame in ("enu", "flu"):  # the axes of ROS
+            to_mavlink = ENU_TO_NED if is_earth_frame else FLU_TO_FRD
+            quaternion = multiply(multiply(to_mavlink, quaternion), FLU_TO_FRD)
+            x, y, up = position  # x and y are east and north, or forward and left
+            position = (y, x, -up) if is_earth_frame else (x, -y, -up)
             velocity = None if velocity is None else (velocity[0], -velocity[1], -velocity[2])
-        frame = self._session.autopilot.external.ned_frame if is_north else MavFrame.LOCAL_FRD
+        frame = self._session.autopilot.external.ned_frame if is_earth_frame else MavFrame.LOCAL_FRD
         return (
             m.Odometry(
                 self._time_us(value.measured_at),
                 frame,
                 MavFrame.BODY_FRD,
                 *position,
-                _normalized(q),
+                _normalized(quaternion),
                 *(UNKNOWN_VECTOR if velocity is None else velocity),
                 *UNKNOWN_VECTOR,
                 _triangle(value.position_variance_m2, value.orientation_variance_rad2),
@@ -85,40 +87,52 @@ class MeasurementEncoder:
 
     def vision_position(self, value: v.PoseMeasurement) -> tuple[Message, ...]:
         """Return VISION_POSITION_ESTIMATE."""
-        time, place, covariance = self._pose(value)
-        attitude, count = value.attitude, _reset_counter(value.reset_counter)
+        time_us, position, covariance = self._pose(value)
+        attitude, reset_count = value.attitude, _reset_counter(value.reset_counter)
         roll, pitch, yaw = map(math.radians, (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))
-        return (m.VisionPositionEstimate(time, *place, roll, pitch, yaw, covariance, count),)
+        return (m.VisionPositionEstimate(time_us, *position, roll, pitch, yaw, covariance, reset_count),)
 
     def motion_capture(self, value: v.PoseMeasurement) -> tuple[Message, ...]:
         """Return ATT_POS_MOCAP, or VISION_POSITION_ESTIMATE for an autopilot that does not read ATT_POS_MOCAP."""
         if not self._session.autopilot.external.has_mocap:
             return self.vision_position(value)
-        time, place, covariance = self._pose(value)
-        return (m.AttPosMocap(time, value.attitude.quaternion, *place, covariance),)
+        time_us, position, covariance = self._pose(value)
+        return (m.AttPosMocap(time_us, value.attitude.quaternion, *position, covariance),)
 
     def _pose(self, value: v.PoseMeasurement) -> tuple[int, Vector, list[float]]:
-        """Check a pose; return its time stamp, its position with its orientation, and its covariance."""
-        place = (value.north_m, value.east_m, value.down_m)
-        check_finite("position", *place)
+        """Check a pose; return its time stamp, its position and its covariance."""
+        position = (value.north_m, value.east_m, value.down_m)
+        check_finite("position", *position)
         check_finite("attitude", value.attitude.roll_deg, value.attitude.pitch_deg, value.attitude.yaw_deg)
         covariance = _triangle(value.position_variance_m2, value.orientation_variance_rad2)
-        return self._time_us(value.measured_at), place, covariance
+        return self._time_us(value.measured_at), position, covariance
 
     def vision_speed(self, value: v.SpeedMeasurement) -> tuple[Message, ...]:
         """Return VISION_SPEED_ESTIMATE, or ODOMETRY without a pose if the autopilot reads only ODOMETRY."""
         speeds = (value.north_m_s, value.east_m_s, value.down_m_s)
         check_finite("velocity", *speeds)
-        time, count = self._time_us(value.measured_at), _reset_counter(value.reset_counter)
+        time_us, reset_count = self._time_us(value.measured_at), _reset_counter(value.reset_counter)
         variance = value.variance_m2_s2
         if self._session.autopilot.external.has_vision_speed:
             _check_variance(variance)
             covariance = [NAN] * 9 if variance is None else [variance, 0, 0, 0, variance, 0, 0, 0, variance]
-            return (m.VisionSpeedEstimate(time, *speeds, covariance, count),)
-        ned, unknown = MavFrame.LOCAL_NED, _triangle(None, None)
-        pose = (*UNKNOWN_VECTOR, (NAN,) * 4)
-        known = _triangle(variance, None)
-        return (m.Odometry(time, ned, ned, *pose, *speeds, *UNKNOWN_VECTOR, unknown, known, count, VISION, 100),)
+            return (m.VisionSpeedEstimate(time_us, *speeds, covariance, reset_count),)
+        frames = (MavFrame.LOCAL_NED, MavFrame.LOCAL_NED)
+        unknown_quaternion = (NAN,) * 4
+        covariances = (_triangle(None, None), _triangle(variance, None))
+        last_fields = (reset_count, VISION, 100)  # 100 is the quality in percent
+        return (
+            m.Odometry(
+                time_us,
+                *frames,
+                *UNKNOWN_VECTOR,  # position
+                unknown_quaternion,
+                *speeds,
+                *UNKNOWN_VECTOR,  # turn rates
+                *covariances,
+                *last_fields,
+            ),
+        )
 
     def gps(self, value: v.GpsMeasurement) -> tuple[Message, ...]:
         """Return GPS_INPUT."""
@@ -131,22 +145,25 @@ class MeasurementEncoder:
         check_range("fix", value.fix, 0, 8)
         check_range("satellites", value.satellites, 0, 255)
         check_range("instance", value.instance, 0, 255)
-        ignored = GpsInputIgnoreFlags
-        optional = (
-            (value.hdop, ignored.HDOP),
-            (value.vdop, ignored.VDOP),
-            (value.velocity_m_s, ignored.VEL_HORIZ | ignored.VEL_VERT),
-            (value.speed_accuracy_m_s, ignored.SPEED_ACCURACY),
-            (value.horizontal_accuracy_m, ignored.HORIZONTAL_ACCURACY),
-            (value.vertical_accuracy_m, ignored.VERTICAL_ACCURACY),
+        ignore = GpsInputIgnoreFlags
+        optional_fields = (
+            (value.hdop, ignore.HDOP),
+            (value.vdop, ignore.VDOP),
+            (value.velocity_m_s, ignore.VEL_HORIZ | ignore.VEL_VERT),
+            (value.speed_accuracy_m_s, ignore.SPEED_ACCURACY),
+            (value.horizontal_accuracy_m, ignore.HORIZONTAL_ACCURACY),
+            (value.vertical_accuracy_m, ignore.VERTICAL_ACCURACY),
         )
-        flags = sum(flag for known, flag in optional if known is None)
+        ignore_flags = sum(flag for field, flag in optional_fields if field is None)
         week, week_ms = _gps_time(value.unix_time_s)
+        yaw_cdeg = 0  # means "no heading"; north is sent as 36000
+        if value.yaw_deg is not None:
+            yaw_cdeg = round(value.yaw_deg % 360 * 100) or 36000
         return (
             m.GpsInput(
                 self._time_us(value.measured_at),
                 value.instance,
-                flags,
+                ignore_flags,
                 week_ms,
                 week,
                 value.fix,
@@ -160,7 +177,7 @@ class MeasurementEncoder:
                 value.horizontal_accuracy_m or 0.0,
                 value.vertical_accuracy_m or 0.0,
                 value.satellites,
-                0 if value.yaw_deg is None else round(value.yaw_deg % 360 * 100) or 36000,  # 0 means "no heading"
+                yaw_cdeg,
             ),
         )
 
@@ -171,24 +188,26 @@ class MeasurementEncoder:
         count = len(value.distances_m)
         if not 1 <= count <= MAX_SECTORS:
             raise InvalidArgument(f"distances_m has {count} distances; allowed: 1 to {MAX_SECTORS}")
-        low, high = _centimetres("min_m", value.min_m), _centimetres("max_m", value.max_m)
+        min_cm, max_cm = _centimetres("min_m", value.min_m), _centimetres("max_m", value.max_m)
         distances = [UNKNOWN_DISTANCE] * MAX_SECTORS
-        for index, distance in enumerate(value.distances_m):
-            if distance is not None:
-                is_free = distance > value.max_m
-                distances[index] = high + 1 if is_free else _centimetres("distances_m", distance)
-        time, step = self._time_us(value.measured_at), value.step_deg
-        return (m.ObstacleDistance(time, LASER, distances, 0, low, high, step, value.first_deg, MavFrame.BODY_FRD),)
+        for index, distance_m in enumerate(value.distances_m):
+            if distance_m is None:
+                continue
+            is_free = distance_m > value.max_m  # sent as max_distance + 1, which means "no obstacle"
+            distances[index] = max_cm + 1 if is_free else _centimetres("distances_m", distance_m)
+        time_us = self._time_us(value.measured_at)
+        angles = (value.step_deg, value.first_deg)
+        return (m.ObstacleDistance(time_us, LASER, distances, 0, min_cm, max_cm, *angles, MavFrame.BODY_FRD),)
 
     def obstacle_points(self, value: v.ObstaclePoints) -> tuple[Message, ...]:
         """Return one OBSTACLE_DISTANCE_3D for each point, all with the same time stamp."""
         check_range("min_m", value.min_m, 0, 1e5)
         check_range("max_m", value.max_m, 0, 1e5, above=True)
-        time = self._time_us(value.measured_at) // 1000 & 0xFFFFFFFF
+        time_ms = self._time_us(value.measured_at) // 1000 & 0xFFFFFFFF
         for point in value.points_m:
             check_finite("points_m", *point)
         return tuple(
-            m.ObstacleDistance3d(time, LASER, MavFrame.BODY_FRD, UNKNOWN_DISTANCE, *point, value.min_m, value.max_m)
+            m.ObstacleDistance3d(time_ms, LASER, MavFrame.BODY_FRD, UNKNOWN_DISTANCE, *point, value.min_m, value.max_m)
             for point in value.points_m
         )
 
@@ -199,14 +218,15 @@ class MeasurementEncoder:
         if value.quality is not None:
             check_range("quality", value.quality, 1, 100)
         _check_variance(value.variance_m2)
-        low, high = _centimetres("min_m", value.min_m), _centimetres("max_m", value.max_m)
-        distance = _centimetres("distance_m", value.distance_m)
-        variance = NO_COVARIANCE
+        limits_cm = (_centimetres("min_m", value.min_m), _centimetres("max_m", value.max_m))
+        distance_cm = _centimetres("distance_m", value.distance_m)
+        covariance_cm2 = UNKNOWN_COVARIANCE
         if value.variance_m2 is not None:
-            variance = min(NO_COVARIANCE - 1, round(value.variance_m2 * 1e4))
-        time = self._time_us(value.measured_at) // 1000 & 0xFFFFFFFF
-        place = (ORIENTATIONS[value.direction], variance)
-        return (m.DistanceSensor(time, low, high, distance, LASER, 0, *place, signal_quality=value.quality or 0),)
+            covariance_cm2 = min(UNKNOWN_COVARIANCE - 1, round(value.variance_m2 * 1e4))
+        time_ms = self._time_us(value.measured_at) // 1000 & 0xFFFFFFFF
+        sensor = (LASER, 0, ORIENTATIONS[value.direction])  # type, id, orientation
+        quality = value.quality or 0  # 0 means "unknown"
+        return (m.DistanceSensor(time_ms, *limits_cm, distance_cm, *sensor, covariance_cm2, signal_quality=quality),)
 
     def landing_target(self, value: v.TargetMeasurement) -> tuple[Message, ...]:
         """Return LANDING_TARGET relative to the vehicle, or converted to the local frame for PX4."""
@@ -215,55 +235,62 @@ class MeasurementEncoder:
         check_range("number", value.number, 0, 255)
         distance = math.hypot(*offset)
         if not distance > 0:
-            raise InvalidArgument("the distance of the target is 0; it must be above 0")
+            raise InvalidArgument("forward_m = right_m = down_m = 0 is not allowed: the target must be at a distance")
         frame = MavFrame.LOCAL_FRD if value.is_level else MavFrame.BODY_FRD
         if self._session.autopilot.external.target_is_local:
             frame, offset = MavFrame.LOCAL_NED, self._in_local_frame(offset, is_level=value.is_level)
-        time, no_size = self._time_us(value.measured_at), (0.0, 0.0)
+        time_us, unknown_size = self._time_us(value.measured_at), (0.0, 0.0)
         angles = (math.atan2(value.right_m, value.down_m), -math.atan2(value.forward_m, value.down_m))
-        q = (1.0, 0.0, 0.0, 0.0)
-        return (m.LandingTarget(time, value.number, frame, *angles, distance, *no_size, *offset, q, 2, 1),)
+        no_rotation = (1.0, 0.0, 0.0, 0.0)
+        last_fields = (LANDING_TARGET_TYPE_VISION_FIDUCIAL, 1)  # 1: the position is valid
+        return (
+            m.LandingTarget(
+                time_us, value.number, frame, *angles, distance, *unknown_size, *offset, no_rotation, *last_fields
+            ),
+        )
 
     def optical_flow(self, value: v.FlowMeasurement) -> tuple[Message, ...]:
         """Return OPTICAL_FLOW_RAD for PX4, or OPTICAL_FLOW scaled as ArduPilot reads it."""
         check_finite("flow", value.x_rad, value.y_rad, *(value.gyro_rad or ()))
         check_range("interval_s", value.interval_s, 0, 10, above=True)
         check_range("quality", value.quality, 0, 255)
-        time = self._time_us(value.measured_at)
-        distance = -1.0 if value.distance_m is None else value.distance_m
-        check_finite("distance_m", distance)
+        time_us = self._time_us(value.measured_at)
+        distance_m = -1.0 if value.distance_m is None else value.distance_m  # a negative distance means "unknown"
+        check_finite("distance_m", distance_m)
         if self._session.autopilot.external.flow_in_radians:
             gyro = UNKNOWN_VECTOR if value.gyro_rad is None else value.gyro_rad
             interval_us = round(value.interval_s * 1e6)
             flow = (value.x_rad, value.y_rad, *gyro)
-            return (m.OpticalFlowRad(time, 0, interval_us, *flow, 0, value.quality, 0, distance),)
+            return (m.OpticalFlowRad(time_us, 0, interval_us, *flow, 0, value.quality, 0, distance_m),)
         # ArduPilot multiplies flow_x by the interval between messages to get rad/s (AP_OpticalFlow_MAV.cpp).
-        x, y = (round(angle / value.interval_s**2) for angle in (value.x_rad, value.y_rad))
-        for name, count in (("x_rad", x), ("y_rad", y)):
-            check_range(name, count, -0x8000, 0x7FFF)
+        flow_x, flow_y = (round(angle / value.interval_s**2) for angle in (value.x_rad, value.y_rad))
+        for name, flow_field in (("x_rad", flow_x), ("y_rad", flow_y)):
+            check_range(name, flow_field, -0x8000, 0x7FFF)
         rates = (value.x_rad / value.interval_s, value.y_rad / value.interval_s)
-        return (m.OpticalFlow(time, 0, x, y, 0.0, 0.0, value.quality, distance, *rates),)
+        return (m.OpticalFlow(time_us, 0, flow_x, flow_y, 0.0, 0.0, value.quality, distance_m, *rates),)
 
     def _in_local_frame(self, offset: Vector, *, is_level: bool) -> Vector:
+        """Return a position in the local frame; ``offset`` is relative to the vehicle, along its body axes."""
         telemetry = self._session.telemetry
         if max(telemetry.attitude.age, telemetry.local_position.age) > POSITION_MAX_AGE_S:
             raise ValueUnknownError("landing target: the vehicle's attitude or local position is unknown, or too old")
-        attitude, here = telemetry.attitude.value, telemetry.local_position.value
-        if is_level:
+        attitude, own_position = telemetry.attitude.value, telemetry.local_position.value
+        if is_level:  # The axes of the offset turn with the vehicle, but do not tilt.
             attitude = Attitude(0.0, 0.0, attitude.yaw_deg)
         north, east, down = rotate(attitude.quaternion, offset)
-        return (here.north_m + north, here.east_m + east, here.down_m + down)
+        return (own_position.north_m + north, own_position.east_m + east, own_position.down_m + down)
 
     def _time_us(self, measured_at: float | None) -> int:
+        """Return the time stamp in microseconds; None stands for now."""
         now = self._session.connection.now()
-        stamp = now if measured_at is None else measured_at
-        check_range("measured_at", stamp, 0, now)
-        return int(stamp * 1e6)
+        seconds = now if measured_at is None else measured_at
+        check_range("measured_at", seconds, 0, now)
+        return int(seconds * 1e6)
 
 
-def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+def multiply(left: Quaternion, right: Quaternion) -> Quaternion:
     """Return the product of two quaternions (w, x, y, z)."""
-    (aw, ax, ay, az), (bw, bx, by, bz) = a, b
+    (aw, ax, ay, az), (bw, bx, by, bz) = left, right
     return (
         aw * bw - ax * bx - ay * by - az * bz,
         aw * bx + ax * bw + ay * bz - az * by,
@@ -272,36 +299,39 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-def rotate(q: Quaternion, vector: Vector) -> Vector:
+def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
     """Return a vector rotated by a unit quaternion."""
-    conjugate = (q[0], -q[1], -q[2], -q[3])
-    _, x, y, z = multiply(multiply(q, (0.0, *vector)), conjugate)
+    w, x, y, z = quaternion
+    conjugate = (w, -x, -y, -z)
+    _, x, y, z = multiply(multiply(quaternion, (0.0, *vector)), conjugate)
     return (x, y, z)
 
 
-def _normalized(q: Quaternion) -> Quaternion:
-    size = math.hypot(*q)
-    if not 0.9 < size < 1.1:
-        raise InvalidArgument(f"orientation = {q!r} is not allowed: a quaternion (w, x, y, z) of length 1")
-    sign = -1.0 if q[0] < 0 else 1.0
-    return (sign * q[0] / size, sign * q[1] / size, sign * q[2] / size, sign * q[3] / size)
+def _normalized(quaternion: Quaternion) -> Quaternion:
+    """Return the unit quaternion of the same rotation, whose w is not negative."""
+    length = math.hypot(*quaternion)
+    if not 0.9 < length < 1.1:
+        raise InvalidArgument(f"orientation = {quaternion!r} is not allowed: a quaternion (w, x, y, z) of length 1")
+    w, x, y, z = quaternion
+    sign = -1.0 if w < 0 else 1.0
+    return (sign * w / length, sign * x / length, sign * y / length, sign * z / length)
 
 
-def _triangle(first: float | None, second: float | None) -> list[float]:
+def _triangle(linear_variance: float | None, angular_variance: float | None) -> list[float]:
     """Return the upper triangle of a 6x6 covariance matrix whose diagonal has each of two variances three times.
 
-    An unknown first variance is sent as NaN. An unknown second variance is sent as 0: both autopilots then use the
+    An unknown linear variance is sent as NaN. An unknown angular variance is sent as 0: both autopilots then use the
     minimum in their parameters, and ArduPilot does not accept NaN there.
     """
-    _check_variance(first)
-    _check_variance(second)
-    values = [0.0] * TRIANGLE_SIZE
-    for places, variance in ((POSITION_DIAGONAL, first), (ORIENTATION_DIAGONAL, second)):
-        for place in places:
-            values[place] = variance or 0.0
-    if first is None:
-        values[0] = NAN
-    return values
+    _check_variance(linear_variance)
+    _check_variance(angular_variance)
+    triangle = [0.0] * TRIANGLE_SIZE
+    for indexes, variance in ((POSITION_DIAGONAL, linear_variance), (ORIENTATION_DIAGONAL, angular_variance)):
+        for index in indexes:
+            triangle[index] = variance or 0.0
+    if linear_variance is None:
+        triangle[0] = NAN
+    return triangle
 
 
 def _check_variance(variance: float | None) -> None:
@@ -320,6 +350,7 @@ def _centimetres(name: str, metres: float) -> int:
 
 
 def _gps_time(unix_time_s: float | None) -> tuple[int, int]:
+    """Return the number of the GPS week, and milliseconds since its beginning; zeros if the time is unknown."""
     if unix_time_s is None:
         return 0, 0
     check_range("unix_time_s", unix_time_s, GPS_EPOCH_S, GPS_EPOCH_S + 65535 * SECONDS_PER_WEEK)

@@ -151,35 +151,39 @@ class External:
             OperationTimeout: the vehicle did not report the origin in time.
         """
         if origin.altitude_amsl_m is None:
-            raise InvalidArgument("origin has no altitude_amsl_m, which the local frame requires")
-        cell, session = self._session.telemetry.origin, self._session
-        if (present := cell.latest) is not None:
-            if _are_equal(present, origin):
+            raise InvalidArgument(
+                "origin.altitude_amsl_m = None is not allowed: the origin needs an altitude above mean sea level"
+            )
+        session, present_origin = self._session, self._session.telemetry.origin.latest
+        if present_origin is not None:
+            if _are_close(present_origin, origin):
                 return
             if session.autopilot.external.origin_is_final:
                 raise OperationRejected(
-                    f"set_origin: {session.autopilot.firmware} has the origin {present} and keeps it until a reboot"
+                    f"set_origin: {session.autopilot.firmware} has the origin {present_origin} and keeps it until a"
+                    " reboot"
                 )
         latitude, longitude = round(origin.latitude_deg * 1e7), round(origin.longitude_deg * 1e7)
-        altitude = round(origin.altitude_amsl_m * 1000)
+        altitude_mm = round(origin.altitude_amsl_m * 1000)
         time_us = int(session.connection.now() * 1e6)
         with self._context.arbiter.auxiliary_order() as order:
             self._context.sender.raise_if_ended(order)
-            session.send(SetGpsGlobalOrigin(session.system_id, latitude, longitude, altitude, time_us))
+            session.send(SetGpsGlobalOrigin(session.system_id, latitude, longitude, altitude_mm, time_us))
         await self._await_origin(origin, timeout)
 
     async def _await_origin(self, origin: Position, timeout: float) -> None:
         cell, connection = self._session.telemetry.origin, self._session.connection
         until = connection.now() + timeout
-        while (left := until - connection.now()) > 0:
+        while (remaining_s := until - connection.now()) > 0:
             self._request_origin()
+            wait_s = min(POLL_INTERVAL_S, remaining_s)
             try:
-                await cell.wait_until(lambda value: _are_equal(value, origin), timeout=min(POLL_INTERVAL_S, left))
+                await cell.wait_until(lambda reported: _are_close(reported, origin), timeout=wait_s)
             except OperationTimeout:
                 continue
             return
-        known = f"it reports {cell.latest}" if cell.is_known else "it reports none"
-        raise OperationTimeout(f"set_origin: the vehicle did not report the origin within {timeout:g} s; {known}")
+        report = f"it reports {cell.latest}" if cell.is_known else "it reports none"
+        raise OperationTimeout(f"set_origin: the vehicle did not report the origin within {timeout:g} s; {report}")
 
     def _request_origin(self) -> None:
         self._session.commands.send_unconfirmed(MavCmd.REQUEST_MESSAGE, GpsGlobalOrigin.ID)
@@ -197,8 +201,9 @@ class External:
         )
 
 
-def _are_equal(present: Position, wanted: Position) -> bool:
-    if present.altitude_amsl_m is None or wanted.altitude_amsl_m is None:
+def _are_close(reported: Position, ordered: Position) -> bool:
+    """Return True if both origins are the same, apart from rounding."""
+    if reported.altitude_amsl_m is None or ordered.altitude_amsl_m is None:
         return False
-    is_level = abs(present.altitude_amsl_m - wanted.altitude_amsl_m) <= ORIGIN_TOLERANCE_M
-    return is_level and present.distance_to(wanted) <= ORIGIN_TOLERANCE_M
+    has_same_altitude = abs(reported.altitude_amsl_m - ordered.altitude_amsl_m) <= ORIGIN_TOLERANCE_M
+    return has_same_altitude and reported.distance_to(ordered) <= ORIGIN_TOLERANCE_M

@@ -81,21 +81,23 @@ async def land_on(
     """Land on a target; see :meth:`aerokit.Vehicle.land_on`."""
     check_range("acquire_timeout", acquire_timeout, 0, 3600, above=True)
     session, mode = context.session, context.sender.mode_for("land_on", "precision_land")
-    check = TakeoverCheck(context, mode)
-    local = ("attitude", "local_position") if session.autopilot.external.target_is_local else ()
+    takeover_check = TakeoverCheck(context, mode)
+    # The states that convert a target to the local frame, which PX4 requires.
+    local_states = ("attitude", "local_position") if session.autopilot.external.target_is_local else ()
     async with external.landing_target(rate_hz=rate_hz) as stream:
         landing = TargetLanding(context, stream)
         reader = asyncio.get_running_loop().create_task(landing.read(target, 1 / rate_hz))
-        with session.streaming(*local, hz=rate_hz), session.streaming("position", "landed_state"):
+        with session.streaming(*local_states, hz=rate_hz), session.streaming("position", "landed_state"):
             try:
                 await landing.acquire(reader, acquire_timeout)
-                check.raise_if_changed("land_on")
+                takeover_check.raise_if_changed("land_on")
                 sent_before = stream.sent
                 order = context.arbiter.order(mode)
                 await context.sender.change_mode(mode, order, reported_since=order.given_at)
                 await landing.await_disarmed(order, timeout, max_silence_s)
             finally:
                 reader.cancel()
+                # Shielded, so that no code of the program's source runs after this call, even if the call is cancelled.
                 with anyio.CancelScope(shield=True):
                     await asyncio.wait([reader])
         return landing.report(is_used=stream.sent > sent_before, texts=session.texts_since(order.given_at))
@@ -107,6 +109,7 @@ class TargetLanding:
     def __init__(self, context: VehicleContext, stream: MeasurementStream[TargetMeasurement]) -> None:
         self._context, self._session, self._stream = context, context.session, stream
         self._last: TargetMeasurement | None = None
+        # When the target was last visible, and the vehicle's height then.
         self._seen_at = -math.inf
         self._seen_height_m: float | None = None
         self._lowest_m, self._climbed_m = math.inf, 0.0
@@ -118,11 +121,11 @@ class TargetLanding:
         try:
             if isinstance(source, AsyncIterable):
                 async for target in source:
-                    self._take(target)
+                    self._on_target(target)
                 return
             while True:
-                found = source()
-                self._take(await found if isawaitable(found) else found)
+                result = source()
+                self._on_target(await result if isawaitable(result) else result)
                 await anyio.sleep(period_s)
         except Exception as error:
             self._error = error
@@ -133,14 +136,14 @@ class TargetLanding:
         while self._last is None:
             self._raise_error()
             if reader.done() or self._now() - started >= timeout:
-                waited = "" if reader.done() else f" within {timeout:g} s"
-                raise OperationTimeout(f"land_on: the target was not seen{waited}; the landing was not ordered")
+                within = "" if reader.done() else f" within {timeout:g} s"
+                raise OperationTimeout(f"land_on: the target was not seen{within}; the landing was not ordered")
             await anyio.sleep(min(POLL_INTERVAL_S, timeout))
 
     async def await_disarmed(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
         """Wait until the vehicle is on the ground and disarmed."""
         telemetry, ground = self._session.telemetry, GroundCheck(self._session)
-        stays = self._context.sender.stays_until_disarmed(order)
+        landing_failure = self._context.sender.landing_failure(order)
 
         def is_down() -> bool:
             height = height_above_home(self._session.telemetry)
@@ -159,7 +162,7 @@ class TargetLanding:
             self._session,
             "land_on",
             is_done=is_down,
-            trouble=lambda: ground.trouble(stays),
+            failure_reason=lambda: ground.failure_reason(landing_failure),
             describe=describe,
             timeout=timeout,
             max_silence_s=max_silence_s,
@@ -177,17 +180,16 @@ class TargetLanding:
         if self._error is not None:
             raise self._error
 
-    def _take(self, target: TargetMeasurement | None) -> None:
+    def _on_target(self, target: TargetMeasurement | None) -> None:
+        """Send a target that is visible, and record it for the report."""
         if target is None:
             return
         check_kind("target", target, TargetMeasurement)
-        with contextlib.suppress(ValueUnknownError):  # PX4's attitude or local position is unknown.
+        # Without PX4's attitude or local position, the target cannot be sent, and counts as not visible.
+        with contextlib.suppress(ValueUnknownError):
             self._stream.send(target)
-            gap = self._now() - self._seen_at
-            if LOST_AFTER_S < gap < math.inf:
-                self._losses.append(TargetLoss(gap, self._seen_height_m))
-            self._last, self._seen_at, self._seen_height_m = (
-                target,
-                self._now(),
-                height_above_home(self._session.telemetry),
-            )
+            unseen_s = self._now() - self._seen_at
+            if LOST_AFTER_S < unseen_s < math.inf:
+                self._losses.append(TargetLoss(unseen_s, self._seen_height_m))
+            self._last, self._seen_at = target, self._now()
+            self._seen_height_m = height_above_home(self._session.telemetry)

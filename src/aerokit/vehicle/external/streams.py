@@ -30,6 +30,7 @@ EstimatorUse: TypeAlias = Literal["used", "not used", "unknown"]
 
 # Flag of EKF_STATUS_REPORT and ESTIMATOR_STATUS: the estimator has no position and assumes that it is constant.
 CONSTANT_POSITION = 1 << 7
+# Maximum age of a report of the estimator that describes its present state.
 ESTIMATOR_MAX_AGE_S = 2.5
 
 
@@ -42,20 +43,20 @@ class TimesyncAnswers:
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
-        self._users = 0
+        self._open_streams = 0
         self._detach: Detach | None = None
 
     def open(self) -> None:
         """Start to answer requests. Each call must be paired with a call of `close`."""
-        self._users += 1
-        if self._users == 1:
+        self._open_streams += 1
+        if self._open_streams == 1:
             bus = self._session.connection.bus
             self._detach = bus.attach(Timesync, self._on_timesync, system_id=self._session.system_id)
 
     def close(self) -> None:
         """Stop answering requests if this was the last open stream."""
-        self._users -= 1
-        if self._users == 0 and self._detach is not None:
+        self._open_streams -= 1
+        if self._open_streams == 0 and self._detach is not None:
             self._detach()
             self._detach = None
 
@@ -90,7 +91,7 @@ class MeasurementStream(Generic[MeasurementT]):
         kind: ExternalKind,
         value_type: type[MeasurementT],
         encode: Callable[[MeasurementT], tuple[Message, ...]],
-        answers: TimesyncAnswers,
+        timesync_answers: TimesyncAnswers,
         probe: Probe,
         rate_hz: float,
         valid_for_s: float,
@@ -99,9 +100,10 @@ class MeasurementStream(Generic[MeasurementT]):
         check_range("valid_for_s", valid_for_s, 0, 60, above=True)
         self._session, self._value_type, self._encode = session, value_type, encode
         self._kind: ExternalKind = kind
-        self._answers, self._probe = answers, probe
+        self._timesync_answers, self._probe = timesync_answers, probe
         self._period_s, self._valid_for_s = 1 / rate_hz, valid_for_s
         self._parameters: dict[str, float] = {}
+        # The messages of the measurement to send at the end of the period, and the time of the measurement.
         self._waiting: tuple[tuple[Message, ...], float] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._next_at = -math.inf
@@ -142,14 +144,16 @@ class MeasurementStream(Generic[MeasurementT]):
         has_position = health.has_relative_position or health.has_absolute_position
         # PX4 also sets this flag while the vehicle stands still on the ground.
         is_resting = self._session.telemetry.landed_state.latest == MavLandedState.ON_GROUND
-        is_constant = health.flags & CONSTANT_POSITION and not (
-            is_resting and self._session.autopilot.external.constant_position_at_rest
-        )
-        if is_constant or not has_position:
+        is_flag_expected = is_resting and self._session.autopilot.external.constant_position_at_rest
+        assumes_constant = health.flags & CONSTANT_POSITION and not is_flag_expected
+        if assumes_constant or not has_position:
             return "not used"
-        known = [(self._parameters[name], allowed) for name, allowed in rule.sole_source if name in self._parameters]
-        is_alone = rule.sole_source[0][0] in self._parameters and all(value in allowed for value, allowed in known)
-        return "used" if is_alone else "unknown"
+        # The first parameter selects the source of the position; the vehicle need not have the others.
+        selecting_parameter, _ = rule.sole_source[0]
+        is_sole_source = selecting_parameter in self._parameters and all(
+            self._parameters[name] in allowed for name, allowed in rule.sole_source if name in self._parameters
+        )
+        return "used" if is_sole_source else "unknown"
 
     def send(self, measurement: MeasurementT) -> None:
         """Send a measurement now, or at the end of the period if another measurement was already sent in it.
@@ -170,10 +174,10 @@ class MeasurementStream(Generic[MeasurementT]):
         if not connection.is_open:
             connection.send(messages[0])  # If the connection has ended, this raises the error that ended it.
         now = connection.now()
-        given: float | None = getattr(measurement, "measured_at", None)
+        measured_at: float | None = getattr(measurement, "measured_at", None)
         if self._waiting is not None:
             self._dropped += 1
-        self._waiting = (messages, now if given is None else given)
+        self._waiting = (messages, now if measured_at is None else measured_at)
         if now >= self._next_at:
             self._flush()
         elif self._timer is None:
@@ -191,8 +195,9 @@ class MeasurementStream(Generic[MeasurementT]):
         if now - measured_at > self._valid_for_s or session.watch.is_silent or not session.connection.is_open:
             self._dropped += 1
             return
-        following = self._next_at + self._period_s
-        self._next_at = following if following > now else now + self._period_s
+        # Keep the rate on average, but do not catch up after a pause.
+        next_period_at = self._next_at + self._period_s
+        self._next_at = next_period_at if next_period_at > now else now + self._period_s
         for message in messages:
             session.send(message)
         self._sent += 1
@@ -202,7 +207,7 @@ class MeasurementStream(Generic[MeasurementT]):
             raise SetpointStreamStopped(f"this {self._kind} stream can be entered only once: open another one")
         self._was_entered = True
         self._parameters = await self._check_support()
-        self._answers.open()
+        self._timesync_answers.open()
         self._is_open = True
         return self
 
@@ -211,22 +216,26 @@ class MeasurementStream(Generic[MeasurementT]):
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self._answers.close()
+        self._timesync_answers.close()
 
     async def _check_support(self) -> dict[str, float]:
         """Raise an error unless the vehicle uses these measurements; return the parameters that select them."""
         firmware, rule = self._session.autopilot.firmware, self._session.autopilot.external.kinds.get(self._kind)
-        what = self._kind.replace("_", " ")
+        measurement = self._kind.replace("_", " ")
         if rule is None:
-            raise NotSupported(f"{what}: {firmware} does not read such measurements by MAVLink")
-        names = [name for group, _ in rule.required for name in group]
-        values = await known_values(self._probe, *names, *(name for name, _ in rule.sole_source))
-        for group, allowed in rule.required:
-            found = next((name for name in group if name in values), None)
-            if found is None or values[found] not in allowed:
-                now = f"{group[0]} does not exist" if found is None else f"{found} = {values[found]:g}"
-                choice = " or ".join(f"{each:g}" for each in allowed[:4])
-                raise OperationRejected(
-                    f"{what}: {now}, so that {firmware} ignores the measurements; set {group[0]} to {choice} and reboot"
-                )
+            raise NotSupported(f"{measurement}: {firmware} does not read such measurements by MAVLink")
+        required_names = [name for names, _ in rule.required for name in names]
+        values = await known_values(self._probe, *required_names, *(name for name, _ in rule.sole_source))
+        for names, allowed in rule.required:  # ``names`` are those of one parameter in different firmware versions
+            present_name = next((name for name in names if name in values), None)
+            if present_name is not None and values[present_name] in allowed:
+                continue
+            problem = (
+                f"{names[0]} does not exist" if present_name is None else f"{present_name} = {values[present_name]:g}"
+            )
+            choices = " or ".join(f"{value:g}" for value in allowed[:4])
+            raise OperationRejected(
+                f"{measurement}: {problem}, so that {firmware} ignores the measurements;"
+                f" set {names[0]} to {choices} and reboot"
+            )
         return values

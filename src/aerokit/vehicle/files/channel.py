@@ -60,7 +60,7 @@ class FileChannel:
     @asynccontextmanager
     async def operation(
         self,
-        what: str,
+        description: str,
         *,
         timeout: float | None,
         idle_timeout_s: float,
@@ -76,10 +76,10 @@ class FileChannel:
                     for session in tuple(self._closing):
                         await self._finish_closing(session, idle_timeout_s)
                     yield
-        except OperationTimeout:
+        except OperationTimeout:  # a TimeoutError from inside the operation
             raise
         except TimeoutError:
-            raise FileTimeout(f"{what}: not done within {timeout:g} s", missing=missing()) from None
+            raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
 
     async def request(
         self,
@@ -119,14 +119,14 @@ class FileChannel:
                 await self._close(file.session, path, idle_timeout_s)
                 if attempt == MAX_OPEN_ATTEMPTS:
                     raise
-            except (OperationTimeout, ConnectionClosed, LinkError):
+            except (OperationTimeout, ConnectionClosed, LinkError):  # The vehicle would not answer now.
                 self._close_soon(file.session, path)
                 raise
             except Exception:
                 with suppress(FileTimeout):
                     await self._close(file.session, path, min(idle_timeout_s, CLOSE_TIMEOUT_S))
                 raise
-            except BaseException:
+            except BaseException:  # A cancelled call must not wait.
                 self._close_soon(file.session, path)
                 raise
             else:
@@ -139,19 +139,20 @@ class FileChannel:
 
     async def _open(self, opcode: MavFtpOpcode, path: str, idle_timeout_s: float) -> RemoteFile:
         """Open a file. If another session is in the way, wait once until the vehicle times that session out."""
-        may_wait, may_be_ours = True, True
+        may_wait, may_be_own_session = True, True
         while True:
-            request = self._request(opcode, path, self.client.next_session(), idle_timeout_s)
+            request = self._session_request(opcode, path, self.client.next_session(), idle_timeout_s)
             try:
                 reply = await self.transfers.run(request)
             except FileError as error:
-                if may_be_ours and request.attempts > 1 and error.code in SESSION_IN_USE:
-                    # The first request may have opened this file: its reply was lost.
-                    may_be_ours = False
+                if may_be_own_session and request.attempts > 1 and error.code in SESSION_IN_USE:
+                    # If the reply to the first request was lost, the session in the way may be that of this file.
+                    may_be_own_session = False
                     for session in self._possible_sessions(request):
                         await self._close(session, path, idle_timeout_s)
                     continue
                 pause_s = SESSION_TIMEOUT_S.get(error.code)
+                # The pause may exceed the caller's idle time-out by one second.
                 if not may_wait or pause_s is None or pause_s > idle_timeout_s + 1.0:
                     raise
                 may_wait = False
@@ -163,7 +164,7 @@ class FileChannel:
             else:
                 return RemoteFile(reply.session, int.from_bytes(reply.data[:4], "little"))
 
-    def _request(
+    def _session_request(
         self, opcode: MavFtpOpcode, path: str, session: int, idle_timeout_s: float, *, is_sent: bool = False
     ) -> FtpRequest:
         return FtpRequest(
@@ -183,7 +184,7 @@ class FileChannel:
 
     async def _close(self, session: int, path: str, idle_timeout_s: float) -> None:
         """Close a session and wait for the confirmation; if that fails, continue in the background."""
-        request = self._request(MavFtpOpcode.TERMINATESESSION, path, session, idle_timeout_s)
+        request = self._session_request(MavFtpOpcode.TERMINATESESSION, path, session, idle_timeout_s)
         try:
             await self.transfers.run(request)
         except BaseException:
@@ -192,7 +193,7 @@ class FileChannel:
 
     def _close_soon(self, session: int, path: str) -> None:
         """Close a session without waiting; the next operation waits for the confirmation."""
-        request = self._request(MavFtpOpcode.TERMINATESESSION, path, session, IDLE_TIMEOUT_S, is_sent=True)
+        request = self._session_request(MavFtpOpcode.TERMINATESESSION, path, session, IDLE_TIMEOUT_S, is_sent=True)
         with suppress(AerokitError):  # The connection may be closed.
             self.transfers.connection.send(request.message)
             closing = self._closing[session] = _Closing(request)
@@ -230,7 +231,7 @@ class LogChannel:
         self._ending: asyncio.Event | None = None
 
     async def list(
-        self, idle_timeout_s: float, only: int | None, *, max_unanswered: int | None
+        self, idle_timeout_s: float, only_id: int | None, *, max_unanswered: int | None
     ) -> tuple[LogEntry, ...]:
         """Request all entries of the log list, or the entry of one log, within an operation."""
         transfers = self._transfers
@@ -238,8 +239,8 @@ class LogChannel:
             transfers.system_id,
             transfers.component_id,
             first_id=transfers.autopilot.first_log_id,
-            start=only,
-            end=only,
+            start=only_id,
+            end=only_id,
             max_unanswered=max_unanswered,
             round_trip=transfers.round_trip,
             idle_timeout_s=idle_timeout_s,
@@ -272,7 +273,7 @@ class LogChannel:
     @asynccontextmanager
     async def operation(
         self,
-        what: str,
+        description: str,
         timeout: float | None,
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
@@ -287,10 +288,10 @@ class LogChannel:
                     except BaseException:
                         self._end()
                         raise
-        except OperationTimeout:
+        except OperationTimeout:  # a TimeoutError from inside the operation
             raise
         except TimeoutError:
-            raise FileTimeout(f"{what}: not done within {timeout:g} s", missing=missing()) from None
+            raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
 
     def _end(self) -> None:
         """Send LOG_REQUEST_END. A background task confirms the end before the next operation starts."""

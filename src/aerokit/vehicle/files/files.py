@@ -29,6 +29,7 @@ __all__ = ["FileEntry", "Files"]
 CAPABILITY_FTP = 0x20
 CRC_UNSUPPORTED = (MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND)
 MAX_FILE_SIZE = 0xFFFFFFFF
+CRC_INVERSION = 0xFFFFFFFF
 BLOCK_SIZE = 1 << 16
 # A directory listing counts as endless after this many consecutive replies without entries, or this many entries.
 MAX_EMPTY_REPLIES, MAX_ENTRIES = 50, 1_000_000
@@ -114,10 +115,10 @@ class Files:
         start = part.size if resume and not is_virtual(path) else 0
         try:
             await self._fetch_to(part, path, start, idle_timeout_s, timeout, on_progress)
-            is_whole = not start or await self._is_same(path, part, idle_timeout_s, timeout)
+            is_correct = not start or await self._has_same_crc(path, part, idle_timeout_s, timeout)
         except _ShorterError:
-            is_whole = False
-        if not is_whole:
+            is_correct = False
+        if not is_correct:
             await self._fetch_to(part, path, 0, idle_timeout_s, timeout, on_progress)
         part.finish()
 
@@ -134,11 +135,14 @@ class Files:
         offset = empty_replies = 0
         async with self._channel.operation(f"list {path}", timeout=timeout, idle_timeout_s=idle_timeout_s):
             while (reply := await self._list_from(path, offset, idle_timeout_s)) is not None:
-                names = [text for text in reply.data.split(b"\0") if text]
-                before = len(entries)
-                entries.update((entry.name, entry) for entry in map(_entry, names) if entry is not None)
-                offset += len(names) or 1  # Skip a name that is too long for a message.
-                empty_replies = empty_replies + 1 if len(entries) == before else 0
+                texts = [text for text in reply.data.split(b"\0") if text]
+                count_before = len(entries)
+                for text in texts:
+                    entry = _parse_entry(text)
+                    if entry is not None:
+                        entries[entry.name] = entry
+                offset += len(texts) or 1  # Skip a name that is too long for a message.
+                empty_replies = empty_replies + 1 if len(entries) == count_before else 0
                 if empty_replies > MAX_EMPTY_REPLIES or offset > MAX_ENTRIES:
                     raise RemoteProtocolError(
                         f"list {path}: the vehicle's listing does not end, it has reached entry {offset}"
@@ -180,8 +184,13 @@ class Files:
         data = bytes(data)
         if len(data) > MAX_FILE_SIZE:
             raise InvalidArgument(f"data of {len(data)} bytes is not allowed: at most {MAX_FILE_SIZE}")
-        channel, missing = self._channel, lambda: ((0, len(data)),)
-        async with channel.operation(f"write {path}", timeout=timeout, idle_timeout_s=idle_timeout_s, missing=missing):
+        channel = self._channel
+        async with channel.operation(
+            f"write {path}",
+            timeout=timeout,
+            idle_timeout_s=idle_timeout_s,
+            missing=lambda: ((0, len(data)),),  # After a failure, the whole file must be written again.
+        ):
             await channel.with_file(
                 MavFtpOpcode.CREATEFILE,
                 path,
@@ -288,10 +297,12 @@ class Files:
         path_bytes(path)
         channel = self._channel
 
-        async def use(file: RemoteFile) -> None:
-            if file.size < into.start:
+        async def read_file(file: RemoteFile) -> None:
+            if file.size < into.start:  # shorter than what an interrupted download has already read
                 raise _ShorterError
-            if file.size < into.position and not is_virtual(path):
+            if file.size < into.position and not is_virtual(
+                path
+            ):  # The vehicle had closed it, and it was opened again.
                 raise RemoteProtocolError(f"read {path}: the file became shorter during the read")
             transfer = FtpDownload(
                 channel.client,
@@ -308,7 +319,7 @@ class Files:
         async with channel.operation(
             f"read {path}", timeout=timeout, idle_timeout_s=idle_timeout_s, missing=into.missing
         ):
-            await channel.with_file(MavFtpOpcode.OPENFILERO, path, use, idle_timeout_s=idle_timeout_s)
+            await channel.with_file(MavFtpOpcode.OPENFILERO, path, read_file, idle_timeout_s=idle_timeout_s)
 
     async def _fetch_to(
         self,
@@ -323,14 +334,15 @@ class Files:
             into = Reassembly(disk.write, block_size=DATA_SIZE, start=start)
             await self._fetch(path, into, idle_timeout_s, timeout, on_progress)
 
-    async def _is_same(self, path: str, part: PartFile, idle_timeout_s: float, timeout: float | None) -> bool:
+    async def _has_same_crc(self, path: str, part: PartFile, idle_timeout_s: float, timeout: float | None) -> bool:
+        """Return True if the local copy has the CRC-32 of the vehicle's file, or the vehicle cannot compute it."""
         try:
-            theirs = await self.crc32(path, idle_timeout_s=idle_timeout_s, timeout=timeout)
+            vehicle_crc = await self.crc32(path, idle_timeout_s=idle_timeout_s, timeout=timeout)
         except FileError as error:
             if error.code in CRC_UNSUPPORTED:
                 return True
             raise
-        return theirs == _crc32_of_file(part.path)
+        return vehicle_crc == _crc32_of_file(part.path)
 
     async def _upload_to(
         self, file: RemoteFile, path: str, data: bytes, idle_timeout_s: float, on_progress: OnProgress | None
@@ -347,16 +359,17 @@ class Files:
         await self._transfers.run(transfer)
 
     async def _verify(self, path: str, data: bytes, idle_timeout_s: float) -> None:
-        ours = _crc32(data)
+        """Raise VerificationFailed if the vehicle computes another CRC-32 for its file. Do nothing if it cannot."""
+        own_crc = _crc32(data)
         try:
             reply = await self._channel.request(MavFtpOpcode.CALCFILECRC, path, idle_timeout_s=idle_timeout_s)
         except FileError as error:
             if error.code in CRC_UNSUPPORTED:
                 return
             raise
-        theirs = _crc32_in(path, reply)
-        if theirs != ours:
-            difference = f"CRC-32 0x{theirs:08x} on the vehicle, 0x{ours:08x} here"
+        vehicle_crc = _crc32_in(path, reply)
+        if vehicle_crc != own_crc:
+            difference = f"CRC-32 0x{vehicle_crc:08x} on the vehicle, 0x{own_crc:08x} here"
             raise VerificationFailed(f"{path} was written, but has other content", differences=(difference,))
 
 
@@ -368,14 +381,15 @@ def _content_of(source: str | os.PathLike[str]) -> bytes:
     return Path(source).read_bytes()
 
 
-def _entry(text: bytes) -> FileEntry | None:
+def _parse_entry(text: bytes) -> FileEntry | None:
     """Parse one entry of a listing; None for entries to skip."""
-    kind, rest = text[:1], text[1:].decode("utf-8", "replace")
-    if kind == b"D" and rest not in (".", ".."):
-        return FileEntry(rest.partition("\t")[0], None, True)
+    kind, name_and_size = text[:1], text[1:].decode("utf-8", "replace")
+    name, _, size_text = name_and_size.partition("\t")
+    if kind == b"D" and name_and_size not in (".", ".."):
+        return FileEntry(name, size=None, is_directory=True)
     if kind == b"F":
-        name, _, size = rest.partition("\t")
-        return FileEntry(name, int(size) if size.isascii() and size.isdigit() else None, False)
+        size = int(size_text) if size_text.isascii() and size_text.isdigit() else None
+        return FileEntry(name, size=size, is_directory=False)
     return None
 
 
@@ -385,8 +399,9 @@ def _crc32_in(path: str, reply: FtpMessage) -> int:
     return int.from_bytes(reply.data[:4], "little")
 
 
-def _crc32(data: bytes, before: int = 0) -> int:
-    return zlib.crc32(data, before ^ MAX_FILE_SIZE) ^ MAX_FILE_SIZE
+def _crc32(data: bytes, previous_crc: int = 0) -> int:
+    """Return the CRC-32 of MAVFTP, which does not invert the start value and the result, as zlib does."""
+    return zlib.crc32(data, previous_crc ^ CRC_INVERSION) ^ CRC_INVERSION
 
 
 def _crc32_of_file(path: Path) -> int:

@@ -21,7 +21,9 @@ __all__ = ["LogStream"]
 
 START = SimpleOrder("logs.stream", MavCmd.LOGGING_START, (0,))
 STOP = SimpleOrder("logs.stream", MavCmd.LOGGING_STOP)
-MAGIC, HEADER_BYTES, NO_START = b"ULog\x01\x12\x35", 16, 255
+MAGIC, HEADER_BYTES = b"ULog\x01\x12\x35", 16
+NO_MESSAGE_START = 255
+"""Value of ``first_message_offset`` if no ULog message begins in a LOGGING_DATA."""
 MAX_WAITING = 8192
 """Messages that may wait for the reader: about 2 MB."""
 DROPOUT = b"\x02\x00O"
@@ -38,46 +40,48 @@ class UlogAssembler:
         self.lost: int = 0
         """Number of messages that were not received."""
         self._next: int | None = None
-        self._began = self._is_aligned = False
+        self._has_header = self._is_aligned = False
         self._buffer = bytearray()
         self._received_at = 0.0
 
     def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
-        """Take the next message and return the complete ULog messages."""
+        """Add a message of the stream; return the data of the file that is complete now, perhaps none."""
         gap = 0 if self._next is None else (message.sequence - self._next) % 0x10000
         if gap >= 0x8000:  # A repetition of an earlier message, whose acknowledgement was lost.
             return b""
-        data, first = bytes(message.data[: message.length]), message.first_message_offset
-        marks = b""
+        data, first_offset = bytes(message.data[: message.length]), message.first_message_offset
+        prefix = b""  # header of the file, or mark of a gap
         if gap:
             self.lost += gap
             self._buffer.clear()
             self._is_aligned = False
         self._next = (message.sequence + 1) % 0x10000
-        if not self._began:
-            self._began = self._is_aligned = data.startswith(MAGIC)
-            if not self._began:
+        if not self._has_header:
+            self._has_header = self._is_aligned = data.startswith(MAGIC)
+            if not self._has_header:
                 return b""
-            marks, data = data[:HEADER_BYTES], data[HEADER_BYTES:]
+            prefix, data = data[:HEADER_BYTES], data[HEADER_BYTES:]
         elif not self._is_aligned:
-            if first == NO_START:
+            if first_offset == NO_MESSAGE_START:
                 return b""
-            self._is_aligned, data = True, data[first:]
-            marks = DROPOUT + min(0xFFFF, round(1000 * (now - self._received_at))).to_bytes(2, "little")
+            self._is_aligned, data = True, data[first_offset:]
+            gap_ms = round(1000 * (now - self._received_at))
+            prefix = DROPOUT + min(0xFFFF, gap_ms).to_bytes(2, "little")
         self._received_at = now
         self._buffer += data
-        return marks + self._take_whole()
+        return prefix + self._pop_complete()
 
-    def _take_whole(self) -> bytes:
+    def _pop_complete(self) -> bytes:
+        """Remove and return the complete messages: 2 bytes of length, 1 byte of type, content."""
         end = 0
         while len(self._buffer) >= end + 3:
             size = 3 + int.from_bytes(self._buffer[end : end + 2], "little")
             if len(self._buffer) < end + size:
                 break
             end += size
-        whole = bytes(self._buffer[:end])
+        complete = bytes(self._buffer[:end])
         del self._buffer[:end]
-        return whole
+        return complete
 
 
 @checks_arguments

@@ -145,7 +145,7 @@ class Logs:
             FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
             OSError: the local file cannot be written.
         """
-        _check(log)
+        _check_id(log)
         path, entry = await self._locate(log, method, idle_timeout_s, timeout)
         growth = GrowthReporter(entry if isinstance(log, int) else log, on_progress)
         if path is not None:
@@ -156,8 +156,8 @@ class Logs:
             return
         part = PartFile(to, _part_suffix(entry))
         # The time is part of the file name's suffix. Without it, a log of another flight may have the same suffix.
-        is_known = entry.time_utc is not None
-        start = part.size if resume and is_known and part.size <= entry.size else 0
+        has_time = entry.time_utc is not None
+        start = part.size if resume and has_time and part.size <= entry.size else 0
         with part.writing(start) as disk:
             into = Reassembly(disk.write, block_size=LOG_BLOCK, start=start)
             await self._channel.download(entry.id, entry.size, into, idle_timeout_s, timeout, growth)
@@ -180,7 +180,7 @@ class Logs:
             FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
             FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
         """
-        _check(log)
+        _check_id(log)
         path, entry = await self._locate(log, method, idle_timeout_s, timeout)
         growth = GrowthReporter(entry if isinstance(log, int) else log, on_progress)
         if path is not None:
@@ -202,15 +202,15 @@ class Logs:
             FileTimeout: some of the old logs still exist.
         """
         async with self._channel.operation("erase logs", timeout):
-            before = {(entry.time_utc, entry.size) for entry in await self._entries(IDLE_TIMEOUT_S)}
-            until = self._transfers.connection.now() + idle_timeout_s
-            while before:
+            # Identified by time and size, because a new log may get the id of an erased log.
+            remaining = {(entry.time_utc, entry.size) for entry in await self._entries(IDLE_TIMEOUT_S)}
+            deadline = self._transfers.connection.now() + idle_timeout_s
+            while remaining:
                 self._transfers.connection.send(LogErase(self._transfers.system_id, self._transfers.component_id))
                 await anyio.sleep(ERASE_RETRY_INTERVAL_S)
-                now_there = {(entry.time_utc, entry.size) for entry in await self._entries(IDLE_TIMEOUT_S)}
-                before &= now_there
-                if before and self._transfers.connection.now() >= until:
-                    raise FileTimeout(f"erase logs: {len(before)} logs still exist after {idle_timeout_s:g} s")
+                remaining &= {(entry.time_utc, entry.size) for entry in await self._entries(IDLE_TIMEOUT_S)}
+                if remaining and self._transfers.connection.now() >= deadline:
+                    raise FileTimeout(f"erase logs: {len(remaining)} logs still exist after {idle_timeout_s:g} s")
 
     def stream(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> LogStream:
         """Receive the flight log while PX4 writes it, during an ``async with`` block (MAV_CMD_LOGGING_START).
@@ -239,9 +239,12 @@ class Logs:
                 return path, log
         try:
             entry = await self._entry(log, idle_timeout_s, timeout, may_be_silent=method == "auto")
-        except FileTimeout:  # ArduPilot does not answer while it is armed.
-            path = await self._path(log, idle_timeout_s) if isinstance(log, LogEntry) and method == "auto" else None
-            if path is None or not isinstance(log, LogEntry):
+        except FileTimeout:
+            # ArduPilot does not answer LOG_* while it is armed; a log with a known entry can be read by MAVFTP.
+            if not isinstance(log, LogEntry) or method != "auto":
+                raise
+            path = await self._path(log, idle_timeout_s)
+            if path is None:
                 raise
             return path, log
         if prefers_messages:
@@ -260,12 +263,16 @@ class Logs:
     async def _entry(
         self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, *, may_be_silent: bool
     ) -> LogEntry:
-        """Return the current entry of a log. An unknown id is not requested: ArduPilot would list nonexistent logs
-        endlessly.
+        """Return the current entry of a log.
+
+        For a mere id, the whole list is requested: if there is no log with this id, a request for it alone would make
+        ArduPilot list nonexistent logs endlessly.
         """
-        log_id, only = (log, None) if isinstance(log, int) else (log.id, log.id)
+        log_id = log if isinstance(log, int) else log.id
+        only_id = None if isinstance(log, int) else log.id
+        max_unanswered = MAX_UNANSWERED_REQUESTS if may_be_silent else None
         async with self._channel.operation(f"log {log_id}", timeout):
-            entries = await self._entries(idle_timeout_s, only, MAX_UNANSWERED_REQUESTS if may_be_silent else None)
+            entries = await self._entries(idle_timeout_s, only_id, max_unanswered)
         for entry in entries:
             if entry.id == log_id:
                 if isinstance(log, LogEntry) and _is_different_log(log, entry):
@@ -276,23 +283,23 @@ class Logs:
         raise _no_such_log(log_id, "the logs on the vehicle have changed: call list() again")
 
     async def _entries(
-        self, idle_timeout_s: float, only: int | None = None, max_unanswered: int | None = None
+        self, idle_timeout_s: float, only_id: int | None = None, max_unanswered: int | None = None
     ) -> tuple[LogEntry, ...]:
-        """Request the list. ArduPilot also lists erased logs, with a size of 0."""
-        autopilot, listed = self._transfers.autopilot, self._channel.list
+        """Request the list, without erased logs, which ArduPilot lists with a size of 0."""
+        autopilot, request_list = self._transfers.autopilot, self._channel.list
         logs: Sequence[LogMessage | ListedLog] | None = None
         if autopilot.silent_without_logs and await self._files.is_supported():
             try:
-                logs = await listed(idle_timeout_s, only, max_unanswered=MAX_UNANSWERED_REQUESTS)
+                logs = await request_list(idle_timeout_s, only_id, max_unanswered=MAX_UNANSWERED_REQUESTS)
             except FileTimeout:
                 logs = await listed_logs(self._files, autopilot.log_directories, idle_timeout_s)
-                max_unanswered = None
+                max_unanswered = None  # If `logs` is None, there are logs, so that the vehicle must answer.
         if logs is None:
-            logs = await listed(idle_timeout_s, only, max_unanswered=max_unanswered)
+            logs = await request_list(idle_timeout_s, only_id, max_unanswered=max_unanswered)
         return tuple(_entry_of(log) for log in logs if log.size)
 
 
-def _check(log: LogEntry | int) -> None:
+def _check_id(log: LogEntry | int) -> None:
     log_id = log.id if isinstance(log, LogEntry) else log
     if not isinstance(log_id, int) or not 0 <= log_id <= MAX_LOG_ID:
         raise InvalidArgument(f"log = {log!r} is not allowed: an entry, or an id from 0 to {MAX_LOG_ID}")
@@ -303,13 +310,16 @@ def _entry_of(log: LogMessage | ListedLog) -> LogEntry:
     return LogEntry(log.id, log.size, time_utc)
 
 
-def _is_different_log(before: LogEntry, now: LogEntry) -> bool:
-    # A log grows while it is written. If it is smaller or much older than before, it is another log.
-    if now.size < before.size:
+def _is_different_log(old: LogEntry, new: LogEntry) -> bool:
+    """Return True if two entries with the same id, from an old and a new list, cannot be of the same log.
+
+    A log grows while it is written. If it is smaller or much older than before, it is another log.
+    """
+    if new.size < old.size:
         return True
-    if before.time_utc is None:
+    if old.time_utc is None:
         return False
-    return now.time_utc is None or now.time_utc < before.time_utc - MAX_CLOCK_DIFFERENCE
+    return new.time_utc is None or new.time_utc < old.time_utc - MAX_CLOCK_DIFFERENCE
 
 
 def _no_such_log(log_id: int, text: str) -> FileError:
@@ -350,13 +360,17 @@ async def log_path(
             entries = await files.list(directory, idle_timeout_s=idle_timeout_s)
         except FileError:
             continue
-        numbered = {int(match[1]): entry for entry in entries if (match := ARDUPILOT_NAME.fullmatch(entry.name))}
+        numbered: dict[int, FileEntry] = {}
+        for entry in entries:
+            match = ARDUPILOT_NAME.fullmatch(entry.name)
+            if match is not None:
+                numbered[int(match[1])] = entry
         if numbered:
             return _numbered_path(directory, numbered, log, has_grown)
-        if any(entry.is_directory for entry in entries):
+        if any(entry.is_directory for entry in entries):  # PX4 has a directory for each day or session.
             logs = await _list_in(files, directory, idle_timeout_s)
-            is_same = log.id < len(logs) and logs[log.id].size == log.size
-            return logs[log.id].path if is_same else None
+            has_size = log.id < len(logs) and logs[log.id].size == log.size
+            return logs[log.id].path if has_size else None
     return None
 
 
@@ -382,15 +396,18 @@ async def _list_in(files: Files, directory: str, idle_timeout_s: float) -> tuple
     except FileError:
         return ()
     matches = [PX4_LINE.fullmatch(line) for line in text.decode("utf-8", "replace").splitlines()]
-    logs = [
-        ListedLog(number, int(match[1]), int(match[2]), f"{directory}/{match[3].partition('/log/')[2]}")
-        for number, match in enumerate(matches)
-        if match is not None
-    ]
-    return tuple(logs) if len(logs) == len(matches) else ()
+    logs = []
+    for number, match in enumerate(matches):
+        if match is not None:
+            path_below_directory = match[3].partition("/log/")[2]
+            logs.append(ListedLog(number, int(match[1]), int(match[2]), f"{directory}/{path_below_directory}"))
+    if len(logs) < len(matches):  # A file with other lines is not PX4's list.
+        return ()
+    return tuple(logs)
 
 
 def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry, has_grown: bool) -> str | None:
+    """Return the path of a log among ArduPilot's numbered files; log 1 is the file with the lowest number."""
     number = min(entries) + log.id - 1
     entry = entries.get(number)
     if entry is None or entry.size is None:

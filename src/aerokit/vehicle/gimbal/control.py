@@ -38,26 +38,26 @@ RELEASE_ATTEMPTS, ATTEMPT_TIMEOUT_S = 10, 0.5
 class ReleaseCommand:
     """The last command of a block, which stops or releases a gimbal. Sent at once, and retried in the background.
 
-    While the vehicle is silent, it is sent at the next HEARTBEAT. ``is_meant`` is checked before each attempt, so that
-    the command does not undo a newer order or the control of another station. If the gimbal manager has fallen silent,
-    the command is sent once more at its next HEARTBEAT.
+    While the vehicle is silent, it is sent at the next HEARTBEAT. ``is_still_due`` is checked before each attempt, so
+    that the command does not undo a newer order or the control of another station. If the gimbal manager has fallen
+    silent, the command is sent once more at its next HEARTBEAT.
     """
 
     def __init__(
-        self, orders: GimbalOrders, command: int, params: tuple[float, ...], is_meant: Callable[[], bool]
+        self, orders: GimbalOrders, command: int, params: tuple[float, ...], is_still_due: Callable[[], bool]
     ) -> None:
         self._orders, self._session = orders, orders.session
-        self._command, self._params, self._is_meant = command, params, is_meant
+        self._command, self._params, self._is_still_due = command, params, is_still_due
         self._target = orders.manager_id
 
-    async def send_and_wait(self, what: str) -> None:
+    async def send_and_wait(self, description: str) -> None:
         """Send the command and wait for the acknowledgement; raise OperationTimeout if the vehicle is silent."""
-        if not self._is_meant():
+        if not self._is_still_due():
             return
-        if not self._orders.context.arbiter.is_known:
+        if not self._orders.context.arbiter.is_state_recent:
             self.send_soon()
             raise OperationTimeout(
-                f"{what}: not sent yet, because the vehicle is silent; it will be sent at the next HEARTBEAT;"
+                f"{description}: not sent yet, because the vehicle is silent; it will be sent at the next HEARTBEAT;"
                 f" {self._session.describe_link()}"
             )
         self._send()
@@ -65,9 +65,9 @@ class ReleaseCommand:
 
     def send_soon(self) -> None:
         """Send the command without waiting, e.g. when a block exits by an error or cancellation."""
-        if not self._session.connection.is_open or self._session.is_closed or not self._is_meant():
+        if not self._session.connection.is_open or self._session.is_closed or not self._is_still_due():
             return
-        is_sent = self._orders.context.arbiter.is_known
+        is_sent = self._orders.context.arbiter.is_state_recent
         if is_sent:
             self._send()
 
@@ -75,7 +75,7 @@ class ReleaseCommand:
             with suppress(AerokitError):
                 if not is_sent:
                     await self._session.wait_for_heartbeat()
-                    if not self._is_meant():
+                    if not self._is_still_due():
                         return
                     self._send()
                 try:
@@ -84,7 +84,7 @@ class ReleaseCommand:
                     if not self._is_target_silent():
                         raise
                     await self._wait_target_heartbeat()
-                    if self._is_meant():
+                    if self._is_still_due():
                         self._send()
                         await self._confirm()
 
@@ -100,7 +100,7 @@ class ReleaseCommand:
                 self._command,
                 *self._params,
                 component_id=self._target,
-                is_done=lambda: not self._is_meant(),
+                is_done=lambda: not self._is_still_due(),
                 attempts=RELEASE_ATTEMPTS,
                 attempt_timeout=ATTEMPT_TIMEOUT_S,
                 is_sent=True,
@@ -153,9 +153,9 @@ class GimbalControl:
         self._orders, self._session = orders, orders.session
         self._is_primary = is_primary
         self._device: GimbalDevice | None = None
-        self._claim_state = ControlClaim(0, 0, is_primary=is_primary)
+        self._claim = ControlClaim(0, 0, is_primary=is_primary)
         self._taken: GimbalTaken | None = None
-        self._was_raised = self._was_entered = self._is_ended = False
+        self._loss_was_raised = self._was_entered = self._is_ended = False
         self._lost = asyncio.Event()
         self._detach: list[Callable[[], None]] = []
 
@@ -181,7 +181,7 @@ class GimbalControl:
             OperationRejected: the block ended.
             ConnectionClosed, LinkLost: the connection ended.
         """
-        detach = self._session.connection.on_end(lambda _: self._lost.set())
+        detach = self._session.connection.on_end(lambda _: self._lost.set())  # The end of the connection ends the wait.
         try:
             await self._lost.wait()
         finally:
@@ -189,7 +189,7 @@ class GimbalControl:
         self._session.connection.raise_if_ended()
         if self._taken is None:
             raise OperationRejected(f"{self._orders.name}: the block that had control has ended")
-        self._was_raised = True
+        self._loss_was_raised = True
         return self._taken.system_id, self._taken.component_id
 
     def raise_if_taken(self) -> None:
@@ -199,9 +199,10 @@ class GimbalControl:
             GimbalTaken: another station is in control, or none.
         """
         if self._taken is not None:
-            self._was_raised = True
-            lost = self._taken
-            raise GimbalTaken(str(lost), system_id=lost.system_id, component_id=lost.component_id)
+            self._loss_was_raised = True
+            taken = self._taken
+            # A new exception each time, because a raised one collects the tracebacks of all places that raise it.
+            raise GimbalTaken(str(taken), system_id=taken.system_id, component_id=taken.component_id)
 
     async def __aenter__(self) -> Self:
         orders = self._orders
@@ -212,19 +213,20 @@ class GimbalControl:
         if not self._is_primary and not orders.rules.has_secondary:
             orders.raise_not_supported("has no secondary control")
         self._was_entered = True
-        self._claim_state = ControlClaim(orders.manager_id, orders.gimbal_id_param, is_primary=self._is_primary)
-        orders.registry.claims.append(self._claim_state)
+        self._claim = ControlClaim(orders.manager_id, orders.gimbal_id_param, is_primary=self._is_primary)
+        orders.registry.claims.append(self._claim)
         release = self._release_command()
         since = self._session.connection.now()
         try:
-            await self._claim()
+            await self._request_control()
             await self._await_confirmation(since)
-        except (CommandRejected, NotSupported, BusyError):  # Control was not obtained.
+        except (CommandRejected, NotSupported, BusyError):
+            # Control was not obtained, but an earlier block may have left the release of its control to this one.
             self._end()
-            if self._claim_state.owes_release:
+            if self._claim.owes_release:
                 release.send_soon()
             raise
-        except BaseException:
+        except BaseException:  # The manager may have given us control without our knowing.
             self._end()
             release.send_soon()
             raise
@@ -233,7 +235,7 @@ class GimbalControl:
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if self._taken is not None:
             self._end()
-            if error is None and not self._was_raised:
+            if error is None and not self._loss_was_raised:
                 self.raise_if_taken()
             return
         if self._is_ended:  # the vehicle's block ended before this block
@@ -245,11 +247,11 @@ class GimbalControl:
         else:
             release.send_soon()
 
-    async def _claim(self) -> None:
+    async def _request_control(self) -> None:
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary)
         try:
-            await orders.send(None, CONFIGURE, *params)
+            await orders.send(None, CONFIGURE, *params)  # Taking control belongs to no order.
         except CommandRejected as error:
             if error.result == MavResult.UNSUPPORTED:
                 orders.raise_not_supported("has no gimbal manager whose control could be taken")
@@ -264,7 +266,7 @@ class GimbalControl:
 
         async def wait(seconds: float) -> None:
             await cell.wait_until(
-                lambda controllers: self._of(controllers) == orders.own_ids and cell.updated_at >= since,
+                lambda controllers: self._controller_in(controllers) == orders.own_ids and cell.updated_at >= since,
                 timeout=seconds,
                 description=f"{orders.name}: confirmation of our control",
             )
@@ -275,14 +277,15 @@ class GimbalControl:
             orders.ask_in_background(GimbalManagerStatus.ID)
             await wait(CONFIRM_TIMEOUT_S - STATUS_TIMEOUT_S)
         device = orders.device
+        # Another block may have been entered during the wait, or the first gimbal may now be another one.
         if self._is_primary in device.control_blocks:
             raise BusyError(f"{orders.name}: this program is already in control of it")
         device.control_blocks[self._is_primary], self._device = self, device
         self._detach.append(device.controllers.observe(self._on_controllers, every_arrival=True))
         orders.context.on_finish.append(self._finish)
 
-    def _on_controllers(self, _: GimbalControllers | None, now: GimbalControllers) -> None:
-        controller = self._of(now)
+    def _on_controllers(self, _: GimbalControllers | None, controllers: GimbalControllers) -> None:
+        controller = self._controller_in(controllers)
         if controller == self._orders.own_ids or self._taken is not None:
             return
         text = f"{controller[0]}/{controller[1]} has it now" if controller != (0, 0) else "it has no controller now"
@@ -295,21 +298,21 @@ class GimbalControl:
         self._session.publish(GimbalControlLost, device_id, self._is_primary, *controller)
         self._lost.set()
 
-    def _of(self, controllers: GimbalControllers) -> tuple[int, int]:
+    def _controller_in(self, controllers: GimbalControllers) -> tuple[int, int]:
         return controllers.primary if self._is_primary else controllers.secondary
 
     def _release_command(self) -> ReleaseCommand:
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary, release=True)
         claims = orders.registry.claims
-        return ReleaseCommand(
-            orders,
-            CONFIGURE,
-            params,
-            lambda: self._taken is None and self._claim_state.may_be_released(claims),
-        )
+
+        def is_still_due() -> bool:
+            return self._taken is None and self._claim.may_be_released(claims)
+
+        return ReleaseCommand(orders, CONFIGURE, params, is_still_due)
 
     def _finish(self) -> None:
+        """Release control without waiting, because the block of the vehicle ends."""
         release = self._release_command()
         self._end()
         release.send_soon()
@@ -318,8 +321,8 @@ class GimbalControl:
         self._is_ended = True
         self._lost.set()
         claims = self._orders.registry.claims
-        if self._claim_state in claims:
-            claims.remove(self._claim_state)
+        if self._claim in claims:
+            claims.remove(self._claim)
         if self._device is not None and self._device.control_blocks.get(self._is_primary) is self:
             del self._device.control_blocks[self._is_primary]
         if self._finish in self._orders.context.on_finish:

@@ -11,7 +11,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.connection.cells import Source, StateCell
 from aerokit.mavlink.enums import GimbalDeviceErrorFlags, GimbalManagerCapFlags
 from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
-from aerokit.vehicle.session.rates import SUBSCRIPTION_HZ, WatchedStream
+from aerokit.vehicle.session.subscriber import SUBSCRIPTION_HZ, WatchedStream
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -33,7 +33,7 @@ __all__ = ["GimbalControllers", "GimbalInformation", "YawFrame"]
 YawFrame = Literal["earth", "vehicle"]
 """Reference of a yaw angle: true north, or the nose of the vehicle."""
 
-Can = GimbalManagerCapFlags
+CapFlags = GimbalManagerCapFlags
 
 
 class GimbalControllers(Snapshot):
@@ -72,23 +72,23 @@ class GimbalInformation(Snapshot):
     @property
     def can_retract(self) -> bool:
         """True if the gimbal has a retracted position."""
-        return self.can(Can.HAS_RETRACT)
+        return self.can(CapFlags.HAS_RETRACT)
 
     @property
     def has_neutral(self) -> bool:
         """True if the gimbal has a neutral position."""
-        return self.can(Can.HAS_NEUTRAL)
+        return self.can(CapFlags.HAS_NEUTRAL)
 
     @property
     def axes(self) -> tuple[str, ...]:
         """The axes about which the gimbal rotates: some of ``"roll"``, ``"pitch"`` and ``"yaw"``."""
-        bits = (("roll", Can.HAS_ROLL_AXIS), ("pitch", Can.HAS_PITCH_AXIS), ("yaw", Can.HAS_YAW_AXIS))
+        bits = (("roll", CapFlags.HAS_ROLL_AXIS), ("pitch", CapFlags.HAS_PITCH_AXIS), ("yaw", CapFlags.HAS_YAW_AXIS))
         return tuple(name for name, bit in bits if self.can(bit))
 
     @property
     def can_point_at_location(self) -> bool:
         """True if the manager can point the gimbal at a global position."""
-        return self.can(Can.CAN_POINT_LOCATION_GLOBAL)
+        return self.can(CapFlags.CAN_POINT_LOCATION_GLOBAL)
 
 
 def information_of(
@@ -100,23 +100,23 @@ def information_of(
     """Combine the messages of manager and device; the manager's capabilities and limits take precedence."""
     source = manager or device
     assert source is not None
-    capabilities = manager.cap_flags if manager is not None else source.cap_flags
     limits = (
         _limits(source.roll_min, source.roll_max),
         _limits(source.pitch_min, source.pitch_max),
         _limits(source.yaw_min, source.yaw_max),
     )
     if device is None:
-        return GimbalInformation(device_id, manager_id, capabilities, *limits)
+        return GimbalInformation(device_id, manager_id, source.cap_flags, *limits)
     names = (device.vendor_name, device.model_name, device.custom_name)
     versions = (_version(device.firmware_version), _version(device.hardware_version))
-    return GimbalInformation(device_id, manager_id, capabilities, *limits, *names, *versions, device.uid)
+    return GimbalInformation(device_id, manager_id, source.cap_flags, *limits, *names, *versions, device.uid)
 
 
 def _limits(low: float, high: float) -> tuple[float, float] | None:
     # Devices send zeros for limits that they do not know.
     if not (math.isfinite(low) and math.isfinite(high)) or low >= high:
         return None
+    # Adding 0.0 turns -0.0 into 0.0.
     return round(math.degrees(low), 2) + 0.0, round(math.degrees(high), 2) + 0.0
 
 
@@ -182,8 +182,8 @@ class GimbalDevice:
         self._manager_rank = 0
         self._status_ms = 0
         self._system_id = context.session.system_id
-        context.session.keep(self.attitude)
-        context.session.keep(self.controllers)
+        context.session.register_cell(self.attitude)
+        context.session.register_cell(self.controllers)
 
     def _request_attitude(self, session: VehicleSession) -> Detach | None:
         """Request GIMBAL_DEVICE_ATTITUDE_STATUS from the autopilot, unless another component sends the attitude."""
@@ -222,8 +222,8 @@ class GimbalDevice:
 
     def update_status(self, message: GimbalManagerStatus) -> bool:
         """Set the controllers. Ignore a status that arrived out of order, and return False."""
-        behind = self._status_ms - message.time_boot_ms
-        if 0 < behind < REORDER_WINDOW_MS:
+        older_by_ms = self._status_ms - message.time_boot_ms
+        if 0 < older_by_ms < REORDER_WINDOW_MS:
             return False
         self._status_ms = message.time_boot_ms
         self.set_controllers(message)
@@ -235,7 +235,7 @@ class GimbalDevice:
         self.controllers.set(GimbalControllers(primary, secondary), self._source(message))
 
     def update_manager(self, component_id: int, rank: int, *, is_gone: bool) -> None:
-        """Choose between two managers: the one with the higher rank, or the earlier one unless it is gone."""
+        """Record a manager. It replaces the present manager if it has a higher rank, or if the present one is gone."""
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
         elif self.manager_id is None or rank > self._manager_rank or is_gone:
@@ -243,6 +243,7 @@ class GimbalDevice:
             self._status_ms = 0  # The time stamps of the new manager are from another clock.
 
     def reset(self) -> None:
+        """Forget what the gimbal and its manager have reported, because the vehicle has rebooted."""
         self.reboots += 1
         self._status_ms = self._manager_rank = 0
         self.manager_id = self.component_id if self.number else None
@@ -259,29 +260,29 @@ class GimbalDevice:
 
 
 class ControlClaim:
-    """A control block's claim to a gimbal, from the entry of the block on. A ``gimbal_id_param`` of 0 means all gimbals
-    of the manager.
+    """The control of a gimbal that a block has requested, from its entry on.
+
+    A ``gimbal_id_param`` of 0 means all gimbals of the manager.
     """
 
-    def __init__(self, manager_id: int, parameter: int, *, is_primary: bool) -> None:
+    def __init__(self, manager_id: int, gimbal_id_param: int, *, is_primary: bool) -> None:
         self.manager_id: int = manager_id
-        self.gimbal_id_param: int = parameter
+        self.gimbal_id_param: int = gimbal_id_param
         self.is_primary: bool = is_primary
         # True if an earlier block did not release control because of this claim. This block must release it then.
         self.owes_release = False
 
-    def shares(self, other: ControlClaim) -> bool:
+    def is_released_with(self, other: ControlClaim) -> bool:
         """Return True if releasing one of the two claims would release the other, too."""
-        is_same = (self.manager_id, self.is_primary) == (other.manager_id, other.is_primary)
-        return is_same and (
-            self.gimbal_id_param == other.gimbal_id_param or 0 in (self.gimbal_id_param, other.gimbal_id_param)
-        )
+        has_same_role = (self.manager_id, self.is_primary) == (other.manager_id, other.is_primary)
+        gimbals = (self.gimbal_id_param, other.gimbal_id_param)
+        return has_same_role and (gimbals[0] == gimbals[1] or 0 in gimbals)
 
     def may_be_released(self, claims: Iterable[ControlClaim]) -> bool:
-        """Return True if no other claim shares this control. Otherwise leave the release of control to the other
-        claims.
+        """Return True if no other claim would be released, too. Otherwise mark the other claims, so that their blocks
+        release control.
         """
-        others = [other for other in claims if other is not self and other.shares(self)]
-        for other in others:
-            other.owes_release = True
-        return not others
+        shared = [claim for claim in claims if claim is not self and claim.is_released_with(self)]
+        for claim in shared:
+            claim.owes_release = True
+        return not shared

@@ -66,34 +66,36 @@ class GimbalRegistry:
 
     @property
     def reporting(self) -> GimbalDevice | None:
+        """The first of the gimbals that have reported their attitude."""
         reporting = [device for device in self.devices.values() if device.attitude.is_known]
         return min(reporting, key=self.sort_key, default=None)
 
     def sort_key(self, device: GimbalDevice) -> tuple[bool, tuple[int, int]]:
         """Sort key. Gimbals that are gone come last, unless an order or a control block uses them."""
-        return (not device.is_in_use and self._has_gone(device), device.key)
+        return (not device.is_in_use and self._is_device_gone(device), device.key)
 
     def silent_for_s(self, component_id: int) -> float:
         """Seconds since the last message of a component; inf if there was none."""
         return self._session.connection.now() - self._received_at.get(component_id, -math.inf)
 
-    def _has_gone(self, device: GimbalDevice) -> bool:
+    def _is_device_gone(self, device: GimbalDevice) -> bool:
         # If a device sends nothing itself, the messages of its manager count.
         component_id = device.component_id
         if component_id not in self._received_at and device.manager_id is not None:
             component_id = device.manager_id
-        return not device.is_discovered or self._is_gone(component_id)
+        return not device.is_discovered or self._is_component_gone(component_id)
 
-    def _is_gone(self, component_id: int) -> bool:
-        received_at = self._received_at.get
-        since = max(self._steady_since, received_at(component_id, -math.inf))
-        return received_at(self._session.component_id, -math.inf) - since > MAX_SILENCE_S
+    def _is_component_gone(self, component_id: int) -> bool:
+        """Return True if only this component is silent: during a silence of the whole vehicle, no component is gone."""
+        silent_since = max(self._steady_since, self._received_at.get(component_id, -math.inf))
+        autopilot_received_at = self._received_at.get(self._session.component_id, -math.inf)
+        return autopilot_received_at - silent_since > MAX_SILENCE_S
 
     def find(self, device_id: int) -> GimbalDevice | None:
         """Return the gimbal with this id. A gimbal attached to the autopilot takes precedence over others."""
-        found = [device for device in self.devices.values() if device.device_id == device_id]
+        matching = [device for device in self.devices.values() if device.device_id == device_id]
         autopilot_id = self._session.component_id
-        return min(found, key=lambda device: (device.component_id != autopilot_id, device.key), default=None)
+        return min(matching, key=lambda device: (device.component_id != autopilot_id, device.key), default=None)
 
     def device(self, component_id: int, number: int) -> GimbalDevice | None:
         """Return the gimbal with this component id and number, created if needed; None if there are too many."""
@@ -125,13 +127,13 @@ class GimbalRegistry:
         frame = message.received_frame
         component_id = self._session.component_id if frame is None else frame.component_id
         if device_id > MAX_GIMBAL_NUMBER and device_id != component_id:
-            return None
+            return None  # about another component
         has_own_id = component_id > MAX_GIMBAL_NUMBER and component_id != self._session.component_id
-        is_itself = device_id > MAX_GIMBAL_NUMBER or (device_id == 0 and has_own_id)
-        number = 0 if is_itself else device_id or 1  # Older autopilots send 0 for their gimbal.
-        return self._discovered(self.device(component_id, number))
+        is_sender = device_id > MAX_GIMBAL_NUMBER or (device_id == 0 and has_own_id)
+        number = 0 if is_sender else device_id or 1  # Older autopilots send 0 for their gimbal.
+        return self._marked_discovered(self.device(component_id, number))
 
-    def _discovered(self, device: GimbalDevice | None) -> GimbalDevice | None:
+    def _marked_discovered(self, device: GimbalDevice | None) -> GimbalDevice | None:
         if device is not None:
             device.is_discovered = True
         return device
@@ -177,11 +179,11 @@ class GimbalRegistry:
         if device_id > MAX_GIMBAL_NUMBER and device_id != sender:
             self._record_received(message)
             device = self._device_with_own_id(device_id, may_be_new=rank > RANK_STATUS)
-        else:
+        else:  # The device is the sender itself, or attached to it.
             device, rank = self._device_of(message, device_id), max(rank, RANK_INFORMATION)
         if device is None:
             return None
-        is_gone = device.manager_id is not None and self._is_gone(device.manager_id)
+        is_gone = device.manager_id is not None and self._is_component_gone(device.manager_id)
         device.update_manager(sender, rank, is_gone=is_gone)
         return device if device.manager_id == sender else None
 
@@ -189,7 +191,7 @@ class GimbalRegistry:
         # A GIMBAL_MANAGER_STATUS may name a device that does not exist. GIMBAL_MANAGER_INFORMATION does not.
         key = (device_id, 0)
         if key in self.devices or (may_be_new and device_id in GIMBAL_COMPONENT_IDS):
-            return self._discovered(self.device(*key))
+            return self._marked_discovered(self.device(*key))
         return None
 
     def _on_information(self, message: GimbalDeviceInformation) -> None:

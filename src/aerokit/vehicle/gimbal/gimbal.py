@@ -87,7 +87,7 @@ class RoiMixin(GimbalMixin):
         Args:
             target: the position.
             wait: False: return when the manager has accepted the order.
-            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
 
         Raises:
@@ -125,7 +125,7 @@ class RoiMixin(GimbalMixin):
         Args:
             system_id: MAVLink system id of the other vehicle, 1 to 255.
             wait: False: return when the manager has accepted the order.
-            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
 
         Raises:
@@ -134,7 +134,7 @@ class RoiMixin(GimbalMixin):
 
         Otherwise raises as :meth:`neutral`.
         """
-        if isinstance(system_id, bool):
+        if isinstance(system_id, bool):  # Otherwise True would count as system 1.
             raise InvalidArgument(f"system_id = {system_id} is not allowed: 1 to 255")
         check_range("system_id", system_id, 1, 255)
         check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
@@ -152,8 +152,8 @@ class RoiMixin(GimbalMixin):
             await orders.send_roi(order, MavCmd.DO_SET_ROI_SYSID, system_id, orders.roi_parameter)
             if wait:
                 aim = AngleTarget(tracker.direction, tolerance_deg, f"the position of system {system_id} is unknown")
-                what = f"{orders.name}: look_at_system({system_id})"
-                await wait_until_there(orders, order, what, aim, since=since, timeout=timeout)
+                description = f"{orders.name}: look_at_system({system_id})"
+                await wait_until_there(orders, order, description, aim, since=since, timeout=timeout)
 
     async def stop_looking(self) -> None:
         """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE). Afterwards the gimbal manager chooses the direction.
@@ -193,17 +193,18 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         """
         orders = self._orders
         manager_id = await orders.find_manager()
-        refused: CommandRejected | CommandTimeout | None = None
+        failure: CommandRejected | CommandTimeout | None = None
         try:
             await orders.ask(GimbalManagerInformation.ID, manager_id)
             await orders.wait_for(
                 lambda: orders.device.manager_information, GimbalManagerInformation, INFORMATION_TIMEOUT_S
             )
         except (CommandRejected, CommandTimeout) as error:
-            refused = error
+            failure = error
         device = orders.device
-        if refused is None or device.component_id:
-            target = manager_id if device.number or not device.component_id else device.component_id
+        if failure is None or device.component_id:
+            has_own_id = device.component_id != 0 and device.number == 0
+            target = device.component_id if has_own_id else manager_id
             try:
                 await orders.ask(GimbalDeviceInformation.ID, target, attempts=1)
                 await orders.wait_for(
@@ -214,7 +215,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         device = orders.device
         messages = (device.manager_information, device.device_information)
         if messages == (None, None):
-            raise refused or CommandTimeout(
+            raise failure or CommandTimeout(
                 f"{orders.name}: it accepted the request for information, but sent none;"
                 f" {self._session.describe_link()}"
             )
@@ -312,7 +313,7 @@ class Gimbals:
             ConnectionClosed, LinkLost: the connection ended.
         """
         session = self._context.session
-        until = session.connection.now() + timeout
+        deadline = session.connection.now() + timeout
         with anyio.move_on_after(timeout):
             with suppress(CommandRejected, CommandTimeout):  # Other components than the autopilot may still answer.
                 await session.commands.send_long(
@@ -321,7 +322,7 @@ class Gimbals:
                     component_id=BROADCAST_COMPONENT,
                     attempts=2,
                 )
-        await anyio.sleep(max(0.0, until - session.connection.now()))
+        await anyio.sleep(max(0.0, deadline - session.connection.now()))
         session.connection.raise_if_ended()
         return self.ids
 

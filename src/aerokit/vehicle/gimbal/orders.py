@@ -35,6 +35,7 @@ LEVEL = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
 # Roll and pitch relative to the horizon, yaw relative to north.
 LOCKED = LEVEL | GimbalManagerFlags.YAW_LOCK
 
+# Ids with a special meaning in MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE.
 RELEASE, UNCHANGED = -3, -1
 MANAGER_TIMEOUT_S = 1.0
 STANDARD_RULES = GimbalRules()
@@ -109,7 +110,7 @@ class GimbalOrders:
             )
 
     def begin_order(self) -> Order:
-        return self.context.arbiter.of_device(self.device.topic)
+        return self.context.arbiter.device_order(self.device.topic)
 
     async def send_claiming_control(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
         """Send a command. If the manager denies it because we are not in control, claim control and send it again."""
@@ -125,7 +126,7 @@ class GimbalOrders:
 
     async def send_pitch_yaw(self, order: Order, pitch: float, yaw: float, *rates: float, flags: int) -> bool:
         """Send MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW in degrees; return False if the manager does not support it."""
-        if self.session.commands.is_unknown(PITCHYAW, self.manager_id):
+        if self.session.commands.is_unsupported(PITCHYAW, self.manager_id):
             return False
         pitch_rate, yaw_rate = rates or (NAN, NAN)
         params = (pitch, yaw, pitch_rate, yaw_rate, flags, 0, self.gimbal_id_param)
@@ -159,7 +160,7 @@ class GimbalOrders:
 
     async def send_mount_mode(self, order: Order, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> bool:
         """Send DO_MOUNT_CONTROL. Older firmware gets the mode by MOUNT_CONFIGURE instead; return False then."""
-        if not self.session.commands.is_unknown(MOUNT, self.manager_id):
+        if not self.session.commands.is_unsupported(MOUNT, self.manager_id):
             try:
                 await self.send(order, MOUNT, pitch, roll, yaw, 0, 0, 0, mode)
             except CommandRejected as error:
@@ -167,20 +168,29 @@ class GimbalOrders:
                     raise
             else:
                 return True
-        if not order.is_newest:
+        if not order.is_newest:  # A newer order was given during the wait for the answer.
             return True
-        self.session.send(MountConfigure(self.session.system_id, self.manager_id, mode, 1, 1, 1))
+        stabilized = {"stab_roll": 1, "stab_pitch": 1, "stab_yaw": 1}
+        self.session.send(MountConfigure(self.session.system_id, self.manager_id, mode, **stabilized))
         return False
 
     async def send_mount_angles(self, order: Order, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
         """Send mount angles. The mount turns with the vehicle, so a yaw from north is right only at this moment."""
-        heading = self.session.telemetry.attitude.latest
-        nose = 0.0 if heading is None else heading.yaw_deg
-        turned = yaw if from_nose else math.remainder(yaw - nose, 360.0)
-        if not await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, turned):
-            north = yaw + nose if from_nose else yaw
-            a, b, c = (round(angle * 100) for angle in (pitch, roll, north))
-            self.session.send(MountControl(self.session.system_id, self.manager_id, a, b, c, 0))
+        attitude = self.session.telemetry.attitude.latest
+        heading = 0.0 if attitude is None else attitude.yaw_deg
+        yaw_from_nose = yaw if from_nose else math.remainder(yaw - heading, 360.0)
+        if not await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, yaw_from_nose):
+            # MOUNT_CONTROL, for older firmware, has a yaw from north.
+            yaw_from_north = yaw + heading if from_nose else yaw
+            message = MountControl(
+                self.session.system_id,
+                self.manager_id,
+                input_a=round(pitch * 100),
+                input_b=round(roll * 100),
+                input_c=round(yaw_from_north * 100),
+                save_position=0,
+            )
+            self.session.send(message)
 
     def ask_in_background(self, message_id: int) -> None:
         """Request a message from the manager once; errors are ignored."""
@@ -196,18 +206,18 @@ class GimbalOrders:
             MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=attempts
         )
 
-    async def wait_for(self, found: Callable[[], object], kind: type[Message], within_s: float) -> None:
-        """Wait at most ``within_s`` seconds until ``found()``, called at each message of type ``kind``, is not None."""
+    async def wait_for(self, value: Callable[[], object], message_type: type[Message], within_s: float) -> None:
+        """Wait until ``value()``, checked at each message of this type, is not None; at most ``within_s`` seconds."""
         done = asyncio.Event()
 
         def check(_: Message) -> None:
-            if found() is not None:
+            if value() is not None:
                 done.set()
 
-        if found() is not None:
+        if value() is not None:
             return
         bus = self.session.connection.bus
-        detach = bus.attach(kind, check, system_id=self.session.system_id)
+        detach = bus.attach(message_type, check, system_id=self.session.system_id)
         timer = asyncio.get_running_loop().call_later(within_s, done.set)
         try:
             await done.wait()
@@ -226,15 +236,10 @@ class GimbalOrders:
 
     def control_params(self, *, is_primary: bool, release: bool = False) -> tuple[float, ...]:
         """Parameters that claim or release control. They have our ids, because PX4 takes -2 ("sender") for itself."""
-        pair = (RELEASE, RELEASE) if release else self.own_ids
+        controller = (RELEASE, RELEASE) if release else self.own_ids
         unchanged = (UNCHANGED, UNCHANGED)
-        return (
-            *(pair if is_primary else unchanged),
-            *(unchanged if is_primary else pair),
-            0,
-            0,
-            self.gimbal_id_param,
-        )
+        primary, secondary = (controller, unchanged) if is_primary else (unchanged, controller)
+        return (*primary, *secondary, 0, 0, self.gimbal_id_param)
 
     def claim_if_denied(self, command: int) -> bool:
         """Claim control if the manager denied this command because we are not in control; return True if claimed."""
@@ -242,11 +247,7 @@ class GimbalOrders:
         if self.device.control_blocks or commands.last_result(command, manager_id) != MavResult.DENIED:
             return False
         commands.forget_result(command, manager_id)
-        params = (
-            self.own_ids
-            if self.gimbal_id_param == 0
-            else (*self.own_ids, UNCHANGED, UNCHANGED, 0, 0, self.gimbal_id_param)
-        )
+        params = self._primary_params(self.own_ids)
         commands.send_unconfirmed(CONFIGURE, *params, component_id=manager_id)
         self._claimed = manager_id
         return True
@@ -255,10 +256,13 @@ class GimbalOrders:
         """Release control that was claimed outside of a control block."""
         if self._claimed == self.manager_id:
             self._claimed = None
-            params = (
-                (RELEASE, RELEASE) if self.gimbal_id_param == 0 else self.control_params(is_primary=True, release=True)
-            )
-            await self.send(order, CONFIGURE, *params)
+            await self.send(order, CONFIGURE, *self._primary_params((RELEASE, RELEASE)))
+
+    def _primary_params(self, controller: tuple[int, int]) -> tuple[float, ...]:
+        """Parameters that set the primary controller. All others are 0 for the first gimbal of an autopilot."""
+        if self.gimbal_id_param == 0:
+            return controller
+        return (*controller, UNCHANGED, UNCHANGED, 0, 0, self.gimbal_id_param)
 
     def raise_if_taken(self) -> None:
         """Raise GimbalTaken if an open control block has lost control and no other open block is in control."""
@@ -273,10 +277,11 @@ class GimbalOrders:
         blocks = self.device.control_blocks.values()
         return bool(blocks) and not any(block.is_held for block in blocks)
 
-    def raise_not_supported(self, what: str) -> NoReturn:
+    def raise_not_supported(self, predicate: str) -> NoReturn:
+        """Raise NotSupported with the text ``<gimbal>: <manager> <predicate>``."""
         autopilot = self.session.autopilot
         manager = autopilot.firmware if self.manager_id == self.session.component_id else short_repr(self.manager_id)
-        raise NotSupported(f"{self.name}: {manager} {what}; nothing was sent")
+        raise NotSupported(f"{self.name}: {manager} {predicate}; nothing was sent")
 
 
 class GimbalMixin:
@@ -285,12 +290,12 @@ class GimbalMixin:
     def __init__(self, context: VehicleContext, registry: GimbalRegistry, device: GimbalDevice | None) -> None:
         self._orders = GimbalOrders(context, registry, device)
         self._context, self._session = context, context.session
-        shown = self._orders.public_device
-        self.attitude: StateCell[GimbalAttitude] = shown.attitude
+        device_with_cells = self._orders.public_device
+        self.attitude: StateCell[GimbalAttitude] = device_with_cells.attitude
         """Attitude (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS).
         It is requested from the autopilot while your program watches this cell; reading it requests nothing.
         """
-        self.controllers: StateCell[GimbalControllers] = shown.controllers
+        self.controllers: StateCell[GimbalControllers] = device_with_cells.controllers
         """Stations in control, as reported by the manager (GIMBAL_MANAGER_STATUS)."""
 
     @property

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.gimbal.device import GimbalDevice
     from aerokit.vehicle.gimbal.orders import GimbalOrders
+    from aerokit.vehicle.state.equipment import GimbalAttitude
 
 # A gimbal that turns by less than this angle (degrees) in this time (seconds) stands still. Attitudes arrive about five
 # times a second.
@@ -35,25 +36,26 @@ Angles = tuple[float | None, float | None, float | None, float | None]
 
 
 class AngleTarget:
-    """Target of an order: angles to reach within a tolerance. ``wanted`` returns the angles, or None while they are
-    unknown.
+    """Target of an order: angles to reach within a tolerance.
+
+    ``target_angles`` returns the angles, or None while they are unknown; ``why_unknown`` is the text for this case.
     """
 
-    def __init__(self, wanted: Callable[[], Angles | None], tolerance_deg: float, unknown: str = "") -> None:
-        self._wanted, self._tolerance_deg, self._unknown = wanted, tolerance_deg, unknown
+    def __init__(self, target_angles: Callable[[], Angles | None], tolerance_deg: float, why_unknown: str = "") -> None:
+        self._target_angles, self._tolerance_deg, self._why_unknown = target_angles, tolerance_deg, why_unknown
 
     def is_reached(self, device: GimbalDevice) -> bool:
-        attitude = device.attitude.value
-        wanted = self._wanted()
-        actual = (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_deg, attitude.yaw_from_nose_deg)
-        return wanted is not None and all(
-            want is None or (have is not None and abs(math.remainder(have - want, 360)) <= self._tolerance_deg)
-            for want, have in zip(wanted, actual, strict=True)
-        )
+        targets = self._target_angles()
+        return targets is not None and all(map(self._is_near, _angles_of(device.attitude.value), targets))
+
+    def _is_near(self, angle: float | None, target: float | None) -> bool:
+        if target is None:  # Any angle is right.
+            return True
+        return angle is not None and abs(math.remainder(angle - target, 360)) <= self._tolerance_deg
 
     def describe(self) -> str:
-        wanted = self._wanted()
-        return f"expected {_angles(wanted)}" if wanted is not None else self._unknown
+        targets = self._target_angles()
+        return f"expected {_format_angles(targets)}" if targets is not None else self._why_unknown
 
 
 class RestTarget:
@@ -64,20 +66,24 @@ class RestTarget:
 
     def __init__(self, flag: int, *, or_ahead: bool) -> None:
         self._flag, self._or_ahead = flag, or_ahead
-        self._still_from: tuple[float, tuple[float, ...]] | None = None
+        # Angles (pitch, roll, yaw from the nose) at the last movement, and its time.
+        self._last_angles: tuple[float, float, float] | None = None
+        self._moved_at = 0.0
 
     def is_reached(self, device: GimbalDevice) -> bool:
-        attitude = device.attitude.value
-        at = device.attitude.updated_at
-        angles = tuple(angle or 0.0 for angle in (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_from_nose_deg))
-        before = self._still_from
-        if before is None or any(
-            abs(math.remainder(new - old, 360)) > STILL_DEG for new, old in zip(angles, before[1], strict=True)
-        ):
-            self._still_from = (at, angles)
+        attitude, updated_at = device.attitude.value, device.attitude.updated_at
+        pitch, roll, yaw = attitude.pitch_deg or 0.0, attitude.roll_deg or 0.0, attitude.yaw_from_nose_deg or 0.0
+        if self._has_moved((pitch, roll, yaw)):
+            self._last_angles, self._moved_at = (pitch, roll, yaw), updated_at
             return False
-        is_ahead = self._or_ahead and all(abs(angle) <= 2 * STILL_DEG for angle in (angles[0], angles[2]))
-        return at - before[0] >= STILL_S and bool(device.flags & self._flag or is_ahead)
+        is_ahead = self._or_ahead and abs(pitch) <= 2 * STILL_DEG and abs(yaw) <= 2 * STILL_DEG
+        return updated_at - self._moved_at >= STILL_S and bool(device.flags & self._flag or is_ahead)
+
+    def _has_moved(self, angles: tuple[float, float, float]) -> bool:
+        if self._last_angles is None:
+            return True
+        turns = [math.remainder(new - old, 360) for new, old in zip(angles, self._last_angles, strict=True)]
+        return any(abs(turn) > STILL_DEG for turn in turns)
 
     def describe(self) -> str:
         return "it has not reported that it rests there"
@@ -101,15 +107,15 @@ def attitude_stream(orders: GimbalOrders) -> Iterator[None]:
 async def wait_until_there(
     orders: GimbalOrders,
     order: Order,
-    what: str,
+    description: str,
     target: AngleTarget | RestTarget,
     *,
     since: float,
     timeout: float,
 ) -> None:
     """Wait until an attitude newer than ``since`` shows that the target is reached; errors as for `Gimbal.point`."""
-    session, seen = orders.session, since
-    until, reboots = session.connection.now() + timeout, orders.public_device.reboots
+    session, checked_at = orders.session, since
+    deadline, reboots = session.connection.now() + timeout, orders.public_device.reboots
     cells = (orders.public_device.attitude, orders.attitude_source.attitude, orders.device.controllers)
     with orders.device.in_use(), ChangeSignal(session, *cells, every_arrival=True) as changes:
         while True:
@@ -117,48 +123,50 @@ async def wait_until_there(
             session.connection.raise_if_ended()
             if not order.is_newest or orders.public_device.reboots != reboots:
                 reason = SUPERSEDED if orders.public_device.reboots == reboots else "the vehicle rebooted"
-                raise OperationRejected(f"{what}: {reason}")
+                raise OperationRejected(f"{description}: {reason}")
             orders.raise_if_taken()
-            if source.attitude.is_known and source.attitude.updated_at > seen:
-                seen = source.attitude.updated_at
+            if source.attitude.is_known and source.attitude.updated_at > checked_at:
+                checked_at = source.attitude.updated_at
                 if target.is_reached(source):
                     return
             if session.watch.silent_for_s > MAX_SILENCE_S:
-                raise HeartbeatTimeout(f"{what}: {session.describe_link()}")
-            left = until - session.connection.now()
-            if left <= 0:
+                raise HeartbeatTimeout(f"{description}: {session.describe_link()}")
+            remaining_s = deadline - session.connection.now()
+            if remaining_s <= 0:
                 raise OperationTimeout(
-                    f"{what}: not reached within {timeout:g} s: {_position(orders, since)}, {target.describe()};"
-                    f" {session.describe_link()}"
+                    f"{description}: not reached within {timeout:g} s: {_describe_state(orders, since)},"
+                    f" {target.describe()}; {session.describe_link()}"
                 )
-            await changes.next(min(POLL_INTERVAL_S, left))
+            await changes.next(min(POLL_INTERVAL_S, remaining_s))
 
 
-def _position(orders: GimbalOrders, since: float) -> str:
+def _describe_state(orders: GimbalOrders, since: float) -> str:
     source, device = orders.attitude_source, orders.device
     cell = source.attitude
     if not cell.is_known:
         return f"the gimbal does not report its attitude (no {cell.waits_for})"
-    attitude = cell.value
-    angles = (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_deg, attitude.yaw_from_nose_deg)
-    text = f"it points to {_angles(angles)}"
+    text = f"it points to {_format_angles(_angles_of(cell.value))}"
     if cell.updated_at <= since:
         text += f", reported {cell.age:.1f} s ago, before the order"
     if device.failures:
         text += f", it reports {device.describe_failures()}"
     if device.manager_information is not None:
-        limits = information_of(device.device_id, orders.manager_id, device.manager_information, None)
-        text += f", its limits are pitch {_range(limits.pitch_deg)}, yaw {_range(limits.yaw_deg)}"
+        limits = information_of(device.device_id, orders.manager_id, device.manager_information, device=None)
+        text += f", its limits are pitch {_format_limits(limits.pitch_deg)}, yaw {_format_limits(limits.yaw_deg)}"
     return text
 
 
-def _angles(angles: Angles) -> str:
+def _angles_of(attitude: GimbalAttitude) -> Angles:
+    return (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_deg, attitude.yaw_from_nose_deg)
+
+
+def _format_angles(angles: Angles) -> str:
     names = ("pitch", "roll", "yaw from north", "yaw from the nose")
     known = [f"{name} {angle:.1f}" for name, angle in zip(names, angles, strict=True) if angle is not None]
     return ", ".join(known) or "unknown angles"
 
 
-def _range(limits: tuple[float, float] | None) -> str:
+def _format_limits(limits: tuple[float, float] | None) -> str:
     return "unknown" if limits is None else f"{limits[0]:g} to {limits[1]:g}"
 
 
@@ -171,9 +179,10 @@ MIN_BEARING_DISTANCE_M = 1.0
 
 def ordered_angles(pitch: float, yaw: float, roll: float | None, *, from_nose: bool) -> Angles:
     """Return the angles of an order. The yaw is None when pointing straight down or up: any yaw is right then."""
-    is_upright = abs(pitch) > MAX_PITCH_FOR_YAW_DEG
-    turned = None if is_upright else yaw
-    return (pitch, roll, None if from_nose else turned, turned if from_nose else None)
+    is_vertical = abs(pitch) > MAX_PITCH_FOR_YAW_DEG
+    from_north_deg = None if from_nose or is_vertical else yaw
+    from_nose_deg = yaw if from_nose and not is_vertical else None
+    return (pitch, roll, from_north_deg, from_nose_deg)
 
 
 def direction_to(context: VehicleContext, target: Position) -> Angles | None:
@@ -182,23 +191,25 @@ def direction_to(context: VehicleContext, target: Position) -> Angles | None:
     here = cell.latest
     if here is None or cell.age > POSITION_MAX_AGE_S:
         return None
-    pairs = (
-        (target.altitude_relative_m, here.altitude_relative_m),
-        (target.altitude_amsl_m, here.altitude_amsl_m),
-    )
-    up = next((theirs - own for theirs, own in pairs if theirs is not None and own is not None), None)
-    if up is None:
-        if target.altitude_relative_m is not None or target.altitude_amsl_m is not None:
-            return None
-        up = 0.0
-    along = here.distance_to(target)
-    pitch = math.degrees(math.atan2(up, along))
-    return (
-        pitch,
-        None,
-        here.bearing_to(target) if along > MIN_BEARING_DISTANCE_M and abs(pitch) <= MAX_PITCH_FOR_YAW_DEG else None,
-        None,
-    )
+    height_m = _height_above(here, target)
+    if height_m is None:
+        return None
+    distance_m = here.distance_to(target)
+    pitch = math.degrees(math.atan2(height_m, distance_m))
+    has_bearing = distance_m > MIN_BEARING_DISTANCE_M and abs(pitch) <= MAX_PITCH_FOR_YAW_DEG
+    yaw_from_north = here.bearing_to(target) if has_bearing else None
+    return (pitch, None, yaw_from_north, None)
+
+
+def _height_above(here: Position, target: Position) -> float | None:
+    """Height of the target above the vehicle; None if it is unknown. A target without an altitude is at its height."""
+    if target.altitude_relative_m is None and target.altitude_amsl_m is None:
+        return 0.0
+    if target.altitude_relative_m is not None and here.altitude_relative_m is not None:
+        return target.altitude_relative_m - here.altitude_relative_m
+    if target.altitude_amsl_m is not None and here.altitude_amsl_m is not None:
+        return target.altitude_amsl_m - here.altitude_amsl_m
+    return None
 
 
 RETRACT, NEUTRAL = GimbalDeviceFlags.RETRACT, GimbalDeviceFlags.NEUTRAL
@@ -228,7 +239,7 @@ class PointingMixin(GimbalMixin):
                 then turns with the vehicle, so a yaw from north is right only at the time of the order.
             frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards.
             wait: False: return when the manager has accepted the order.
-            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
 
         Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. If the manager denies it, aerokit claims control until
@@ -254,16 +265,16 @@ class PointingMixin(GimbalMixin):
             if roll_deg or not await orders.send_pitch_yaw(order, pitch_deg, yaw_deg, flags=flags):
                 await orders.send_mount_angles(order, pitch_deg, roll_deg, yaw_deg, from_nose=from_nose)
 
-        wanted = ordered_angles(pitch_deg, yaw_deg, roll_deg or None, from_nose=from_nose)
+        angles = ordered_angles(pitch_deg, yaw_deg, roll_deg or None, from_nose=from_nose)
         if not wait:
             await send()
             return
         with attitude_stream(orders):
             since = self._now()
             await send()
-            what = f"{orders.name}: point({pitch_deg:g}, {yaw_deg:g})"
-            target = AngleTarget(lambda: wanted, tolerance_deg)
-            await wait_until_there(orders, order, what, target, since=since, timeout=timeout)
+            description = f"{orders.name}: point({pitch_deg:g}, {yaw_deg:g})"
+            target = AngleTarget(lambda: angles, tolerance_deg)
+            await wait_until_there(orders, order, description, target, since=since, timeout=timeout)
 
     async def neutral(self, *, wait: bool = True, timeout: float = 10.0) -> None:
         """Turn the gimbal to its neutral position, usually level and straight ahead; returns when it rests there.
@@ -309,7 +320,7 @@ class PointingMixin(GimbalMixin):
         await self._orders.send_mount_mode(order, MavMountMode.RC_TARGETING)
         await self._orders.release_control(order)
 
-    async def _rest(self, what: str, flag: int, mode: int, *, wait: bool, timeout: float) -> None:
+    async def _rest(self, action: str, flag: int, mode: int, *, wait: bool, timeout: float) -> None:
         orders, order = self._orders, self._orders.begin_order()
 
         async def send() -> None:
@@ -323,18 +334,25 @@ class PointingMixin(GimbalMixin):
             since = self._now()
             await send()
             target = RestTarget(flag, or_ahead=flag == NEUTRAL)
-            await wait_until_there(orders, order, f"{orders.name}: {what}", target, since=since, timeout=timeout)
+            await wait_until_there(orders, order, f"{orders.name}: {action}", target, since=since, timeout=timeout)
 
     def _check_limits(self, pitch: float, roll: float, yaw: float | None) -> None:
         device = self._orders.device
         if device.manager_information is None or not device.checks_limits:
             return
-        limits = information_of(device.device_id, self._orders.manager_id, device.manager_information, None)
-        checks = (("pitch_deg", pitch, limits.pitch_deg), ("yaw_deg", yaw, limits.yaw_deg))
-        for name, angle, allowed in (*checks, ("roll_deg", roll or None, limits.roll_deg)):
-            if angle is None or allowed is None or allowed[1] - allowed[0] >= 360:
+        limits = information_of(device.device_id, self._orders.manager_id, device.manager_information, device=None)
+        checks = (
+            ("pitch_deg", pitch, limits.pitch_deg),
+            ("yaw_deg", yaw, limits.yaw_deg),
+            ("roll_deg", roll or None, limits.roll_deg),  # A roll of 0 is always allowed.
+        )
+        for name, angle, allowed in checks:
+            if angle is None or allowed is None:
                 continue
+            lowest, highest = allowed
+            # The same yaw may be written as −90 or 270.
             turns = (-360, 0, 360) if name == "yaw_deg" else (0,)
-            if not any(allowed[0] <= angle + turn <= allowed[1] for turn in turns):
-                text = f"{self._orders.name} turns from {allowed[0]:g} to {allowed[1]:g}"
+            is_allowed = any(lowest <= angle + turn <= highest for turn in turns)
+            if not is_allowed and highest - lowest < 360:
+                text = f"{self._orders.name} turns from {lowest:g} to {highest:g}"
                 raise InvalidArgument(f"{name} = {angle:g} is not allowed: {text}")

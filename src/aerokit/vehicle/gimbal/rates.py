@@ -85,7 +85,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     async def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
         """Supply one pair of rates for ``duration_s`` seconds. Arguments and errors as for :meth:`set`."""
         _check(pitch_deg_s, yaw_deg_s)
-        await self._feed((pitch_deg_s, yaw_deg_s), duration_s)
+        await self._supply_for((pitch_deg_s, yaw_deg_s), duration_s)
 
     async def __aenter__(self) -> Self:
         if self._was_entered:
@@ -109,18 +109,19 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return self
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        if self._stopped is None and (reason := self._takeover()):
+        reason = self._takeover_reason() if self._stop_error is None else None
+        if reason:
             self._stop(reason, hold=False)
-        if self._stopped is None:
-            zero = self._zero()
+        if self._stop_error is None:
+            zero = self._zero_rates_command()  # Before `_end`: afterwards, the first gimbal may be another one.
             self._end()
-            self._stopped = SetpointStreamStopped("the block of these rates has ended")
+            self._stop_error = SetpointStreamStopped("the block of these rates has ended")
             if error is None:
                 await zero.send_and_wait(f"{self._orders.name}: rates of zero")
             else:
                 zero.send_soon()
-        elif error is None and not self._is_reported:
-            raise self._stopped
+        elif error is None and not self._has_raised_stop:
+            raise self._stop_error
 
     def _send(self) -> None:
         self._session.connection.send(self._encode_rates(self._value))  # The manager may have changed.
@@ -133,14 +134,14 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             return GimbalManagerSetPitchyaw(*address, NAN, NAN, pitch, yaw)
         return GimbalManagerSetAttitude(*address, (NAN, NAN, NAN, NAN), 0.0, pitch, yaw)
 
-    def _why_stop(self, lag: float) -> str | None:
+    def _stop_reason(self, lag: float) -> str | None:
         manager_id = self._orders.manager_id
         silent_for_s = min(self._orders.registry.silent_for_s(manager_id), self._now() - self._began_at)
         is_silent = manager_id != self._session.component_id and silent_for_s > SILENT_AFTER_S
-        silence = f"the gimbal's manager has been silent for {silent_for_s:.1f} s" if is_silent else None
-        return super()._why_stop(lag) or silence
+        manager_silence = f"the gimbal's manager has been silent for {silent_for_s:.1f} s" if is_silent else None
+        return super()._stop_reason(lag) or manager_silence
 
-    def _takeover(self) -> str | None:
+    def _takeover_reason(self) -> str | None:
         try:
             self._orders.raise_if_taken()
         except AerokitError as error:
@@ -149,19 +150,21 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return SUPERSEDED if self._order is not None and not self._order.is_newest else None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
-        zero = self._zero()
+        zero = self._zero_rates_command()
         super()._stop(reason, hold=hold)
         if hold:
             zero.send_soon()
         if self._taken is not None:
-            self._stopped = self._taken
+            self._stop_error = self._taken
 
-    def _zero(self) -> ReleaseCommand:
+    def _zero_rates_command(self) -> ReleaseCommand:
         orders, order = self._orders, self._order
         params = (NAN, NAN, 0.0, 0.0, self._flags, 0, orders.gimbal_id_param)
-        return ReleaseCommand(
-            orders, PITCHYAW, params, lambda: order is not None and order.is_newest and not orders.is_taken
-        )
+
+        def is_still_due() -> bool:
+            return order is not None and order.is_newest and not orders.is_taken
+
+        return ReleaseCommand(orders, PITCHYAW, params, is_still_due)
 
     def _finish(self) -> None:
         self._stop("the block of the vehicle has ended")

@@ -31,15 +31,16 @@ if TYPE_CHECKING:
 # Two and a half periods of MISSION_CURRENT, which is sent at 1 Hz.
 PLAN_ID_MAX_AGE_S = 2.5
 
-# If the same item is reported as reached again within this time, the message is a repetition.
+# If the same item is reported as reached again within this time, the message is a duplicate.
 DUPLICATE_WINDOW_S = 0.3
 
-REPEAT_AFTER_S = 1.0
+# If an item becomes the current one this long after it was reached, the vehicle approaches it a second time.
+SECOND_APPROACH_S = 1.0
 
 # Between a landing and disarming, a vehicle may report another item than the last for this long.
 FINAL_ITEM_MAX_AGE_S = 3.0
 
-# A vehicle that starts its mission again may still report for this long that the mission is complete.
+# After a second start of its mission, a vehicle may still report for this long that the mission is complete.
 STALE_STATE_S = 3.0
 
 
@@ -75,7 +76,7 @@ class PlanContext:
         self.lock: asyncio.Lock = asyncio.Lock()
         # The index is the MAV_MISSION_TYPE.
         self.caches: tuple[PlanCache, PlanCache, PlanCache] = (PlanCache(), PlanCache(), PlanCache())
-        self._current: Frame | None = None
+        self._current: Frame | None = None  # the last MISSION_CURRENT, decoded when it is needed
         session = vehicle_context.session
         session.at_close(
             session.connection.bus.attach_frames(MissionCurrent, self._on_current, system_id=session.system_id)
@@ -109,10 +110,10 @@ class PlanContext:
 
     async def wait_for_plan_id(self, mission_type: int, opaque_id: int) -> bool:
         """Wait for a MISSION_CURRENT with this plan id; False if none arrives in time."""
-        received, now = asyncio.Event(), self.now()
+        received, started_at = asyncio.Event(), self.now()
 
         def check(_: MissionCurrent) -> None:
-            if self.plan_id(mission_type, now) == opaque_id:
+            if self.plan_id(mission_type, started_at) == opaque_id:
                 received.set()
 
         detach = self.session.connection.bus.attach(MissionCurrent, check, system_id=self.session.system_id)
@@ -140,7 +141,7 @@ class MissionTracker:
         self._session = session
         self._source = Source(session.system_id, session.component_id, "MISSION_CURRENT")
         self._offset = int(session.autopilot.home_is_item_0)
-        self._repeats = session.autopilot.repeats_item_reached
+        self._repeats_item_reached = session.autopilot.repeats_item_reached
         new_cell = session.connection.new_cell
         self.current: StateCell[int | None] = new_cell("mission.current", "MISSION_CURRENT")
         self.count: StateCell[int] = new_cell("mission.count", "MISSION_CURRENT with a number of items")
@@ -150,9 +151,11 @@ class MissionTracker:
         self.reached: int | None = None
         # True if the last mission was flown to its end.
         self.is_complete: bool = False
-        self._reached_at = self._at_last_at = -math.inf
-        self._may_repeat = False
+        self._reached_at = self._last_item_current_at = -math.inf
+        self._is_approached_again = False
+        # True if the vehicle has flown the mission since its last end.
         self._was_active = False
+        # Until this time, a report of completion may be about the previous flight.
         self._stale_until = -math.inf
         telemetry = session.telemetry
         session.at_close(
@@ -165,15 +168,15 @@ class MissionTracker:
         session.on_reboot.append(self.forget)
 
     @property
-    def last(self) -> int | None:
+    def last_item(self) -> int | None:
         """Index of the last item; None while the number of items is unknown."""
         count = self.count.latest
         return count - 1 if count else None
 
     @property
-    def is_at_last(self) -> bool:
+    def is_at_last_item(self) -> bool:
         """True while the current item is the last item, and shortly afterwards."""
-        return self._session.connection.now() - self._at_last_at <= FINAL_ITEM_MAX_AGE_S
+        return self._session.connection.now() - self._last_item_current_at <= FINAL_ITEM_MAX_AGE_S
 
     def on_transfer_count(self, count: int) -> None:
         self.count.set(count, Source(self._session.system_id, self._session.component_id, "MISSION_COUNT"))
@@ -192,6 +195,7 @@ class MissionTracker:
             cell.close(error)
 
     def _on_current(self, _: MissionProgress | None, reported: MissionProgress) -> None:
+        """Set the cells from MISSION_CURRENT, with the item numbers of the program, which do not count home."""
         before = self.current.latest
         current = None if reported.current is None else reported.current - self._offset
         if current is not None and current < 0:  # item 0 of ArduPilot, which is home
@@ -203,19 +207,25 @@ class MissionTracker:
             self.count.set(reported.total, self._source)
         self.progress.set(MissionProgress(current, self.count.latest, reported.state), self._source)
         self.current.set(current, self._source)
-        if current is not None and current == self.last:
-            self._at_last_at = self._session.connection.now()
+        if current is not None and current == self.last_item:
+            self._last_item_current_at = self._session.connection.now()
         if current != before:
-            self._detect_repeat(before, current)
+            self._detect_second_approach(before, current)
             self._session.publish(MissionCurrentChanged, before, current)
         self._on_state(reported.state)
 
-    def _detect_repeat(self, before: int | None, current: int | None) -> None:
-        # The vehicle approaches an item that it has reached before. PX4 may report an item as reached before it
-        # becomes the current one.
-        if current is not None and current == self.reached:
-            is_long_ago = self._session.connection.now() - self._reached_at > REPEAT_AFTER_S
-            self._may_repeat = self._may_repeat or is_long_ago or (before is not None and before > current)
+    def _detect_second_approach(self, before: int | None, current: int | None) -> None:
+        """Record whether the vehicle flies again to the item that it has reached last.
+
+        This takes time or comes from a later item, because PX4 may report an item as reached just before it becomes
+        the current one.
+        """
+        if current is None or current != self.reached:
+            return
+        is_long_ago = self._session.connection.now() - self._reached_at > SECOND_APPROACH_S
+        comes_from_later_item = before is not None and before > current
+        if is_long_ago or comes_from_later_item:
+            self._is_approached_again = True
 
     def _on_state(self, state: int) -> None:
         if state != MissionState.COMPLETE:
@@ -226,18 +236,19 @@ class MissionTracker:
             self._complete()
 
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:
-        if not is_armed and self._was_active and self.is_at_last and self.is_in_mission_mode:
+        if not is_armed and self._was_active and self.is_at_last_item and self.is_in_mission_mode:
             self._complete()
 
     def _on_reached(self, _: int | None, seq: int) -> None:
         # ArduPilot reports item 0 (home) when it has reached a guided target.
         item, now = seq - self._offset, self._session.connection.now()
-        is_again = item == self.reached and (
-            not self._may_repeat if self._repeats else now - self._reached_at < DUPLICATE_WINDOW_S
-        )
-        if item < 0 or is_again:
+        if self._repeats_item_reached:
+            is_duplicate = item == self.reached and not self._is_approached_again
+        else:
+            is_duplicate = item == self.reached and now - self._reached_at < DUPLICATE_WINDOW_S
+        if item < 0 or is_duplicate:
             return
-        self.reached, self._reached_at, self._may_repeat = item, now, False
+        self.reached, self._reached_at, self._is_approached_again = item, now, False
         self._session.publish(MissionItemReached, item)
 
     def _complete(self) -> None:

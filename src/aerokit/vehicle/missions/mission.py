@@ -55,37 +55,42 @@ class MissionEndDetector:
         session = vehicle_context.session
         self._vehicle_context, self._session = vehicle_context, session
         self._tracker, self._mode = tracker, mode
-        self._order = vehicle_context.arbiter.newest
-        last = items[-1].command if items else None
-        self._ends_by_landing = last in LANDING_COMMANDS
-        self._ends_in_air = last == MavCmd.NAV_RETURN_TO_LAUNCH and not session.autopilot.lands_after_return
-        self._returns_since: float | None = None
+        self._order = vehicle_context.arbiter.newest  # the newest order when the wait began
+        last_command = items[-1].command if items else None
+        is_return = last_command == MavCmd.NAV_RETURN_TO_LAUNCH
+        self._ends_by_landing = last_command in LANDING_COMMANDS
+        self._ends_in_air = is_return and not session.autopilot.lands_after_return
+        self._return_began_at: float | None = None
         self._landing_modes = tuple(
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol) for purpose in ("return", "land")
         )
         self._grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
-        self._left_at: float | None = None
+        self._left_at: float | None = None  # when the vehicle was first seen disarmed, or in an unexpected mode
         self._ground = GroundCheck(session)
 
     def has_ended(self) -> bool:
-        is_over, is_on_ground = self._is_over(), self._is_on_ground
-        is_down = self._ground.confirms(is_over and is_on_ground)
-        return is_down if is_on_ground else is_over
+        """Return True if the mission has ended; on the ground, only if the vehicle has landed rather than fallen."""
+        is_reported, is_on_ground = self._is_end_reported(), self._is_on_ground
+        # The check must see every call, because it watches the velocity.
+        has_landed = self._ground.confirms(is_reported and is_on_ground)
+        return has_landed if is_on_ground else is_reported
 
-    def _is_over(self) -> bool:
+    def _is_end_reported(self) -> bool:
+        """Return True if the vehicle reports the end, be it a landing or a fall."""
         if self._tracker.is_complete:
+            # ArduPilot reports completion at home, PX4 already when it begins to return.
             at_home = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
             return not self._ends_by_landing or self._is_on_ground or at_home
         # ArduPlane returns in another mode than its mission mode, which stops the mission.
         if self._ends_in_air and self._is_landing:
             return self._is_on_ground or self._is_home
-        self._returns_since = None
+        self._return_began_at = None  # The vehicle is not returning.
         if self._session.telemetry.is_confirmed_disarmed and self._is_landing:
             return True
         progress = self._tracker.progress.latest
         reports_state = progress is not None and progress.state != MissionState.UNKNOWN
-        last = self._tracker.last
+        last = self._tracker.last_item
         return not reports_state and last is not None and self._tracker.reached == last
 
     def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
@@ -93,15 +98,16 @@ class MissionEndDetector:
         session, now = self._session, self._session.connection.now()
         if self._vehicle_context.arbiter.newest not in (self._order, order):
             return "another order was given"
-        if fall := self._ground.fall():
+        fall = self._ground.fall()
+        if fall:
             return f"{fall}, {self.describe()}"
-        if self._ground.is_pending:
+        if self._ground.is_pending:  # `has_ended` has not decided yet whether this is a landing.
             return None
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
-        if not session.telemetry.is_confirmed_disarmed and (
-            is_paused or is_in_mode or self._is_landing or now < self._vehicle_context.arbiter.mode_settles_at
-        ):
+        is_mode_settling = now < self._vehicle_context.arbiter.mode_settles_at
+        may_have_this_mode = is_paused or is_in_mode or self._is_landing or is_mode_settling
+        if may_have_this_mode and not session.telemetry.is_confirmed_disarmed:
             self._left_at = None
             return None
         if self._left_at is None:  # The end of the mission causes a mode change, and may be reported after it.
@@ -117,29 +123,29 @@ class MissionEndDetector:
     def describe(self) -> str:
         """Return e.g. ``at item 3 of 7``."""
         current, count = self._tracker.current.latest, self._tracker.count.latest
-        where = "before its first item" if current is None else f"at item {current}"
-        return f"{where} of {'?' if count is None else count}"
+        place = "before its first item" if current is None else f"at item {current}"
+        return f"{place} of {'?' if count is None else count}"
 
     @property
     def _is_landing(self) -> bool:
         """True if the vehicle has changed from the mission mode to the mode of its last item (land or return)."""
         mode = self._session.telemetry.mode.latest
-        current, last = self._tracker.current.latest, self._tracker.last
+        current, last = self._tracker.current.latest, self._tracker.last_item
         return self._ends_by_landing and current is not None and current == last and mode in self._landing_modes
 
     @property
     def _is_home(self) -> bool:
-        """True if the vehicle is at home, or ``RETURN_TIMEOUT_S`` have passed since it began to return."""
+        """True if the vehicle is at home, or ``RETURN_TIMEOUT_S`` have passed since this property was first read."""
         session, now = self._session, self._session.connection.now()
-        if self._returns_since is None:
-            self._returns_since = now
+        if self._return_began_at is None:
+            self._return_began_at = now
+        if now - self._return_began_at > RETURN_TIMEOUT_S:
+            return True
         home = session.telemetry.home.latest
-        place = None if home is None else Position(home.latitude_deg, home.longitude_deg)
-        is_near = (
-            place is not None
-            and self._vehicle_context.vehicle_position.distance_to(place) <= session.autopilot.arrival_radius_m
-        )
-        return is_near or now - self._returns_since > RETURN_TIMEOUT_S
+        if home is None:
+            return False
+        distance_m = self._vehicle_context.vehicle_position.distance_to(Position(home.latitude_deg, home.longitude_deg))
+        return distance_m <= session.autopilot.arrival_radius_m
 
     @property
     def _is_on_ground(self) -> bool:
@@ -226,10 +232,8 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             await self._set_current(item, timeout, order, keeps_jump_counts=False)
             await self._enter_mode(mode, order, timeout)
-        except (
-            anyio.get_cancelled_exc_class(),
-            OperationTimeout,
-        ):  # The vehicle may have received the order.
+        except (anyio.get_cancelled_exc_class(), OperationTimeout):
+            # The vehicle may have received the order.
             vehicle_context.flight_cleanup.hold_in_background(order)
             raise
 
@@ -263,6 +267,7 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             await self._enter_mode(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
+            # The vehicle may have received the order.
             vehicle_context.flight_cleanup.hold_in_background(order)
             raise
         self._is_paused = False
@@ -295,11 +300,11 @@ class MissionControl(VehiclePlan["Mission"]):
                 session,
                 "mission.wait_finished",
                 is_done=end.has_ended,
-                trouble=lambda: end.failure(self._order, is_paused=self._is_paused),
+                failure_reason=lambda: end.failure(self._order, is_paused=self._is_paused),
                 describe=end.describe,
                 timeout=timeout,
                 max_silence_s=max_silence_s,
-                stillness=MissionStallDetector(session, self._tracker, mode, items, lambda: self._is_paused),
+                stall_reason=MissionStallDetector(session, self._tracker, mode, items, lambda: self._is_paused),
             )
 
     @property
@@ -311,11 +316,12 @@ class MissionControl(VehiclePlan["Mission"]):
         session = self._vehicle_context.session
         if self._order is None or self._vehicle_context.arbiter.newest is not self._order:
             return False
-        ends_in = [
+        final_modes = [
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
             for purpose in ("hold", "return", "land")
         ]
-        return (self._tracker.is_complete or self._tracker.is_at_last) and session.telemetry.mode.latest in ends_in
+        is_at_end = self._tracker.is_complete or self._tracker.is_at_last_item
+        return is_at_end and session.telemetry.mode.latest in final_modes
 
     def _plan_type(self) -> type[Mission]:
         from aerokit.missions import Mission
@@ -338,10 +344,10 @@ class MissionControl(VehiclePlan["Mission"]):
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(0)
         if session.autopilot.sets_current_by_command:
+            # ArduPilot resets the jump counts if the number is 0, which is home there.
+            number = 0 if item == 0 and not keeps_jump_counts else seq
             try:
-                await vehicle_context.sender.send_long(
-                    order, MavCmd.DO_SET_MISSION_CURRENT, 0 if item == 0 and not keeps_jump_counts else seq
-                )
+                await vehicle_context.sender.send_long(order, MavCmd.DO_SET_MISSION_CURRENT, number)
             except CommandRejected as error:
                 if error.result != MavResult.UNSUPPORTED:
                     raise
@@ -380,6 +386,7 @@ class MissionControl(VehiclePlan["Mission"]):
         return None if progress is None else progress.current
 
     async def _enter_mode(self, mode: Mode, order: Order, timeout: float) -> None:
+        """Enter the mission mode by MISSION_START, or by a mode change if the vehicle does not support this command."""
         vehicle_context, session = self._vehicle_context, self._session
         if not session.autopilot.mission_starts_by_command:
             await vehicle_context.sender.change_mode(mode, order, timeout, reported_since=order.given_at)
@@ -387,7 +394,9 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             with vehicle_context.arbiter.changing_mode():
                 await vehicle_context.sender.send_long(order, MavCmd.MISSION_START, modes=(mode,))
-                await vehicle_context.sender.await_mode(mode, order, [], timeout, order.given_at)
+                await vehicle_context.sender.await_mode(
+                    mode, order, refusals=[], timeout=timeout, reported_since=order.given_at
+                )
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:
                 raise

@@ -60,9 +60,9 @@ class MissionStallDetector:
             self._stall = StallDetector(self._session)
             return None
         should_move = self._should_move(current)
-        still = self._stall()
-        if still is not None and self._stall.follows_fast_descent and (should_move or self._is_on_ground):
-            return still
+        standstill = self._stall()  # for 12 s
+        if standstill is not None and self._stall.follows_fast_descent and (should_move or self._is_on_ground):
+            return standstill
         if not should_move or current != self._item:
             self._item = current if should_move else None
             self._moving_since = self._session.connection.now()
@@ -72,11 +72,13 @@ class MissionStallDetector:
 
     def _should_move(self, current: int | None) -> bool:
         """Return True if the vehicle flies its mission, and the current item has no hold."""
-        is_known = current is not None and current < len(self._items)
-        if not is_known or self._tracker.is_complete or not self._session.telemetry.is_in(self._mode):
+        if current is None or current >= len(self._items):
             return False
-        item = self._items[current or 0]
-        return item.command in _TAKEOFFS or (item.command in _WAYPOINTS and not item.param1 > 0)
+        if self._tracker.is_complete or not self._session.telemetry.is_in(self._mode):
+            return False
+        item = self._items[current]
+        has_hold = item.param1 > 0  # False for NaN.
+        return item.command in _TAKEOFFS or (item.command in _WAYPOINTS and not has_hold)
 
     @property
     def _is_on_ground(self) -> bool:

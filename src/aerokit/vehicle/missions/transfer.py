@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.missions.context import PlanContext
 
 ResultT = TypeVar("ResultT")
-
 # Seconds after a refusal in which the texts that explain it may arrive.
 REFUSAL_TEXT_DELAY_S = 0.3
 
@@ -71,15 +70,16 @@ class PlanChannel:
         """Replace the items from ``first`` on; return None if the vehicle does not support partial uploads."""
         exchange = await self._upload(items, window=1, first=first)
         try:
-            end = await self._run(exchange)
-            self._has_changed = True
-            return end
+            result = await self._run(exchange)
         except MissionRejected:
             if exchange.was_started:
                 raise
             return None
+        self._has_changed = True
+        return result
 
     async def receive(self, only: Sequence[int] | None = None) -> DownloadResult:
+        """Request all items, or only those with the numbers in ``only``."""
         received = await self._run(
             MissionDownload(
                 *self._target,
@@ -95,7 +95,7 @@ class PlanChannel:
         await self._run(MissionClear(*self._target, **self._wire_options))
 
     async def has_ftp(self) -> bool:
-        return await self._has(MavProtocolCapability.FTP, by_default=False)
+        return await self._has_capability(MavProtocolCapability.FTP, by_default=False)
 
     async def write_file(self, items: Sequence[MissionItem]) -> None:
         """Write the plan's file. ArduPilot evaluates the file when it is closed, and does not report the result."""
@@ -129,12 +129,12 @@ class PlanChannel:
             "round_trip": transfers.round_trip,
         }
 
-    async def _has(self, capability: MavProtocolCapability, *, by_default: bool = True) -> bool:
+    async def _has_capability(self, capability: MavProtocolCapability, *, by_default: bool = True) -> bool:
         capabilities = await self._context.transfers.capabilities()
         return by_default if capabilities is None else bool(capabilities & capability)
 
     async def _supports_int(self) -> bool:
-        is_supported = await self._has(MavProtocolCapability.MISSION_INT)
+        is_supported = await self._has_capability(MavProtocolCapability.MISSION_INT)
         self.is_single_precision = not is_supported
         return is_supported
 
@@ -155,34 +155,35 @@ class PlanChannel:
             raise NotSupported(
                 "MAVLink 1 can transfer only missions: the vehicle would use this plan as its mission; nothing was sent"
             )
-        started = connection.now()
+        started_at = connection.now()
         try:
             return await self._context.transfers.run(exchange)
         except MissionRejected as error:
             await anyio.sleep(REFUSAL_TEXT_DELAY_S)
-            texts = self._context.session.texts_since(started)
-            message = f"{error}{self._describe_remains(exchange, refused=error.item)}"
+            texts = self._context.session.texts_since(started_at)
+            message = f"{error}{self._describe_items_on_vehicle(exchange, refused_item=error.item)}"
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:
-            error.args = (f"{error}{self._describe_remains(exchange, is_silent=True)}",)
+            error.args = (f"{error}{self._describe_items_on_vehicle(exchange, is_silent=True)}",)
             raise
         finally:
             if not exchange.done and connection.is_open:
-                for notice in exchange.cancellation():
-                    connection.send(notice)
+                for cancellation in exchange.cancellation():
+                    connection.send(cancellation)
 
-    def _describe_remains(
-        self, exchange: MissionExchange[Any], *, is_silent: bool = False, refused: int | None = None
+    def _describe_items_on_vehicle(
+        self, exchange: MissionExchange[Any], *, is_silent: bool = False, refused_item: int | None = None
     ) -> str:
+        """Return a clause for the error of an upload: which items, old or new, the vehicle has now."""
         if not isinstance(exchange, MissionUpload):
             return ""
         self._has_changed |= exchange.may_have_changed_items
         is_overwritten = self.mission_type in self._context.autopilot.overwrites_plans_in_place
         if is_silent and exchange.was_sent_completely:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
-        if is_overwritten and self._has_changed and refused:
-            count = "only item 0 is new" if refused == 1 else f"items 0 to {refused - 1} are new"
-            return f"; on the vehicle {count} now, and later items, if it has any, are old: upload again, or clear"
+        if is_overwritten and self._has_changed and refused_item:
+            new_items = "only item 0 is new" if refused_item == 1 else f"items 0 to {refused_item - 1} are new"
+            return f"; on the vehicle {new_items} now, and later items, if it has any, are old: upload again, or clear"
         if is_overwritten and self._has_changed:
             return "; the vehicle now has some new and some old items: upload again, or clear"
         if is_overwritten and is_silent:
@@ -191,10 +192,8 @@ class PlanChannel:
 
 
 PLAN_NAMES = ("mission", "fence", "rally points")
-
 # MISSION_CURRENT, which has the checksum, is sent at 1 Hz.
 CHECKSUM_INTERVAL_S = 1.0
-
 # The extra messages of a partial upload cost about as much as this many items.
 PART_OVERHEAD_ITEMS = 4
 
@@ -235,9 +234,9 @@ class PlanTransfer(Generic[PlanT]):
 
     async def upload(self, plan: PlanT, method: str, *, only_changes: bool, verify: bool) -> None:
         items = plan.to_items()
-        if self._offset:  # Older firmware might otherwise take the plan's home.
+        if self._offset:  # The vehicle's own home, because older firmware might take another one in item 0 as its home.
             items = with_home(items, self._context.home)
-        if len(items) == self._offset:
+        if len(items) == self._offset:  # The plan is empty, except for home.
             await self.clear()
             return
         if only_changes and await self._send_changes(items, method, verify=verify):
@@ -254,9 +253,9 @@ class PlanTransfer(Generic[PlanT]):
     async def clear(self) -> None:
         self._cache.forget(self._context.now())
         await self._channel.clear()
-        left = (await self._channel.receive(only=())).count - self._offset
-        if left > 0:
-            self._raise_mismatch((f"the vehicle still has items: {left}",))
+        remaining = (await self._channel.receive(only=())).count - self._offset  # Requests only the count.
+        if remaining > 0:
+            self._raise_mismatch((f"the vehicle still has items: {remaining}",))
 
     async def _read(self, method: str) -> tuple[MissionItem, ...]:
         if await self._uses_file(method):
@@ -282,7 +281,7 @@ class PlanTransfer(Generic[PlanT]):
             return True
         # ArduPilot clears the old mission before it reads the file, and refuses to do so while it flies the mission.
         is_flying = is_upload and self._type == 0 and self._context.is_flying_mission
-        return has_ftp and self._cache.has_file is not False and not is_flying
+        return has_ftp and self._cache.has_file is not False and not is_flying  # `has_file` is None until tried.
 
     def _on_file_error(self, error: Exception, method: str) -> None:
         """Transfer no files from now on. Raise the error if the caller chose files, or if files have worked before."""
@@ -291,19 +290,20 @@ class PlanTransfer(Generic[PlanT]):
         self._cache.has_file = False
 
     async def _send_items(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
-        end = await self._channel.send(items)
+        """Send all items; read them back to verify them, or if the vehicle's answers to the upload were ambiguous."""
+        result = await self._channel.send(items)
         self._cache.set(items, self._context.now())
-        if (end.is_confirmed and not verify) or await self._has_checksum_of(items):
+        if (result.is_confirmed and not verify) or await self._has_checksum_of(items):
             return
         try:
             self._compare(dict(enumerate(items)), dict(enumerate(await self._read(method))))
         except VerificationFailed as error:
-            if end.is_confirmed:
+            if result.is_confirmed:
                 raise
             raise MissionRejected(
-                f"{self._name}: the vehicle refused at about item {end.item}, and now has other items",
+                f"{self._name}: the vehicle refused at about item {result.item}, and now has other items",
                 result=MavMissionResult.ERROR,
-                item=end.item,
+                item=result.item,
                 reasons=error.differences,
             ) from None
 
@@ -313,9 +313,9 @@ class PlanTransfer(Generic[PlanT]):
         except (FileError, FileTimeout) as error:
             self._on_file_error(error, method)
         else:
-            found = await self._read(method)
+            received = await self._read(method)
             try:
-                self._compare(dict(enumerate(items)), dict(enumerate(found)))
+                self._compare(dict(enumerate(items)), dict(enumerate(received)))
                 return
             except VerificationFailed:
                 if method == "ftp":
@@ -334,52 +334,55 @@ class PlanTransfer(Generic[PlanT]):
             # The plan may have been replaced a moment ago, so the next report must have the same checksum.
             if reported == checksum and await self._context.wait_for_plan_id(self._type, checksum):
                 return True
-        if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changes(items), len(items)):
+        if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changed_seqs(items), len(items)):
             return False
         await self._read(method)  # Another station may have changed the plan.
-        changes = self._changes(items)
-        if changes == []:
+        changed_seqs = self._changed_seqs(items)
+        if changed_seqs == []:
             return True
-        if changes is None or not self._is_worthwhile(changes, len(items)):
+        if changed_seqs is None or not self._is_worthwhile(changed_seqs, len(items)):
             return False
-        held = list(self._cache.items or ())
+        vehicle_items = list(self._cache.items or ())
+        # Unknown until all parts are confirmed, in case the call fails or is cancelled.
         self._cache.forget(self._context.now())
-        for part in _stretches(changes):
+        for part in _consecutive_ranges(changed_seqs):
             if not await self._send_part(items[part.start : part.stop], part.start, verify=verify):
                 return False
-            held[part.start : part.stop] = items[part.start : part.stop]
-        self._cache.set(held, self._context.now())
+            vehicle_items[part.start : part.stop] = items[part.start : part.stop]
+        self._cache.set(vehicle_items, self._context.now())
         return True
 
     async def _send_part(self, items: Sequence[MissionItem], first: int, *, verify: bool) -> bool:
-        end = await self._channel.send_part(items, first)
-        if end is None:
+        result = await self._channel.send_part(items, first)
+        if result is None:
             return False
-        if verify or not end.is_confirmed:
+        if verify or not result.is_confirmed:
             seqs = range(first, first + len(items))
             received = await self._channel.receive(only=seqs)
             self._compare(dict(zip(seqs, items)), dict(zip(seqs, received.items)))  # noqa: B905 - may be shorter
         return True
 
-    def _changes(self, items: Sequence[MissionItem]) -> list[int] | None:
-        """Return the numbers of the items that differ from the known plan; None if the numbers of items differ."""
-        held = self._cache.items
-        if held is None or len(held) != len(items):
+    def _changed_seqs(self, items: Sequence[MissionItem]) -> list[int] | None:
+        """Return the seqs of changed items; None if the vehicle's items are unknown, or there are more or fewer."""
+        vehicle_items = self._cache.items
+        if vehicle_items is None or len(vehicle_items) != len(items):
             return None
-        return [seq for seq in changed_items(items, held, self._storage) if seq >= self._offset]
+        return [seq for seq in changed_items(items, vehicle_items, self._storage) if seq >= self._offset]
 
     @staticmethod
-    def _is_worthwhile(changes: Collection[int] | None, count: int) -> bool:
-        if changes is None:
+    def _is_worthwhile(changed_seqs: Collection[int] | None, count: int) -> bool:
+        """Return True if sending these items in parts takes fewer messages than sending all ``count`` items."""
+        if changed_seqs is None:
             return False
-        return len(changes) + PART_OVERHEAD_ITEMS * len(list(_stretches(changes))) < count or len(changes) == 0
+        parts = list(_consecutive_ranges(changed_seqs))
+        return not parts or len(changed_seqs) + PART_OVERHEAD_ITEMS * len(parts) < count
 
     async def _has_checksum_of(self, items: Sequence[MissionItem]) -> bool:
         """Wait for the checksum of these items if that is faster than reading them back; return True if it arrives."""
         autopilot = self._context.autopilot
         round_trip_s = self._context.transfers.round_trip.smoothed_s or 0.0
-        takes_s = len(items) / autopilot.mission_download_window * round_trip_s
-        if not autopilot.reports_mission_checksum or takes_s < CHECKSUM_INTERVAL_S:
+        reading_takes_s = len(items) / autopilot.mission_download_window * round_trip_s
+        if not autopilot.reports_mission_checksum or reading_takes_s < CHECKSUM_INTERVAL_S:
             return False
         checksum = mission_checksum(items)
         if not await self._context.wait_for_plan_id(self._type, checksum):
@@ -387,15 +390,18 @@ class PlanTransfer(Generic[PlanT]):
         self._cache.set(items, self._context.now())
         return True
 
-    def _compare(self, wanted: dict[int, MissionItem], found: dict[int, MissionItem]) -> None:
+    def _compare(self, sent: dict[int, MissionItem], received: dict[int, MissionItem]) -> None:
+        """Raise VerificationFailed unless the items read back are those that were sent. Both are keyed by seq."""
         differences = []
-        if len(wanted) != len(found):
-            counts = (max(0, len(found) - self._offset), len(wanted) - self._offset)
-            differences = ["there are {} items instead of {}".format(*counts)]
-        for seq in sorted(wanted.keys() & found.keys()):
+        if len(sent) != len(received):
+            received_count = max(0, len(received) - self._offset)
+            differences = [f"there are {received_count} items instead of {len(sent) - self._offset}"]
+        is_single_precision = self._channel.is_single_precision
+        for seq in sorted(sent.keys() & received.keys()):
             if seq >= self._offset:
-                item, other = shift_jumps([wanted[seq], found[seq]], -self._offset)
-                texts = item_differences(item, other, self._storage, single_precision=self._channel.is_single_precision)
+                # Targets of jumps are compared and shown as the program numbers them.
+                item, vehicle_item = shift_jumps([sent[seq], received[seq]], -self._offset)
+                texts = item_differences(item, vehicle_item, self._storage, single_precision=is_single_precision)
                 differences += [f"item {seq - self._offset} ({item.name}): {text}" for text in texts]
         if differences:
             self._raise_mismatch(tuple(differences))
@@ -410,14 +416,15 @@ class PlanTransfer(Generic[PlanT]):
         return PLAN_NAMES[self._type]
 
 
-def _stretches(seqs: Collection[int]) -> Iterator[range]:
+def _consecutive_ranges(seqs: Collection[int]) -> Iterator[range]:
     """Return the ranges of consecutive numbers: 3, 4, 7 become 3–4 and 7."""
-    start = previous = None
+    current: range | None = None
     for seq in sorted(seqs):
-        if previous is not None and start is not None and seq > previous + 1:
-            yield range(start, previous + 1)
-            start = seq
-        start = seq if start is None else start
-        previous = seq
-    if start is not None and previous is not None:
-        yield range(start, previous + 1)
+        if current is not None and seq == current.stop:
+            current = range(current.start, seq + 1)
+            continue
+        if current is not None:
+            yield current
+        current = range(seq, seq + 1)
+    if current is not None:
+        yield current

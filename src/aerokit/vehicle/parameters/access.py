@@ -59,19 +59,22 @@ class ParameterAccess:
         self._downloading = asyncio.Lock()
         self._writing = asyncio.Lock()
         self._has_pack: bool | None = None
-        self._answers: RoundTrip | None = None
-        self._boosts = 0
+        self._answer_round_trip: RoundTrip | None = None
+        self._boosts = 0  # number of running operations that need the raised rate
         self._written_at: dict[str, float] = {}
         # Last value of each parameter that this program has written and the vehicle has confirmed.
         self.written: dict[str, int | float] = {}
 
     @property
-    def _answer_time(self) -> RoundTrip:
-        # Answers take longer than the round trip of the link, because ArduPilot answers at most five reads every 0.1 s.
-        if self._answers is None:
+    def _reply_round_trip(self) -> RoundTrip:
+        """Estimate of the time until an answer.
+
+        It is longer than the round trip of the link, because ArduPilot answers at most five reads every 0.1 s.
+        """
+        if self._answer_round_trip is None:
             link_s = self._transfers.round_trip.smoothed_s
-            self._answers = RoundTrip(None if link_s is None else link_s + ANSWER_DELAY_S)
-        return self._answers
+            self._answer_round_trip = RoundTrip(None if link_s is None else link_s + ANSWER_DELAY_S)
+        return self._answer_round_trip
 
     @property
     def has_upper_case_names(self) -> bool:
@@ -91,6 +94,7 @@ class ParameterAccess:
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> ParameterTable:
+        """Return the whole list: the known one, a cached one with the vehicle's hash, or a new one."""
         async with self._downloading:
             if self.store.is_complete and not refresh:
                 return self.store.table
@@ -108,8 +112,10 @@ class ParameterAccess:
 
     async def _download(self, method: DownloadMethod, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
         if method == "ftp" or (method == "auto" and await self.has_pack()):
+            # The probe ends the attempt early, so that the list can be tried. With "ftp" there is nothing else to try.
+            probe = nullcontext() if method == "ftp" else self._ftp_probe()
             try:
-                with nullcontext() if method == "ftp" else self._ftp_probe():
+                with probe:
                     await self._download_pack(idle_timeout_s, on_progress)
                 return
             except (FileError, FileTimeout, NotSupported, RemoteProtocolError) as error:
@@ -118,7 +124,7 @@ class ParameterAccess:
                 is_temporary = isinstance(error, RemoteProtocolError) or (
                     isinstance(error, FileError) and error.code == MavFtpErr.NOSESSIONSAVAILABLE
                 )
-                self._has_pack = None if is_temporary else False
+                self._has_pack = None if is_temporary else False  # None: try the file again next time.
         await self._download_list(idle_timeout_s, on_progress)
 
     @contextmanager
@@ -129,7 +135,12 @@ class ParameterAccess:
         answers: list[object] = []
         detach = connection.bus.attach(FileTransferProtocol, answers.append, system_id=self._transfers.system_id)
         with anyio.CancelScope() as scope:
-            timer = asyncio.get_running_loop().call_later(timeout_s, lambda: None if answers else scope.cancel())
+
+            def cancel_without_answer() -> None:
+                if not answers:
+                    scope.cancel()
+
+            timer = asyncio.get_running_loop().call_later(timeout_s, cancel_without_answer)
             try:
                 yield
             finally:
@@ -168,11 +179,14 @@ class ParameterAccess:
                 return
 
     def _with_known_defaults(self, table: ParameterTable) -> ParameterTable:
+        """Return the table, with defaults that an earlier download has reported and this one has not."""
         known = self.store.table
-        return ParameterTable(
-            param.replace(default=known[param.name].default) if param.default is None and param.name in known else param
-            for param in table.values()
-        )
+        parameters = []
+        for parameter in table.values():
+            if parameter.default is None and parameter.name in known:
+                parameter = parameter.replace(default=known[parameter.name].default)
+            parameters.append(parameter)
+        return ParameterTable(parameters)
 
     async def _download_list(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
         from aerokit.protocols.parameter_list import ParameterList
@@ -182,7 +196,7 @@ class ParameterAccess:
             transfers.system_id,
             transfers.component_id,
             bytewise=self.store.bytewise,
-            round_trip=self._answer_time,
+            round_trip=self._reply_round_trip,
             idle_timeout_s=idle_timeout_s,
             on_progress=on_progress,
         )
@@ -202,6 +216,7 @@ class ParameterAccess:
         from aerokit.protocols.parameter_requests import ParameterReads
 
         transfers, store = self._transfers, self.store
+        replaced_values = {name: store.replaced_value(name) for name in names}
         exchange = ParameterReads(
             transfers.system_id,
             transfers.component_id,
@@ -209,12 +224,18 @@ class ParameterAccess:
             bytewise=store.bytewise,
             probe=probe,
             alternatives={name: other_names(name) for name in names} if probe else {},
-            possibly_stale={name: old for name in names if (old := store.replaced_value(name)) is not None},
+            possibly_stale={name: value for name, value in replaced_values.items() if value is not None},
             own_system=transfers.connection.source_system,
-            round_trip=self._answer_time,
+            round_trip=self._reply_round_trip,
             idle_timeout_s=idle_timeout_s,
         )
-        with self._boosted(after_s=0.0 if len(names) > MAX_READS_UNBOOSTED else BOOST_DELAY_S if probe else math.inf):
+        if len(names) > MAX_READS_UNBOOSTED:
+            boost_after_s = 0.0
+        elif probe:
+            boost_after_s = BOOST_DELAY_S
+        else:
+            boost_after_s = math.inf
+        with self._boosted(after_s=boost_after_s):
             return await transfers.run(exchange)
 
     @contextmanager
@@ -251,101 +272,104 @@ class ParameterAccess:
         self._transfers.command_in_background(MavCmd.SET_MESSAGE_INTERVAL, ParamValue.ID, interval_us)
 
     async def write(
-        self, wanted: Iterable[Parameter], idle_timeout_s: float, on_progress: OnProgress | None = None
+        self, parameters: Iterable[Parameter], idle_timeout_s: float, on_progress: OnProgress | None = None
     ) -> dict[str, ParameterAnswer]:
         """Set parameters and return the vehicle's values. Writes by other tasks wait until this one is done."""
-        wanted = tuple(wanted)
-        if not wanted:
+        parameters = tuple(parameters)
+        if not parameters:
             return {}
         from aerokit.protocols.parameter_requests import ParameterWrites
 
         transfers = self._transfers
         async with self._writing:
-            before = {
-                parameter.name: parameter.value
-                for parameter in map(self.store.get, _names(wanted))
-                if parameter is not None
-            }
-            for name in _names(wanted):
+            names = _names(parameters)
+            known = [self.store.get(name) for name in names]
+            old_values = {parameter.name: parameter.value for parameter in known if parameter is not None}
+            for name in names:
                 self.written.pop(name, None)
                 self.store.clear_replaced(name)
-            recent = self._recently_written() & set(_names(wanted))
+            recent = self._recently_written() & set(names)
             exchange = ParameterWrites(
                 transfers.system_id,
                 transfers.component_id,
-                wanted,
+                parameters,
                 bytewise=self.store.bytewise,
-                before=before,
+                before=old_values,
                 recent=recent,
                 own_system=transfers.connection.source_system,
-                round_trip=self._answer_time if recent else transfers.round_trip,
+                round_trip=self._reply_round_trip if recent else transfers.round_trip,
                 idle_timeout_s=idle_timeout_s,
                 on_progress=on_progress,
             )
-            with self._boosted(after_s=0.0 if len(recent) > MAX_READS_UNBOOSTED else math.inf):
+            # Recently written parameters are read back, and many reads need the raised rate.
+            boost_after_s = 0.0 if len(recent) > MAX_READS_UNBOOSTED else math.inf
+            with self._boosted(after_s=boost_after_s):
                 answers = await transfers.run(exchange)
             for name, answer in answers.items():
                 self._written_at[name] = transfers.connection.now()
-                if isinstance(answer, Parameter):
-                    self.written[name] = answer.value
-                if isinstance(answer, Parameter) and name in before and answer.value != before[name]:
-                    self.store.mark_replaced(name, before[name])
+                if not isinstance(answer, Parameter):
+                    continue
+                self.written[name] = answer.value
+                if name in old_values and answer.value != old_values[name]:
+                    self.store.mark_replaced(name, old_values[name])
             return answers
 
     def _recently_written(self) -> set[str]:
         """Names for which a late answer to a write may arrive. Their next write is therefore read back."""
-        now = self._transfers.connection.now()
-        self._written_at = {name: at for name, at in self._written_at.items() if now - at < ECHO_WINDOW_S}
+        earliest = self._transfers.connection.now() - ECHO_WINDOW_S
+        self._written_at = {name: written_at for name, written_at in self._written_at.items() if written_at > earliest}
         return set(self._written_at)
 
     async def write_pack(
         self,
-        wanted: Iterable[Parameter],
+        parameters: Iterable[Parameter],
         method: UploadMethod,
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
         """Write parameters in one file if possible; set the values that the vehicle did not apply one by one."""
-        wanted = tuple(wanted)
-        if method == "set" or (method == "auto" and (len(wanted) < MIN_PACK_SIZE or not await self.has_pack())):
-            return await self.write(wanted, idle_timeout_s, on_progress)
+        parameters = tuple(parameters)
+        if method == "auto" and (len(parameters) < MIN_PACK_SIZE or not await self.has_pack()):
+            method = "set"
+        if method == "set":
+            return await self.write(parameters, idle_timeout_s, on_progress)
         answers: dict[str, ParameterAnswer] = {}
         try:
             async with self._writing:
-                await self._upload_pack(wanted, idle_timeout_s, on_progress)
-            answers = await self._read_back(wanted, idle_timeout_s)
+                await self._upload_pack(parameters, idle_timeout_s, on_progress)
+            answers = await self._read_back(parameters, idle_timeout_s)
         except (FileError, FileTimeout, NotSupported):
             if method == "ftp":
                 raise
-        left = [param for param in wanted if not self._was_applied(param, answers.get(param.name))]
-        applied = [param for param in wanted if param not in left]
+        not_applied = [param for param in parameters if not self._was_applied(param, answers.get(param.name))]
+        applied = [param for param in parameters if param not in not_applied]
         self.written.update({param.name: param.value for param in applied})
-        remaining = await self.write(left, idle_timeout_s, on_progress)
-        return {param.name: answers[param.name] for param in applied} | remaining
+        later_answers = await self.write(not_applied, idle_timeout_s, on_progress)
+        return {param.name: answers[param.name] for param in applied} | later_answers
 
     async def _upload_pack(
-        self, wanted: tuple[Parameter, ...], idle_timeout_s: float, on_progress: OnProgress | None
+        self, parameters: tuple[Parameter, ...], idle_timeout_s: float, on_progress: OnProgress | None
     ) -> None:
         from aerokit.parameters.pack import PACK_PATH, pack_parameters
 
         await self._files.write(
-            PACK_PATH, pack_parameters(wanted), idle_timeout_s=idle_timeout_s, on_progress=on_progress
+            PACK_PATH, pack_parameters(parameters), idle_timeout_s=idle_timeout_s, on_progress=on_progress
         )
 
-    async def _read_back(self, wanted: tuple[Parameter, ...], idle_timeout_s: float) -> dict[str, ParameterAnswer]:
-        if len(wanted) <= MAX_READ_BACK:
-            return await self.read(_names(wanted), idle_timeout_s)
+    async def _read_back(self, written: tuple[Parameter, ...], idle_timeout_s: float) -> dict[str, ParameterAnswer]:
+        if len(written) <= MAX_READ_BACK:
+            return await self.read(_names(written), idle_timeout_s)
         await self.download("auto", refresh=True, cache=False, idle_timeout_s=idle_timeout_s, on_progress=None)
         table = self.store.table
-        return {name: table[name] for name in _names(wanted) if name in table}
+        return {name: table[name] for name in _names(written) if name in table}
 
-    def _was_applied(self, wanted: Parameter, answer: ParameterAnswer | None) -> bool:
+    def _was_applied(self, written: Parameter, answer: ParameterAnswer | None) -> bool:
         """Return True if the vehicle has the value. The last bits are ignored in values that were read as floats."""
         if not isinstance(answer, Parameter):
             return False
         if self.store.bytewise:
-            return same_value(answer.value, wanted.value)
-        return same_value(float(answer.value), float(wanted.value))
+            return same_value(answer.value, written.value)
+        return same_value(float(answer.value), float(written.value))
 
 
 class _CachedList:
@@ -358,8 +382,10 @@ class _CachedList:
     async def load_if_current(self, refresh: bool) -> bool:
         """Load the cached list into the store if its hash is the vehicle's; return True if it was loaded."""
         key, store, since = await self._key(), self._access.store, self._access.store.updates
-        self._hash = await self._read_hash()
-        table = None if refresh or self._hash is None else self._cache.load(key, self._hash)
+        self._hash = await self._read_hash()  # also with `refresh`, because `save` needs it
+        if refresh or self._hash is None:
+            return False
+        table = self._cache.load(key, self._hash)
         if table is None:
             return False
         store.replace(table, since=since)

@@ -151,11 +151,11 @@ class Parameters(ReadOnly):
             ParameterTimeout: there was no answer.
         """
         with self._transfers.limit(timeout):
-            found = _raise_failure((await self._names.resolve([name], idle_timeout_s))[name])
-            if found.is_fresh:
-                return found.as_requested(found.parameter)
-            answer = _raise_failure((await self._access.read([found.name], idle_timeout_s))[found.name])
-            return found.as_requested(answer)
+            resolved = _value_or_raise((await self._names.resolve([name], idle_timeout_s))[name])
+            if resolved.is_fresh:  # It has just been read to resolve the name.
+                return resolved.as_requested(resolved.parameter)
+            answers = await self._access.read([resolved.name], idle_timeout_s)
+            return resolved.as_requested(_value_or_raise(answers[resolved.name]))
 
     async def probe(
         self, *names: str, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
@@ -321,11 +321,11 @@ class Parameters(ReadOnly):
         return "; ".join(filter(None, notes))
 
     def _needs_reboot(self, name: str) -> bool:
-        known = None if self._metadata is None else self._metadata.get(name)
-        return known is not None and bool(known.reboot_required)
+        entry = None if self._metadata is None else self._metadata.get(name)
+        return entry is not None and bool(entry.reboot_required)
 
 
-def _raise_failure(answer: ResultT | ParameterRejected | ParameterTimeout) -> ResultT:
+def _value_or_raise(answer: ResultT | ParameterRejected | ParameterTimeout) -> ResultT:
     if isinstance(answer, (ParameterRejected, ParameterTimeout)):
         raise answer
     return answer

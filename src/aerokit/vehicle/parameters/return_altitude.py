@@ -31,14 +31,15 @@ async def write_return_altitude(parameters: Parameters, session: VehicleSession,
 async def _find(action: str, parameters: Parameters, session: VehicleSession) -> tuple[str, float, float]:
     """Return name, value and scale of the altitude parameter that the vehicle has."""
     autopilot = session.autopilot
-    names = autopilot.return_altitude_parameters(is_vtol=session.telemetry.is_vtol)
-    if not names:
+    names_and_scales = autopilot.return_altitude_parameters(is_vtol=session.telemetry.is_vtol)
+    if not names_and_scales:
         raise NotSupported(f"{action}: {autopilot.firmware} does not climb for a return; nothing was sent")
-    answers = await parameters.probe(*(name for name, _ in names))
+    answers = await parameters.probe(*(name for name, _ in names_and_scales))
     failures: list[ParameterRejected | ParameterTimeout] = []
-    for name, scale in names:
+    for name, scale in names_and_scales:
         answer = answers[name]
         if not isinstance(answer, (ParameterRejected, ParameterTimeout)):
             return name, answer.value, scale
         failures.append(answer)
+    # A time-out takes precedence, because the vehicle may have this parameter.
     raise next((failure for failure in failures if isinstance(failure, ParameterTimeout)), failures[0])

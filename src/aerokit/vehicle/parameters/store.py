@@ -41,7 +41,9 @@ class ParameterStore:
         self.updates = 0
         # Number of parameters according to the last message. ArduPilot may show and hide parameters at any time.
         self.count: int | None = None
+        # Value of `updates` at the last message with this parameter.
         self._updated_at: dict[str, int] = {}
+        # Previous value of a written parameter, and the time until which messages with it are ignored.
         self._replaced: dict[str, tuple[int | float, float]] = {}
 
     @property
@@ -75,8 +77,11 @@ class ParameterStore:
         self._replaced.pop(name, None)
 
     def replaced_value(self, name: str) -> int | float | None:
-        value, until = self._replaced.get(name, (0, 0.0))
-        return value if self._transfers.connection.now() < until else None
+        """Return the value marked by `mark_replaced`, while messages with it are ignored."""
+        if name not in self._replaced:
+            return None
+        value, ignored_until = self._replaced[name]
+        return value if self._transfers.connection.now() < ignored_until else None
 
     def attach(self) -> Detach:
         transfers = self._transfers
@@ -90,19 +95,18 @@ class ParameterStore:
 
     def replace(self, table: ParameterTable, *, since: int) -> None:
         """Replace all parameters by a list requested when ``updates`` was ``since``. Newer messages take precedence."""
-        newer = {name for name, at in self._updated_at.items() if at > since}
-        before, self._known = self._known, {}
+        newer_names = {name for name, updated_at in self._updated_at.items() if updated_at > since}
+        old, self._known = self._known, {}
         for name, parameter in table.items():
-            known = before.get(name)
-            if known is not None and name in newer:
-                parameter = merge_update(parameter, known, self.bytewise)
+            if name in old and name in newer_names:
+                parameter = merge_update(parameter, old[name], self.bytewise)
             self._known[name] = parameter
-        for name in newer - self._known.keys():
-            self._known[name] = before[name]
+        for name in newer_names - self._known.keys():
+            self._known[name] = old[name]
         self._table = None
         self.is_complete = True
         for name, parameter in self._known.items():
-            self._publish(before.get(name), parameter)
+            self._publish(old.get(name), parameter)
 
     def _on_param_value(self, message: ParamValue) -> None:
         frame = message.received_frame
@@ -111,29 +115,30 @@ class ParameterStore:
         if message.param_id == HASH_NAME or not message.param_id:
             return
         received = parameter_of(message, self.bytewise)
-        known, old = self._known.get(received.name), self.replaced_value(received.name)
-        if known is None and len(self._known) >= MAX_PARAMETERS:
+        name, old = received.name, self._known.get(received.name)
+        if old is None and len(self._known) >= MAX_PARAMETERS:
             return
-        if known is not None and old is not None and same_value(received.value, old):
-            return
-        after = received if known is None else merge_update(known, received, self.bytewise)
-        self._known[received.name], self._table = after, None
+        replaced_value = self.replaced_value(name)
+        if old is not None and replaced_value is not None and same_value(received.value, replaced_value):
+            return  # a late message, from before the last write
+        new = received if old is None else merge_update(old, received, self.bytewise)
+        self._known[name], self._table = new, None
         self.updates += 1
         self.count = message.param_count
-        self._updated_at[received.name] = self.updates
-        self._publish(known, after)
+        self._updated_at[name] = self.updates
+        self._publish(old, new)
 
-    def _publish(self, before: Parameter | None, after: Parameter) -> None:
-        if before is None or same_value(before.value, after.value):
+    def _publish(self, old: Parameter | None, new: Parameter) -> None:
+        if old is None or same_value(old.value, new.value):
             return
         transfers = self._transfers
         transfers.connection.bus.publish(
             ParameterChanged(
                 transfers.connection.now(),
                 transfers.system_id,
-                after.name,
-                before.value,
-                after.value,
+                new.name,
+                old.value,
+                new.value,
                 transfers.component_id,
             )
         )
@@ -147,9 +152,9 @@ def default_directory() -> Path:
 
     An absolute path in ``XDG_CACHE_HOME`` takes precedence (https://specifications.freedesktop.org/basedir-spec).
     """
-    given = os.environ.get("XDG_CACHE_HOME", "")
-    if os.path.isabs(given):
-        base = Path(given)
+    xdg_cache_home = os.environ.get("XDG_CACHE_HOME", "")
+    if os.path.isabs(xdg_cache_home):
+        base = Path(xdg_cache_home)
     elif sys.platform == "win32":
         base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
     elif sys.platform == "darwin":

@@ -57,7 +57,7 @@ class _Block:
     ) -> None:
         self._registry, self._access, self._writing = registry, access, writing
         self._idle_timeout_s = idle_timeout_s
-        self._before: dict[str, Parameter] = {}
+        self._saved: dict[str, Parameter] = {}  # parameters before their first write in this block
 
     async def _write(self, values: Mapping[str, float]) -> dict[str, ParameterWrite]:
         await self._save_previous(values)
@@ -65,69 +65,71 @@ class _Block:
 
     async def _save_previous(self, values: Mapping[str, float]) -> None:
         # Read again, because the store may be outdated.
-        found = await self._writing.names.resolve(values, self._idle_timeout_s)
-        resolved = [answer for answer in found.values() if isinstance(answer, ResolvedParameter)]
+        answers_by_name = await self._writing.names.resolve(values, self._idle_timeout_s)
+        resolved = [answer for answer in answers_by_name.values() if isinstance(answer, ResolvedParameter)]
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
-        known = {answer.name for answer in resolved}
-        answers = await self._access.read(known - fresh.keys() - self._before.keys(), self._idle_timeout_s)
+        all_names = {answer.name for answer in resolved}
+        answers = await self._access.read(all_names - fresh.keys() - self._saved.keys(), self._idle_timeout_s)
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
-            if name not in self._before:
+            if name not in self._saved:
                 # The store is preferred, because a value that was read as a float may lack its last bits.
-                self._before[name] = self._access.store.get(name) or answer
+                self._saved[name] = self._access.store.get(name) or answer
                 self._registry.add(name, self)
 
-    def _release_own(self) -> list[Parameter]:
-        """Return the parameters that this block must restore. Parameters that an overlapping block also wrote are left
-        to it.
+    def _take_saved(self) -> list[Parameter]:
+        """Return the parameters that this block must restore. Those that an overlapping block has written later are
+        left to that block, with the value from before this block.
         """
-        own = []
-        for name, before in self._before.items():
-            later = self._registry.remove(name, self)
-            if later is None:
-                own.append(before)
+        to_restore = []
+        for name, saved in self._saved.items():
+            later_block = self._registry.remove(name, self)
+            if later_block is None:
+                to_restore.append(saved)
             else:
-                later._before[name] = before
-        return own
+                later_block._saved[name] = saved
+        return to_restore
 
     def _discard(self) -> None:
-        for name in self._before:
+        for name in self._saved:
             self._registry.remove(name, self)
 
     async def _restore(self, cause: BaseException | None) -> None:
         """Restore within a limited time, shielded from cancellation; RollbackFailed names what was not restored."""
-        await run_shielded(self._write_previous(self._release_own(), cause))
+        await run_shielded(self._write_previous(self._take_saved(), cause))
 
-    async def _write_previous(self, wanted: list[Parameter], cause: BaseException | None) -> None:
+    async def _write_previous(self, saved: list[Parameter], cause: BaseException | None) -> None:
         answers: Mapping[str, object] = {}
         reason = ""
         with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
             try:
-                changed = await self._changed_by_others(wanted)
-                wanted = [param for param in wanted if not isinstance(changed.get(param.name), Parameter)]
-                to_write = [param for param in wanted if param.name not in changed]
+                changed = await self._changed_by_others(saved)
+                # A value of another station stays. What cannot be read is not written, and counts as not restored.
+                saved = [param for param in saved if not isinstance(changed.get(param.name), Parameter)]
+                to_write = [param for param in saved if param.name not in changed]
                 answers = await self._access.write(to_write, self._idle_timeout_s)
             except AerokitError as error:
                 reason = f" ({error})"
-        left = {param.name: param.value for param in wanted if not _is_restored(param, answers.get(param.name))}
-        if left:
-            names = ", ".join(f"{name} = {value!r}" for name, value in left.items())
-            raise RollbackFailed(f"could not restore{reason}: {names}", not_restored=left) from cause
+        not_restored = {param.name: param.value for param in saved if not _is_restored(param, answers.get(param.name))}
+        if not_restored:
+            names = ", ".join(f"{name} = {value!r}" for name, value in not_restored.items())
+            raise RollbackFailed(f"could not restore{reason}: {names}", not_restored=not_restored) from cause
 
-    async def _changed_by_others(self, wanted: list[Parameter]) -> dict[str, object]:
+    async def _changed_by_others(self, saved: list[Parameter]) -> dict[str, object]:
         """Return the parameters that cannot be read, or that another station has changed since the write; log these
         changes.
         """
         written = self._access.written
-        own = [param.name for param in wanted if param.name in written]
+        names = [param.name for param in saved if param.name in written]
         changed: dict[str, object] = {}
-        for name, actual in (await self._access.read(own, self._idle_timeout_s)).items():
-            if not isinstance(actual, Parameter) or float(actual.value) != float(written[name]):
-                changed[name] = actual
-            if isinstance(actual, Parameter) and name in changed:
+        for name, answer in (await self._access.read(names, self._idle_timeout_s)).items():
+            if not isinstance(answer, Parameter):
+                changed[name] = answer
+            elif float(answer.value) != float(written[name]):
+                changed[name] = answer
                 text = "%s is not restored: another station has changed it from %r to %r"
-                logger.warning(text, name, written[name], actual.value)
+                logger.warning(text, name, written[name], answer.value)
         return changed
 
 
@@ -186,7 +188,7 @@ class Transaction(_Block):
     ) -> None:
         super().__init__(registry, access, writing, idle_timeout_s)
         self._name_needs_reboot = needs_reboot
-        self._after: dict[str, int | float] = {}
+        self._new_values: dict[str, int | float] = {}
         self._is_open = False
 
     @property
@@ -195,9 +197,9 @@ class Transaction(_Block):
         from aerokit.parameters import ParameterDifference
 
         return tuple(
-            ParameterDifference(name, self._before[name].value, after)
-            for name, after in self._after.items()
-            if not same_value(self._before[name].value, after)
+            ParameterDifference(name, self._saved[name].value, new_value)
+            for name, new_value in self._new_values.items()
+            if not same_value(self._saved[name].value, new_value)
         )
 
     @property
@@ -216,19 +218,19 @@ class Transaction(_Block):
         if not self._is_open:
             raise InvalidArgument("this transaction is not open: it has ended, or was not entered yet")
         results = await self._write(values)
-        for name in self._before:
+        for name in self._saved:
             known = self._access.store.get(name)
             if known is not None:
-                self._after[name] = known.value
+                self._new_values[name] = known.value
         _raise_first_error(results)
         clamped = [result for result in results.values() if result.outcome == "clamped"]
         if clamped:
-            texts = tuple(f"{one.name}: requested {one.requested:g}, is {one.value:g}" for one in clamped)
+            texts = tuple(f"{result.name}: requested {result.requested:g}, is {result.value:g}" for result in clamped)
             raise VerificationFailed("the vehicle has set other values than requested", differences=texts)
         return results
 
     async def __aenter__(self) -> Self:
-        if self._is_open or self._before:
+        if self._is_open or self._saved:
             raise InvalidArgument("this transaction was entered already: call transaction() again")
         self._is_open = True
         return self
@@ -247,5 +249,5 @@ def _raise_first_error(results: Mapping[str, ParameterWrite]) -> None:
             raise result.error
 
 
-def _is_restored(wanted: Parameter, answer: object) -> bool:
-    return isinstance(answer, Parameter) and same_value(answer.value, wanted.value)
+def _is_restored(saved: Parameter, answer: object) -> bool:
+    return isinstance(answer, Parameter) and same_value(answer.value, saved.value)

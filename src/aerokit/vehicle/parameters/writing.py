@@ -55,11 +55,11 @@ class ResolvedParameter(Snapshot):
 def resolve_known(name: str, known: Mapping[str, Parameter]) -> ResolvedParameter | None:
     """Return the known parameter that has this name or another name of the same parameter; None if unknown."""
     if name in known:
-        return ResolvedParameter(name, known[name], False)
+        return ResolvedParameter(name, known[name], is_fresh=False)
     from aerokit.parameters.renames import resolve_rename
 
     renamed = resolve_rename(name, known)
-    return None if renamed is None else ResolvedParameter(name, known[renamed.name], False, renamed)
+    return None if renamed is None else ResolvedParameter(name, known[renamed.name], is_fresh=False, renamed=renamed)
 
 
 class NameResolver:
@@ -72,19 +72,20 @@ class NameResolver:
         self, names: Iterable[str], idle_timeout_s: float
     ) -> dict[str, ResolvedParameter | ParameterFailure]:
         """Resolve names, reading parameters that are unknown. Warns of renamed parameters."""
-        spelled = {check_name(name): self._normalized(name) for name in names}
-        found: dict[str, ResolvedParameter | ParameterFailure] = {}
-        answers = await self._access.read(self._unknown_names(spelled.values()), idle_timeout_s, probe=True)
-        for asked, name in spelled.items():
-            resolved = self._resolve_one(name, answers)
-            if isinstance(resolved, ResolvedParameter):
-                resolved = resolved.replace(requested=asked)
-                if resolved.renamed is not None:
-                    warn_of_rename(resolved.renamed)
-            found[asked] = resolved
-        return found
+        normalized_names = {check_name(name): self._normalized(name) for name in names}
+        results: dict[str, ResolvedParameter | ParameterFailure] = {}
+        answers = await self._access.read(self._unknown_names(normalized_names.values()), idle_timeout_s, probe=True)
+        for requested, name in normalized_names.items():
+            result = self._resolve_one(name, answers)
+            if isinstance(result, ResolvedParameter):
+                result = result.replace(requested=requested)
+                if result.renamed is not None:
+                    warn_of_rename(result.renamed)
+            results[requested] = result
+        return results
 
     def translated(self, values: Mapping[str, float], table: ParameterTable) -> dict[str, int | float]:
+        """Convert values to the names and units of the vehicle. Warns of renamed parameters."""
         from aerokit.parameters.renames import translate_values
 
         values = {self._normalized(name): value for name, value in values.items()}
@@ -97,10 +98,12 @@ class NameResolver:
         """Drop values of parameters for which ``values`` also has a value under the vehicle's own name."""
         from aerokit.parameters.renames import resolve_rename
 
-        renamed = {name: resolve_rename(name, table) for name in values}
-        return {
-            name: value for name, value in values.items() if (own := renamed[name]) is None or own.name not in values
-        }
+        remaining = {}
+        for name, value in values.items():
+            renamed = resolve_rename(name, table)
+            if renamed is None or renamed.name not in values:
+                remaining[name] = value
+        return remaining
 
     def _normalized(self, name: str) -> str:
         # ArduPilot accepts lower case, but confirms the parameter in upper case.
@@ -111,24 +114,26 @@ class NameResolver:
         from aerokit.parameters.renames import other_names, resolve_rename
 
         store = self._access.store
-        wanted: dict[str, None] = {}
+        to_read: dict[str, None] = {}  # a dictionary, because its order is that of the requests
         for name in names:
             if name not in store and resolve_rename(name, store) is None:
-                wanted.update(dict.fromkeys((name, *other_names(name))))
-        return wanted
+                to_read.update(dict.fromkeys((name, *other_names(name))))
+        return to_read
 
     def _resolve_one(self, name: str, answers: Mapping[str, ParameterAnswer]) -> ResolvedParameter | ParameterFailure:
-        own = answers.get(name, self._access.store.get(name))
-        if isinstance(own, Parameter):
-            return ResolvedParameter(name, own, name in answers)
+        """Find the parameter under this name or another name of it, in the answers or else in the store."""
+        direct = answers.get(name, self._access.store.get(name))
+        if isinstance(direct, Parameter):
+            return ResolvedParameter(name, direct, is_fresh=name in answers)
         from aerokit.parameters.renames import Renamed, find_rename, other_names
 
-        for other in other_names(name):
-            answer = answers.get(other, self._access.store.get(other))
-            rename = find_rename(name, other)
+        for other_name in other_names(name):
+            answer = answers.get(other_name, self._access.store.get(other_name))
+            rename = find_rename(name, other_name)
             if isinstance(answer, Parameter) and rename is not None:
-                return ResolvedParameter(name, answer, other in answers, Renamed(name, other, rename))
-        return self._with_hint(own or ParameterRejected(f"the vehicle has no parameter {name}", name=name))
+                renamed = Renamed(name, other_name, rename)
+                return ResolvedParameter(name, answer, is_fresh=other_name in answers, renamed=renamed)
+        return self._with_hint(direct or ParameterRejected(f"the vehicle has no parameter {name}", name=name))
 
     def _with_hint(self, answer: ParameterFailure) -> ParameterFailure:
         """Add a hint to the error: similar names, or the name that replaced this one."""
@@ -136,8 +141,8 @@ class NameResolver:
             return answer
         from aerokit.parameters.renames import replacement_of
 
-        replaced = replacement_of(answer.name)
-        hint = f"; replaced by {replaced}" if replaced else did_you_mean(answer.name, self._access.store.table)
+        replacement = replacement_of(answer.name)
+        hint = f"; replaced by {replacement}" if replacement else did_you_mean(answer.name, self._access.store.table)
         return ParameterRejected(f"{answer}{hint}", name=answer.name, code=answer.code)
 
 
@@ -181,28 +186,29 @@ class ParameterWrite(Snapshot):
     error: AerokitError | None = None
 
 
-def failed(name: str, requested: float, known: Parameter | None, error: AerokitError) -> ParameterWrite:
+def _failed_write(name: str, requested: float, known: Parameter | None, error: AerokitError) -> ParameterWrite:
     value, type_ = (math.nan, ParameterType.REAL32) if known is None else (known.value, known.type)
     return ParameterWrite(name, requested, value, type_, "failed", "", error)
 
 
-def outcome_of(wanted: Parameter, before: Parameter | None, answer: ParameterAnswer) -> Outcome | AerokitError:
+def outcome_of(sent: Parameter, old: Parameter | None, answer: ParameterAnswer) -> Outcome | AerokitError:
+    """Compare the vehicle's answer with the value that was sent, and with the old value."""
     if not isinstance(answer, Parameter):
         return answer
-    if same_value(answer.value, wanted.value):
-        return "unchanged" if before is not None and same_value(before.value, answer.value) else "set"
-    if before is not None and same_value(before.value, answer.value):
-        text = f"{wanted.name} = {wanted.value:g} was refused: the vehicle keeps {answer.value:g}"
-        return ParameterRejected(text, name=wanted.name)
-    if same_value(float(answer.value), float(wanted.value)):
+    is_old_value = old is not None and same_value(old.value, answer.value)
+    if same_value(answer.value, sent.value):
+        return "unchanged" if is_old_value else "set"
+    if is_old_value:
+        text = f"{sent.name} = {sent.value:g} was refused: the vehicle keeps {answer.value:g}"
+        return ParameterRejected(text, name=sent.name)
+    if same_value(float(answer.value), float(sent.value)):
         return "rounded"  # The requested value is an integer that a float cannot represent exactly.
-    distance = abs(answer.value - wanted.value)
-    near = (
-        distance < MAX_INTEGER_ROUNDING
-        if answer.type.is_integer
-        else distance <= MAX_RELATIVE_ROUNDING * abs(wanted.value)
-    )
-    return "rounded" if near else "clamped"
+    difference = abs(answer.value - sent.value)
+    if answer.type.is_integer:
+        is_near = difference < MAX_INTEGER_ROUNDING
+    else:
+        is_near = difference <= MAX_RELATIVE_ROUNDING * abs(sent.value)
+    return "rounded" if is_near else "clamped"
 
 
 # Maximum number of rounds of writes. Parameters that appear after a round are looked up and set in the next one.
@@ -212,16 +218,19 @@ NoteOf = Callable[[str, float], str]
 
 
 class _PlannedWrite(Snapshot):
-    """One requested value, converted for the vehicle."""
+    """One requested value; ``to_send`` is the parameter with this value, in the name and unit of the vehicle."""
 
-    found: ResolvedParameter
+    resolved: ResolvedParameter
     requested: int | float
-    wanted: Parameter
-    before: Parameter
+    to_send: Parameter
+
+    @property
+    def old(self) -> Parameter:
+        return self.resolved.parameter
 
     @property
     def is_done(self) -> bool:
-        return same_value(self.before.value, self.wanted.value)
+        return same_value(self.old.value, self.to_send.value)
 
 
 class ParameterWriter:
@@ -244,16 +253,17 @@ class ParameterWriter:
         possible.
         """
         results: dict[str, ParameterWrite] = {}
-        left = check_values(values)
+        pending = check_values(values)
         for attempt in range(MAX_ROUNDS):
-            found = await self.names.resolve(left, idle_timeout_s)
-            count = self._access.store.count
-            plans, errors = self._plan_writes(found, left, is_first=attempt == 0)
+            resolved = await self.names.resolve(pending, idle_timeout_s)
+            count_before = self._access.store.count
+            plans, errors = self._plan_writes(resolved, pending, is_first=attempt == 0)
             answers = await self._send(plans, upload, idle_timeout_s, on_progress)
-            results.update({name: failed(name, left[name], None, error) for name, error in errors.items()})
-            results.update({plan.found.requested: self._result(plan, answers) for plan in plans})
-            left = {name: left[name] for name, error in errors.items() if isinstance(error, ParameterRejected)}
-            if not left or not plans or self._access.store.count == count:
+            results.update({name: _failed_write(name, pending[name], None, error) for name, error in errors.items()})
+            results.update({plan.resolved.requested: self._result(plan, answers) for plan in plans})
+            pending = {name: pending[name] for name, error in errors.items() if isinstance(error, ParameterRejected)}
+            has_new_parameters = bool(plans) and self._access.store.count != count_before
+            if not pending or not has_new_parameters:
                 break
         return {name: results[name] for name in values}
 
@@ -265,58 +275,60 @@ class ParameterWriter:
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
         if upload is None:
-            return await self._access.write((plan.wanted for plan in plans), idle_timeout_s, on_progress)
-        changed = [plan.wanted for plan in plans if not plan.is_done]
-        unchanged: dict[str, ParameterAnswer] = {plan.before.name: plan.before for plan in plans if plan.is_done}
+            return await self._access.write((plan.to_send for plan in plans), idle_timeout_s, on_progress)
+        changed = [plan.to_send for plan in plans if not plan.is_done]
+        unchanged: dict[str, ParameterAnswer] = {plan.old.name: plan.old for plan in plans if plan.is_done}
         return unchanged | await self._access.write_pack(changed, upload, idle_timeout_s, on_progress)
 
     def _plan_writes(
         self,
-        found: Mapping[str, ResolvedParameter | AerokitError],
+        answers: Mapping[str, ResolvedParameter | AerokitError],
         values: Mapping[str, int | float],
         *,
         is_first: bool,
     ) -> tuple[list[_PlannedWrite], dict[str, AerokitError]]:
         """Return the planned writes and the errors. In the first round, an invalid value raises InvalidArgument."""
-        plans: dict[str, _PlannedWrite] = {}
+        plans: list[_PlannedWrite] = []
+        first_plans: dict[str, _PlannedWrite] = {}  # by the vehicle's name: two requested names may mean one parameter
         errors: dict[str, AerokitError] = {}
-        for name, resolved in found.items():
-            if not isinstance(resolved, ResolvedParameter):
-                errors[name] = resolved
+        for name, answer in answers.items():
+            if not isinstance(answer, ResolvedParameter):
+                errors[name] = answer
                 continue
             try:
-                plan = _plan_write(resolved, values[name])
-                _check_same(plan, plans.setdefault(plan.wanted.name, plan))
-                plans[name] = plan
+                plan = _plan_write(answer, values[name])
+                _check_same_value(plan, first_plans.setdefault(plan.to_send.name, plan))
+                plans.append(plan)
             except InvalidArgument as error:
                 if is_first:
                     raise
                 errors[name] = error
-        return [plan for name, plan in plans.items() if name == plan.found.requested], errors
+        return plans, errors
 
     def _result(self, plan: _PlannedWrite, answers: Mapping[str, ParameterAnswer]) -> ParameterWrite:
-        name, requested, answer = plan.found.requested, plan.requested, answers[plan.wanted.name]
-        outcome = outcome_of(plan.wanted, plan.before, answer)
-        if not isinstance(outcome, str) or not isinstance(answer, Parameter):
-            error = outcome if isinstance(outcome, AerokitError) else ParameterRejected(name, name=name)
-            return failed(name, requested, plan.found.as_requested(plan.before), error)
-        written = plan.found.as_requested(answer)
-        notes = (plan.found.note, self._note_of(plan.wanted.name, answer.value))
+        name, requested, answer = plan.resolved.requested, plan.requested, answers[plan.to_send.name]
+        outcome = outcome_of(plan.to_send, plan.old, answer)
+        if isinstance(outcome, AerokitError):
+            return _failed_write(name, requested, plan.resolved.as_requested(plan.old), outcome)
+        assert isinstance(answer, Parameter)  # For all other answers, the outcome is an error.
+        written = plan.resolved.as_requested(answer)
+        notes = (plan.resolved.note, self._note_of(plan.to_send.name, answer.value))
         note = "; ".join(filter(None, notes))
         return ParameterWrite(name, requested, written.value, written.type, outcome, note)
 
 
-def _plan_write(found: ResolvedParameter, value: int | float) -> _PlannedWrite:
-    on_vehicle = found.parameter
-    checked = checked_value(found.name, found.to_vehicle(value), on_vehicle.type)
-    return _PlannedWrite(found, value, Parameter(found.name, checked, on_vehicle.type), on_vehicle)
+def _plan_write(resolved: ResolvedParameter, value: int | float) -> _PlannedWrite:
+    kind = resolved.parameter.type
+    checked = checked_value(resolved.name, resolved.to_vehicle(value), kind)
+    return _PlannedWrite(resolved, value, Parameter(resolved.name, checked, kind))
 
 
-def _check_same(one: _PlannedWrite, other: _PlannedWrite) -> None:
-    if not same_value(one.wanted.value, other.wanted.value):
+def _check_same_value(plan: _PlannedWrite, first: _PlannedWrite) -> None:
+    """Raise InvalidArgument if the first plan for the same parameter has another value."""
+    if not same_value(plan.to_send.value, first.to_send.value):
         raise InvalidArgument(
-            f"{one.found.requested} = {one.requested:g} and {other.found.requested} = {other.requested:g} contradict:"
-            f" both names mean {one.wanted.name} on this vehicle"
+            f"{plan.resolved.requested} = {plan.requested:g} and {first.resolved.requested} = {first.requested:g}"
+            f" contradict: both names mean {plan.to_send.name} on this vehicle"
         )
 
 

@@ -74,8 +74,8 @@ class Caster:
         except ValueError:  # The text of this error may contain the password.
             parts, host, port = urlsplit(""), None, None
         mount = unquote(parts.path[1:])
-        is_printable = mount.isascii() and mount.isprintable() and "/" not in mount and " " not in mount
-        if not host or not mount or not is_printable or parts.scheme not in ("ntrip", "ntrips") or port == 0:
+        is_mount_valid = mount.isascii() and mount.isprintable() and "/" not in mount and " " not in mount
+        if not host or not mount or not is_mount_valid or parts.scheme not in ("ntrip", "ntrips") or port == 0:
             raise InvalidArgument(
                 "url is not allowed (it is not shown, because it may contain a password):"
                 " ntrip://user:password@host:2101/MOUNT, with %40 for an @ in the password"
@@ -100,7 +100,8 @@ class Caster:
         return "\r\n".join((*lines, "", "")).encode()
 
     def __repr__(self) -> str:
-        return f"ntrip{'s' * self.is_encrypted}://{self.host}:{self.port}/{self.mount}"
+        scheme = "ntrips" if self.is_encrypted else "ntrip"
+        return f"{scheme}://{self.host}:{self.port}/{self.mount}"
 
 
 class _Response:
@@ -108,7 +109,7 @@ class _Response:
 
     def __init__(self, reader: asyncio.StreamReader, status: str, headers: dict[str, str]) -> None:
         self._reader, self.status, self._headers = reader, status, headers
-        words = status.split()
+        words = status.split()  # "HTTP/1.1 200 OK", or in NTRIP 1 "ICY 200 OK", "SOURCETABLE 200 OK", "ERROR - text"
         self.code = words[1] if len(words) > 1 and words[0] != "ERROR" else ""
         self.is_table = words[:1] == ["SOURCETABLE"] or "sourcetable" in headers.get("content-type", "")
         self.is_stream = self.code == "200" and not self.is_table
@@ -166,7 +167,7 @@ class NtripClient:
         self._session, self._send, self._caster, self._timeout = session, send, caster, timeout
         self._sends_position = send_position
         self._name = f"NTRIP {caster!r}"
-        self._work, self._ended = Cancellation(), asyncio.Event()
+        self._cancellation, self._ended = Cancellation(), asyncio.Event()
         self._was_entered = False
         self._writer: asyncio.StreamWriter | None = None
         self._problem = ""
@@ -210,7 +211,7 @@ class NtripClient:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        self._work.cancel()
+        self._cancellation.cancel()
         writer = self._writer
         self._close()
         await run_shielded(self._wait_closed(writer))
@@ -226,7 +227,7 @@ class NtripClient:
     async def _run(self, response: _Response) -> None:
         """Forward corrections, and reconnect when necessary, until the block ends."""
         try:
-            with self._work:
+            with self._cancellation:
                 await self._forward(response)
                 pause_s = MIN_RETRY_S
                 while True:
@@ -253,7 +254,7 @@ class NtripClient:
         """Send the corrections from one connection to the vehicle; return the number of messages."""
         reader, count = RtcmReader(), 0
         reason = "the caster closed the connection"
-        reports = asyncio.ensure_future(self._report_position()) if self._sends_position else None
+        position_task = asyncio.ensure_future(self._report_position()) if self._sends_position else None
         body = response.body()
         try:
             while True:
@@ -266,14 +267,14 @@ class NtripClient:
                         self._oversized += 1
         except asyncio.TimeoutError:
             reason = f"no data for {MAX_SILENCE_S:g} s"
-        except StopAsyncIteration:
+        except StopAsyncIteration:  # the end of the body
             pass
         except (OSError, ValueError, EOFError) as error:
             reason = f"the connection failed ({type(error).__name__})"
         finally:
-            if reports is not None:
-                reports.cancel()
-                await asyncio.gather(reports, return_exceptions=True)
+            if position_task is not None:
+                position_task.cancel()
+                await asyncio.gather(position_task, return_exceptions=True)
             self._close()
         self._report(f"{self._name}: {reason} after {count} messages")
         return count
@@ -289,13 +290,14 @@ class NtripClient:
         response = await self._request(mount)
         if response.is_stream:
             return response
-        names = await self._table(response) if response.is_table else {}
+        # A caster answers with its source table if it has no such mount point.
+        names = await self._read_source_table(response) if response.is_table else {}
         self._close()
         status = printable(response.status[:80]) or "an empty answer"
         reason = f"the caster answered {status!r}"
         if response.is_table or response.code == "404":
-            known = f"; it has {', '.join(sorted(names)[:20])}" if names else ""
-            reason = f"the caster has no mount point {mount!r}{known}"
+            available = f"; it has {', '.join(sorted(names)[:20])}" if names else ""
+            reason = f"the caster has no mount point {mount!r}{available}"
         elif response.code in ("401", "403") or "password" in status.lower():
             reason = f"the caster refused the user or the password ({status})"
         raise OperationRejected(f"{self._name}: {reason}")
@@ -306,9 +308,8 @@ class NtripClient:
 
         async def exchange() -> _Response:
             reader, self._writer = await open_connection(caster.host, caster.port, ssl=context)
-            self._writer.write(
-                caster.request(mount, gga_sentence(self._session) if mount and self._sends_position else None)
-            )
+            position = gga_sentence(self._session) if mount and self._sends_position else None
+            self._writer.write(caster.request(mount, position))
             return await _Response.read(reader)
 
         try:
@@ -325,11 +326,11 @@ class NtripClient:
         """Return True if the source table says that the mount point needs the position (GGA)."""
         try:
             response = await self._request("")
-            return (await self._table(response)).get(self._caster.mount, False)
+            return (await self._read_source_table(response)).get(self._caster.mount, False)
         finally:
             self._close()
 
-    async def _table(self, response: _Response) -> dict[str, bool]:
+    async def _read_source_table(self, response: _Response) -> dict[str, bool]:
         """Read a source table: map each mount point to True if it needs the position (field ``nmea``)."""
         text = b""
         with suppress(OSError, ValueError, EOFError, asyncio.TimeoutError):
@@ -338,13 +339,15 @@ class NtripClient:
                 if b"ENDSOURCETABLE" in data or len(text) > MAX_TABLE_SIZE:
                     break
         rows = [line.split(";") for line in text.decode("latin-1").splitlines() if line.startswith("STR;")]
-        return {printable(row[1]): row[11:12] == ["1"] for row in rows if len(row) > 1}
+        return {printable(row[1]): len(row) > 11 and row[11] == "1" for row in rows if len(row) > 1}
 
     async def _report_position(self) -> None:
+        """Send the position to the caster every 10 s; while it is unknown, look for it every second."""
         with self._session.streaming("position", "gps"):
-            while (writer := self._writer) is not None:
-                if sentence := gga_sentence(self._session):
-                    writer.write(sentence)
+            while self._writer is not None:
+                sentence = gga_sentence(self._session)
+                if sentence:
+                    self._writer.write(sentence)
                 await anyio.sleep(POSITION_INTERVAL_S if sentence else POSITION_POLL_INTERVAL_S)
 
     def _close(self) -> None:
@@ -359,20 +362,24 @@ def gga_sentence(session: VehicleSession) -> bytes | None:
     place = cell.latest
     if place is None or cell.age > POSITION_MAX_AGE_S or place.altitude_amsl_m is None:
         return None
-    receiver = next(iter(session.telemetry.cells["gps"].latest or ()), None)
-    quality = QUALITIES.get(receiver.fix_type, 1) if receiver is not None else 1
-    satellites = (receiver.satellites if receiver is not None else None) or 4
-    clock = time.strftime("%H%M%S", time.gmtime(session.connection.unix_time()))
+    receivers = session.telemetry.cells["gps"].latest
+    quality, satellites = 1, 4  # A position needs four satellites at least.
+    if receivers:
+        quality = QUALITIES.get(receivers[0].fix_type, quality)
+        satellites = receivers[0].satellites or satellites
+    utc = time.strftime("%H%M%S", time.gmtime(session.connection.unix_time()))
+    latitude = f"{_format_angle(place.latitude_deg, 2)},{'S' if place.latitude_deg < 0 else 'N'}"
+    longitude = f"{_format_angle(place.longitude_deg, 3)},{'W' if place.longitude_deg < 0 else 'E'}"
+    # HDOP and the height of the geoid are mandatory, but casters use only the position: 1.0 and 0.0.
     fields = (
-        f"GPGGA,{clock}.00,{_angle(place.latitude_deg, 2)},{'NS'[place.latitude_deg < 0]},"
-        f"{_angle(place.longitude_deg, 3)},{'EW'[place.longitude_deg < 0]},{quality},{satellites:02d},1.0,"
-        f"{place.altitude_amsl_m:.1f},M,0.0,M,,"
+        f"GPGGA,{utc}.00,{latitude},{longitude},{quality},{satellites:02d},1.0,{place.altitude_amsl_m:.1f},M,0.0,M,,"
     )
-    return f"${fields}*{reduce(xor, fields.encode()):02X}\r\n".encode()
+    checksum = reduce(xor, fields.encode())
+    return f"${fields}*{checksum:02X}\r\n".encode()
 
 
-def _angle(degrees: float, digits: int) -> str:
+def _format_angle(degrees: float, digits: int) -> str:
     """Format an angle as degrees and minutes without a separator between them: 4723.86456."""
-    units = round(abs(degrees) * 60 * 100_000)
-    whole, rest = divmod(units, 60 * 100_000)
-    return f"{whole:0{digits}d}{rest // 100_000:02d}.{rest % 100_000:05d}"
+    whole_degrees, rest = divmod(round(abs(degrees) * 60 * 100_000), 60 * 100_000)
+    minutes, fraction = divmod(rest, 100_000)
+    return f"{whole_degrees:0{digits}d}{minutes:02d}.{fraction:05d}"

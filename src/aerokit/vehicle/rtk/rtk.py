@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 __all__ = ["Corrections", "Rtk"]
 
 BANDWIDTH_WINDOW_S = 10.0
-# If another vehicle passes an equal message on within this many seconds, it is the same message. A base station repeats
-# an equal message (1005, its position) after a second at the earliest.
+# If the program passes an equal message to another vehicle within this many seconds, it is the same message. A base
+# station repeats an equal message (1005, its position) after a second at the earliest.
 REPEAT_WINDOW_S = 0.9
 MAX_RECENT = 64
 
@@ -32,9 +32,11 @@ class _SentMessages:
     def __init__(self) -> None:
         self.sequence = 0
         self.recent: dict[bytes, tuple[float, set[int]]] = {}
-        """Maps each message to the time at which it was sent, and the ids of the objects that passed it on."""
+        """Maps each message to the time at which it was sent, and the ids of the `Rtk` objects that passed it on."""
 
 
+# Shared by the vehicles of a connection, because GPS_RTCM_DATA reaches all of them. Weak, so that an entry ends with
+# its connection.
 _SENT: WeakKeyDictionary[Connection, _SentMessages] = WeakKeyDictionary()
 
 
@@ -43,15 +45,17 @@ def send_rtcm(connection: Connection, message: bytes, sender: object) -> int:
 
     Sends nothing if another sender has just sent the same message. Returns the number of MAVLink messages sent.
     """
-    sent = _SENT.setdefault(connection, _SentMessages())
-    now, (at, senders) = connection.now(), sent.recent.get(message, (0.0, {id(sender)}))
-    if id(sender) not in senders and now - at < REPEAT_WINDOW_S:
-        senders.add(id(sender))
-        return 0
+    sent, now = _SENT.setdefault(connection, _SentMessages()), connection.now()
+    if message in sent.recent:
+        sent_at, sender_ids = sent.recent[message]
+        if id(sender) not in sender_ids and now - sent_at < REPEAT_WINDOW_S:
+            sender_ids.add(id(sender))
+            return 0
     pieces = fragments(message, sent.sequence)
     for piece in pieces:
         connection.send(piece)
     sent.sequence += 1
+    # Removed before it is stored, so that the dictionary has the newest message last, and the oldest can be dropped.
     sent.recent.pop(message, None)
     sent.recent[message] = (now, {id(sender)})
     if len(sent.recent) > MAX_RECENT:
@@ -85,9 +89,9 @@ class Rtk:
         self._corrections: StateCell[Corrections] = StateCell(
             "rtk.corrections", context.session.connection.now, "corrections by rtk.send or rtk.ntrip"
         )
-        self._session.keep(self._corrections)
+        self._session.register_cell(self._corrections)
         self._messages = self._bytes = 0
-        self._recent: deque[tuple[float, int]] = deque()
+        self._recent: deque[tuple[float, int]] = deque()  # time and size of each message in the window
 
     @property
     def corrections(self) -> StateCell[Corrections]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import CommandInt, CommandLong
     from aerokit.protocols.command import OrderStatus
 
-UNKNOWN = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavResult.COMMAND_UNSUPPORTED_MAV_FRAME)
+UNSUPPORTED_RESULTS = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavResult.COMMAND_UNSUPPORTED_MAV_FRAME)
 """MAV_RESULTs that mean that the firmware does not support the command, or does not support it in this message type."""
 # A command is not repeated before this many measured round trips, because its answer may still arrive.
 ROUND_TRIPS = 2
@@ -54,9 +54,10 @@ class CommandSender:
         self._acks_per_command = acks_per_command
         self._locks: defaultdict[_Key, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
-        # Maps a running command to the status of its order.
-        self._standings: dict[_Key, OrderStatus | None] = {}
-        self._under_way: dict[_Key, list[float]] = {}
+        # Maps each running command to the status of its order; None for a command without an order.
+        self._order_statuses: dict[_Key, OrderStatus | None] = {}
+        # For each ack of an earlier command that may still arrive: the time since which it is expected.
+        self._pending_acks: dict[_Key, list[float]] = {}
         self._results: dict[_Key, int] = {}
         self._accepted_at: dict[_Key, float] = {}
         self._is_closed = False
@@ -84,7 +85,10 @@ class CommandSender:
         order_status: OrderStatus | None = None,
         is_sent: bool = False,
     ) -> CommandAck:
-        """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`."""
+        """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`.
+
+        ``is_sent`` is True if `send_unconfirmed` has just sent the command, so that only repetitions are sent.
+        """
         target = self._component_id if component_id is None else component_id
         message = command_long(self._system_id, target, command, params)
         options = (attempts, attempt_timeout, progress_timeout, on_progress, order_status, is_sent)
@@ -126,33 +130,31 @@ class CommandSender:
                 command, *params, frame=MavFrame.GLOBAL_INT, x=x, y=y, z=z, order_status=order_status, **options
             )
         except CommandRejected as error:
-            is_known = error.result not in UNKNOWN
-            if is_known or (order_status is not None and order_status.end):
+            is_supported = error.result not in UNSUPPORTED_RESULTS
+            if is_supported or (order_status is not None and order_status.end):
                 raise
-        place = (x * 1e-7, y * 1e-7, z)
-        fill = (0.0,) * (4 - len(params))
-        return await self.send_long(command, *params, *fill, *place, order_status=order_status, **options)
+        # The place is param5 to param7 of a COMMAND_LONG, in degrees.
+        first_params = (*params, *(0.0,) * (4 - len(params)))
+        return await self.send_long(command, *first_params, x * 1e-7, y * 1e-7, z, order_status=order_status, **options)
 
     def send_unconfirmed(self, command: int, *params: float, component_id: int | None = None) -> None:
         """Send a COMMAND_LONG once without waiting, for code that must not await."""
         target = self._component_id if component_id is None else component_id
         self._connection.send(command_long(self._system_id, target, command, params))
-        self._expect_answers((target, command), self._acks_of(command))
+        self._expect_acks((target, command), self._acks_of(command))
 
     def is_for_us(self, ack: CommandAck) -> bool:
         """Return True if the ack is addressed to us. Targets are 0 in MAVLink 1 and in old firmware."""
-        return ack.target_system in (0, self._connection.source_system) and ack.target_component in (
-            0,
-            self._connection.source_component,
-        )
+        is_for_our_system = ack.target_system in (0, self._connection.source_system)
+        return is_for_our_system and ack.target_component in (0, self._connection.source_component)
 
     def last_result(self, command: int, component_id: int | None = None) -> int | None:
         """Return the last MAV_RESULT received for this command, even if the call that sent it was cancelled."""
         return self._results.get((self._component_id if component_id is None else component_id, command))
 
-    def is_unknown(self, command: int, component_id: int | None = None) -> bool:
-        """Return True if the vehicle's last answer to this command was one of `UNKNOWN`."""
-        return self.last_result(command, component_id) in UNKNOWN
+    def is_unsupported(self, command: int, component_id: int | None = None) -> bool:
+        """Return True if the vehicle's last answer to this command was one of `UNSUPPORTED_RESULTS`."""
+        return self.last_result(command, component_id) in UNSUPPORTED_RESULTS
 
     def accepted_at(self, command: int) -> float:
         """Return the time of the autopilot's last ACCEPTED ack that was addressed to us; −inf if there was none."""
@@ -178,70 +180,71 @@ class CommandSender:
         order_status: OrderStatus | None,
         is_sent: bool,
     ) -> CommandAck:
-        key = (
-            message.target_component or self._component_id,
-            message.command,
-        )  # For a command to all components, the autopilot's answer counts.
-        self._make_way(key)
-        end = "" if order_status is None else order_status.end
+        # For a command to all components (0), the autopilot's answer counts.
+        key = (message.target_component or self._component_id, message.command)
+        self._abort_if_ended(key)
+        end_before = "" if order_status is None else order_status.end
         async with self._locks[key]:
             if self._is_closed:
                 raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
-            # The order ended while the call waited for the lock.
-            if order_status is not None and order_status.end != end and not is_sent:
+            if order_status is not None and order_status.end != end_before and not is_sent:
+                # The order ended while the call waited for the lock.
                 raise CommandTimeout(f"{command_name(message.command)} was not sent: {order_status.end}")
             acks_per_sending = self._acks_of(message.command)
-            earlier = self._take_answers_under_way(key)
-            if is_sent:
-                del earlier[-acks_per_sending:]
+            pending_acks = self._pop_pending_acks(key)
+            if is_sent:  # `send_unconfirmed` has recorded the acks of this command as pending.
+                del pending_acks[-acks_per_sending:]
             exchange = CommandExchange(
                 message,
                 own_system=self._connection.source_system,
                 own_component=self._connection.source_component,
                 attempts=attempts,
                 attempt_timeout=attempt_timeout,
-                min_timeout_s=self._answers_within_s(),
+                min_timeout_s=self._min_attempt_timeout_s(),
                 progress_timeout=progress_timeout,
                 on_progress=on_progress,
-                earlier_answers=len(earlier),
+                earlier_answers=len(pending_acks),
                 acks_per_sending=acks_per_sending,
                 order_status=order_status,
                 is_sent=is_sent,
             )
             run = self._runs[key] = ExchangeRun(self._connection, exchange)
-            self._standings[key] = order_status
+            self._order_statuses[key] = order_status
             try:
                 return await run.result()
             except CommandTimeout as error:
                 raise CommandTimeout(f"{error}; {self._describe()}") from None
             finally:
-                del self._runs[key], self._standings[key]
-                self._expect_answers(key, exchange.pending_answers, earlier[exchange.answers :])
+                del self._runs[key], self._order_statuses[key]
+                self._expect_acks(key, exchange.pending_answers, pending_acks[exchange.answers :])
 
-    def _make_way(self, key: _Key) -> None:
+    def _abort_if_ended(self, key: _Key) -> None:
         """Abort the running command with this key if its order has ended, so that a newer command need not wait."""
-        order_status = self._standings.get(key)
+        order_status = self._order_statuses.get(key)
         if order_status is not None and order_status.end:
             text = f"no COMMAND_ACK for {command_name(key[1])} yet; not sent again: {order_status.end}"
             self._runs[key].abort(CommandTimeout(text))
 
-    def _answers_within_s(self) -> float:
-        """Return the minimum time to wait for an ack. It is limited, because a stalled link makes round trips look too
-        long.
+    def _min_attempt_timeout_s(self) -> float:
+        """Return the minimum time to wait for an ack.
+
+        It is limited, because round trips that were measured over a stalled link are too long.
         """
         return min(ROUND_TRIPS * (self._round_trip_s() or 0.0), MAX_ATTEMPT_TIMEOUT_S)
 
     def _acks_of(self, command: int) -> int:
+        """Return the number of acks that the vehicle sends for this command; PX4 sends two for some commands."""
         return self._acks_per_command.get(command, 1)
 
-    def _expect_answers(self, key: _Key, count: int, earlier: Sequence[float] = ()) -> None:
-        """Record acks that may still arrive, so that the next command with this key ignores them."""
-        if expected := [*earlier, *[self._connection.now()] * count]:
-            self._under_way.setdefault(key, []).extend(expected)
+    def _expect_acks(self, key: _Key, count: int, earlier_acks: Sequence[float] = ()) -> None:
+        """Record earlier acks, and ``count`` new ones, that may still arrive, so that the next command ignores them."""
+        if expected := [*earlier_acks, *[self._connection.now()] * count]:
+            self._pending_acks.setdefault(key, []).extend(expected)
 
-    def _take_answers_under_way(self, key: _Key) -> list[float]:
+    def _pop_pending_acks(self, key: _Key) -> list[float]:
+        """Return and forget the acks that may still arrive for this key; older ones are considered lost."""
         oldest = self._connection.now() - PENDING_ACK_TIMEOUT_S
-        return [at for at in self._under_way.pop(key, ()) if at >= oldest]
+        return [expected_since for expected_since in self._pending_acks.pop(key, ()) if expected_since >= oldest]
 
     def _abort(self, error: Exception) -> None:
         for run in tuple(self._runs.values()):
@@ -252,14 +255,17 @@ class CommandSender:
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         run = self._runs.get(key)
-        is_answer = (run is not None or key in self._under_way) and self.is_for_us(ack)
+        is_answer = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
         if is_answer and ack.result != MavResult.IN_PROGRESS:
             self._results[key] = ack.result
+            # An ack without a target may be for another ground station.
             if ack.result == MavResult.ACCEPTED and ack.target_system == self._connection.source_system:
                 self._accepted_at[key] = self._connection.now()
         if run is not None:
             run.receive(ack)
-        elif key in self._under_way and ack.result != MavResult.IN_PROGRESS:
-            self._under_way[key].pop(0)
-            if not self._under_way[key]:
-                del self._under_way[key]
+        elif (
+            key in self._pending_acks and ack.result != MavResult.IN_PROGRESS
+        ):  # After IN_PROGRESS, another ack is due.
+            self._pending_acks[key].pop(0)
+            if not self._pending_acks[key]:
+                del self._pending_acks[key]

@@ -36,7 +36,8 @@ from aerokit.mavlink.messages import (
     HomePosition,
 )
 from aerokit.vehicle.session.commands import CommandSender
-from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates, WatchedStream
+from aerokit.vehicle.session.rates import MessageRates
+from aerokit.vehicle.session.subscriber import ComponentSubscriber, WatchedStream
 from aerokit.vehicle.session.transfers import Transfers
 from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
 from aerokit.vehicle.state.field import MESSAGE_IDS
@@ -54,14 +55,17 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
 
 
+# Interval between requests for constants that are not known yet.
 RETRY_INTERVAL_S = 3.0
 
-EAGER_REQUESTS, EAGER_S = 4, 0.3
+# Number of the first requests for the version, and the interval between them.
+EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 
 
 async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
-    """Request version, home, origin and modes until they are known, and again after each reboot. Runs until the link
-    closes.
+    """Request version, home and origin until they are known, and again after each reboot; request the modes once.
+
+    Runs until the link closes.
     """
     has_requested_modes = False
     await _learn_version(commands, telemetry)
@@ -84,13 +88,13 @@ async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
     for _ in range(EAGER_REQUESTS):
         if version.is_known:
             return
-        await _request(commands, AutopilotVersion.ID, attempt_timeout=EAGER_S)
-        with anyio.move_on_after(EAGER_S):
+        await _request(commands, AutopilotVersion.ID, attempt_timeout=EAGER_INTERVAL_S)
+        with anyio.move_on_after(EAGER_INTERVAL_S):
             await version.wait_until(lambda _: True)
 
 
 async def _request(commands: CommandSender, message_id: int, *, attempt_timeout: float = 1.0) -> bool:
-    """Request one message once; return True if there was an ack, including a refusal."""
+    """Request one message, twice if necessary; return True if there was an ack, including a refusal."""
     try:
         await commands.send_long(MavCmd.REQUEST_MESSAGE, message_id, attempts=2, attempt_timeout=attempt_timeout)
     except CommandTimeout:
@@ -137,7 +141,7 @@ class VehicleSession:
             connection, self.commands, system_id, component_id, self.autopilot.stream_groups
         )
         self.subscriber: ComponentSubscriber = ComponentSubscriber(
-            connection, system_id, component_id, self.rates, keep=self.keep, at_close=self.at_close
+            connection, system_id, component_id, self.rates, register_cell=self.register_cell, at_close=self.at_close
         )
         self.watch: VehicleWatch = VehicleWatch(connection, system_id, component_id, self._on_reboot)
         self.link_watch: LinkWatch = LinkWatch(
@@ -172,8 +176,8 @@ class VehicleSession:
         self.telemetry.receive(heartbeat)
         for message_type, hz in (self.telemetry.default_rates if rates is None else rates).items():
             self.rates.request(message_type, hz, is_optional=rates is None)
-        for function in (self.rates.run, self.rates.watch, self._run_link_watch, self._learn_constants):
-            self.background.start(function, f"aerokit {function.__qualname__}")
+        for task in (self.rates.run, self.rates.watch, self._run_link_watch, self._learn_constants):
+            self.background.start(task, f"aerokit {task.__qualname__}")
 
     def close(self) -> None:
         """Stop sending and receiving; waiting calls raise ConnectionClosed."""
@@ -194,7 +198,7 @@ class VehicleSession:
             for function in functions:
                 function()
 
-    def keep(self, cell: StateCell[Any]) -> None:
+    def register_cell(self, cell: StateCell[Any]) -> None:
         """Close a cell with the session, and reset it when the vehicle reboots."""
         self._cells.append(cell)
         self.add_timeout_hint(cell)
@@ -240,8 +244,8 @@ class VehicleSession:
 
     async def wait_for_heartbeat(self, since: float | None = None) -> None:
         """Wait for a HEARTBEAT that is received after ``since``; None means from now on."""
-        armed, after = self.telemetry.armed, self.connection.now() if since is None else since
-        await armed.wait_until(lambda _: armed.updated_at > after, description="the next HEARTBEAT")
+        armed, start = self.telemetry.armed, self.connection.now() if since is None else since
+        await armed.wait_until(lambda _: armed.updated_at > start, description="the next HEARTBEAT")
 
     @contextmanager
     def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
@@ -250,8 +254,8 @@ class VehicleSession:
 
         def collect(ack: CommandAck) -> None:
             frame = ack.received_frame
-            is_its = frame is not None and frame.component_id == self.component_id
-            if ack.command != command or not is_its or not self.commands.is_for_us(ack):
+            is_from_autopilot = frame is not None and frame.component_id == self.component_id
+            if ack.command != command or not is_from_autopilot or not self.commands.is_for_us(ack):
                 return
             if ack.result == MavResult.ACCEPTED:
                 refusals.clear()
@@ -279,7 +283,7 @@ class VehicleSession:
             if text.severity <= MavSeverity.WARNING or self.autopilot.is_refusal(text.text)
         ]
         return CommandRejected(
-            str(error).partition("\n")[0],
+            str(error).partition("\n")[0],  # without the list of reasons, which the constructor adds again
             command=error.command,
             result=error.result,
             reasons=self.deduplicate_reasons(*error.reasons, *texts, *reasons),
@@ -327,42 +331,47 @@ class VehicleSession:
             if message_type is None:
                 continue
             if message_id in streams:
-                detach = bus.attach_lazily(message_type, streams[message_id].take, system_id=self.system_id)
+                detach = bus.attach_lazily(message_type, streams[message_id].receive, system_id=self.system_id)
             else:
                 detach = bus.attach(message_type, handler, system_id=self.system_id)
             self._detach.append(detach)
         telemetry, publish = self.telemetry, self.publish
-        self._request_watched()
+        self._attach_watched_streams()
         self.add_timeout_hint(*telemetry.cells.values(), self.link_quality, self.watch.link_state)
         self._detach += [
-            telemetry.mode.observe(lambda old, new: publish(ModeChanged, old and old.name, new.name)),
-            telemetry.armed.observe(lambda _, new: publish(ArmedChanged, new)),
-            telemetry.landed_state.observe(lambda old, new: publish(LandedStateChanged, old, new)),
+            telemetry.mode.observe(
+                lambda before, mode: publish(ModeChanged, None if before is None else before.name, mode.name)
+            ),
+            telemetry.armed.observe(lambda _, armed: publish(ArmedChanged, armed)),
+            telemetry.landed_state.observe(lambda before, after: publish(LandedStateChanged, before, after)),
             telemetry.status_text.observe(
-                lambda _, new: publish(StatusTextReceived, new.severity, new.text), every_arrival=True
+                lambda _, text: publish(StatusTextReceived, text.severity, text.text), every_arrival=True
             ),
             bus.attach_event(LinkRestored, lambda _: self.rates.request_again()),
-            bus.attach_event(LinkSelected, self._on_link_chosen),
+            bus.attach_event(LinkSelected, self._on_link_selected),
             bus.attach_event(ComputerSlept, self._on_computer_slept),
             self.connection.on_end(self._on_end),
         ]
 
-    def _request_watched(self) -> None:
-        """Request messages that have no default rate while one of their cells is watched."""
+    def _attach_watched_streams(self) -> None:
+        """For each message without a default rate: request it while one of its cells is watched."""
         for name, state in STATES.items():
             cell = self.telemetry.cells[name]
             for source in state.sources:
-                kind = self.connection.bus.dialect.get(MESSAGE_IDS[source.message])
-                if source.watched_hz is not None and kind is not None and self.autopilot.sends(kind):
-                    request = partial(self.rates.request, kind, source.watched_hz, is_optional=True)
+                message_type = self.connection.bus.dialect.get(MESSAGE_IDS[source.message])
+                if source.watched_hz is None or message_type is None:
+                    continue
+                if self.autopilot.sends(message_type):
+                    request = partial(self.rates.request, message_type, source.watched_hz, is_optional=True)
                     cell._feed_from(*cell._feeds, WatchedStream(cell, request))
 
-    def _on_link_chosen(self, event: LinkSelected) -> None:
+    def _on_link_selected(self, event: LinkSelected) -> None:
         """Request all streams again, because an autopilot keeps separate rates for each of its ports."""
         if event.system_id == self.system_id and event.before is not None:
             self.rates.request_again()
 
     def _on_computer_slept(self, event: ComputerSlept) -> None:
+        """Add the time of the sleep to all ages, because the loop's clock stood still meanwhile."""
         self.watch.last_heartbeat_at -= event.seconds
         for cell in (*self.telemetry.cells.values(), *self._cells):
             cell._add_age(event.seconds)

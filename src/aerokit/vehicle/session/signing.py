@@ -6,28 +6,21 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.errors import (
-    NotSupported,
-    OperationTimeout,
-)
-from aerokit.mavlink.messages import (
-    SetupSigning,
-)
+from aerokit.errors import NotSupported, OperationTimeout
+from aerokit.mavlink.messages import SetupSigning
 
 if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
     from aerokit.vehicle.session.session import VehicleSession
 
 
-# HEARTBEAT is sent at this interval, and its signature shows whether the vehicle has accepted the key.
+# The vehicle sends HEARTBEAT at this interval, and its signature shows whether the vehicle has accepted the key.
 RETRY_INTERVAL_S = 1.0
 
-
+# The key in SETUP_SIGNING that removes the vehicle's key.
 NO_KEY = bytes(32)
 
-
-# The vehicle's initial timestamp must not be older than the frame that sets it, or its frames would be
-# rejected as replayed.
+# The time stamp of a signature counts units of 10 microseconds.
 TIMESTAMP_TICKS_PER_S = 100_000
 
 
@@ -35,25 +28,26 @@ async def set_up_signing(session: VehicleSession, signing: Signing | None, timeo
     """Implement :meth:`aerokit.Vehicle.setup_signing`."""
     _check_vehicle(session)
     connection, started = session.connection, session.connection.now()
-    with connection._gate.key_handover(signing, session.system_id, session.component_id) as taken:
+    with connection._gate.key_handover(signing, session.system_id, session.component_id) as has_accepted:
         with anyio.move_on_after(timeout):
-            while not taken.is_set():
+            while not has_accepted.is_set():
                 session.send(_message(session, signing))
                 with anyio.move_on_after(RETRY_INTERVAL_S):
-                    await taken.wait()
+                    await has_accepted.wait()
                 connection.raise_if_ended()
-        if taken.is_set():
+        if has_accepted.is_set():
             return
     texts = "; ".join(session.texts_since(started)) or "no status text about it"
     if session.autopilot.signing_key_restriction:
         texts += f"; {session.autopilot.signing_key_restriction}"
-    wanted = "without a signature" if signing is None else f"signed with {signing.key!r}"
+    expected = "without a signature" if signing is None else f"signed with {signing.key!r}"
     raise OperationTimeout(
-        f"setup_signing: no frame {wanted} arrived within {timeout:g} s; {texts}; {session.describe_link()}"
+        f"setup_signing: no frame {expected} arrived within {timeout:g} s; {texts}; {session.describe_link()}"
     )
 
 
 def _check_vehicle(session: VehicleSession) -> None:
+    """Raise unless both sides use MAVLink 2 and the vehicle is disarmed."""
     heartbeat = session.connection.heartbeats.get((session.system_id, session.component_id))
     frame = None if heartbeat is None else heartbeat.received_frame
     if session.connection.mavlink_version == 1 or (frame is not None and frame.version == 1):
@@ -65,5 +59,7 @@ def _check_vehicle(session: VehicleSession) -> None:
 def _message(session: VehicleSession, signing: Signing | None) -> SetupSigning:
     if signing is None:
         return SetupSigning(session.system_id, session.component_id, NO_KEY, 0)
-    stamp = signing.timestamp_now(session.connection.unix_time()) + TIMESTAMP_TICKS_PER_S
-    return SetupSigning(session.system_id, session.component_id, signing.key.secret, stamp)
+    # The time stamp is a second ahead: if it were older than that of this frame, the frames that the vehicle signs from
+    # now on would be rejected as replayed.
+    timestamp = signing.timestamp_now(session.connection.unix_time()) + TIMESTAMP_TICKS_PER_S
+    return SetupSigning(session.system_id, session.component_id, signing.key.secret, timestamp)

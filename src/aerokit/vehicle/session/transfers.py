@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 
 ResultT = TypeVar("ResultT")
 
+# Seconds to wait for AUTOPILOT_VERSION, which has the capabilities.
 VERSION_TIMEOUT_S = 3.0
-IN_BACKGROUND_S = 5.0
+BACKGROUND_COMMAND_TIMEOUT_S = 5.0
 
 
 class Messaging(Protocol):
@@ -84,7 +85,7 @@ class Transfers:
         if self.is_closed:
             raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
         with self.limit(timeout):
-            self._measure_link()
+            self._init_round_trip()
             try:
                 result = await run_exchange(self.connection, self.system_id, exchange)
             except OperationTimeout as error:
@@ -99,8 +100,11 @@ class Transfers:
     def _explain(self, error: OperationTimeout) -> None:
         error.args = (f"{error}; {self._describe()}",)
 
-    def _measure_link(self) -> None:
-        seconds = self._round_trip_s() if self.round_trip.smoothed_s is None else None
+    def _init_round_trip(self) -> None:
+        """Use the round trip of TIMESYNC until a transfer has measured one."""
+        if self.round_trip.smoothed_s is not None:
+            return
+        seconds = self._round_trip_s()
         if seconds is not None:
             self.round_trip.add_sample(seconds)
 
@@ -110,7 +114,7 @@ class Transfers:
         try:
             with anyio.fail_after(timeout):
                 yield
-        except OperationTimeout:
+        except OperationTimeout:  # It was raised in the block, and is a TimeoutError, too.
             raise
         except TimeoutError:
             raise OperationTimeout(f"not done within {timeout:g} s; {self._describe()}") from None
@@ -119,13 +123,13 @@ class Transfers:
         """Send an optional command without waiting; a failure is ignored."""
         send = self._send_command
 
-        async def order() -> None:
+        async def send_command() -> None:
             if send is not None:
-                with suppress(AerokitError), anyio.move_on_after(IN_BACKGROUND_S):
+                with suppress(AerokitError), anyio.move_on_after(BACKGROUND_COMMAND_TIMEOUT_S):
                     await send(command, *params)
 
         if not self.is_closed:
-            self.background.start(order, "aerokit command of a transfer")
+            self.background.start(send_command, "aerokit command of a transfer")
 
     @property
     def version(self) -> AutopilotVersion | None:
@@ -140,6 +144,7 @@ class Transfers:
 
     async def capabilities(self) -> int | None:
         """Return the MAV_PROTOCOL_CAPABILITY bits of the autopilot; None if it does not send them within a few seconds.
+
         A component that does not answer is not asked again.
         """
         if not self._version.is_known and not self._is_version_unavailable:
@@ -147,6 +152,7 @@ class Transfers:
                 if self._request_version is not None:
                     await self._request_version()
                 await self._version.wait_until(lambda _: True)
+            # An autopilot's version may still arrive, because the session requests it again and again.
             self._is_version_unavailable = self._request_version is not None and not self._version.is_known
         version = self._version.latest
         return None if version is None else version.capabilities

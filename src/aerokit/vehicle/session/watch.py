@@ -11,7 +11,7 @@ import anyio
 
 from aerokit.connection.cells import StateCell
 from aerokit.connection.heartbeats import LinkStateTracker
-from aerokit.connection.loop_watch import CHECK_INTERVAL_S
+from aerokit.connection.loop_watch import BLOCKED_THRESHOLD_S, CHECK_INTERVAL_S
 from aerokit.errors import LinkLost
 from aerokit.events import (
     SILENT_AFTER_S,
@@ -36,8 +36,10 @@ if TYPE_CHECKING:
 REBOOT_STEP_MS = 3000
 # The decreased time must persist for this long and in at least two messages, because one message may be late.
 REBOOT_CONFIRM_S = 0.2
-# The same limit after an accepted reboot command. A boot takes longer than this; messages are delayed by less.
+# While a reboot is expected, a clock that is behind by more than this shows the reboot. A boot takes longer than this;
+# messages are delayed by less.
 MIN_REBOOT_STEP_MS = 2000
+# Seconds of reports from which the speed of a simulation's clock is computed; before that, it counts as real time.
 CLOCK_SPAN_S = 5.0
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
@@ -68,21 +70,25 @@ class VehicleWatch:
         self._state_watch.record_activity(connection.now())
         self._is_reported_silent = self._has_ended = False
         self.reboots = 0
-        self._times: dict[str, tuple[int, float]] = {}
+        # Per clock of the vehicle: its last time in milliseconds, and the time of the loop at which it was read.
+        self._last_times: dict[str, tuple[int, float]] = {}
+        # The first ``time_boot_ms`` since boot, and the time of the loop at which it was read.
         self._first_time: tuple[int, float] | None = None
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
-        self._candidates: dict[str, tuple[int, float]] = {}
+        # Per clock: a decreased time that shows a reboot if the next messages confirm it, and when it was read.
+        self._decreased_times: dict[str, tuple[int, float]] = {}
         self._expects_reboot = False
+        # The time of the loop at which the last TIMESYNC answer arrived, and the vehicle's time in it.
         self._last_answer = (-math.inf, 0)
         attach = connection.bus.attach
         self._detach: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
         attach_frames = connection.bus.attach_frames
-        for message_type, take in (
+        for message_type, handler in (
             (Attitude, self._on_boot_time),
             (GlobalPositionInt, self._on_boot_time),
             (SystemTime, self._on_system_time),
         ):
-            self._detach.append(attach_frames(message_type, take, system_id=system_id))
+            self._detach.append(attach_frames(message_type, handler, system_id=system_id))
         self._detach.append(attach(Timesync, self._on_timesync, system_id=system_id))
         self._detach.append(connection.bus.attach_event(LinkInterrupted, self._on_link_interrupted))
 
@@ -113,16 +119,16 @@ class VehicleWatch:
             detach()
 
     def boot_time_ms(self, now: float) -> float | None:
-        """Return the vehicle's time since boot at ``now``, extrapolated from the last message that had it; None if
-        unknown.
+        """Return the vehicle's time since boot at ``now``, extrapolated from the last report; None if unknown.
 
         The speed of a simulation is taken into account.
         """
-        if "time_boot_ms" not in self._times or self._first_time is None:
+        if "time_boot_ms" not in self._last_times or self._first_time is None:
             return None
-        (last, at), (first, since) = self._times["time_boot_ms"], self._first_time
-        speed = (last - first) / (at - since) if at - since > CLOCK_SPAN_S else 1000.0
-        return last + speed * (now - at)
+        (last_ms, last_at), (first_ms, first_at) = self._last_times["time_boot_ms"], self._first_time
+        span_s = last_at - first_at
+        ms_per_second = (last_ms - first_ms) / span_s if span_s > CLOCK_SPAN_S else 1000.0
+        return last_ms + ms_per_second * (now - last_at)
 
     @contextmanager
     def expecting_reboot(self) -> Iterator[None]:
@@ -139,12 +145,12 @@ class VehicleWatch:
         If the request was sent after the previous answer had arrived, a lower time can only come from a reboot. A
         second message need not confirm it, even in a fast simulation.
         """
-        before_at, before = self._last_answer
-        if requested_at <= before_at:
+        answered_at, milliseconds_before = self._last_answer
+        if requested_at <= answered_at:
             return
         self._last_answer = (self._connection.now(), milliseconds)
-        if milliseconds < before:
-            self._has_rebooted("TIMESYNC", milliseconds)
+        if milliseconds < milliseconds_before:
+            self._on_reboot_detected("TIMESYNC", milliseconds)
 
     def check(self) -> None:
         """Publish VehicleSilent if heartbeats have stopped; called once a second."""
@@ -171,49 +177,50 @@ class VehicleWatch:
         self._state_watch.mark_lost(event.at)
 
     def _on_boot_time(self, frame: Frame) -> None:
-        """Read ``time_boot_ms`` at the start of the payload."""
+        """Read ``time_boot_ms`` at the start of the payload, which begins at byte 9 of ``body``."""
         if frame.component_id == self._component_id:
-            self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[9:13], "little"))
+            self._record_time(frame, "time_boot_ms", int.from_bytes(frame.body[9:13], "little"))
 
     def _on_system_time(self, frame: Frame) -> None:
-        """Read ``time_boot_ms``, which follows ``time_unix_usec`` in the payload."""
+        """Read ``time_boot_ms``, which follows the 8 bytes of ``time_unix_usec`` in the payload."""
         if frame.component_id == self._component_id:
-            self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
+            self._record_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
 
     def _on_timesync(self, message: Timesync) -> None:
         """Process answers to our TIMESYNC requests. A vehicle sends them even if it streams no messages."""
         frame = message.received_frame
         if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
-            self._note_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
+            self._record_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
 
-    def _note_time(self, frame: Frame, clock: str, milliseconds: int) -> None:
+    def _record_time(self, frame: Frame, clock: str, milliseconds: int) -> None:
+        """Detect a reboot from a time since boot in milliseconds, ``clock`` being the message or field that has it."""
         now = self._now()
-        before, then = self._times.get(clock, (milliseconds, now))
-        # This is a lower bound, because the earlier message may have been delayed as well.
-        late = 1000 * (frame.received_at - then) - (milliseconds - before)
-        if self._expects_reboot and late > MIN_REBOOT_STEP_MS:
-            self._has_rebooted(clock, milliseconds)
-        elif milliseconds + REBOOT_STEP_MS >= before:
-            self._times[clock] = (milliseconds, now)
+        milliseconds_before, read_at = self._last_times.get(clock, (milliseconds, now))
+        # How far the vehicle's clock is behind its expected time, or more if the earlier message was delayed.
+        behind_ms = 1000 * (frame.received_at - read_at) - (milliseconds - milliseconds_before)
+        if self._expects_reboot and behind_ms > MIN_REBOOT_STEP_MS:
+            self._on_reboot_detected(clock, milliseconds)
+        elif milliseconds + REBOOT_STEP_MS >= milliseconds_before:  # no reboot
+            self._last_times[clock] = (milliseconds, now)
             if self._first_time is None and clock == "time_boot_ms":
                 self._first_time = (milliseconds, now)
-            if self._candidates:
-                self._candidates.pop(clock, None)
-        elif self._is_confirmed(clock, milliseconds):
-            self._has_rebooted(clock, milliseconds)
+            if self._decreased_times:  # An earlier decrease came from a late message.
+                self._decreased_times.pop(clock, None)
+        elif self._is_decrease_confirmed(clock, milliseconds):
+            self._on_reboot_detected(clock, milliseconds)
 
-    def _is_confirmed(self, clock: str, milliseconds: int) -> bool:
+    def _is_decrease_confirmed(self, clock: str, milliseconds: int) -> bool:
         """Return True if the time has continued from its decreased value for ``REBOOT_CONFIRM_S``."""
         now = self._connection.now()
-        first, since = self._candidates.setdefault(clock, (milliseconds, now))
-        if milliseconds < first:
-            self._candidates[clock] = (milliseconds, now)
+        decreased_ms, decreased_at = self._decreased_times.setdefault(clock, (milliseconds, now))
+        if milliseconds < decreased_ms:
+            self._decreased_times[clock] = (milliseconds, now)
             return False
-        return milliseconds > first and now - since >= REBOOT_CONFIRM_S
+        return milliseconds > decreased_ms and now - decreased_at >= REBOOT_CONFIRM_S
 
-    def _has_rebooted(self, clock: str, milliseconds: int) -> None:
+    def _on_reboot_detected(self, clock: str, milliseconds: int) -> None:
         now = self._connection.now()
-        self._times, self._candidates, self._first_time = {clock: (milliseconds, now)}, {}, None
+        self._last_times, self._decreased_times, self._first_time = {clock: (milliseconds, now)}, {}, None
         self._expects_reboot, self._last_answer = False, (now, 0)
         self.reboots += 1
         self._on_reboot()
@@ -239,7 +246,7 @@ class LinkWatch:
         self._round_trip_s: float | None = None
         self._open_requests: deque[int] = deque(maxlen=MAX_OPEN_REQUESTS)
         self._next_request_at = connection.now()
-        self._before = self._count()
+        self._counts_before = self._count()
         self._detach = connection.bus.attach(Timesync, self._on_timesync, system_id=system_id)
 
     def close(self) -> None:
@@ -256,7 +263,11 @@ class LinkWatch:
         self.request_time()
         self._next_request_at = self._connection.now()  # The first report sends another request.
         while self._connection.is_open:
+            started = self._connection.now()
             await anyio.sleep(REPORT_PERIOD_S)
+            if self._connection.now() - started > REPORT_PERIOD_S + BLOCKED_THRESHOLD_S:
+                # The program was blocked. Heartbeats that arrived meanwhile may not have been read yet.
+                await anyio.sleep(CHECK_INTERVAL_S)
             if self._connection.is_open:
                 if self._connection.now() >= self._next_request_at:
                     self.request_time()
@@ -271,10 +282,9 @@ class LinkWatch:
         self._connection.send(Timesync(0, self._open_requests[-1]), to=self._system_id)
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Process the autopilot's answer to our request. All other TIMESYNC messages are ignored.
+        """Process the autopilot's answer to our request.
 
-        Another component of the vehicle, such as a companion computer, may answer before the autopilot; its answer is
-        ignored.
+        All other TIMESYNC messages are ignored, for example the answer of a companion computer to the same request.
         """
         frame = message.received_frame
         if frame is None or frame.component_id != self._component_id:
@@ -282,27 +292,31 @@ class LinkWatch:
         if message.tc1 != 0 and message.ts1 in self._open_requests:
             self._open_requests.remove(message.ts1)
             now = self._connection.now()
-            if now - frame.received_at < CHECK_INTERVAL_S:  # Otherwise this program delayed the answer.
+            # A longer time between arrival and processing is a delay of this program, not of the link.
+            if now - frame.received_at < CHECK_INTERVAL_S:
                 self._round_trip_s = now - message.ts1 / 1e9
             self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
 
     def _report(self) -> None:
-        at, (received, lost), total = count = self._count()
-        then, (received_before, lost_before), total_before = self._before
-        self._before = count
-        seconds = max(at - then, 1e-9)
+        """Publish the link's quality since the last report."""
+        counts, counts_before = self._count(), self._counts_before
+        self._counts_before = counts
+        now, (received, lost), total_bytes = counts
+        reported_at, (received_before, lost_before), total_bytes_before = counts_before
+        seconds = max(now - reported_at, 1e-9)
         frames, missing = max(0, received - received_before), max(0, lost - lost_before)
         report = LinkReport(
-            at,
+            now,
             self._system_id,
             100 * missing / (frames + missing) if frames + missing else None,
             self._round_trip_s,
             frames / seconds,
-            (total - total_before) / seconds,
+            (total_bytes - total_bytes_before) / seconds,
         )
         self._on_report(report)
         self._connection.bus.publish(report)
 
     def _count(self) -> tuple[float, tuple[int, int], int]:
-        total = sum(statistics.bytes for statistics in self._connection.statistics())
-        return self._connection.now(), self._connection.counts(self._system_id), total
+        """Return the time, the frames received from the vehicle and lost, and the bytes received on the link."""
+        total_bytes = sum(statistics.bytes for statistics in self._connection.statistics())
+        return self._connection.now(), self._connection.counts(self._system_id), total_bytes

@@ -16,7 +16,7 @@ from aerokit.mavlink.enums import (
     MavVtolState,
     MissionState,
 )
-from aerokit.vehicle.state.field import U16, Context, finite, member, unless
+from aerokit.vehicle.state.field import U16, Context, enum_member, finite, known
 
 if TYPE_CHECKING:
     from aerokit.mavlink import messages
@@ -45,7 +45,10 @@ __all__ = [
 ]
 
 SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "INFO", "DEBUG")
+# An earlier time (before September 2001) shows that the vehicle's clock is not set.
 EARLIEST_UNIX_S = 1_000_000_000
+# Flags of EKF_STATUS_REPORT and ESTIMATOR_STATUS, which have the same values.
+ATTITUDE, HORIZONTAL_VELOCITY, RELATIVE_POSITION, ABSOLUTE_POSITION, ALTITUDE = 1, 2, 8, 16, 32
 
 
 class SystemTime(Snapshot):
@@ -99,27 +102,27 @@ class EstimatorHealth(Snapshot):
     @property
     def has_attitude(self) -> bool:
         """True if the attitude estimate is good."""
-        return bool(self.flags & 1)
+        return bool(self.flags & ATTITUDE)
 
     @property
     def has_horizontal_velocity(self) -> bool:
         """True if the horizontal velocity estimate is good."""
-        return bool(self.flags & 2)
+        return bool(self.flags & HORIZONTAL_VELOCITY)
 
     @property
     def has_relative_position(self) -> bool:
         """True if the position relative to the starting point is good."""
-        return bool(self.flags & 8)
+        return bool(self.flags & RELATIVE_POSITION)
 
     @property
     def has_absolute_position(self) -> bool:
         """True if the global position estimate is good."""
-        return bool(self.flags & 16)
+        return bool(self.flags & ABSOLUTE_POSITION)
 
     @property
     def has_altitude(self) -> bool:
         """True if the altitude estimate is good."""
-        return bool(self.flags & 32)
+        return bool(self.flags & ALTITUDE)
 
 
 class MissionProgress(Snapshot):
@@ -159,6 +162,8 @@ def mode(message: messages.Heartbeat, context: Context) -> Mode:
 
 def current_mode(message: messages.CurrentMode, context: Context) -> Mode | None:
     """Return the flight mode in CURRENT_MODE. It arrives before the next HEARTBEAT, but lacks ``base_mode``."""
+    # A custom_mode of 0 is a mode or not set, so HEARTBEAT must report it. The mode also depends on base_mode, which is
+    # unknown before the first HEARTBEAT.
     if not message.custom_mode or context.before is None:
         return None
     return context.autopilot.mode(message.custom_mode, context.base_mode, context.mode_names)
@@ -171,19 +176,19 @@ def armed(message: messages.Heartbeat) -> bool:
 
 def system_status(message: messages.Heartbeat) -> int:
     """Return the MAV_STATE."""
-    return member(MavState, message.system_status)
+    return enum_member(MavState, message.system_status)
 
 
 def vtol_state(message: messages.ExtendedSysState) -> int:
     """Return the MAV_VTOL_STATE."""
-    return member(MavVtolState, message.vtol_state)
+    return enum_member(MavVtolState, message.vtol_state)
 
 
 def landed_state(message: messages.ExtendedSysState) -> int | None:
     """Return the MAV_LANDED_STATE."""
     if message.landed_state == MavLandedState.UNDEFINED:
         return None
-    return member(MavLandedState, message.landed_state)
+    return enum_member(MavLandedState, message.landed_state)
 
 
 def landed_state_of_heartbeat(message: messages.Heartbeat, context: Context) -> int | None:
@@ -203,22 +208,22 @@ def capabilities(message: messages.AutopilotVersion) -> int:
 
 
 def system_time(message: messages.SystemTime) -> SystemTime:
-    """Return time since boot, and UTC unless it is before 2000."""
+    """Return time since boot, and UTC if the vehicle's clock is set."""
     unix_s = message.time_unix_usec / 1e6
     return SystemTime(unix_s if unix_s > EARLIEST_UNIX_S else None, message.time_boot_ms / 1e3)
 
 
 def sensor_health(message: messages.SysStatus, context: Context) -> SensorHealth:
     """Return the sensor health. The meaning of the bits depends on the autopilot."""
-    bits = (
+    present_enabled_healthy = (
         message.onboard_control_sensors_present,
         message.onboard_control_sensors_enabled,
         message.onboard_control_sensors_health,
     )
     return SensorHealth(
-        *bits,
-        context.autopilot.failing_sensors(*bits),
-        context.autopilot.prearm_checks_pass(*bits),
+        *present_enabled_healthy,
+        context.autopilot.failing_sensors(*present_enabled_healthy),
+        context.autopilot.prearm_checks_pass(*present_enabled_healthy),
         message.load / 10,
     )
 
@@ -257,10 +262,10 @@ def estimator_health(message: messages.EstimatorStatus, context: Context) -> Est
 
 def mission_progress(message: messages.MissionCurrent) -> MissionProgress:
     """Return the mission progress. In the message, ``total`` is UINT16_MAX without a mission, and 0 if not reported."""
-    state = member(MissionState, message.mission_state)
+    state = enum_member(MissionState, message.mission_state)
     if message.total == U16:
         return MissionProgress(None, None, state)
-    return MissionProgress(unless(message.seq, U16), unless(message.total, 0), state)
+    return MissionProgress(known(message.seq, unknown=U16), known(message.total, unknown=0), state)
 
 
 def mission_reached(message: messages.MissionItemReached) -> int:

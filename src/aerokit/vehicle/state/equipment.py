@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.values import Snapshot
 from aerokit.mavlink.enums import GimbalDeviceFlags, GpsFixType, MavBatteryChargeState, MavPowerStatus
-from aerokit.vehicle.state.field import I16, U8, U16, Context, finite, member, scaled, unless
-from aerokit.vehicle.state.movement import place
+from aerokit.vehicle.state.field import I16, U8, U16, Context, divided, enum_member, finite, known
+from aerokit.vehicle.state.movement import valid_coordinates
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,8 +47,10 @@ _CHANNELS = attrgetter(*(f"chan{number}_raw" for number in range(1, 19)))
 
 _SERVOS = attrgetter(*(f"servo{number}_raw" for number in range(1, 17)))
 
+# GPS_RAW_INT.yaw has this value for north, because 0 means that it is unknown.
 NORTH_CDEG = 36000
 
+# MAV_SENSOR_ROTATION_PITCH_270.
 LOOKING_DOWN = 25
 
 GPS_FIX_TYPE_3D = 3
@@ -57,6 +59,7 @@ GPS_FIX_TYPE_3D = 3
 # last have this value.
 FULL_CELL = 0xFFFE
 
+# DISTANCE_SENSOR.signal_quality: 0 is unknown, 1 is an invalid reading.
 INVALID_QUALITY = 1
 
 OUTPUTS_PER_PORT = 16
@@ -162,77 +165,80 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
         message.orientation,
         message.min_distance / 100,
         message.max_distance / 100,
-        quality if quality > INVALID_QUALITY else None,
+        quality if quality > INVALID_QUALITY else None,  # 0 means "unknown"
     )
-    return _with(context.before, sensor, _id_of)
+    return _replaced(context.before, sensor, _id_of)
 
 
 def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
     """Return the downward sensor reported by ArduPilot's older message RANGEFINDER."""
-    return _with(context.before, RangeFinder(0, finite(message.distance), LOOKING_DOWN), _id_of)
+    return _replaced(context.before, RangeFinder(0, finite(message.distance), LOOKING_DOWN), _id_of)
 
 
 def first_gps(message: messages.GpsRawInt, context: Context) -> tuple[GpsReceiver, ...]:
     """Return the known receivers, with the first receiver replaced or added."""
-    return _with(context.before, _gps_receiver(message, 0), _index_of)
+    return _replaced(context.before, _gps_receiver(message, 0), _index_of)
 
 
 def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver, ...]:
     """Return the known receivers, with the second receiver replaced or added."""
-    return _with(context.before, _gps_receiver(message, 1), _index_of)
+    return _replaced(context.before, _gps_receiver(message, 1), _index_of)
 
 
 def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) -> GpsReceiver:
-    where = place(message.lat, message.lon) if message.fix_type >= GpsFixType.TYPE_2D_FIX else None
-    latitude, longitude = where or (None, None)
+    has_fix = message.fix_type >= GpsFixType.TYPE_2D_FIX
+    coordinates = valid_coordinates(message.lat, message.lon) if has_fix else None
+    latitude, longitude = coordinates or (None, None)
+    # A yaw of 0 means that the receiver reports none, U16 that it has none at present.
+    yaw_deg = None if message.yaw in (0, U16) else message.yaw % NORTH_CDEG / 100
     return GpsReceiver(
         index,
-        member(GpsFixType, message.fix_type),
-        unless(message.satellites_visible, U8),
-        scaled(message.eph, U16, 100),
-        scaled(message.epv, U16, 100),
+        enum_member(GpsFixType, message.fix_type),
+        known(message.satellites_visible, unknown=U8),
+        divided(message.eph, 100, unknown=U16),
+        divided(message.epv, 100, unknown=U16),
         latitude,
         longitude,
-        message.alt / 1e3 if where else None,
-        scaled(message.vel, U16, 100),
-        scaled(message.cog, U16, 100),
-        scaled(message.h_acc, 0, 1000),
-        scaled(message.v_acc, 0, 1000),
-        scaled(message.vel_acc, 0, 1000),
-        None if message.yaw in (0, U16) else message.yaw % NORTH_CDEG / 100,
+        message.alt / 1e3 if coordinates else None,
+        divided(message.vel, 100, unknown=U16),
+        divided(message.cog, 100, unknown=U16),
+        divided(message.h_acc, 1000, unknown=0),
+        divided(message.v_acc, 1000, unknown=0),
+        divided(message.vel_acc, 1000, unknown=0),
+        yaw_deg,
     )
 
 
 def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Battery, ...]:
-    """Return the known batteries with the battery of this message replaced or added. In the message, 0 means that a
-    cell from 11 to 14 is absent.
-    """
-    cells = [mv for mv in message.voltages if mv != U16]
-    cells += [mv for mv in message.voltages_ext if mv not in (0, U16)]
-    is_pack = len(cells) == 1 or FULL_CELL in cells
+    """Return the known batteries with the battery of this message replaced or added."""
+    cells_mv = [millivolts for millivolts in message.voltages if millivolts != U16]
+    # 0 means that a cell from 11 to 14 is absent, because these fields are an extension of the message.
+    cells_mv += [millivolts for millivolts in message.voltages_ext if millivolts not in (0, U16)]
+    # A battery whose cells are not measured reports its total voltage as one "cell", or as several; see FULL_CELL.
+    is_only_total = len(cells_mv) == 1 or FULL_CELL in cells_mv
     battery = Battery(
         message.id,
-        sum(cells) / 1e3 if cells else None,
+        sum(cells_mv) / 1e3 if cells_mv else None,
         current(message.current_battery, context.autopilot),
-        unless(message.battery_remaining, -1),
-        () if is_pack else tuple(mv / 1e3 for mv in cells),
-        scaled(message.temperature, I16, 100),
+        known(message.battery_remaining, unknown=-1),
+        () if is_only_total else tuple(millivolts / 1e3 for millivolts in cells_mv),
+        divided(message.temperature, 100, unknown=I16),
         message.current_consumed if message.current_consumed >= 0 else None,
         message.energy_consumed / 36 if message.energy_consumed >= 0 else None,
-        unless(message.time_remaining, 0),
-        member(MavBatteryChargeState, message.charge_state),
+        known(message.time_remaining, unknown=0),
+        enum_member(MavBatteryChargeState, message.charge_state),
     )
-    return _with(context.before, battery, _id_of)
+    return _replaced(context.before, battery, _id_of)
 
 
 def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery, ...] | None:
     """Return the first battery from SYS_STATUS; None if the message has no data about it."""
     voltage = None if message.voltage_battery in (0, U16) else message.voltage_battery / 1e3
-    remaining = unless(message.battery_remaining, -1)
+    remaining = known(message.battery_remaining, unknown=-1)
     if voltage is None and remaining is None:
         return None
     battery = Battery(0, voltage, current(message.current_battery, context.autopilot), remaining)
-    return _with(context.before, battery, _id_of)
+    return _replaced(context.before, battery, _id_of)
 
 
 def current(centiampere: int, autopilot: Autopilot) -> float | None:
@@ -242,24 +248,31 @@ def current(centiampere: int, autopilot: Autopilot) -> float | None:
 
 def power(message: messages.PowerStatus) -> Power:
     """Return the supply voltages; None for a 0 in the message, which means that the voltage is not measured."""
-    return Power(scaled(message.Vcc, 0, 1000), scaled(message.Vservo, 0, 1000), member(MavPowerStatus, message.flags))
+    return Power(
+        divided(message.Vcc, 1000, unknown=0),
+        divided(message.Vservo, 1000, unknown=0),
+        enum_member(MavPowerStatus, message.flags),
+    )
 
 
 def rc_channels(message: messages.RcChannels) -> RcChannels:
     """Return the channels that the receiver has."""
     count = min(message.chancount, 18)
     channels = _CHANNELS(message)[:count]
-    return RcChannels(tuple([None if us == U16 else us for us in channels]), unless(message.rssi, U8))
+    return RcChannels(
+        tuple([known(channel_us, unknown=U16) for channel_us in channels]), known(message.rssi, unknown=U8)
+    )
 
 
 def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOutputs:
     """Return the known outputs with the sixteen outputs of the message's port (eight in MAVLink 1) replaced."""
     frame = message.received_frame
-    outputs: tuple[int, ...] = _SERVOS(message)[: 8 if frame is not None and frame.version == 1 else 16]
-    before: tuple[int, ...] = () if context.before is None else context.before.outputs_us
-    begin = message.port * OUTPUTS_PER_PORT
-    head = (*before[:begin], *(0,) * (begin - len(before)))
-    return ServoOutputs((*head, *outputs, *before[begin + len(outputs) :]))
+    count = 8 if frame is not None and frame.version == 1 else OUTPUTS_PER_PORT
+    outputs: tuple[int, ...] = _SERVOS(message)[:count]
+    known_outputs: tuple[int, ...] = () if context.before is None else context.before.outputs_us
+    first_index = message.port * OUTPUTS_PER_PORT
+    missing = (0,) * (first_index - len(known_outputs))  # outputs of earlier ports that were not received yet
+    return ServoOutputs((*known_outputs[:first_index], *missing, *outputs, *known_outputs[first_index + count :]))
 
 
 def vibration(message: messages.Vibration) -> Vibration:
@@ -268,10 +281,10 @@ def vibration(message: messages.Vibration) -> Vibration:
     return Vibration(message.vibration_x, message.vibration_y, message.vibration_z, clippings)
 
 
-def _with(items: tuple[Any, ...] | None, item: Any, key: Callable[[Any], int]) -> tuple[Any, ...]:
-    """Return the items sorted by key, with this item replaced or added."""
-    number = key(item)
-    return tuple(sorted((item, *(existing for existing in items or () if key(existing) != number)), key=key))
+def _replaced(items: tuple[Any, ...] | None, item: Any, key: Callable[[Any], int]) -> tuple[Any, ...]:
+    """Return the items sorted by key, with the item of the same key replaced, or added."""
+    other_items = (existing for existing in items or () if key(existing) != key(item))
+    return tuple(sorted((item, *other_items), key=key))
 
 
 def _id_of(item: Battery | RangeFinder) -> int:
@@ -288,8 +301,8 @@ YAW_IN_VEHICLE_FRAME = GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME.value
 
 YAW_IN_EARTH_FRAME = GimbalDeviceFlags.YAW_IN_EARTH_FRAME.value
 
-# If the sine of the pitch exceeds this, the camera points straight up or down, and roll and yaw have the same axis.
-STRAIGHT = 0.99999
+# If the sine of the pitch exceeds this, the camera points straight up or down.
+MIN_SINE_STRAIGHT = 0.99999
 
 
 class GimbalAttitude(Snapshot):
@@ -318,12 +331,12 @@ def from_orientation(message: MountOrientation, heading: float | None) -> Gimbal
     ``heading`` is the vehicle's heading in degrees; while it is unknown, ``yaw_deg`` is relative to the nose.
     """
     if message.yaw_absolute and math.isfinite(message.yaw_absolute):
-        yaw = _compass(message.yaw_absolute)
+        yaw = _rounded_to_360(message.yaw_absolute)
     elif heading is not None:
-        yaw = _compass(message.yaw + heading)
+        yaw = _rounded_to_360(message.yaw + heading)
     else:
-        yaw = _known(message.yaw)
-    return GimbalAttitude(_known(message.pitch), _known(message.roll), yaw, _turned(message.yaw))
+        yaw = _rounded(message.yaw)
+    return GimbalAttitude(_rounded(message.pitch), _rounded(message.roll), yaw, _rounded_to_180(message.yaw))
 
 
 def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> GimbalAttitude:
@@ -333,32 +346,41 @@ def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> G
     ``heading`` in degrees. While both are unknown, ``yaw_deg`` stays relative to the nose.
     """
     pitch, roll, yaw = _euler(message.q)
+    # Older gimbals send neither these flags nor ``delta_yaw``, which is an extension of the message.
     has_delta = message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME) and math.isfinite(message.delta_yaw)
     if has_delta and message.delta_yaw:  # PX4 also sends 0 when the difference is unknown.
-        nose: float | None = math.degrees(message.delta_yaw)
+        nose_deg: float | None = math.degrees(message.delta_yaw)
     else:
-        nose = heading
-    angles = (_known(pitch), _known(roll))
-    if not _is_from_nose(message.flags):
-        return GimbalAttitude(*angles, _compass(yaw), None if nose is None else _turned(yaw - nose))
-    from_north = _known(yaw) if nose is None else _compass(yaw + nose)
-    return GimbalAttitude(*angles, from_north, _turned(yaw))
+        nose_deg = heading
+    pitch_and_roll = (_rounded(pitch), _rounded(roll))
+    if _is_from_nose(message.flags):
+        yaw_from_north = _rounded(yaw) if nose_deg is None else _rounded_to_360(yaw + nose_deg)
+        return GimbalAttitude(*pitch_and_roll, yaw_from_north, _rounded_to_180(yaw))
+    yaw_from_nose = None if nose_deg is None else _rounded_to_180(yaw - nose_deg)
+    return GimbalAttitude(*pitch_and_roll, _rounded_to_360(yaw), yaw_from_nose)
 
 
 def _is_from_nose(flags: int) -> bool:
+    """Return True if the yaw is relative to the vehicle's nose, False if it is relative to north.
+
+    Gimbals that set none of the newer two flags tell by YAW_LOCK.
+    """
     if flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME):
         return not flags & YAW_IN_EARTH_FRAME
     return not flags & YAW_LOCK
 
 
-def _euler(q: tuple[float, ...]) -> tuple[float, float, float]:
-    """Return pitch, roll and yaw in degrees. If the camera points straight up or down, roll is 0."""
-    length = math.sqrt(sum(component * component for component in q))
+def _euler(quaternion: tuple[float, ...]) -> tuple[float, float, float]:
+    """Return pitch, roll and yaw in degrees; NaN for an invalid quaternion.
+
+    If the camera points straight up or down, roll and yaw have the same axis; roll is then 0.
+    """
+    length = math.sqrt(sum(component * component for component in quaternion))
     if not length > 0:
         return math.nan, math.nan, math.nan
-    w, x, y, z = (component / length for component in q)
-    sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
-    if abs(sine) > STRAIGHT:
+    w, x, y, z = (component / length for component in quaternion)
+    sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))  # of the pitch; rounding may exceed 1
+    if abs(sine) > MIN_SINE_STRAIGHT:
         return (
             math.degrees(math.asin(sine)),
             0.0,
@@ -369,14 +391,16 @@ def _euler(q: tuple[float, ...]) -> tuple[float, float, float]:
     return math.degrees(math.asin(sine)), math.degrees(roll), math.degrees(yaw)
 
 
-def _known(degrees: float) -> float | None:
-    """Round to hundredths of a degree, the resolution of MOUNT_STATUS."""
-    return round(degrees, 2) + 0.0 if math.isfinite(degrees) else None
+def _rounded(degrees: float) -> float | None:
+    """Round to hundredths of a degree, the resolution of MOUNT_STATUS; None for NaN."""
+    return round(degrees, 2) + 0.0 if math.isfinite(degrees) else None  # + 0.0 turns -0.0 into 0.0
 
 
-def _turned(degrees: float) -> float | None:
+def _rounded_to_180(degrees: float) -> float | None:
+    """Like :func:`_rounded`, for an angle from -180 to 180."""
     return round(math.remainder(degrees, 360.0), 2) + 0.0 if math.isfinite(degrees) else None
 
 
-def _compass(degrees: float) -> float | None:
+def _rounded_to_360(degrees: float) -> float | None:
+    """Like :func:`_rounded`, for an angle from 0 to below 360."""
     return round(degrees % 360.0, 2) % 360.0 if math.isfinite(degrees) else None

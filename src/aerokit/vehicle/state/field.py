@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MESSAGE_IDS = {row[0]: message_id for message_id, row in messages.INDEX.items()}
+MESSAGE_IDS = {class_name: message_id for message_id, (class_name, *_) in messages.INDEX.items()}
 """Maps the name of a message class to the message id, without importing the class."""
 
 
 def message_type(class_name: str) -> type[Message]:
     """Return the message class of this name."""
-    found: type[Message] = getattr(messages, class_name)
-    return found
+    message_class: type[Message] = getattr(messages, class_name)
+    return message_class
 
 
 class MessageSource(Generic[T]):
@@ -110,22 +110,20 @@ class StateField(Generic[T]):
 
     def requested_from(self, autopilot: Autopilot) -> list[type[Message]]:
         """Return the messages to request from this autopilot for this state."""
-        names = [source.message for source in self.sources[:1]] + [
-            source.message for source in self.sources if source.alternative
-        ]
-        return [kind for kind in map(message_type, names) if autopilot.sends(kind)]
+        best, *others = self.sources
+        names = [best.message, *(source.message for source in others if source.alternative)]
+        return [message_class for message_class in map(message_type, names) if autopilot.sends(message_class)]
 
     def waits_for(self, autopilot: Autopilot) -> str:
         """Return the messages that report the state, for error texts."""
         if self._waits_for:
             return self._waits_for
-        sent = " or ".join(kind.NAME for kind in self.requested_from(autopilot))
-        return sent or f"{message_type(self.sources[0].message).NAME}, which {autopilot.firmware} does not send,"
+        names = " or ".join(message_class.NAME for message_class in self.requested_from(autopilot))
+        return names or f"{message_type(self.sources[0].message).NAME}, which {autopilot.firmware} does not send,"
 
 
-U8, U16 = 0xFF, 0xFFFF
-
-I16 = 0x7FFF
+# The greatest value of an integer field, by which MAVLink often denotes "unknown".
+U8, U16, I16 = 0xFF, 0xFFFF, 0x7FFF
 
 
 class Context:
@@ -141,7 +139,7 @@ class Context:
         self.before: Any = None
 
 
-def member(enum: type[int], value: int) -> int:
+def enum_member(enum: type[int], value: int) -> int:
     """Return the enum's member, or the number itself if the enum does not contain it."""
     return enum._value2member_map_.get(value, value)  # type: ignore[attr-defined,no-any-return]
 
@@ -151,20 +149,21 @@ def finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def unless(value: int, unknown: int) -> int | None:
+def known(value: int, *, unknown: int) -> int | None:
     """Return the number; None if it equals ``unknown``."""
     return None if value == unknown else value
 
 
-def scaled(value: int, unknown: int, divisor: int) -> float | None:
-    """Return the number divided by ``divisor``; None if it equals ``unknown``."""
+def divided(value: int, divisor: int, *, unknown: int) -> float | None:
+    """Return the number divided by ``divisor``; None if the number equals ``unknown``."""
     return None if value == unknown else value / divisor
 
 
-# A frame whose values are not read is decoded after at most this many seconds, because the next frame replaces it and
-# may lack some of its values. Without a fix, for example, the position is missing.
+# Even if no value is read, a frame is decoded after at most this many seconds. The next frame replaces it, and may lack
+# some of its values: without a fix, for example, the position is missing.
 MAX_DECODE_DELAY_S = 5.0
 
+# Number of bytes before the payload in ``Frame.body``.
 _HEADER_LENGTH = 9
 
 
@@ -172,18 +171,19 @@ class StreamedMessage:
     """One message type of a vehicle's autopilot. Keeps the latest frame and decodes it on access.
 
     ``instance_at`` is the offset in the payload of the byte that distinguishes several instances; the latest frame of
-    each instance is kept. While one of ``cells`` has observers, each frame is decoded (``apply(frame, message)``) when
-    it arrives. Frames arrive in the event loop's thread; any thread may read. ``lock`` protects the state.
+    each instance is kept. ``apply(frame, message)`` decodes the frame, unless its message is given, and updates the
+    cells. While one of ``cells`` has observers, each frame is decoded when it arrives. Frames arrive in the event
+    loop's thread; any thread may read. ``lock`` protects the state.
     """
 
     __slots__ = (
         "_apply",
         "_cells",
         "_component_id",
+        "_decode_from",
+        "_instance_at",
         "_is_watched",
         "_lock",
-        "_look_at",
-        "_number_at",
         "pending",
     )
 
@@ -196,43 +196,45 @@ class StreamedMessage:
         lock: threading.RLock,
     ) -> None:
         self._component_id, self._cells, self._apply, self._lock = component_id, cells, apply, lock
-        self._number_at = None if instance_at is None else instance_at + _HEADER_LENGTH
-        self._look_at = -math.inf
+        self._instance_at = None if instance_at is None else instance_at + _HEADER_LENGTH
+        # The next frame that arrives from this time on is decoded at once.
+        self._decode_from = -math.inf
         self._is_watched = False
         self.pending: dict[int, Frame | Message] = {}
         """Frames that are not decoded yet, by instance."""
 
-    def take(self, frame: Frame, message: Message | None = None) -> None:
+    def receive(self, frame: Frame, message: Message | None = None) -> None:
         """Process a frame of the vehicle's system, and ``message`` if it is decoded. Ignore other components."""
         if frame.component_id != self._component_id:
             return
-        if self._is_watched or frame.received_at >= self._look_at:
-            self._look_at = frame.received_at + MAX_DECODE_DELAY_S
+        if self._is_watched or frame.received_at >= self._decode_from:
+            self._decode_from = frame.received_at + MAX_DECODE_DELAY_S
             # Observers must be called in the loop's thread, so another thread must not decode the frame.
             with self._lock:
                 if self.pending:
-                    self.catch_up()
+                    self.catch_up()  # Earlier frames must be applied first.
                 self._apply(frame, message)
             return
-        number, number_at = 0, self._number_at
-        if number_at is not None and len(frame.body) > number_at:
-            number = frame.body[number_at]
-        self.pending[number] = message or frame
+        instance, instance_at = 0, self._instance_at
+        # MAVLink 2 truncates zeros at the end of the payload, so a missing byte is 0.
+        if instance_at is not None and len(frame.body) > instance_at:
+            instance = frame.body[instance_at]
+        self.pending[instance] = message or frame
 
     def catch_up(self) -> None:
         """Decode the pending frames in the order of their arrival."""
         with self._lock:
-            waiting: list[tuple[Frame, Message | None]] = []
+            to_apply: list[tuple[Frame, Message | None]] = []
             # All frames are removed before the first one is decoded. A decoder may read the previous value, which calls
             # this function again.
             while self.pending:
-                came = self.pending.popitem()[1]
-                if isinstance(came, Frame):
-                    waiting.append((came, None))
-                elif came.received_frame is not None:
-                    waiting.append((came.received_frame, came))
-            waiting.sort(key=lambda entry: entry[0].received_at)
-            for frame, message in waiting:
+                _, pending = self.pending.popitem()
+                if isinstance(pending, Frame):
+                    to_apply.append((pending, None))
+                elif pending.received_frame is not None:
+                    to_apply.append((pending.received_frame, pending))
+            to_apply.sort(key=lambda frame_and_message: frame_and_message[0].received_at)
+            for frame, message in to_apply:
                 self._apply(frame, message)
 
     def watchers_changed(self) -> None:
@@ -243,4 +245,4 @@ class StreamedMessage:
         """Discard the pending frames."""
         with self._lock:
             self.pending.clear()
-            self._look_at = -math.inf
+            self._decode_from = -math.inf

@@ -8,18 +8,19 @@ from typing import TYPE_CHECKING
 from aerokit._internal.values import Snapshot
 from aerokit.mavlink.enums import AdsbAltitudeType, AdsbEmitterType, AdsbFlags, MavFrame, MavWinchStatusFlag
 from aerokit.position import Position
-from aerokit.vehicle.state.field import I16, Context, finite, member, scaled, unless
-from aerokit.vehicle.state.movement import place
+from aerokit.vehicle.state.field import I16, Context, divided, enum_member, finite, known
+from aerokit.vehicle.state.movement import valid_coordinates
 
 if TYPE_CHECKING:
     from aerokit.mavlink import messages
 
 __all__ = ["ActuatorControls", "AirPressure", "Aircraft", "Altitude", "Imu", "Odometry", "RawImu", "WinchStatus"]
 
+# Factors: thousandths of g to m/s², milligauss to microtesla, hectopascal to pascal, radians to degrees.
 MG_M_S2, MGAUSS_UT, HPA_PA, RAD_DEG = 9.80665e-3, 0.1, 100.0, math.degrees(1)
+# ALTITUDE.altitude_terrain below NO_TERRAIN_M means unknown, and so does a sensor temperature of 0.
 NO_TERRAIN_M, UNKNOWN_TEMPERATURE = -1000.0, 0
 MAX_AIRCRAFT = 64
-_F = AdsbFlags
 
 
 class Imu(Snapshot):
@@ -159,7 +160,7 @@ def scaled_imu(message: messages.ScaledImu) -> Imu:
         _scaled(MG_M_S2, message.xacc, message.yacc, message.zacc),
         _scaled(RAD_DEG / 1000, message.xgyro, message.ygyro, message.zgyro),
         _scaled(MGAUSS_UT, message.xmag, message.ymag, message.zmag),
-        scaled(message.temperature, UNKNOWN_TEMPERATURE, 100),
+        divided(message.temperature, 100, unknown=UNKNOWN_TEMPERATURE),
     )
 
 
@@ -168,26 +169,27 @@ def raw_imu(message: messages.RawImu) -> RawImu:
         (message.xacc, message.yacc, message.zacc),
         (message.xgyro, message.ygyro, message.zgyro),
         (message.xmag, message.ymag, message.zmag),
-        scaled(message.temperature, UNKNOWN_TEMPERATURE, 100),
+        divided(message.temperature, 100, unknown=UNKNOWN_TEMPERATURE),
     )
 
 
 def odometry(message: messages.Odometry) -> Odometry:
     w, x, y, z = message.q
     return Odometry(
-        member(MavFrame, message.frame_id),
-        member(MavFrame, message.child_frame_id),
+        enum_member(MavFrame, message.frame_id),
+        enum_member(MavFrame, message.child_frame_id),
         (message.x, message.y, message.z),
         (w, x, y, z),
         (message.vx, message.vy, message.vz),
         _scaled(RAD_DEG, message.rollspeed, message.pitchspeed, message.yawspeed),
         _covariance(message.pose_covariance),
         _covariance(message.velocity_covariance),
-        message.quality or None,
+        message.quality or None,  # 0 means "unknown"
     )
 
 
 def _covariance(values: tuple[float, ...]) -> tuple[float, ...] | None:
+    """Return the covariance; None if its first element is NaN, which means that all are unknown."""
     return None if math.isnan(values[0]) else tuple(values)
 
 
@@ -196,23 +198,24 @@ def air_pressure(message: messages.ScaledPressure) -> AirPressure:
         message.press_abs * HPA_PA,
         message.press_diff * HPA_PA,
         message.temperature / 100,
-        scaled(message.temperature_press_diff, UNKNOWN_TEMPERATURE, 100),
+        divided(message.temperature_press_diff, 100, unknown=UNKNOWN_TEMPERATURE),
     )
 
 
 def ground_truth(message: messages.HilStateQuaternion) -> Position | None:
     """Return the position in HIL_STATE_QUATERNION, the truth of PX4's simulation; None if it is invalid."""
-    where = place(message.lat, message.lon)
-    return where and Position(*where, message.alt / 1000)
+    coordinates = valid_coordinates(message.lat, message.lon)
+    return None if coordinates is None else Position(*coordinates, message.alt / 1000)
 
 
 def simulation_state(message: messages.SimState) -> Position | None:
     """Return the position in SIM_STATE, the truth of ArduPilot's simulation; None if it is invalid."""
     latitude, longitude = message.lat_int, message.lon_int
+    # Firmware that does not send the extension fields lat_int and lon_int sends less exact numbers.
     if not (latitude or longitude) and abs(message.lat) <= 90 and abs(message.lon) <= 180:
         latitude, longitude = round(message.lat * 1e7), round(message.lon * 1e7)
-    where, altitude = place(latitude, longitude), finite(message.alt)
-    return None if where is None or altitude is None else Position(*where, altitude)
+    coordinates, altitude_m = valid_coordinates(latitude, longitude), finite(message.alt)
+    return None if coordinates is None or altitude_m is None else Position(*coordinates, altitude_m)
 
 
 def altitude(message: messages.Altitude) -> Altitude:
@@ -237,19 +240,19 @@ def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft,
     def if_valid(flag: AdsbFlags, value: float) -> float | None:
         return value if message.flags & flag else None
 
-    others = [seen for seen in context.before or () if seen.icao != message.ICAO_address]
+    others = [other for other in context.before or () if other.icao != message.ICAO_address]
     reported = Aircraft(
         message.ICAO_address,
-        message.callsign.strip() if message.flags & _F.VALID_CALLSIGN else "",
-        if_valid(_F.VALID_COORDS, message.lat * 1e-7),
-        if_valid(_F.VALID_COORDS, message.lon * 1e-7),
-        if_valid(_F.VALID_ALTITUDE, message.altitude / 1000),
+        message.callsign.strip() if message.flags & AdsbFlags.VALID_CALLSIGN else "",
+        if_valid(AdsbFlags.VALID_COORDS, message.lat * 1e-7),
+        if_valid(AdsbFlags.VALID_COORDS, message.lon * 1e-7),
+        if_valid(AdsbFlags.VALID_ALTITUDE, message.altitude / 1000),
         message.altitude_type == AdsbAltitudeType.GEOMETRIC,
-        if_valid(_F.VALID_HEADING, message.heading / 100),
-        if_valid(_F.VALID_VELOCITY, message.hor_velocity / 100),
-        if_valid(_F.VALID_VELOCITY, message.ver_velocity / 100),
-        message.squawk if message.flags & _F.VALID_SQUAWK else None,
-        member(AdsbEmitterType, message.emitter_type),
+        if_valid(AdsbFlags.VALID_HEADING, message.heading / 100),
+        if_valid(AdsbFlags.VALID_VELOCITY, message.hor_velocity / 100),
+        if_valid(AdsbFlags.VALID_VELOCITY, message.ver_velocity / 100),
+        message.squawk if message.flags & AdsbFlags.VALID_SQUAWK else None,
+        enum_member(AdsbEmitterType, message.emitter_type),
         message.tslc,
     )
     return (*others[-(MAX_AIRCRAFT - 1) :], reported)
@@ -262,6 +265,6 @@ def winch(message: messages.WinchStatus) -> WinchStatus:
         finite(message.tension),
         finite(message.voltage),
         finite(message.current),
-        unless(message.temperature, I16),
+        known(message.temperature, unknown=I16),
         message.status,
     )

@@ -34,15 +34,16 @@ __all__ = [
     "local_position",
     "local_velocity",
     "origin",
-    "place",
     "position",
     "throttle_percent",
+    "valid_coordinates",
     "wind",
     "wind_of_covariance",
 ]
 
 # Positions within 0.01 degrees of 0°N 0°E are treated as missing.
 MIN_COORDINATE = 100_000
+# Two altitudes in GLOBAL_POSITION_INT that differ by at most this much count as equal.
 SAME_ALTITUDE_MM = 100
 
 
@@ -118,7 +119,7 @@ class Wind(Snapshot):
     down_m_s: float | None = None
 
 
-def place(latitude: int, longitude: int) -> tuple[float, float] | None:
+def valid_coordinates(latitude: int, longitude: int) -> tuple[float, float] | None:
     """Convert 1e-7 degrees to degrees; return None without a fix, and for a place that is not on earth.
 
     Without a fix, autopilots report 0, 0 or a place near 0, 0: ArduPlane was observed to dead-reckon from there.
@@ -135,16 +136,17 @@ def position(message: messages.GlobalPositionInt, context: Context) -> Position 
 
     Until home is set, ``relative_alt`` is the altitude above mean sea level, so the result has no relative altitude.
     """
-    where = place(message.lat, message.lon)
-    if where is None:
+    coordinates = valid_coordinates(message.lat, message.lon)
+    if coordinates is None:
         return None
-    is_known = context.home_is_known() or abs(message.relative_alt - message.alt) > SAME_ALTITUDE_MM
-    return Position(*where, message.alt / 1e3, message.relative_alt / 1e3 if is_known else None)
+    is_relative_to_home = context.home_is_known() or abs(message.relative_alt - message.alt) > SAME_ALTITUDE_MM
+    relative_m = message.relative_alt / 1e3 if is_relative_to_home else None
+    return Position(*coordinates, message.alt / 1e3, relative_m)
 
 
 def global_velocity(message: messages.GlobalPositionInt) -> Velocity | None:
     """Return the velocity over ground, None before the first fix."""
-    if place(message.lat, message.lon) is None:
+    if valid_coordinates(message.lat, message.lon) is None:
         return None
     return Velocity(message.vx / 100, message.vy / 100, message.vz / 100)
 
@@ -214,16 +216,16 @@ def attitude_of_quaternion(message: messages.AttitudeQuaternion) -> Attitude:
 
 def home(message: messages.HomePosition) -> Home | None:
     """Return the home position; None if its coordinates are invalid."""
-    where = place(message.latitude, message.longitude)
-    if where is None:
+    coordinates = valid_coordinates(message.latitude, message.longitude)
+    if coordinates is None:
         return None
-    return Home(*where, message.altitude / 1e3, finite(message.x), finite(message.y), finite(message.z))
+    return Home(*coordinates, message.altitude / 1e3, finite(message.x), finite(message.y), finite(message.z))
 
 
 def origin(message: messages.GpsGlobalOrigin) -> Position | None:
     """Return the origin of the local frame."""
-    where = place(message.latitude, message.longitude)
-    return None if where is None else Position(*where, message.altitude / 1e3)
+    coordinates = valid_coordinates(message.latitude, message.longitude)
+    return None if coordinates is None else Position(*coordinates, message.altitude / 1e3)
 
 
 def wind(message: messages.Wind) -> Wind:

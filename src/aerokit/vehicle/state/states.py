@@ -256,23 +256,23 @@ STATES: Mapping[str, StateField[Any]] = {
 """All declarations by name of the state."""
 
 
-def _by_message() -> dict[str, list[tuple[StateField[Any], MessageSource[Any]]]]:
-    found: dict[str, list[tuple[StateField[Any], MessageSource[Any]]]] = {}
+def _sources_by_message() -> dict[str, list[tuple[StateField[Any], MessageSource[Any]]]]:
+    by_message: dict[str, list[tuple[StateField[Any], MessageSource[Any]]]] = {}
     for field in STATES.values():
         for source in field.sources:
-            found.setdefault(source.message, []).append((field, source))
-    return found
+            by_message.setdefault(source.message, []).append((field, source))
+    return by_message
 
 
-SOURCES: Mapping[str, list[tuple[StateField[Any], MessageSource[Any]]]] = _by_message()
+SOURCES: Mapping[str, list[tuple[StateField[Any], MessageSource[Any]]]] = _sources_by_message()
 """Maps the name of a message class to the states that the message reports, each with its `MessageSource`."""
 
-LAZY = tuple(name for name, rows in SOURCES.items() if not any(field.eager for field, _ in rows))
+LAZY = tuple(name for name, sources in SOURCES.items() if not any(field.eager for field, _ in sources))
 """Message classes that are decoded only when one of their states is accessed."""
 
 DEFAULT_RATES_HZ: Mapping[str, float] = {
-    name: max(source.hz for _, source in rows if source.hz is not None)
-    for name, rows in SOURCES.items()
-    if any(source.hz is not None for _, source in rows)
+    name: max(source.hz for _, source in sources if source.hz is not None)
+    for name, sources in SOURCES.items()
+    if any(source.hz is not None for _, source in sources)
 }
 """Default rates in Hz by name of the message class."""

@@ -17,6 +17,7 @@ __all__ = ["StatusTextAssembler"]
 CHUNK_LENGTH = 50
 """Number of bytes of text in one STATUSTEXT."""
 CHUNK_TIMEOUT_S = 2.0
+"""Seconds to wait for the next chunk of a text."""
 MAX_RECENT_TEXTS = 64
 # Maximum number of chunks of one text. A longer text is invalid, and is passed on in parts.
 MAX_CHUNKS = 20
@@ -35,24 +36,24 @@ class StatusTextAssembler:
     """
 
     def __init__(self) -> None:
-        self._open: dict[tuple[_Sender, int], _OpenText] = {}
+        self._incomplete: dict[tuple[_Sender, int], _IncompleteText] = {}
         self._recent: deque[StatusText] = deque(maxlen=MAX_RECENT_TEXTS)
 
     def receive(self, message: Statustext, now: float) -> list[StatusText]:
         """Process one message and return the texts that are complete now."""
-        late = self.expire(now)
+        truncated_texts = self.expire(now)
         chunk = _bytes_of(message)
         if message.id == 0:
             texts = [StatusText(message.severity, _text(chunk), now)]
         else:
-            texts = list(self._take_chunk(message, chunk, now))
+            texts = list(self._add_chunk(message, chunk, now))
         self._recent.extend(texts)
-        return late + texts
+        return truncated_texts + texts
 
     def expire(self, now: float) -> list[StatusText]:
         """Return the incomplete texts whose next chunk has not arrived for two seconds."""
-        late = [key for key, text in self._open.items() if now - text.touched_at > CHUNK_TIMEOUT_S]
-        texts = [self._open.pop(key).cut(now) for key in late]
+        overdue = [key for key, text in self._incomplete.items() if now - text.last_chunk_at > CHUNK_TIMEOUT_S]
+        texts = [self._incomplete.pop(key).truncated(now) for key in overdue]
         self._recent.extend(texts)
         return texts
 
@@ -62,35 +63,37 @@ class StatusTextAssembler:
 
     def clear(self) -> None:
         """Discard incomplete and recent texts."""
-        self._open.clear()
+        self._incomplete.clear()
         self._recent.clear()
 
-    def _take_chunk(self, message: Statustext, chunk: bytes, now: float) -> Iterator[StatusText]:
+    def _add_chunk(self, message: Statustext, chunk: bytes, now: float) -> Iterator[StatusText]:
+        """Add a chunk to its text, and yield the texts that are complete or truncated now."""
         key = (_sender(message), message.id)
-        text = self._open.get(key)
+        text = self._incomplete.get(key)
         if text is not None and message.chunk_seq < text.next_seq:
             if message.chunk_seq == text.next_seq - 1 and text.last_chunk == chunk:
                 return  # The same chunk was already received by another link.
-            yield self._open.pop(key).cut(now)
+            # Another text with the same id has begun, so the end of this one was lost.
+            yield self._incomplete.pop(key).truncated(now)
             text = None
         if text is None:
-            text = self._open_text(key, message.severity)
+            text = self._begin_text(key, message.severity)
         text.add(message.chunk_seq, chunk, now)
         if len(chunk) < CHUNK_LENGTH or text.next_seq >= MAX_CHUNKS:
-            yield self._open.pop(key).whole(now)
+            yield self._incomplete.pop(key).complete(now)
 
-    def _open_text(self, key: tuple[_Sender, int], severity: int) -> _OpenText:
-        while len(self._open) >= MAX_OPEN:
-            del self._open[next(iter(self._open))]
-        text = self._open[key] = _OpenText(severity)
+    def _begin_text(self, key: tuple[_Sender, int], severity: int) -> _IncompleteText:
+        while len(self._incomplete) >= MAX_OPEN:
+            del self._incomplete[next(iter(self._incomplete))]  # the oldest
+        text = self._incomplete[key] = _IncompleteText(severity)
         return text
 
 
-class _OpenText:
+class _IncompleteText:
     """An incomplete text: the chunks of it that were received, at least one."""
 
     last_chunk: bytes
-    touched_at: float
+    last_chunk_at: float
 
     def __init__(self, severity: int) -> None:
         self.severity = severity
@@ -101,12 +104,12 @@ class _OpenText:
         if seq > self.next_seq:
             self._parts.append(ELLIPSIS.encode())
         self._parts.append(chunk)
-        self.next_seq, self.last_chunk, self.touched_at = seq + 1, chunk, now
+        self.next_seq, self.last_chunk, self.last_chunk_at = seq + 1, chunk, now
 
-    def whole(self, now: float) -> StatusText:
+    def complete(self, now: float) -> StatusText:
         return StatusText(self.severity, _text(b"".join(self._parts)), now)
 
-    def cut(self, now: float) -> StatusText:
+    def truncated(self, now: float) -> StatusText:
         return StatusText(self.severity, _text(b"".join(self._parts)) + ELLIPSIS, now)
 
 

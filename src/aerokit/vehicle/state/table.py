@@ -29,19 +29,16 @@ watched": only while your program waits for the state or follows its changes; re
 
 def documentation() -> dict[str, tuple[str, str]]:
     """Return type and documentation of each state by name, from the source."""
-    (body,) = (
-        node.body
-        for node in ast.parse(Path(states.__file__).read_text(encoding="utf-8")).body
-        if isinstance(node, ast.ClassDef)
-    )
-    found: dict[str, tuple[str, str]] = {}
-    for node, below in pairwise(body):
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
-            text = str(below.value.value) if is_text else ""  # type: ignore[attr-defined]
-            kind = ast.unparse(node.annotation).removeprefix("StateField[").removesuffix("]")
-            found[node.target.id] = (kind, text)
-    return found
+    module = ast.parse(Path(states.__file__).read_text(encoding="utf-8"))
+    (states_class,) = (node for node in module.body if isinstance(node, ast.ClassDef))
+    type_and_text: dict[str, tuple[str, str]] = {}
+    for declaration, next_node in pairwise(states_class.body):
+        if isinstance(declaration, ast.AnnAssign) and isinstance(declaration.target, ast.Name):
+            is_text = isinstance(next_node, ast.Expr) and isinstance(next_node.value, ast.Constant)
+            text = str(next_node.value.value) if is_text else ""  # type: ignore[attr-defined]
+            value_type = ast.unparse(declaration.annotation).removeprefix("StateField[").removesuffix("]")
+            type_and_text[declaration.target.id] = (value_type, text)
+    return type_and_text
 
 
 def rendered() -> str:
@@ -50,9 +47,9 @@ def rendered() -> str:
     return HEAD + "".join(_row(name, *texts[name], field) for name, field in states.STATES.items())
 
 
-def _row(name: str, kind: str, text: str, field: StateField[Any]) -> str:
+def _row(name: str, value_type: str, text: str, field: StateField[Any]) -> str:
     sources = ", ".join(f"{message_type(source.message).NAME}{_rate(source)}" for source in field.sources)
-    return f"| `{name}` | `{kind}` | {text.partition(' (')[0].rstrip('.')} | {sources} |\n"
+    return f"| `{name}` | `{value_type}` | {text.partition(' (')[0].rstrip('.')} | {sources} |\n"
 
 
 def _rate(source: MessageSource[Any]) -> str:

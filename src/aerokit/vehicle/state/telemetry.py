@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 # Seconds for which a fallback message is ignored after a better message.
 FALLBACK_DELAY_S = 2.0
+# Limit to the memory that a vehicle with invalid AVAILABLE_MODES can fill.
 MAX_MODE_NAMES = 256
 
 Handler = Callable[[Any, Source], None]
@@ -64,11 +65,11 @@ class Telemetry(States):
             for name, field in STATES.items()
         }
         handlers = {name: self._handler(name) for name in (*SOURCES, "AvailableModes")}
-        self._handlers = {MESSAGE_IDS[name]: self._entry(name, handler) for name, handler in handlers.items()}
-        self._streams = {MESSAGE_IDS[name]: self._streamed(name, handlers[name]) for name in LAZY}
+        self._handlers = {MESSAGE_IDS[name]: self._receiver(name, handler) for name, handler in handlers.items()}
+        self._streams = {MESSAGE_IDS[name]: self._streamed_message(name, handlers[name]) for name in LAZY}
         for cell_name, cell in self._cells.items():
-            feeding = (source.message for source in STATES[cell_name].sources if source.message in LAZY)
-            cell._feed_from(*(self._streams[MESSAGE_IDS[name]] for name in feeding))
+            lazy_messages = (source.message for source in STATES[cell_name].sources if source.message in LAZY)
+            cell._feed_from(*(self._streams[MESSAGE_IDS[name]] for name in lazy_messages))
 
     # ------------------------------------------------------------------------------- feeding
 
@@ -123,8 +124,8 @@ class Telemetry(States):
     @property
     def default_rates(self) -> Mapping[type[Message], float]:
         """Default rates in Hz by message class."""
-        known = {message_type(name): hz for name, hz in DEFAULT_RATES_HZ.items()}
-        return {message: hz for message, hz in known.items() if self.autopilot.sends(message)}
+        rates = {message_type(name): hz for name, hz in DEFAULT_RATES_HZ.items()}
+        return {message_class: hz for message_class, hz in rates.items() if self.autopilot.sends(message_class)}
 
     def required_messages(self, name: str) -> tuple[type[Message], ...]:
         """Return the messages to request for the cell of this name."""
@@ -174,48 +175,54 @@ class Telemetry(States):
     def _source(self, class_name: str) -> Source:
         return Source(self.system_id, self.component_id, message_type(class_name).NAME)
 
-    def _entry(self, class_name: str, handler: Handler) -> Callable[[Any], None]:
+    def _receiver(self, class_name: str, handler: Handler) -> Callable[[Any], None]:
+        """Return a function that passes messages to the handler, but only those of the vehicle's autopilot."""
         source = self._source(class_name)
 
-        def take(message: Message) -> None:
+        def on_message(message: Message) -> None:
             frame = message.received_frame
             if frame is None or self.accepts(frame):
                 with self._lock:
                     self._handle(handler, message, source, frame)
 
-        return take
+        return on_message
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
         """Process a message. Its values get the time at which its frame arrived, regardless of when it is decoded."""
-        before, self._arrived_at = self._arrived_at, None if frame is None else frame.received_at
+        # Calls may be nested: a handler may read a cell, and thereby decode another message.
+        outer_arrived_at = self._arrived_at
+        self._arrived_at = None if frame is None else frame.received_at
         try:
             handler(message, source)
         finally:
-            self._arrived_at = before
+            self._arrived_at = outer_arrived_at
 
     def _handler(self, class_name: str) -> Handler:
-        """Return the handler for a message class."""
-        by_itself: Mapping[str, Handler] = {
+        """Return the handler for a message class: it updates the state cells of all values in the message."""
+        special_handlers: Mapping[str, Handler] = {
             "AvailableModes": self._on_available_modes,
             "Statustext": self._on_status_text,
         }
-        if class_name in by_itself:
-            return by_itself[class_name]
-        handlers = [self._handler_for(self._cells[field.name], source) for field, source in SOURCES[class_name]]
+        if class_name in special_handlers:
+            return special_handlers[class_name]
+        updates = [self._cell_update(self._cells[field.name], source) for field, source in SOURCES[class_name]]
 
-        def handler(message: Any, source: Source) -> None:
-            for handler in handlers:
-                handler(message, source)
+        def update_all(message: Any, source: Source) -> None:
+            for update in updates:
+                update(message, source)
 
+        # A ground station or companion may send heartbeats with the autopilot's ids.
         def on_heartbeat(message: Any, source: Source) -> None:
             if self._is_of_autopilot(message):
-                handler(message, source)
+                update_all(message, source)
 
-        return on_heartbeat if class_name == "Heartbeat" else handlers[0] if len(handlers) == 1 else handler
+        if class_name == "Heartbeat":
+            return on_heartbeat
+        return updates[0] if len(updates) == 1 else update_all
 
-    def _handler_for(self, cell: StateCell[Any], by: MessageSource[Any]) -> Handler:
-        """Return the handler that updates one cell from one type of message. Decoded values of None are ignored."""
-        decode, context = by.decode, self._context
+    def _cell_update(self, cell: StateCell[Any], message_source: MessageSource[Any]) -> Handler:
+        """Return the function that updates one cell from one type of message. Decoded values of None are ignored."""
+        decode, context = message_source.decode, self._context
         assert decode is not None
 
         def update(message: Any, source: Source) -> None:
@@ -229,29 +236,31 @@ class Telemetry(States):
             if value is not None:
                 cell.set(value, source)
 
-        handler = update_with_context if by.needs_context else update
+        chosen_update = update_with_context if message_source.needs_context else update
 
-        def update_unless_better(message: Any, source: Source) -> None:
-            if not self._has_better(cell, source):
-                handler(message, source)
+        def update_as_fallback(message: Any, source: Source) -> None:
+            if not self._has_recent_better_value(cell, source):
+                chosen_update(message, source)
 
-        return update_unless_better if by.fallback else handler
+        return update_as_fallback if message_source.fallback else chosen_update
 
-    def _streamed(self, class_name: str, handler: Handler) -> StreamedMessage:
-        source, kind = self._source(class_name), message_type(class_name)
-        decode = decoder_of(kind)
+    def _streamed_message(self, class_name: str, handler: Handler) -> StreamedMessage:
+        """Return the object that keeps the frames of a message class, and decodes them when a cell is accessed."""
+        source, message_class = self._source(class_name), message_type(class_name)
+        decode = decoder_of(message_class)
 
         def apply(frame: Frame, message: Message | None) -> None:
             decoded = decode(frame.body, frame) if message is None else message
             self._handle(handler, decoded, source, frame)
 
-        rows = SOURCES[class_name]
-        cells = [self._cells[field.name] for field, _ in rows]
-        instance_field = next((source.instance_field for _, source in rows if source.instance_field is not None), None)
-        instance_at = None if instance_field is None else offset_of(kind, instance_field)
+        fields_and_sources = SOURCES[class_name]
+        cells = [self._cells[field.name] for field, _ in fields_and_sources]
+        instance_fields = (message_source.instance_field for _, message_source in fields_and_sources)
+        instance_field = next((field_name for field_name in instance_fields if field_name is not None), None)
+        instance_at = None if instance_field is None else offset_of(message_class, instance_field)
         return StreamedMessage(self.component_id, cells, instance_at, apply, self._lock)
 
-    def _has_better(self, cell: StateCell[Any], source: Source) -> bool:
+    def _has_recent_better_value(self, cell: StateCell[Any], source: Source) -> bool:
         """Return True if a better message than ``source`` has reported the cell's value recently."""
         return (
             cell.source is not None

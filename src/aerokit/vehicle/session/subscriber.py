@@ -1,0 +1,172 @@
+"""Subscriptions to the messages of one component, and state cells with their latest values.
+
+Both request the rates that they need from the vehicle.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from aerokit.autopilots.telemetry import STREAMED_MESSAGES
+from aerokit.connection.bus import Overflow, Subscription
+from aerokit.connection.cells import Source, StateCell
+from aerokit.mavlink.message import Message
+from aerokit.vehicle.session.rates import check_rate
+from aerokit.vehicle.state.states import DEFAULT_RATES_HZ
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.connection.bus import Detach, Sink
+    from aerokit.connection.connection import Connection
+    from aerokit.events import Event
+    from aerokit.vehicle.session.rates import MessageRates
+
+SUBSCRIPTION_HZ = 4.0
+"""Rate in Hz for a subscription without a rate, to a streamed message that has no default rate."""
+
+
+def subscription_rate_hz(message_type: type[Message]) -> float | None:
+    """Return the rate for a subscription without a rate; None for messages that are sent on demand."""
+    name = message_type.__name__
+    return DEFAULT_RATES_HZ.get(name, SUBSCRIPTION_HZ if name in STREAMED_MESSAGES else None)
+
+
+ItemT = TypeVar("ItemT", bound="Message | Event")
+
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+class ComponentSubscriber:
+    """Subscriptions and cells for one component.
+
+    ``register_cell`` and ``at_close`` are methods of the session: they register a cell, and a callback for its end.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        system_id: int,
+        component_id: int,
+        rates: MessageRates,
+        *,
+        register_cell: Callable[[StateCell[Any]], None],
+        at_close: Callable[[Detach], None],
+    ) -> None:
+        self._connection, self._rates = connection, rates
+        self._system_id, self._component_id = system_id, component_id
+        self._register_cell, self._at_close = register_cell, at_close
+        self._cells: dict[type[Message], StateCell[Any]] = {}
+        self._cell_rates: dict[type[Message], Detach] = {}
+
+    def subscribe(
+        self,
+        types: tuple[type[ItemT], ...],
+        capacity: int,
+        overflow: Overflow,
+        rate_hz: float | None,
+        *,
+        entire_system: bool = False,
+    ) -> Subscription[ItemT]:
+        """Return a stream of events, and of messages of this component or the ``entire_system``; request the rates."""
+        self._connection.check_types(types)
+        message_types: list[type[Message]] = [type_ for type_ in types if issubclass(type_, Message)]
+        if rate_hz is not None:
+            for message_type in message_types:
+                check_rate(message_type, rate_hz)
+
+        # Called when the program enters the block of the subscription.
+        def attach(sink: Sink) -> list[Detach]:
+            filtered_sink = sink if entire_system else self._of_component(sink)
+            detach_callbacks = self._connection.attach(types, filtered_sink, system_id=self._system_id)
+            detach_callbacks.append(self._connection.on_end(subscription.close))
+            for message_type in message_types:
+                hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
+                if hz is not None:
+                    detach_callbacks.append(self._rates.request(message_type, hz))
+            return detach_callbacks
+
+        subscription: Subscription[ItemT] = Subscription(attach, capacity=capacity, overflow=overflow)
+        subscription._explain_timeout = lambda: self._connection.describe_signature_problems(self._system_id)
+        return subscription
+
+    def cell(self, message_type: type[MessageT], rate_hz: float | None) -> StateCell[MessageT]:
+        """Return the cell with the latest message of a type; always the same cell, at the last requested rate."""
+        cell = self._cells.get(message_type)
+        if cell is None:
+            self._connection.check_types((message_type,))
+            cell = self._cells[message_type] = self._new_cell(message_type)
+            self._register_cell(cell)
+            rate_hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
+        if rate_hz is not None:
+            release_previous = self._cell_rates.pop(message_type, None)
+            self._cell_rates[message_type] = self._rates.request(message_type, rate_hz)
+            # The previous rate is released after the new request, because a message that nothing needs is stopped.
+            if release_previous is not None:
+                release_previous()
+        return cell
+
+    def listen(self, message_type: type[MessageT], callback: Callable[[MessageT], object]) -> None:
+        """Call ``callback`` with each message of a type, until the vehicle's block is left.
+
+        Does nothing if the dialect does not contain the message.
+        """
+        bus = self._connection.bus
+        if bus.dialect.get(message_type.ID) is not None:
+            self._at_close(bus.attach(message_type, self._of_component(callback), system_id=self._system_id))
+
+    def _new_cell(self, message_type: type[Message]) -> StateCell[Any]:
+        arrived_at = math.nan
+        cell: StateCell[Any] = StateCell(
+            message_type.NAME, self._connection.now, message_type.NAME, stamp=lambda: arrived_at
+        )
+        source = Source(self._system_id, self._component_id, message_type.NAME)
+
+        def store(message: Message) -> None:
+            nonlocal arrived_at
+            frame = message.received_frame
+            if frame is not None:
+                arrived_at = frame.received_at
+                cell.set(message, source)
+
+        self.listen(message_type, store)
+        return cell
+
+    def _of_component(self, sink: Callable[..., object]) -> Sink:
+        """Return a sink that drops messages of other components and events about other components."""
+
+        def filtered(item: Any) -> None:
+            frame = getattr(item, "received_frame", None)
+            # An event without a component id is about the whole system.
+            event_source = getattr(item, "component_id", self._component_id)
+            source = event_source if frame is None else frame.component_id
+            if source == self._component_id:
+                sink(item)
+
+        return filtered
+
+
+class WatchedStream:
+    """Feed of a cell: requests the cell's message only while the program waits for the cell or follows it.
+
+    ``request`` returns None if the message need not be requested now.
+    """
+
+    pending = False
+    """Part of the interface of feeds: this feed has no messages of its own to decode."""
+
+    def __init__(self, cell: StateCell[Any], request: Callable[[], Detach | None]) -> None:
+        self._cell, self._request = cell, request
+        self._release: Detach | None = None
+
+    def catch_up(self) -> None:
+        """Do nothing, because another feed of the cell decodes the message."""
+
+    def watchers_changed(self) -> None:
+        """Request the message, or release the request, as the cell needs it."""
+        if not self._cell._is_watched and self._release is not None:
+            self._release()
+            self._release = None
+        elif self._cell._is_watched and self._release is None:
+            self._release = self._request()
