@@ -11,7 +11,7 @@ import pytest
 
 import aerokit
 from aerokit import messages as m
-from aerokit.logs.flights import FlightLog, read_flight
+from aerokit.logs.flights import FlightLog, failsafes, read_flight
 from aerokit.logs.flights.flight import FailsafeEvidence, Silence
 from aerokit.logs.report.sections import failsafe_section
 from aerokit.logs.report.silences import ground_station_failsafe
@@ -128,15 +128,18 @@ def test_reaction_to_lost_ground_station_is_of_firmware(vehicle: str, name: str,
 
 def test_failsafe_without_reaction_names_parameters_to_read() -> None:
     flight = FlightLog(Path("log.tlog"), autopilot="ArduPilot", ends_at=60.0, armed=[(0.0, 60.0)])
-    flight.failsafe_evidence = [FailsafeEvidence(30.0, "battery", "text: Battery 1 Failsafe")]
+    flight.failsafe_evidence = [FailsafeEvidence(at, "battery", "text: Battery 1 Failsafe") for at in (30.0, 50.0)]
     text = summary_of(flight)
     assert "No failsafe was reported" not in text
-    assert "1 warning without a recorded reaction: Battery at 0:30.0 (text: Battery 1 Failsafe), configured by" in text
-    assert "BATT_FS_LOW_ACT, BATT_FS_CRT_ACT, which the log does not contain" in text
+    assert "2 warnings without a recorded reaction: Battery at 0:30.0 (text: Battery 1 Failsafe); Battery at" in text
+    assert "parameters that decide on the reaction: BATT_FS_LOW_ACT, BATT_FS_CRT_ACT." in text
+    first, second = (" ".join(failsafe.context) for failsafe in failsafes(flight))
+    assert "parameters to look at, which the log does not contain: BATT_LOW_VOLT, " in first
+    assert "parameters" not in second
     assert "BAT_LOW_THR" not in text
     assert "the log contains no parameters" in failsafe_section(flight).explanation
     flight.parameters["BATT_FS_LOW_ACT"] = 0.0
-    assert "which the log does not contain" not in summary_of(flight)
+    assert "The log does not contain" not in summary_of(flight)
     assert failsafe_section(flight).explanation.endswith("and the parameters that configure it.")
 
 

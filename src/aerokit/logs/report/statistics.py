@@ -16,9 +16,8 @@ from aerokit.logs.report.formatting import clock, length, number, span
 from aerokit.logs.report.silences import silence_sentences
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
-    from aerokit.logs.flights.failsafes import Failsafe
     from aerokit.logs.flights.falls import Fall
     from aerokit.logs.flights.flight import FlightLog, TimeSeries
 
@@ -366,29 +365,34 @@ def _battery_sentence(statistics: FlightStatistics) -> str:
 
 
 def _failsafes_sentence(flight: FlightLog) -> str:
-    acted, warnings = [], []
+    acted, warnings, kinds = [], [], []
     for failsafe in failsafes(flight):
+        at = f"{failsafe.title} at {clock(failsafe.time_s)}"
         if failsafe.acted:
-            acted.append(f"{failsafe.title} at {clock(failsafe.time_s)} ({failsafe.reaction})")
+            acted.append(f"{at} ({failsafe.reaction})")
         else:
-            warnings.append(_warning(flight, failsafe))
+            warnings.append(f"{at} ({failsafe.evidence[0].text})")
+            kinds.append(failsafe.kind)
     sentences = []
     if acted:
         sentences.append(f"{len(acted)} failsafe{'' if len(acted) == 1 else 's'}: {_first_few(acted)}.")
     if warnings:
         plural = "" if len(warnings) == 1 else "s"
         sentences.append(f"{len(warnings)} warning{plural} without a recorded reaction: {_first_few(warnings)}.")
+    unknown = _unknown_actions(flight, kinds)
+    if unknown:
+        sentences.append(f"The log does not contain the parameters that decide on the reaction: {', '.join(unknown)}.")
     return " ".join(sentences) or "No failsafe was reported."
 
 
-def _warning(flight: FlightLog, failsafe: Failsafe) -> str:
-    """Describe a failsafe without a recorded reaction: its evidence, and the parameters that decide on the reaction."""
-    text = f"{failsafe.title} at {clock(failsafe.time_s)} ({failsafe.evidence[0].text})"
-    names = configured_by(flight, failsafe.kind)
-    if not names or any(name in flight.parameters for name in names):
-        return text
-    actions = [name for name in names if "ACT" in name or "ENABL" in name] or names
-    return f"{text}, configured by {', '.join(actions)}, which the log does not contain"
+def _unknown_actions(flight: FlightLog, kinds: Iterable[str]) -> list[str]:
+    """Return the names of parameters that decide on the reaction to these kinds of failsafes, if none is in the log."""
+    unknown: list[str] = []
+    for kind in dict.fromkeys(kinds):
+        names = configured_by(flight, kind)
+        if not any(name in flight.parameters for name in names):
+            unknown += [name for name in names if "ACT" in name or "ENABL" in name] or names
+    return unknown
 
 
 def _first_few(texts: list[str]) -> str:
