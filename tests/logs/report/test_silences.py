@@ -94,15 +94,26 @@ def test_short_silence_names_state_after_it(tmp_path: Path) -> None:
     )
 
 
-def test_pause_of_recording_is_no_certain_silence() -> None:
+def test_pauses_of_recording_are_no_certain_silences() -> None:
     flight = FlightLog(Path("pause.tlog"), ends_at=60.0, armed=[(0.0, 60.0)])
-    flight.silences = [Silence(10.0, 20.0, False)]
-    assert "The recording itself may have paused" in summary_of(flight)
-    flight.armed = [(30.0, 60.0)]
+    flight.silences = [Silence(5.0, 9.0, False), Silence(10.0, 20.0, False)]
+    assert summary_of(flight).startswith(
+        "The log contains no message at all for 10 s from 0:10.0 on, and in 1 shorter gap: the vehicle was silent, or"
+        " the recording paused."
+    )
+    assert "lost ground station" not in summary_of(flight)
+
+
+def test_silence_of_disarmed_vehicle_is_not_mentioned() -> None:
+    flight = FlightLog(Path("ground.tlog"), ends_at=60.0, armed=[(30.0, 60.0)])
+    flight.silences = [Silence(10.0, 20.0, True)]
     assert "Nothing was received" not in summary_of(flight)
+    flight.silences = [Silence(30.0 + at, 34.0 + at, True) for at in (0.0, 5.0, 10.0, 15.0, 20.0)]
+    assert summary_of(flight).count("Nothing was received") == 3
+    assert "The log has 2 more silences of the vehicle." in summary_of(flight)
 
 
-def test_unheard_vehicle_without_silence_is_not_mentioned(tmp_path: Path) -> None:
+def test_recording_without_silence_mentions_none(tmp_path: Path) -> None:
     async def land(flight: Any, vehicle: Any) -> None:
         await vehicle.land()
 

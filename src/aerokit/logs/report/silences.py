@@ -10,7 +10,7 @@ from aerokit.logs.report.formatting import clock, span
 if TYPE_CHECKING:
     from aerokit.logs.flights.flight import FlightLog, Silence
 
-_MAX_LISTED = 5
+_MAX_LISTED = 3
 # After a silence, HEARTBEAT reports the mode within this time.
 _MODE_DELAY_S = 1.5
 
@@ -42,36 +42,49 @@ _ACTIONS: dict[str, dict[int, str]] = {
 
 
 def silence_sentences(flight: FlightLog) -> list[str]:
-    """Return a sentence for each silence while the vehicle was armed, and one about the vehicle's failsafe."""
+    """Return sentences about the silences while the vehicle was armed, and about the vehicle's failsafe."""
     silences = [
         silence for silence in flight.silences if any(begin <= silence.begins_s <= end for begin, end in flight.armed)
     ]
-    if not silences:
+    recorded = [silence for silence in silences if silence.is_recorded]
+    sentences = [_sentence(flight, silence) for silence in recorded[:_MAX_LISTED]]
+    more = len(recorded) - _MAX_LISTED
+    if more > 0:
+        sentences.append(
+            f"{more} more silence{'' if more == 1 else 's'} of the vehicle {'is' if more == 1 else 'are'} not listed."
+        )
+    if recorded:
+        sentences.append(ground_station_failsafe(flight, recorded[0].begins_s))
+    return sentences + _pauses([silence for silence in silences if not silence.is_recorded])
+
+
+def _pauses(pauses: list[Silence]) -> list[str]:
+    """Return a sentence about times without any message, in which the recording itself may have paused."""
+    if not pauses:
         return []
-    more = len(silences) - _MAX_LISTED
-    sentences = [_sentence(flight, silence) for silence in silences[:_MAX_LISTED]]
-    sentences += [f"{more} more silences of the vehicle are not listed."] if more > 0 else []
-    return [*sentences, ground_station_failsafe(flight, silences[0].begins_s)]
+    longest = max(pauses, key=lambda pause: pause.ends_s - pause.begins_s)
+    others = len(pauses) - 1
+    more = f", and in {others} shorter gap{'' if others == 1 else 's'}" if others else ""
+    return [
+        f"The log contains no message at all for {span(longest.ends_s - longest.begins_s)} from"
+        f" {clock(longest.begins_s)} on{more}: the vehicle was silent, or the recording paused."
+    ]
 
 
 def _sentence(flight: FlightLog, silence: Silence) -> str:
     is_at_end = silence.ends_s >= flight.duration_s
-    where = _state(flight, silence.begins_s)
-    text = (
-        f"Nothing was received from the vehicle for {span(silence.ends_s - silence.begins_s)} from"
-        f" {clock(silence.begins_s)} on{', until the log ends' if is_at_end else ''}"
-        f"{f'; it was last {where}' if where else ''}."
-    )
-    if not silence.is_recorded:
-        text += " The recording itself may have paused, because it contains no message of others either."
-    if not is_at_end and (after := _state(flight, silence.ends_s + _MODE_DELAY_S)):
-        text += f" Afterwards it was {after}."
-    return text
+    before = _state(flight, silence.begins_s)
+    text = f"Nothing was received from the vehicle for {span(silence.ends_s - silence.begins_s)}"
+    text += f" from {clock(silence.begins_s)} on"
+    text += ", until the log ends" if is_at_end else ""
+    text += f"; it was last {before}." if before else "."
+    after = "" if is_at_end else _state(flight, silence.ends_s + _MODE_DELAY_S)
+    return f"{text} Afterwards it was {after}." if after else text
 
 
 def _state(flight: FlightLog, time_s: float) -> str:
     height_m, mode = flight.track.at("altitude_relative_m", time_s), flight.mode_at(time_s)
-    parts = [f"{height_m:.1f} m above home"] if height_m == height_m else []
+    parts = [] if math.isnan(height_m) else [f"{height_m:.1f} m above home"]
     return " ".join([*parts, *([f"in {mode}"] if mode else [])])
 
 
