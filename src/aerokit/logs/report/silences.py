@@ -50,9 +50,7 @@ def silence_sentences(flight: FlightLog) -> list[str]:
     sentences = [_sentence(flight, silence) for silence in recorded[:_MAX_LISTED]]
     more = len(recorded) - _MAX_LISTED
     if more > 0:
-        sentences.append(
-            f"{more} more silence{'' if more == 1 else 's'} of the vehicle {'is' if more == 1 else 'are'} not listed."
-        )
+        sentences.append(f"The log has {more} more silence{'' if more == 1 else 's'} of the vehicle.")
     if recorded:
         sentences.append(ground_station_failsafe(flight, recorded[0].begins_s))
     return sentences + _pauses([silence for silence in silences if not silence.is_recorded])
