@@ -148,7 +148,7 @@ class SimulatedVehicle:
 
     def step(self, now: float) -> None:
         """Run everything that is due up to ``now``."""
-        if self._was_never_on:
+        if not self._is_on and math.isnan(self.booted_at):  # It was never on.
             self.now = now
             self.power_on()
         if self.faults.frozen:
@@ -160,13 +160,9 @@ class SimulatedVehicle:
         self.now = max(now, self.now)
 
     @property
-    def _was_never_on(self) -> bool:
-        return math.isnan(self.booted_at)
-
-    @property
     def next_due(self) -> float:
         """Time of the next event; infinity if there is none."""
-        if self._was_never_on:
+        if not self._is_on and math.isnan(self.booted_at):
             return self.now
         if self.faults.frozen:
             return self.now + TICK_S  # `step` must follow the time even while nothing happens.

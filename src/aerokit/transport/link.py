@@ -388,7 +388,7 @@ class MemoryLink(BaseLink):
             return
         now = max(self._loop.time(), self._inbox[0][0])  # a timer may fire early by the clock's resolution
         # Counted before the delivery, so that data written by the receiver arrives in a later loop iteration.
-        due_count = sum(due <= now for due, _ in self._inbox)
+        due_count = 1 if len(self._inbox) == 1 else sum(due <= now for due, _ in self._inbox)
         for _ in range(due_count):
             if not self._inbox:  # closed by the receiver
                 return
