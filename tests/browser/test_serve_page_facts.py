@@ -1,7 +1,8 @@
-"""What the page of ``aerokit serve`` says about orders, automatic disarming and crashes (`nox -s browser`)."""
+"""Facts about orders, automatic disarming and crashes on the page of ``aerokit serve`` (`nox -s browser`)."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -133,10 +134,28 @@ def test_page_reports_crash_and_lets_disarm(browser: Any) -> None:
         facts = page.locator("dialog .facts")
         facts.filter(has_text="It hit the ground at").wait_for()
         assert re.search(r"Now: -?0\.\d m above home, 0\.0 m/s, it reports “\w[\w ]*”", facts.inner_text())
-        page.click("dialog .yes")
+        needs_force = "“on ground”" not in facts.inner_text()
+        assert ("The motors stop whatever it reports" in facts.inner_text()) is needs_force
+        with page.expect_request("**/disarm?*") as sent:
+            page.click("dialog .yes")
+        assert json.loads(sent.value.post_data) == ({"force": True} if needs_force else {})
         wait_done(page, "disarm")
         assert not copter.is_armed
         page.locator("#crashes .silence", has_text="It is disarmed").wait_for()
+
+
+NEEDS_FORCE = """async ([crash, landed]) => {
+    const { needsForce } = await import("/static/facts.js");
+    return needsForce({ crash, states: landed ? { landed_state: { value: landed } } : {} });
+}"""
+
+
+def test_only_crash_that_reports_flying_needs_force(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    crash = {"text": "the vehicle hit the ground at 9.0 m/s", "at_unix_s": 0}
+    with serving(copters[1]) as server, opened(browser, server["page"]) as page:
+        for state, expected in (("IN_AIR", True), ("TAKEOFF", True), (None, True), ("ON_GROUND", False)):
+            assert page.evaluate(NEEDS_FORCE, [crash, state]) is expected
+            assert page.evaluate(NEEDS_FORCE, [None, state]) is False
 
 
 def test_page_separates_cannot_arm_from_cannot_take_off(browser: Any) -> None:

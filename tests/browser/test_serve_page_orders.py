@@ -189,8 +189,8 @@ def test_readiness_shows_all_reasons_and_notes(browser: Any, copters: tuple[list
         text = "Disarmed 4 s after arming, not by an order of this server (DISARM_DELAY = 10 s)"
         assert page.evaluate(READINESS, {"disarming": disarming}) == ["Ready to arm", text]
         assert page.evaluate(READINESS, {"disarming": {**disarming, "age_s": 61}}) == ["Ready to arm"]
-        reasons = {"missing_for_flight": ["compass", "home"], "not_armable": ["compass"]}
-        assert page.evaluate(READINESS, reasons) == ["Cannot arm", "compass"]
+        refused = {"missing_for_flight": ["compass", "home"], "not_armable": ["compass"]}
+        assert page.evaluate(READINESS, refused) == ["Cannot arm", "compass"]
 
 
 OBSTACLE = """async ([order, landed, age, type, link]) => {

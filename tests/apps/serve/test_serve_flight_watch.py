@@ -11,8 +11,10 @@ import anyio
 import pytest
 from serve_stage import Stage, open_stage
 
+import aerokit
 from aerokit.apps.serve.flight_watch import FlightWatch
 from aerokit.mavlink.enums import MavLandedState, MavType
+from aerokit.sim import SimulatedPx4, simulated_link
 from aerokit.vehicle.state.movement import Velocity
 
 pytestmark = pytest.mark.anyio
@@ -26,6 +28,11 @@ def state_of(stage: Stage) -> dict[str, Any]:
 async def fly_up(stage: Stage, altitude_m: float = 10) -> None:
     assert (await stage.submit("arm")).status_code == 200
     assert (await stage.submit("take_off", {"altitude_m": altitude_m})).status_code == 200
+
+
+async def fall(stage: Stage) -> None:
+    stage.flight.copter.faults.motor_failed = True
+    await anyio.sleep(6)
 
 
 async def test_fall_while_hovering_is_reported_as_crash() -> None:
@@ -49,24 +56,39 @@ async def test_only_crashed_vehicle_accepts_forced_disarm() -> None:
         assert (refused.status_code, refused.json()["error"]) == (409, "NotCrashed")
         assert "nothing was sent" in refused.json()["detail"]
         assert stage.flight.copter.is_armed
-        stage.flight.copter.faults.motor_failed = True
-        await anyio.sleep(6)
+        await fall(stage)
         plain = await stage.submit("disarm")
         assert (plain.status_code, plain.json()["error"]) == (409, "CommandRejected")
         assert (await stage.submit("disarm", {"force": True})).status_code == 200
-        assert not stage.flight.copter.is_armed
+        assert state_of(stage)["states"]["armed"]["value"] is False
         assert state_of(stage)["crash"] is not None, "the vehicle still lies there"
 
 
 async def test_crash_ends_with_next_arming() -> None:
     async with open_stage() as stage:
         await fly_up(stage)
-        stage.flight.copter.faults.motor_failed = True
-        await anyio.sleep(6)
+        await fall(stage)
         await stage.submit("disarm", {"force": True})
         stage.flight.copter.faults.motor_failed = False
         assert (await stage.submit("arm")).status_code == 200
         assert state_of(stage)["crash"] is None
+
+
+@pytest.mark.parametrize("falls", [True, False])
+async def test_px4_that_falls_has_crashed_but_not_one_that_lands(falls: bool) -> None:
+    px4 = SimulatedPx4(boot_time_s=0.0)
+    async with simulated_link([px4]) as link, aerokit.connect(link) as vehicle:
+        await vehicle.wait_ready()
+        watch = FlightWatch(vehicle)
+        await vehicle.arm()
+        await vehicle.take_off(10)
+        px4.faults.motor_failed = falls
+        if not falls:
+            await vehicle.land()
+        await anyio.sleep(12)
+        assert (watch.crash is not None) is falls
+        assert watch.disarming is None
+        watch.close()
 
 
 async def test_flight_with_fast_descent_is_no_crash() -> None:

@@ -224,7 +224,7 @@ async def test_submarine_goes_below_home() -> None:
         position = {"latitude_deg": place.latitude_deg, "longitude_deg": place.longitude_deg}
         go_to = next(each for each in ORDERS if each.name == "go_to")
         await go_to.run(vehicle, {**position, "altitude_relative_m": -3})
-        assert vehicle.position.value.altitude_relative_m < -1
+        assert (vehicle.position.value.altitude_relative_m or 0.0) < -1
 
 
 async def test_refusal_contains_reasons() -> None:

@@ -125,7 +125,7 @@ class FlightWatch:
             if self._armed_at is not None and not self._was_in_air and not is_ordered and self._crash is None:
                 self._disarming = now, now - self._armed_at
 
-    def _on_landed(self, before: MavLandedState | None, landed: MavLandedState) -> None:
+    def _on_landed(self, before: int | None, landed: int) -> None:
         self._was_in_air = self._was_in_air or landed in _IN_AIR
 
     def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
