@@ -127,7 +127,10 @@ def test_page_reports_crash_and_lets_disarm(browser: Any) -> None:
         banner.filter(has_text=re.compile(r"Vehicle 1 hit the ground at \d+\.\d m/s at \d\d:\d\d:\d\d")).wait_for()
         page.locator("#readiness.bad strong", has_text="Crashed: propellers may turn").wait_for()
         assert "It is still armed" in banner.inner_text()
-        assert page.locator("button[data-order='take_off']").is_disabled()
+        for name in ("take_off", "pick"):
+            assert page.locator(f"button[data-order='{name}'] small").inner_text() == "Crashed"
+        for name in ("hold", "land", "return_to_launch"):
+            assert page.locator(f"button[data-order='{name}']").is_enabled(), "the page may be wrong"
         check_contrast(page)
         picture(page, "crashed")
         disarm.click()

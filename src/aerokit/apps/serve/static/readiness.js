@@ -41,7 +41,7 @@ export function obstacle(order, vehicle, page) {
       if (page.running?.(vehicle.system_id).some((each) => each.order === "take_off")) return "Running";
       return isSurface ? "Does not fly" : isArmed === false ? "Arm first" : vehicle.crash ? "Crashed" : isFlying ? "Flying" : lacksPosition(vehicle) ? "No position" : "";
     case "go_to":
-      return isArmed === false ? "Arm first" : isOnGround && !isSurface ? "Take off first" : lacksPosition(vehicle) ? "No position" : "";
+      return isArmed === false ? "Arm first" : vehicle.crash ? "Crashed" : isOnGround && !isSurface ? "Take off first" : lacksPosition(vehicle) ? "No position" : "";
     case "return_to_launch":
       if (isArmed && isOnGround && !isSurface) return "On the ground";
       // falls through
@@ -49,6 +49,7 @@ export function obstacle(order, vehicle, page) {
     case "mission/start": case "mission/resume":
       if (vehicle.mission_items === 0) return "No mission";
       if (isArmed === false) return "Arm first";
+      if (vehicle.crash) return "Crashed";
       if (vehicle.is_flying_mission && mission?.state === "ACTIVE" && (isFlying || isSurface)) return "Running";
       // ArduCopter, on the ground after a finished mission, would take off and fly from the first item.
       if (order === "mission/resume" && isOnGround && !isSurface) return "On the ground: use Start";
