@@ -135,6 +135,19 @@ async def test_silent_video_stream_is_lost() -> None:
                     pass
 
 
+async def test_failed_decoder_loses_video_stream(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "video.mp4"
+    encode(str(path), "mp4", 5)
+
+    def fail(*_: object) -> object:
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr("aerokit.video._Reader._read", fail)
+    with pytest.raises(LinkLost, match=r"the decoder of .* failed: RuntimeError\('no memory'\)"):
+        async with open_video(str(path)):
+            pass
+
+
 async def test_missing_video_stream_cannot_be_opened() -> None:
     with pytest.raises(LinkOpenError, match=r"no-such-file\.mp4 cannot be opened"):
         async with open_video("/no-such-file.mp4"):

@@ -69,8 +69,8 @@ async def open_video(
         uri: anything that FFmpeg reads: ``rtsp://…``, ``udp://0.0.0.0:5600``, the path of a file.
             ``vehicle.camera.streams`` lists the addresses of a camera's streams.
         vehicle: adds its position and attitude to the frames.
-        timeout: seconds until the stream must be open, above 0 to 3600.
-        idle_timeout_s: seconds without data after which the stream counts as lost, above 0 to 3600.
+        timeout: seconds until the stream must be open, above 0 and at most 3600.
+        idle_timeout_s: seconds without data after which the stream counts as lost, above 0 and at most 3600.
         options: further FFmpeg options.
 
     Raises:
@@ -196,8 +196,10 @@ class _Reader(threading.Thread):
         try:
             self._read()
             error = EOFError()  # ends the iteration over the frames without an error
-        except Exception as caught:
+        except (LinkOpenError, LinkLost) as caught:
             error = caught
+        except Exception as caught:
+            error = LinkLost(f"the decoder of {self._uri} failed: {caught!r}")
         finally:
             self._call_on_loop(self._stream._on_end, error)
             self._call_on_loop(self.ended.set)

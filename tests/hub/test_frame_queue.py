@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.hub.message_rules import _ANSWERS, _PERIODIC, ORDER_MAX_AGE_S, MessageKind, kind_of
+from aerokit.hub.message_rules import _NOT_ORDERS, _TELEMETRY, ORDER_MAX_AGE_S, MessageKind, kind_of
 from aerokit.hub.port import MAX_QUEUED_BYTES, MAX_QUEUED_FRAMES, FrameQueue, QueuedFrame
 from aerokit.mavlink.dialect import STANDARD
 
@@ -90,7 +90,7 @@ def test_bounds_hold_and_every_frame_is_accounted_for(
 
 
 @pytest.mark.parametrize(
-    ("name", "is_for_one", "kind"),
+    ("name", "has_target", "kind"),
     [
         ("ATTITUDE", False, MessageKind.TELEMETRY),
         ("HEARTBEAT", False, MessageKind.TELEMETRY),
@@ -117,14 +117,14 @@ def test_bounds_hold_and_every_frame_is_accounted_for(
         ("NO_SUCH_MESSAGE", False, MessageKind.TRANSFER),
     ],
 )
-def test_kind_of_message(name: str, is_for_one: bool, kind: MessageKind) -> None:
-    assert kind_of(name, is_for_one=is_for_one) is kind
+def test_kind_of_message(name: str, has_target: bool, kind: MessageKind) -> None:
+    assert kind_of(name, has_target=has_target) is kind
 
 
 def test_telemetry_is_never_an_order_and_has_no_target() -> None:
     names = {kind.NAME: kind for kind in STANDARD}
-    for name in _PERIODIC.split():
-        assert kind_of(name, is_for_one=False) is MessageKind.TELEMETRY
+    for name in sorted(_TELEMETRY):
+        assert kind_of(name, has_target=False) is MessageKind.TELEMETRY
         fields = {field.name for field in names[name].FIELDS}
         instances = {
             field
@@ -133,4 +133,4 @@ def test_telemetry_is_never_an_order_and_has_no_target() -> None:
         }
         assert not instances or name == "MISSION_CURRENT", (name, instances)
         assert "target_system" not in fields
-    assert set(_ANSWERS.split()) <= set(names)
+    assert set(names) >= _NOT_ORDERS

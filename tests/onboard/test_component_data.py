@@ -200,12 +200,15 @@ async def test_mission_id_stays_while_the_current_item_changes() -> None:
         assert (await station.ask(m.MissionRequestList(*station.target), m.MissionCount)).opaque_id != count.opaque_id
 
 
-async def test_mission_refused_by_program_is_not_stored() -> None:
+@pytest.mark.parametrize("raises", [True, False])
+async def test_mission_refused_by_program_is_not_stored(raises: bool) -> None:
     async with autopilot_and_client() as (node, vehicle):
 
         @node.missions.on_upload
-        def check(kind: str, items: tuple[MissionItem, ...]) -> None:
-            raise InvalidArgument("no missions today")
+        def check(kind: str, items: tuple[MissionItem, ...]) -> bool:
+            if raises:
+                raise InvalidArgument("no missions today")
+            return False
 
         with pytest.raises(AerokitError):
             await vehicle.mission.upload(MISSION)

@@ -137,6 +137,18 @@ def test_lost_image_reports_are_sent_on_request() -> None:
     assert client.ask(CAMERA, MavCmd.REQUEST_MESSAGE, m.CameraImageCaptured.ID, 6) == FAILED
 
 
+def test_full_image_log_drops_oldest_and_continues_indices() -> None:
+    camera, client = fitted()
+    camera.max_images = 4
+    client.ask(CAMERA, START, 0, 0.5, 6)
+    client.run(4.0)
+    assert [image.image_index for image in client.all(m.CameraImageCaptured)] == [0, 1, 2, 3, 4, 5]
+    assert camera.image_count == 6
+    assert [image.image_index for image in client.request(CAMERA, m.CameraImageCaptured, -1)] == [2, 3, 4, 5]
+    assert [image.image_index for image in client.request(CAMERA, m.CameraImageCaptured, 1, 3)] == [2, 3]
+    assert client.ask(CAMERA, MavCmd.REQUEST_MESSAGE, m.CameraImageCaptured.ID, 1) == FAILED
+
+
 def test_full_card_refuses_images() -> None:
     camera, client = fitted(capacity_mib=12.0)
     client.ask(CAMERA, START, 0, 0.5, 0)

@@ -218,7 +218,7 @@ def _fail_about_now(delay_s: float) -> None:
 
     def fail() -> None:
         _spin(ends)
-        with contextlib.suppress(VehicleError), flight._interruption.at_an_error():
+        with contextlib.suppress(VehicleError), flight._interruption.on_error():
             flight._server.failure = VehicleError()
             raise flight._server.failure
 

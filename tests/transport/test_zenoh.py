@@ -19,7 +19,7 @@ from aerokit.mavlink.messages import CommandLong, Heartbeat, ParamRequestList, S
 from aerokit.transport import create_link
 from aerokit.transport import link as needed
 from aerokit.transport.zenoh import listen as zenoh_listen
-from aerokit.transport.zenoh.keys import Stamp, sent_at
+from aerokit.transport.zenoh.keys import Stamp, encode_sent_at
 from aerokit.transport.zenoh.listen import CLIENT_TIMEOUT_S, MAX_CLIENTS, ZenohListen
 from aerokit.transport.zenoh.session import LoopQueue
 
@@ -465,7 +465,7 @@ async def test_payload_larger_than_datagram_is_ignored() -> None:
     async with serving(port) as (vehicle, recorder), client(port, "&client=ground") as (link, answered):
         link.write(order := frame(ParamRequestList(1, 1)))
         await recorder.until_data(order)
-        stamp, sent = link._tracker.stamp(link._now()), sent_at(vehicle._freshness.epoch, vehicle._now())
+        stamp, sent = link._tracker.stamp(link._now()), encode_sent_at(vehicle._freshness.epoch, vehicle._now())
         assert stamp is not None
         for session, key, attachment in (
             (link._session, link._keys.to_vehicle("ground"), stamp.encode()),

@@ -34,8 +34,8 @@ from aerokit.transport.zenoh.control_lease import (
     READ_MESSAGES,
     ClientFilter,
     ControlLease,
-    is_read,
-    refusals_in,
+    is_read_only,
+    rejection_frames,
 )
 from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, CHANGED_BY_MESSAGE, REQUEST_COMMANDS
 
@@ -72,13 +72,13 @@ def send(message: Message, *, system: int = 255) -> bytes:
 
 def reads(message: Message) -> bool:
     (frame,) = Framer().receive(send(message))
-    return is_read(frame)
+    return is_read_only(frame)
 
 
 def answer_of(data: bytes) -> Message:
     text, frame = Framer().receive(data)
     assert (frame.system_id, frame.component_id) == (text.system_id, text.component_id) == (1, 1)
-    assert refusals_in(data) == (text.raw, frame.raw)
+    assert rejection_frames(data) == (text.raw, frame.raw)
     said = STANDARD.decode(text)
     assert isinstance(said, Statustext)
     assert said.text == "network: one has control"
@@ -197,14 +197,14 @@ def test_client_without_lease_passes_only_reads(several: list[Message], noise: b
     framer = Framer()
     framer.keep_unknown = True
     for frame in framer.receive(passed):
-        assert is_read(frame)
+        assert is_read_only(frame)
 
 
 @pytest.mark.parametrize(
     "answer", [b"", b"noise", send(HEARTBEAT), send(CommandAck(400, 0)), send(Statustext(6, "hello"))]
 )
 def test_other_frames_are_no_refusals(answer: bytes) -> None:
-    assert refusals_in(answer) == ()
+    assert rejection_frames(answer) == ()
 
 
 def test_one_of_two_programs_with_same_name_gets_control() -> None:

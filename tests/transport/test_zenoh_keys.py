@@ -13,8 +13,8 @@ from aerokit.transport.zenoh.keys import (
     RefusalNotice,
     Stamp,
     check_name,
-    read_sent_at,
-    sent_at,
+    decode_sent_at,
+    encode_sent_at,
 )
 
 u32 = st.integers(0, 2**32 - 1)
@@ -55,7 +55,7 @@ def test_notice_round_trip(message: str, reason: str, lease_holder: str | None, 
 
 @given(u32, st.floats(0, 1e9))
 def test_send_time_round_trip(epoch: int, clock: float) -> None:
-    read = read_sent_at(sent_at(epoch, clock))
+    read = decode_sent_at(encode_sent_at(epoch, clock))
     assert read is not None
     assert read[0] == epoch
     assert read[1] == pytest.approx(clock, abs=0.001)
@@ -77,14 +77,14 @@ def test_decoding_never_raises(data: bytes) -> None:
     Beacon.decode(data)
     RefusalNotice.decode(data)
     Stamp.decode(data)
-    read_sent_at(data)
+    decode_sent_at(data)
 
 
 def test_other_version_is_ignored() -> None:
     beacon = Beacon(1, 1, 1.0)
     assert Beacon.decode(beacon.encode().replace(b'"version":1', b'"version":2')) is None
     assert Stamp.decode(b"\x02" + Stamp(1, 1, 1, 1).encode()[1:]) is None
-    assert read_sent_at(b"\x02" + sent_at(1, 1.0)[1:]) is None
+    assert decode_sent_at(b"\x02" + encode_sent_at(1, 1.0)[1:]) is None
 
 
 @pytest.mark.parametrize("clock", ["NaN", "Infinity", "-Infinity", "1" + 400 * "0"])

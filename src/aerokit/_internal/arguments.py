@@ -267,8 +267,8 @@ def check_range(name: str, value: float, minimum: float, maximum: float, *, abov
     except TypeError:
         is_allowed = False
     if not is_allowed:
-        low = f"above {minimum:g}" if above else f"{minimum:g}"
-        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {low} to {maximum:g}")
+        allowed = f"above {minimum:g} and at most {maximum:g}" if above else f"{minimum:g} to {maximum:g}"
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}")
 
 
 def check_finite(name: str, *values: float) -> None:

@@ -75,7 +75,7 @@ class Bus:
     def require_frames(self, *message_types: type[Message]) -> None:
         """Make the framer build frames of these types even without subscribers, for code that inspects every frame."""
         for message_type in message_types:
-            self.attach(message_type, _ignore)
+            self.attach(message_type, _discard)
 
     def attach_frames(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
         """Like :meth:`attach`, but ``sink`` gets the undecoded frame."""
@@ -99,19 +99,20 @@ class Bus:
         Sinks that ``create()`` attaches get that first message too.
         """
 
-        def first(frame: Frame) -> None:
-            before = self._entries(frame)
+        def on_first(frame: Frame) -> None:
+            entries_before = self._entries(frame)
             create()
             detach_all()
+            # The delivery of this frame uses the sinks from before `create()`, so the new sinks are called here.
             for entry in self._entries(frame):
-                if entry not in before:
+                if entry not in entries_before:
                     kind, sink = entry
                     sink(self.dialect.decode(frame) if kind == MESSAGE else frame)
 
-        attached = [self._attach((system_id, message_id), (FRAME, first), ahead=True) for message_id in message_ids]
+        detachers = [self._attach((system_id, message_id), (FRAME, on_first), ahead=True) for message_id in message_ids]
 
         def detach_all() -> None:
-            for detach in attached:
+            for detach in detachers:
                 detach()
 
         return detach_all
@@ -123,7 +124,7 @@ class Bus:
 
     def deliver(self, frame: Frame) -> None:
         """Deliver a frame, decoded if needed. Exceptions of sinks are logged; the other sinks still get it."""
-        self.deliver_all((frame,), _ignore)
+        self.deliver_all((frame,), _discard)
 
     def deliver_all(
         self, frames: Iterable[Frame], before_heartbeat: Callable[..., None], *context: object
@@ -157,6 +158,7 @@ class Bus:
         return None
 
     def _deliver_both(self, frame: Frame) -> None:
+        """Deliver a frame to sinks that take different arguments: the message, the frame, or both."""
         message = self.dialect.decode(frame)
         for kind, sink in self._entries(frame):
             try:
@@ -191,36 +193,37 @@ class Bus:
         if not entries or self.dialect.get(frame.message_id) is None:
             return FRAME, ()
         kinds = {kind for kind, _ in entries}
-        # Without a sink that needs the message, FRAME and BOTH sinks take the frame alone.
-        kind = FRAME if MESSAGE not in kinds else MESSAGE if kinds == {MESSAGE} else BOTH
+        kind = MESSAGE if kinds == {MESSAGE} else BOTH
+        if MESSAGE not in kinds:
+            kind = FRAME  # BOTH sinks take the frame alone when no other sink needs the decoded message.
         plan = self._plans[frame.system_id << 24 | frame.message_id] = kind, tuple(sink for _, sink in entries)
         return plan
 
     def _entries(self, frame: Frame) -> tuple[_Entry, ...]:
         system_id, message_id = frame.system_id, frame.message_id
-        own = self._sinks.get((system_id, message_id), ()) if system_id != EVERY_SYSTEM else ()
-        return own + self._sinks.get((EVERY_SYSTEM, message_id), ())
+        for_all_systems = self._sinks.get((EVERY_SYSTEM, message_id), ())
+        if system_id == EVERY_SYSTEM:  # an invalid sender, whose own key is that of the sinks for all systems
+            return for_all_systems
+        return self._sinks.get((system_id, message_id), ()) + for_all_systems
 
     def _detach(self, key: tuple[int, int], entry: _Entry) -> None:
-        _drop(self._sinks, key, entry)
+        _remove_sink(self._sinks, key, entry)
         self._plans.clear()
-        left = self.wanted[key[1]] - 1
-        if left:
-            self.wanted[key[1]] = left
-        else:
-            del self.wanted[key[1]]
+        _, message_id = key
+        self.wanted[message_id] -= 1
+        if not self.wanted[message_id]:
+            del self.wanted[message_id]
 
     def _detach_event(self, event_type: type[Event], sink: Sink) -> None:
-        _drop(self._event_sinks, event_type, sink)
+        _remove_sink(self._event_sinks, event_type, sink)
 
 
-def _drop(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -> None:
+def _remove_sink(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -> None:
     """Remove one occurrence of the sink. A delivery in progress continues with the old tuple."""
-    left = list(table[key])
-    left.remove(sink)
-    if left:
-        table[key] = tuple(left)
-    else:
+    remaining = list(table[key])
+    remaining.remove(sink)
+    table[key] = tuple(remaining)
+    if not remaining:
         del table[key]
 
 
@@ -230,12 +233,12 @@ def once(action: Callable[[], None]) -> Detach:
 
     def detach() -> None:
         if pending:
-            pending.pop()()
+            pending.pop()()  # popped first, so that a call from within the action does nothing
 
     return detach
 
 
-def _ignore(item: object) -> None:
+def _discard(item: object) -> None:
     pass
 
 
@@ -254,18 +257,18 @@ def copy_exception(error: ErrorT) -> ErrorT:
     """
     try:
         fresh = copy.copy(error)
-    except Exception:  # the constructor of the exception requires more than `args`
+    except Exception:  # The constructor of this exception takes other arguments than `args`, so it cannot be copied.
         return error.with_traceback(None)
     fresh.__cause__, fresh.__suppress_context__ = error.__cause__, error.__suppress_context__
     return fresh
 
 
 class EndSignal:
-    """One-shot end signal: stores the error and calls the registered callbacks with it."""
+    """One-shot end signal: has the error that ended its owner, and calls the registered callbacks with it."""
 
     def __init__(self) -> None:
         self.error: Exception | None = None
-        """The error passed to :meth:`notify`; None before that."""
+        """The error that ended the owner, set by the owner before it calls :meth:`notify`; None before that."""
         self._callbacks: list[EndCallback] = []
 
     def raise_if_ended(self) -> None:
@@ -287,7 +290,7 @@ class EndSignal:
         return detach
 
     def notify(self, error: Exception) -> None:
-        """Store the error and call all registered callbacks with it."""
+        """Call all registered callbacks with the error, which the owner has stored in :attr:`error`."""
         callbacks, self._callbacks = self._callbacks, []
         for callback in callbacks:
             try:
@@ -324,7 +327,7 @@ class Subscription(Generic[ItemT]):
             raise InvalidArgument(f"capacity = {capacity} is not allowed: at least 1")
         if overflow not in ("drop_oldest", "drop_newest", "error"):
             raise InvalidArgument(f"overflow = {overflow!r} is not allowed: 'drop_oldest', 'drop_newest' or 'error'")
-        # Returns the reason why no items arrive, for time-out errors; "" if unknown.
+        # Returns the reason why no items arrive, for time-out errors. The default, str(), returns "": unknown.
         self._explain_timeout: Callable[[], str] = str
         self.missed: int = 0
         """Number of items dropped because the reader was slow."""
@@ -377,8 +380,9 @@ class Subscription(Generic[ItemT]):
                 return await self.__anext__()
             except StopAsyncIteration:
                 raise InvalidArgument("the subscription is closed: read it inside its `with` block") from None
-        why = self._explain_timeout()
-        raise OperationTimeout(f"the subscription received nothing within {timeout:g} s{f'; {why}' if why else ''}")
+        reason = self._explain_timeout()
+        suffix = f"; {reason}" if reason else ""
+        raise OperationTimeout(f"the subscription received nothing within {timeout:g} s{suffix}")
 
     def get_nowait(self) -> ItemT | None:
         """Return the next item, or None if the queue is empty."""
@@ -399,11 +403,11 @@ class Subscription(Generic[ItemT]):
         if len(self._queue) < self._capacity:
             self._queue.append(item)
         else:
-            self._overflowed(item)
+            self._handle_overflow(item)
         if self._waiter is not None:
             self._wake()
 
-    def _overflowed(self, item: ItemT) -> None:
+    def _handle_overflow(self, item: ItemT) -> None:
         self.missed += 1
         if self._overflow == "drop_oldest":
             self._queue.popleft()

@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-_NAMED_VALUES = 3  # distinct values that a time-out error lists
+_MAX_LISTED_VALUES = 3  # number of distinct values that a time-out error lists
 
 
 class Feed(Protocol):
@@ -85,7 +85,7 @@ class StateCell(Generic[T]):
         self._stamp = clock if stamp is None else stamp  # returns the receive time for a value that is set now
         self.waits_for: str = waits_for
         """Names of the messages that carry the value."""
-        # Returns the reason why no values arrive, for time-out errors; "" if unknown.
+        # Returns the reason why no values arrive, for time-out errors. The default, str(), returns "": unknown.
         self._explain_timeout: Callable[[], str] = str
         self._known = False
         self._latest: T | None = None
@@ -290,13 +290,13 @@ class StateCell(Generic[T]):
     if not TYPE_CHECKING:  # type checkers know the attributes of a cell
 
         def __getattr__(self, name: str) -> NoReturn:
-            """Suggest ``.value`` for an attribute of the value, e.g. ``vehicle.position.latitude_deg``."""
+            """Raise an error that suggests ``.value``, e.g. for ``vehicle.position.latitude_deg``."""
             if not name.startswith("_") and hasattr(self.latest, name):
                 raise AttributeError(f"{self.name} is a StateCell: did you mean .value.{name}?")
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
         def __getitem__(self, key: object) -> NoReturn:
-            """Suggest ``.value[…]``. Iteration over a cell also calls this method."""
+            """Raise an error that suggests ``.value[…]``. Iteration over a cell also calls this method."""
             camera = ", or camera_at(number) for a camera" if self.name == "cameras" else ""
             raise TypeError(f"{self.name} is a StateCell, not its value: use {self.name}.value[…]{camera}")
 
@@ -316,11 +316,11 @@ class Changes(AsyncIterator[T]):
         cell._follow()
         self._cell = cell
         self._every_arrival = every_arrival
-        self._read_at = self._count() - (1 if cell.is_known else 0)
+        self._read_count = self._total() - (1 if cell.is_known else 0)  # a known value is yielded first
         self._missed = 0
 
-    def __del__(self) -> None:
-        if hasattr(self, "_cell"):
+    def __del__(self) -> None:  # the only notice of the end, because a loop can be left at any time
+        if hasattr(self, "_cell"):  # False if __init__ raised
             self._cell._unfollow()
 
     @property
@@ -332,14 +332,15 @@ class Changes(AsyncIterator[T]):
         return self
 
     async def __anext__(self) -> T:
-        while self._count() == self._read_at or not self._cell.is_known:
+        while self._total() == self._read_count or not self._cell.is_known:
             await self._next_arrival()
-        count = self._count()
-        self._missed += count - self._read_at - 1
-        self._read_at = count
+        count = self._total()
+        self._missed += count - self._read_count - 1
+        self._read_count = count
         return self._cell.value
 
-    def _count(self) -> int:
+    def _total(self) -> int:
+        """Return the number of values that the cell has had so far, of the kind that is iterated over."""
         return self._cell._arrivals if self._every_arrival else self._cell._changes
 
     async def _next_arrival(self) -> None:
@@ -387,7 +388,7 @@ class _Waiter(_Sink[T]):
         self._future: asyncio.Future[T | None] = self._loop.create_future()
         self._error: BaseException | None = None
         self._hold_timer: asyncio.TimerHandle | None = None
-        self._seen: deque[T] = deque(maxlen=_NAMED_VALUES)
+        self._seen: deque[T] = deque(maxlen=_MAX_LISTED_VALUES)
         self._seen_count = 0
 
     async def wait(self, timeout: float | None, description: str) -> T:
@@ -408,11 +409,11 @@ class _Waiter(_Sink[T]):
             return
         self._record(value)
         try:
-            holds = bool(self._predicate(value))
+            is_met = bool(self._predicate(value))
         except Exception as error:  # a predicate's exception belongs to the caller of wait_until
             self.fail(error)
             return
-        if not holds:
+        if not is_met:
             self._stop_hold()
         elif self._held_for <= 0:
             self._future.set_result(value)
@@ -451,8 +452,8 @@ class _Waiter(_Sink[T]):
             text += f"; it had to hold for {self._held_for:g} s"
         if self._seen_count > 1:
             text += f"; {self._seen_count} values seen, last " + ", ".join(map(repr, self._seen))
-        why = self._cell._explain_timeout()
-        return f"{text}; {why}" if why else text
+        reason = self._cell._explain_timeout()
+        return f"{text}; {reason}" if reason else text
 
 
 class _Observer(_Sink[T]):

@@ -105,7 +105,8 @@ class Connection:
         """System ids that have a vehicle object on this connection."""
         self.components: set[tuple[int, int]] = set()
         """(system id, component id) of the components that this program provides on this connection."""
-        # (system id, component id) → function from loop time to milliseconds since boot; None while unknown.
+        # (system id, component id) → function that converts loop time to the component's milliseconds since boot; it
+        # returns None while they are unknown.
         self.boot_clocks: dict[tuple[int, int], Callable[[float], float | None]] = {}
         self.link_state: StateCell[LinkState] = StateCell("link_state", self.now, "frame")
         """State of the link, from frames of any sender; ``vehicle.link_state`` is about one vehicle."""
@@ -159,7 +160,7 @@ class Connection:
             InvalidArgument: a field is out of range; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended.
         """
-        self._send_by(self._encoder, message, to)
+        self._encode_and_write(self._encoder, message, to)
 
     @checked
     def write_raw(self, data: bytes) -> None:
@@ -177,13 +178,13 @@ class Connection:
                 f"data is not exactly one MAVLink frame: {len(data)} bytes starting with {bytes(data[:3]).hex()!r}"
             )
         frame = Frame.parse(bytes(data))
-        message_type = self.bus.dialect.get(frame.message_id)
-        self._write(frame.raw, None if message_type is None else self.bus.dialect.decode(frame), None)
+        is_known = self.bus.dialect.get(frame.message_id) is not None
+        self._write(frame.raw, self.bus.dialect.decode(frame) if is_known else None, to=None)
 
     def send_as(self, encoder: FrameEncoder, message: Message, *, to: int | None = None) -> None:
         """Send a message of another component of this program, which has an encoder of its own. See :meth:`send`."""
         encoder.version, encoder.signing = self._encoder.version, self._encoder.signing
-        self._send_by(encoder, message, to)
+        self._encode_and_write(encoder, message, to)
 
     def feed(self) -> None:
         """Keep our heartbeat going for another ``fed_within_s`` seconds (see `OwnHeartbeat`).
@@ -279,16 +280,18 @@ class Connection:
         """
         self.raise_if_ended()
         with self.subscribe(VehicleFound, capacity=MAX_ROUTES) as discoveries:
-            known = [discovery_event(heartbeat, self.now(), *source) for source, heartbeat in self.heartbeats.items()]
-            for found in known:
-                if isinstance(found, VehicleFound):
-                    yield found
-            async for found in discoveries:
-                yield found
+            earlier_discoveries = [
+                discovery_event(heartbeat, self.now(), *source) for source, heartbeat in self.heartbeats.items()
+            ]
+            for event in earlier_discoveries:
+                if isinstance(event, VehicleFound):
+                    yield event
+            async for event in discoveries:
+                yield event
 
     def attach(self, types: Sequence[type[Any]], sink: Sink, *, system_id: int = 0) -> list[Detach]:
         """Deliver these messages and events, of one system (0: of all), to ``sink``."""
-        return [self._attach(item, sink, system_id) for item in types]
+        return [self._attach(message_or_event, sink, system_id) for message_or_event in types]
 
     def observe_frames(self, callback: FrameObserver) -> Detach:
         """Call ``callback(frame, peer)`` with every received frame, after the subscribers got the message.
@@ -450,7 +453,7 @@ class Connection:
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
         """Called when the vehicle side of a zenoh network refused one of our commands."""
         self.bus.publish(OrderRefused(self._clock(), 0, message, reason, lease_holder))
-        for answer in answers:  # not through a framer, which would count them as received frames
+        for answer in answers:  # A framer would count these answers as received frames.
             self.bus.deliver(Frame.parse(answer, self._clock()))
 
     def link_lost(self, error: LinkLost) -> None:
@@ -479,6 +482,7 @@ class Connection:
             self._background.start(self._multilink.watch, "aerokit links")
 
     async def _send_heartbeats(self) -> None:
+        """Once a second: send our heartbeat if the program is active, update the link's state, save the recording."""
         while self.is_open:
             if self._heartbeat is not None and self._heartbeat.should_send():
                 self.send(self._heartbeat.message)
@@ -490,8 +494,9 @@ class Connection:
     def _end(self, error: Exception) -> None:
         if not self.is_open:
             return
-        self._end_signal.error = error
+        self._end_signal.error = error  # first, so that sinks of the following events find the connection closed
         self._receiver.close()
+        # A program that closes the connection itself needs no event about it.
         self._state_watch.mark_lost(self._clock(), publish=isinstance(error, LinkLost))
         self.link_state.close(error)
         if self._multilink is not None:
@@ -502,7 +507,7 @@ class Connection:
         self.deadlines.close()
         self._background.cancel()
 
-    def _send_by(self, encoder: FrameEncoder, message: Message, to: int | None) -> None:
+    def _encode_and_write(self, encoder: FrameEncoder, message: Message, to: int | None) -> None:
         self.raise_if_ended()
         data = self._encode(encoder, message)
         self._write(data, message, to)
@@ -523,13 +528,13 @@ class Connection:
         self.link.write(data, peer)
         self._observers.record_sent(data, self._clock())
 
-    def _attach(self, item: type[Any], sink: Sink, system_id: int) -> Detach:
-        if issubclass(item, Message):
-            return self.bus.attach(item, sink, system_id=system_id)
-        return self.bus.attach_event(item, _only(system_id, sink) if system_id else sink)
+    def _attach(self, message_or_event: type[Any], sink: Sink, system_id: int) -> Detach:
+        if issubclass(message_or_event, Message):
+            return self.bus.attach(message_or_event, sink, system_id=system_id)
+        return self.bus.attach_event(message_or_event, _filter_by_system(system_id, sink) if system_id else sink)
 
 
-def _only(system_id: int, sink: Sink) -> Sink:
+def _filter_by_system(system_id: int, sink: Sink) -> Sink:
     """Wrap a sink so that it gets only events of this system and of the link as a whole."""
 
     def filtered(event: Event) -> None:

@@ -75,9 +75,11 @@ class ExchangeRun(Generic[ResultT]):
         self._after_step()
 
     def _expire(self) -> None:
-        # A timer may fire early by the clock's resolution. The exchange must not wait again because of that.
         now = self._connection.now()
-        now, self._deadline = max(now, now if self._deadline is None else self._deadline), None
+        if self._deadline is not None:
+            # A timer may fire early by the clock's resolution. Without this line, the exchange would wait again.
+            now = max(now, self._deadline)
+            self._deadline = None
         try:
             self._exchange.expire(now)
         except Exception as error:

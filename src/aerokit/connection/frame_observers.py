@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-MAX_WAITING = 1000
+MAX_WAITING = 1000  # frames
 
-SETUP_SIGNING = (256).to_bytes(3, "little")
+SETUP_SIGNING = (256).to_bytes(3, "little")  # message id, as in the header of a MAVLink 2 frame
 
 
 class Recording:
@@ -48,10 +48,11 @@ class Recording:
         self._path = os.fspath(path)
         self._unix_epoch_s = time.time() - now
         self._writer: TlogWriter | None = None
-        self._waiting: deque[tuple[bytes, float]] | None = None  # frames sent before the first received one
+        # Sent frames that wait until the first frame is received and an existing file is replaced; None: write at once.
+        self._waiting: deque[tuple[bytes, float]] | None = None
         try:
             if os.path.isfile(path) and os.path.getsize(path):
-                with open(path, "ab"):
+                with open(path, "ab"):  # raises now if the file cannot be written later
                     self._waiting = deque(maxlen=MAX_WAITING)
             else:
                 self._writer = TlogWriter(path)
@@ -135,7 +136,7 @@ class FrameObservers:
 
     @property
     def want_all(self) -> bool:
-        """True if all received frames are needed, with or without subscribers."""
+        """True if the framer must build all received frames, also those without subscribers."""
         return self.recording is not None or bool(self.received)
 
     def add(self, callback: FrameObserver) -> Detach:
@@ -201,6 +202,6 @@ class FrameObservers:
 
 
 def _without(observers: tuple[_ObserverT, ...], callback: _ObserverT) -> tuple[_ObserverT, ...]:
-    left = list(observers)
-    left.remove(callback)
-    return tuple(left)
+    remaining = list(observers)
+    remaining.remove(callback)
+    return tuple(remaining)

@@ -102,6 +102,7 @@ class PeerTable:
         return framer
 
     def _make_room(self, now: float) -> bool:
+        """Evict a peer if the table is full. Return False if there is still no room."""
         if len(self.framers) < MAX_PEERS:
             return True
         evicted = list(self._evictable_peers(self.framers, now))
@@ -183,27 +184,29 @@ class FrameReceiver:
             self._check_and_deliver(frames, framer, peer)
             return
         last = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
-        if last is not None:  # a sink has closed the connection, set a key or added an observer
+        if last is not None:  # a sink of this frame has closed the connection, set a key or added an observer
             self.observers.notify_received(last, peer)
             self._check_and_deliver(frames[frames.index(last) + 1 :], framer, peer)
 
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
         """Deliver the frames that pass all checks, and pass them to the recording and the observers."""
         framers, multilink, gate, observers = self.framers, self._multilink, self._gate, self.observers
-        has_stale = bool(framer.late or framer.foreign)
+        may_be_stale = bool(framer.late or framer.foreign)
         for frame in frames:
-            if self._is_closed:  # a sink closed the receiver while processing an earlier frame
+            if self._is_closed:  # A sink of an earlier frame has closed the connection.
                 return
             if multilink is not None and multilink.is_copy(frame, peer):
                 continue
             is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
             if not gate.is_open and not self._is_admitted(frame, is_other_peer):
                 continue
+            # The recording of one link has every frame with a valid signature, also the frames that are refused below.
+            # With several links, frames are recorded after `accepts`, so that each frame is in the file once.
             if observers.recording is not None and multilink is None:
                 observers.recording.write(frame.raw, self._clock())
             if is_other_peer and not self._claims_route(framer, frame, peer):
                 continue
-            if has_stale and self._is_stale(framer, frame):
+            if may_be_stale and self._is_stale(framer, frame):
                 continue
             if multilink is not None:
                 if not multilink.accepts(frame, peer, framer.counters_of(frame)):
@@ -224,6 +227,7 @@ class FrameReceiver:
         return (framer.statistics for framer in self._peers)
 
     def counts(self, system_id: int) -> tuple[int, int]:
+        """Return how many frames of this system were received, and how many were lost by sequence number."""
         sources = [
             source
             for statistics in self.statistics()
@@ -275,7 +279,7 @@ class FrameReceiver:
         return is_admitted
 
     def _claims_route(self, framer: Framer, frame: Frame, peer: Peer) -> bool:
-        return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_checked(frame))
+        return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_verified(frame))
 
     def _is_stale(self, framer: Framer, frame: Frame) -> bool:
         """Return True if an out-of-order frame is to be dropped: a second sender's frame or an outdated heartbeat."""
@@ -299,6 +303,6 @@ class FrameReceiver:
             self.heartbeats[source] = heartbeat
             if is_new:
                 self._bus.publish(discovery_event(heartbeat, self._clock(), *source))
-            if len(self.heartbeats) > MAX_ROUTES:
-                for source in [source for source in self.heartbeats if not self._routes.has_route(source)]:
-                    del self.heartbeats[source]
+            if len(self.heartbeats) > MAX_ROUTES:  # more than there are routes, so some belong to expired routes
+                for expired in [source for source in self.heartbeats if not self._routes.has_route(source)]:
+                    del self.heartbeats[expired]

@@ -119,20 +119,29 @@ class HeartbeatWatchdog:
     """Decides each second whether our heartbeat is sent, and publishes an event when that changes."""
 
     def __init__(self, settings: OwnHeartbeat, clock: Callable[[], float], publish: Callable[[Event], None]) -> None:
-        self.message: Heartbeat = Heartbeat(settings.type, MavAutopilot.INVALID, 0, 0, MavState.ACTIVE, 3)
+        self.message: Heartbeat = Heartbeat(
+            settings.type,
+            MavAutopilot.INVALID,
+            base_mode=0,
+            custom_mode=0,
+            system_status=MavState.ACTIVE,
+            mavlink_version=3,
+        )
         self.activity: ActivityMonitor = ActivityMonitor(clock)
         self._limit_s = settings.fed_within_s
         self._clock, self._publish = clock, publish
         self._paused_at: float | None = None
 
     def require(self, activity: ActivityMonitor, fed_within_s: float) -> None:
-        """Also watch this activity. ``fed_within_s`` is the limit if the settings have none."""
+        """Watch this activity from now on. ``fed_within_s`` is the limit if the settings have none."""
         self.activity = activity
-        self._limit_s = fed_within_s if self._limit_s is None else self._limit_s
+        if self._limit_s is None:
+            self._limit_s = fed_within_s
 
     def should_send(self) -> bool:
         """Return True if the heartbeat is to be sent now."""
-        idle_s, limit_s = self.activity.idle_s, math.inf if self._limit_s is None else self._limit_s
+        idle_s = self.activity.idle_s
+        limit_s = math.inf if self._limit_s is None else self._limit_s
         now = self._clock()
         if idle_s <= limit_s:
             if self._paused_at is not None:
@@ -172,6 +181,7 @@ class LinkStateTracker:
             self._set(LinkState.CONNECTED, at)
 
     def update(self, now: float, frames: int) -> None:
+        """Set the state from ``frames``, the number of frames received since the start."""
         if frames != self._frames:
             self._frames = frames
             self.record_activity(now)

@@ -62,6 +62,7 @@ class LoopWatch:
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._on_blocked, self._on_slept = on_blocked, on_slept
+        # The maximum of three readings, because a single reading may be too small; see `_has_slept`.
         self._suspended, self._suspended_before = suspended, max(suspended() for _ in range(3))
         self.late_after: float = math.inf
         """Data read up to this loop time has not waited. For data read later, call :meth:`arrival`."""
@@ -69,7 +70,7 @@ class LoopWatch:
         self._timer: asyncio.TimerHandle | None = None
         self.oldest_arrival: float = math.inf
         """Earliest possible receive time of data that is read now; infinite while no data can have waited."""
-        self._check_sleep_at = -math.inf
+        self._check_sleep_at = -math.inf  # the next time at which to read the clocks, because reading them is slow
         self._has_read = False
         self._idle_iterations = 0
 
@@ -97,29 +98,29 @@ class LoopWatch:
             self._set_timer(now)
             return now
         self._has_read = True
-        return self._fall_behind()
+        return self._assume_waiting_data()
 
     def _tick(self) -> None:
         now = self._loop.time()
-        late = now - self._due
+        late_s = now - self._due
         has_slept = self._has_slept()
         if self._timer is None:  # A sink of ComputerSlept has closed the connection.
             return
-        if has_slept or late > LATE_THRESHOLD_S:
-            self._fall_behind()
+        if has_slept or late_s > LATE_THRESHOLD_S:
+            self._assume_waiting_data()
         self._set_timer(now)
-        if late > BLOCKED_THRESHOLD_S:
-            self._on_blocked(late + CHECK_INTERVAL_S)
+        if late_s > BLOCKED_THRESHOLD_S:
+            self._on_blocked(late_s + CHECK_INTERVAL_S)
 
     def _has_slept(self) -> bool:
-        # If the process is preempted between reading the two clocks, the value is too small. The true value never
-        # shrinks.
+        # The suspended time is too small if the process is preempted between reading the two clocks. It never shrinks,
+        # so the largest reading is the best.
         before = self._suspended_before
         self._suspended_before = max(before, self._suspended())
         slept_s = self._suspended_before - before
         if slept_s <= LATE_THRESHOLD_S:
             return False
-        self._ran_at -= slept_s
+        self._ran_at -= slept_s  # the loop's clock stood still, so data may have waited for this time, too
         self._on_slept(slept_s)
         return True
 
@@ -129,19 +130,21 @@ class LoopWatch:
             self.late_after = now + CHECK_INTERVAL_S / 2
         self._timer = self._loop.call_at(self._due, self._tick)
 
-    def _fall_behind(self) -> float:
+    def _assume_waiting_data(self) -> float:
+        """Date data that is read from now on to the time at which the loop last ran. Return that time."""
         if self.oldest_arrival == math.inf:
             self.oldest_arrival, self.late_after, self._idle_iterations = self._ran_at, -math.inf, 0
-            self._loop.call_soon(self._check_idle)
+            self._loop.call_soon(self._end_assumption_when_idle)
         return self.oldest_arrival
 
-    def _check_idle(self) -> None:
+    def _end_assumption_when_idle(self) -> None:
+        """After `IDLE_ITERATIONS` iterations without a read, take data as received when it is read again."""
         self._idle_iterations = 0 if self._has_read else self._idle_iterations + 1
         self._has_read = False
         if self._timer is None:
             return
         if self._idle_iterations < IDLE_ITERATIONS:
-            self._loop.call_soon(self._check_idle)
+            self._loop.call_soon(self._end_assumption_when_idle)
         else:
             self.oldest_arrival = math.inf
             self.late_after = self._ran_at + CHECK_INTERVAL_S / 2

@@ -92,7 +92,7 @@ async def open_connection(
     """
     if not baud > 0:
         raise InvalidArgument(f"baud = {baud} is not allowed: above 0")
-    link = _link(address, baud, reconnect, peers)
+    link = _create_link(address, baud, reconnect, peers)
     _import_messages()
     connection = Connection(
         link,
@@ -128,12 +128,14 @@ def _import_messages() -> None:
         import_module(f"aerokit.mavlink.messages.{name}")
 
 
-def _link(address: str | Link | Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None) -> Link:
+def _create_link(
+    address: str | Link | Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None
+) -> Link:
     if isinstance(address, str):
         make_link = partial(create_link, address, baud=baud, peers=peers)
         return ReconnectingLink(make_link) if reconnect else make_link()
     if not isinstance(address, Link):
-        return _several(address, baud, reconnect, peers)
+        return _create_multilink(address, baud, reconnect, peers)
     if reconnect:
         raise InvalidArgument(
             "reconnect = True is not allowed with a link object, which can be opened only once: pass an address,"
@@ -146,15 +148,15 @@ def _link(address: str | Link | Sequence[str | Link], baud: int, reconnect: bool
     return address
 
 
-def _several(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None) -> Link:
+def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None) -> Link:
     if not isinstance(addresses, (list, tuple)) or not all(isinstance(address, (str, Link)) for address in addresses):
         raise InvalidArgument(
             f"address = {short_repr(addresses)} is not allowed: an address, a link, or a list of them"
         )
     if len(addresses) < 2:
         if not addresses:
-            raise InvalidArgument("address = [] is not allowed: at least one")
-        return _link(addresses[0], baud, reconnect, peers)
+            raise InvalidArgument("address = [] is not allowed: at least one address or link")
+        return _create_link(addresses[0], baud, reconnect, peers)
     from aerokit.transport import MultiLink, parse_address  # imported here because few programs need them
 
     targets = [address if isinstance(address, Link) else parse_address(address) for address in addresses]
@@ -163,7 +165,7 @@ def _several(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers:
     costly: set[int] = set()
     for index, address in enumerate(addresses):
         if isinstance(address, Link):
-            factories.append(partial(_identity, address))
+            factories.append(partial(_return_link, address))
             continue
         parsed = parse_address(address)
         if parsed.option("costly") == "1":
@@ -172,8 +174,9 @@ def _several(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers:
             raise InvalidArgument(
                 f"{address} is not allowed among several links: a recording cannot replace a link to a vehicle"
             )
-        accepted = peers if parsed.kind in ("udpin", "udpbcast", "tcpin") else None
-        factories.append(partial(ReconnectingLink, partial(create_link, parsed, baud=baud, peers=accepted)))
+        # The filter applies to the listening links of the list. Other kinds of links refuse the argument.
+        peer_filter = peers if parsed.kind in ("udpin", "udpbcast", "tcpin") else None
+        factories.append(partial(ReconnectingLink, partial(create_link, parsed, baud=baud, peers=peer_filter)))
     return MultiLink(factories, costly=costly, survives_loss=reconnect)
 
 
@@ -194,14 +197,16 @@ def _target_key(target: Link | LinkAddress) -> object:
     """Return a key of the port or socket that an address opens; None if it opens a new socket each time."""
     if isinstance(target, Link):
         return id(target)
-    is_new = (target.kind in ("udpin", "tcpin") and not target.port) or (target.kind == "pty" and not target.path)
-    if is_new:
+    opens_new_socket = (target.kind in ("udpin", "tcpin") and not target.port) or (
+        target.kind == "pty" and not target.path
+    )
+    if opens_new_socket:
         return None
     endpoints = [option for option in target.options if option[0] in ("connect", "listen")]  # options of zenoh
     return target.kind, target.host, target.port, target.device, target.path, tuple(endpoints)
 
 
-def _identity(link: Link) -> Link:
+def _return_link(link: Link) -> Link:
     return link
 
 
@@ -218,7 +223,7 @@ def explain_no_vehicle(connection: Connection, wanted_system: int | None) -> str
 
 class _Diagnosis:
     def __init__(self, connection: Connection, wanted_system: int | None) -> None:
-        self._wanted = wanted_system
+        self._wanted_system = wanted_system
         self._heartbeats = connection.heartbeats
         self._signature_problems = connection.describe_signature_problems()
         statistics = list(connection.statistics())
@@ -226,8 +231,8 @@ class _Diagnosis:
         self._frames = sum(counters.frames for counters in statistics)
         self._bad_crcs = sum(counters.bad_crcs for counters in statistics)
         self._bad_bytes = sum(counters.bad_bytes for counters in statistics)
-        self._unknown = sum(counters.unknown_ids for counters in statistics)
-        self._unknown_messages = {number for counters in statistics for number in counters.unknown_messages}
+        self._unknown_frames = sum(counters.unknown_ids for counters in statistics)
+        self._unknown_messages = {message_id for counters in statistics for message_id in counters.unknown_messages}
         self._systems = {system for counters in statistics for system, _ in counters.sources}
 
     def text(self) -> str:
@@ -242,11 +247,12 @@ class _Diagnosis:
     def _without_frames(self) -> str:
         # Noise contains a few patterns that look like frames, so a few of them justify no diagnosis.
         received = f"{self._bytes} bytes were received"
-        if self._unknown and 2 * self._bad_bytes < self._bytes:
+        is_mostly_framed = 2 * self._bad_bytes < self._bytes
+        if self._unknown_frames and is_mostly_framed:
             numbers = ", ".join(map(str, sorted(self._unknown_messages)[:MAX_LISTED_IDS]))
             return (
-                f"{received}, with {self._unknown} frames of an unknown dialect (messages {numbers}) and no known"
-                " message: pass dialect=Dialect.from_xml(...)"
+                f"{received}, with {self._unknown_frames} frames of an unknown dialect (messages {numbers}) and no"
+                " known message: pass dialect=Dialect.from_xml(...)"
             )
         if self._bad_crcs * NOISE_BYTES > self._bytes:
             return f"{received}, with {self._bad_crcs} damaged frames and no valid one: noisy link, or another dialect?"
@@ -261,11 +267,11 @@ class _Diagnosis:
         return f"{received}, but no HEARTBEAT among them"
 
     def _without_vehicle(self) -> str:
-        autopilots = sorted({system for (system, _), beat in self._heartbeats.items() if is_autopilot(beat)})
+        autopilots = sorted({system for (system, _), heartbeat in self._heartbeats.items() if is_autopilot(heartbeat)})
         if autopilots:
             names = ", ".join(map(str, autopilots))
-            return f"only vehicles with other system ids were received: {names} (wanted: {self._wanted})"
+            return f"only vehicles with other system ids were received: {names} (wanted: {self._wanted_system})"
         names = ", ".join(f"{system}/{component}" for system, component in sorted(self._heartbeats))
-        if all(beat.type == MavType.GCS for beat in self._heartbeats.values()):
+        if all(heartbeat.type == MavType.GCS for heartbeat in self._heartbeats.values()):
             return f"only ground stations were received ({names})"
         return f"only components that are not autopilots were received ({names})"

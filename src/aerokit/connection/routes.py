@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 # Message id → offset of time_boot_ms in a frame's body: SYSTEM_TIME, ATTITUDE, ATTITUDE_QUATERNION, LOCAL_POSITION_NED,
 # GLOBAL_POSITION_INT.
-_BOOT_TIME_AT = {2: 17, 30: 9, 31: 9, 32: 9, 33: 9}
+_BOOT_TIME_OFFSETS = {2: 17, 30: 9, 31: 9, 32: 9, 33: 9}
 
 CLAIM_MIN_FRAMES = 3
 
@@ -35,55 +35,61 @@ class RouteClaim:
     """
 
     __slots__ = (
+        "_claimed_at",
         "_clock_matches",
         "_expected",
         "_frames",
         "_sequence_matches",
-        "_since",
         "is_duplicate_reported",
         "is_refusal_reported",
     )
 
     def __init__(self) -> None:
-        self._expected: int | None = None
+        self._expected: int | None = None  # sequence number expected of the owner when the claim was made
+        # True if the peer's sequence numbers and time since boot continue the owner's stream; None: unknown.
         self._sequence_matches: bool | None = None
         self._clock_matches: bool | None = None
-        self._frames, self._since = 0, 0.0  # counted since the owner's last frame
+        # Number of the peer's frames since the owner's last frame, and the time of the first of them.
+        self._frames, self._claimed_at = 0, 0.0
         self.is_duplicate_reported: bool = False
         self.is_refusal_reported: bool = False
 
     def add(self, frame: Frame, evidence: tuple[int, bool | None, bool | None]) -> None:
         """Add a frame and its evidence, the result of ``Routes._evidence``."""
         expected, sequence_matches, clock_matches = evidence
-        if expected != self._expected:
+        if expected != self._expected:  # the owner has sent since the last call, so the claim is judged anew
             self._expected = expected
             self._frames = 0
             self.is_refusal_reported = False
             self._sequence_matches, self._clock_matches = sequence_matches, None
-            self._since = frame.received_at
+            self._claimed_at = frame.received_at
         self._frames += 1
-        if clock_matches is not None and self._clock_matches is not False:
+        if clock_matches is not None and self._clock_matches is not False:  # one mismatch is final
             self._clock_matches = clock_matches
 
     @property
     def continues_owner(self) -> bool:
+        """True if the evidence proves that the owner itself sends from the new peer."""
         return self._sequence_matches is not False and self._clock_matches is True
 
     def has_replaced(self, now: float, rate: float) -> bool:
         """Return True if the claim continues the owner's stream, and the owner missed three frames at this rate."""
         return (
-            self.continues_owner and self._frames >= CLAIM_MIN_FRAMES and (now - self._since) * rate >= CLAIM_MIN_FRAMES
+            self.continues_owner
+            and self._frames >= CLAIM_MIN_FRAMES
+            and (now - self._claimed_at) * rate >= CLAIM_MIN_FRAMES
         )
 
     @property
     def may_continue_owner(self) -> bool:
+        """True if no evidence contradicts that the owner itself sends from the new peer."""
         return self._sequence_matches is not False and self._clock_matches is not False
 
 
 def boot_time_ms(frame: Frame) -> int | None:
     """Return the sender's time since boot in milliseconds, or None if the frame does not contain it."""
-    begin = _BOOT_TIME_AT.get(frame.message_id)
-    return None if begin is None else int.from_bytes(frame.body[begin : begin + 4], "little")
+    offset = _BOOT_TIME_OFFSETS.get(frame.message_id)
+    return None if offset is None else int.from_bytes(frame.body[offset : offset + 4], "little")
 
 
 logger: logging.Logger = logging.getLogger("aerokit")
@@ -125,7 +131,7 @@ class Routes:
     dropped (``DuplicateSender``). Another peer takes over the route (``RouteChanged``)
 
     1. at once, if it is another port of the same host and continues the owner's stream: three frames continue the
-    sequence numbers and, where known, the time since boot, while the owner is silent for the time of three frames;
+       sequence numbers and, where known, the time since boot, while the owner is silent for the time of three frames;
     2. after 3.5 s without a heartbeat, or when a TCP client has disconnected: if it is on the same host (a reboot or
        restart, with new numbers), or continues the stream as above from any host, or signs with our key;
     3. in the same case from any host, if the system has no vehicle object or the program allows it (``may_move``).
@@ -162,8 +168,9 @@ class Routes:
                 return False
             route = self._routes[source] = _Route()
         if counters is not None:
-            if route.counters is counters and (elapsed := frame.received_at - route.heartbeat_at) > 0:
-                route.rate = (counters.expected - route.expected) / elapsed
+            is_first = route.counters is not counters  # the first heartbeat, or the first that a new framer counted
+            if not is_first and frame.received_at > route.heartbeat_at:
+                route.rate = (counters.expected - route.expected) / (frame.received_at - route.heartbeat_at)
             route.counters, route.expected = counters, counters.expected
         route.peer, route.heartbeat_at, route.sequence = peer, frame.received_at, frame.sequence
         return True
@@ -190,7 +197,7 @@ class Routes:
         except KeyError:
             peers = {route.peer for (system, _), route in self._routes.items() if system == system_id}
             if len(peers) > 1:
-                peers -= self._duplicates_of(system_id)
+                peers -= self._peers_of_duplicate_autopilots(system_id)
             return peers or EVERY_PEER
 
     def arrived_on_other_peer(self, frame: Frame, peer: Peer) -> bool:
@@ -204,12 +211,12 @@ class Routes:
         route = self._routes[source]
         is_silent = now - route.heartbeat_at > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)
         is_same_host = self._link.host_of(peer) == self._link.host_of(route.peer)
-        is_free = self._may_move or is_signed or is_same_host or frame.system_id not in self._attached
+        needs_no_evidence = self._may_move or is_signed or is_same_host or frame.system_id not in self._attached
         claim = self._claim(source, peer)
         claim.add(frame, self._evidence(route, frame, counters))
         has_replaced = is_same_host and claim.has_replaced(now, route.rate)
-        if has_replaced or (is_silent and (is_free or claim.continues_owner)):
-            self._move(route, frame, peer)
+        if has_replaced or (is_silent and (needs_no_evidence or claim.continues_owner)):
+            self._move_route(route, frame, peer)
             return True
         self._report(claim, frame, peer, is_silent=is_silent, is_same_host=is_same_host)
         return False
@@ -237,7 +244,8 @@ class Routes:
         self._claims = {key: claim for key, claim in self._claims.items() if key[1] != evicted}
         return [evicted]
 
-    def _duplicates_of(self, system_id: int) -> set[Peer]:
+    def _peers_of_duplicate_autopilots(self, system_id: int) -> set[Peer]:
+        """Return the peers reported as duplicates: they send as the autopilot, but another peer owns its route."""
         autopilot = system_id, MavComponent.AUTOPILOT1
         return {
             peer
@@ -250,40 +258,50 @@ class Routes:
         claim = self._claims.get(key)
         if claim is None:
             if len(self._claims) >= MAX_CLAIMS:
-                del self._claims[next(iter(self._claims))]
+                del self._claims[next(iter(self._claims))]  # drop the oldest claim
             claim = self._claims[key] = RouteClaim()
         return claim
 
     def _evidence(
         self, route: _Route, frame: Frame, counters: SourceStatistics | None
     ) -> tuple[int, bool | None, bool | None]:
-        """Return the owner's expected frame count, and whether number and clock continue the stream (None: unknown)."""
+        """Return the evidence for :meth:`RouteClaim.add`.
+
+        It is the frame count that is expected of the owner, and whether the frame's sequence number and time since boot
+        continue the owner's stream (None: unknown).
+        """
         sequence_matches: bool | None = None
-        silent_for = max(frame.received_at - route.heartbeat_at, 0.0)
+        silent_s = max(frame.received_at - route.heartbeat_at, 0.0)
         expected = 0
         if route.counters is not None:
             expected = route.counters.expected
-            max_ahead = 8 + 1.5 * route.rate * silent_for
-            if max_ahead < 128:
+            # The owner may have sent half more frames than at its measured rate, and a burst of eight.
+            max_ahead = 8 + 1.5 * route.rate * silent_s
+            if max_ahead < 128:  # A larger share of the 256 sequence numbers would match by chance.
                 sequence_matches = (frame.sequence - expected) & 0xFF <= max_ahead
         clock = self._boot_clocks.get((frame.system_id, frame.component_id))
         expected_ms = None if clock is None else clock(frame.received_at)
-        if expected_ms is None:
-            return expected, sequence_matches, None if sequence_matches is None else True
         boot_ms = boot_time_ms(frame)
-        clock_matches = None if boot_ms is None else abs(boot_ms - expected_ms) <= 1500 + 50 * silent_for
+        clock_matches: bool | None = None
+        if expected_ms is None:
+            # The owner's clock is unknown, so sequence numbers alone decide.
+            clock_matches = None if sequence_matches is None else True
+        elif boot_ms is not None:
+            tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence
+            clock_matches = abs(boot_ms - expected_ms) <= tolerance_ms
         return expected, sequence_matches, clock_matches
 
-    def _move(self, route: _Route, frame: Frame, peer: Peer) -> None:
+    def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
         before, route.peer, route.heartbeat_at = route.peer, peer, frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
         self._claims = {key: claim for key, claim in self._claims.items() if key[0] != source}
-        self._publish(RouteChanged(frame.received_at, *source, _name(before), _name(peer)))
+        self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
     def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
         source = frame.system_id, frame.component_id
-        if not claim.is_duplicate_reported and not (is_same_host and claim.may_continue_owner):
+        may_be_owner = is_same_host and claim.may_continue_owner  # e.g. the owner has just changed its port
+        if not claim.is_duplicate_reported and not may_be_owner:
             claim.is_duplicate_reported = True
             self._publish(DuplicateSender(frame.received_at, *source))
         if is_silent and not claim.may_continue_owner and not claim.is_refusal_reported:
@@ -292,9 +310,9 @@ class Routes:
                 "%d/%d is silent; frames from %s under the same ids are refused, because they do not continue its"
                 " stream (may_move=True accepts them)",
                 *source,
-                _name(peer),
+                _peer_name(peer),
             )
-            self._publish(RouteChangeRefused(frame.received_at, *source, _name(peer)))
+            self._publish(RouteChangeRefused(frame.received_at, *source, _peer_name(peer)))
 
     def _sweep(self, now: float) -> bool:
         """Remove expired routes, at most once a second. Return True if there is room."""
@@ -311,7 +329,7 @@ class Routes:
 _SAME_PEER = object()  # key for claims of a second sender behind the same peer as the owner
 
 
-def _name(peer: Peer) -> str:
+def _peer_name(peer: Peer) -> str:
     peer = getattr(peer, "peer", peer)  # with a MultiLink, use the peer of the member link
     if isinstance(peer, tuple) and len(peer) >= 2:
         host, port = peer[:2]

@@ -38,12 +38,12 @@ class SignatureGate:
     ) -> None:
         self._encoder, self._unix_time, self._publish = encoder, unix_time, publish
         self._reported: set[Refusal] = set()
-        self._handover: _Handover | None = None
-        self._is_handing_over = False
-        self._keep_error: OSError | None = None
+        self._handover: _Handover | None = None  # None again after the switch
+        self._is_handing_over = False  # True until the block of key_handover() ends
+        self._logged_keep_error: OSError | None = None
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
-        self.on_change: Callable[[], object] = bool
+        self.on_change: Callable[[], object] = bool  # bool() does nothing
         """Called when :attr:`is_open` may have changed."""
 
     def use(self, signing: Signing | None) -> None:
@@ -67,11 +67,11 @@ class SignatureGate:
         if self._is_handing_over:
             raise BusyError("setup_signing: a key handover to another vehicle on this connection is in progress")
         self._is_handing_over = True
-        taken = asyncio.Event()
-        self._handover = _Handover(signing, (system_id, component_id), taken)
+        switched = asyncio.Event()
+        self._handover = _Handover(signing, (system_id, component_id), switched)
         self._update()
         try:
-            yield taken
+            yield switched
         finally:
             self._handover, self._is_handing_over = None, False
             self._update()
@@ -87,16 +87,18 @@ class SignatureGate:
         """
         handover = self._handover
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
-        if handover is not None and is_of_handover and handover.is_shown_by(frame, self._unix_time()):
+        if handover is not None and is_of_handover and handover.is_completed_by(frame, self._unix_time()):
             self._handover = None
             self.use(handover.signing)
-            handover.taken.set()
+            handover.switched.set()
         signing = self._encoder.signing
         if signing is None:
             return True
         try:
             if is_of_handover and not _has_key(frame):
-                return signing.may_be_unsigned(frame)  # neither reported nor counted as refused
+                # The program may be removing this vehicle's key, so its unsigned frames are neither reported nor
+                # counted as refused.
+                return signing.may_be_unsigned(frame)
             refusal = signing.check(frame, self._unix_time())
         except Exception:
             logger.exception("allow_unsigned of %r raised; the frame was refused", signing)
@@ -106,7 +108,7 @@ class SignatureGate:
             self._report(frame, signing, refusal)
         return refusal is None
 
-    def has_checked(self, frame: Frame) -> bool:
+    def has_verified(self, frame: Frame) -> bool:
         """Return True if the signature of an admitted frame was verified with our key."""
         return self._encoder.signing is not None and bool(frame.incompat_flags & SIGNED)
 
@@ -124,9 +126,9 @@ class SignatureGate:
         """Log once when the file of ``Signing(keep=…)`` cannot be written."""
         signing = self._encoder.signing
         error = None if signing is None else signing.keep_error
-        if error is not None and self._keep_error is None:
+        if error is not None and self._logged_keep_error is None:
             logger.error("the time stamp of %r cannot be stored: %s", signing, error)
-        self._keep_error = error
+        self._logged_keep_error = error
 
     def describe(self, heartbeats: Iterable[Heartbeat]) -> str:
         """Explain, for error texts, why signatures block communication with these senders; "" if none do."""
@@ -148,15 +150,16 @@ def _has_key(frame: Frame) -> bool:
 class _Handover:
     """Change of one component to another key, or to no key."""
 
-    def __init__(self, signing: Signing | None, source: tuple[int, int], taken: asyncio.Event) -> None:
-        self.signing, self.taken = signing, taken
+    def __init__(self, signing: Signing | None, source: tuple[int, int], switched: asyncio.Event) -> None:
+        self.signing, self.switched = signing, switched
         self._source = source
         self._unsigned, self._unsigned_since = 0, 0.0
 
     def concerns(self, frame: Frame) -> bool:
         return (frame.system_id, frame.component_id) == self._source
 
-    def is_shown_by(self, frame: Frame, unix_time_s: float) -> bool:
+    def is_completed_by(self, frame: Frame, unix_time_s: float) -> bool:
+        """Return True if this frame and the earlier ones show that the component uses the new key, or no key."""
         if self.signing is not None:
             return self.signing.would_accept(frame, unix_time_s)
         if _has_key(frame):

@@ -133,7 +133,7 @@ class Deadlines:
         self._loop = asyncio.get_running_loop()
         self._deadlines: dict[Alarm, float] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0  # stored here, because a uvloop handle does not give a time that has passed
+        self._timer_at = 0.0  # stored here, because uvloop's TimerHandle does not give a time that has passed
 
     def set(self, alarm: Alarm, at: float) -> None:
         """Call ``alarm`` at ``at`` (seconds, loop time). This replaces an earlier deadline of the alarm."""
@@ -150,10 +150,11 @@ class Deadlines:
             self._timer.cancel()
             self._timer = None
 
-    def _fire(self, now: float) -> None:
+    def _fire(self, timer_at: float) -> None:
+        # Compared with the time of the timer, not with the clock, because a loop may fire a timer slightly early.
         self._timer = None
-        for alarm in [alarm for alarm, at in self._deadlines.items() if at <= now]:
-            if self._deadlines.pop(alarm, None) is not None:
+        for alarm in [alarm for alarm, at in self._deadlines.items() if at <= timer_at]:
+            if self._deadlines.pop(alarm, None) is not None:  # None: an earlier alarm has cancelled this one
                 alarm()
         if self._deadlines:
             self._schedule(min(self._deadlines.values()))

@@ -222,7 +222,7 @@ class CurrentCommand:
             await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
             return
         if aio.heartbeat_age > MODE_MAX_AGE_S:
-            raise APIException(f"next = {seq} was not confirmed, and the vehicle is silent: it may have been set")
+            raise APIException(f"the vehicle is silent and did not confirm next = {seq}, which may or may not be set")
         if seq == 0:
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:

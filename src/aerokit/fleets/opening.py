@@ -91,7 +91,7 @@ async def fleet(
     """
     rules = PolicyRules(on_error, on_error_by_group or {})
     if min_distance_m is not None and not 0 < min_distance_m < 10_000:
-        raise InvalidArgument(f"min_distance_m = {min_distance_m!r} is not allowed: above 0 to 10,000 metres")
+        raise InvalidArgument(f"min_distance_m = {min_distance_m!r} is not allowed: above 0 and below 10,000 metres")
     if on_too_close not in ("hold", "report"):
         raise InvalidArgument(f"on_too_close = {on_too_close!r} is not allowed: 'hold' or 'report'")
     unknown = [group for group in on_error_by_group or {} if group and group not in (groups or {})]

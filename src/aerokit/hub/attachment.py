@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     Report = Callable[["Attachment", HubEventKind, str], object]
 
 # Unsent bytes above which frames are queued: a third of a second of a slow radio.
-HOLD_ABOVE = {"serial": 2048, "pty": 2048}
-DEFAULT_HOLD_ABOVE = 16 * 1024
+QUEUE_ABOVE_BYTES = {"serial": 2048, "pty": 2048}
+DEFAULT_QUEUE_ABOVE_BYTES = 16 * 1024
 
 # These links send or drop data at once, so that their unsent bytes need not be checked.
 UNBUFFERED_KINDS = ("udpin", "udpout", "udpbcast")
@@ -60,7 +60,10 @@ class Attachment:
         self.name: str = endpoint.name or self.link.address
         self.keeps_peers = True
         self.is_open: bool = False
-        self._is_on_link = self._is_single = self._reports_bursts = False
+        self._is_on_link = False  # True once the link was opened here, so that it must be closed here
+        self._reports_bursts = False
+        # True if the link has one remote end, e.g. a serial port. Its port is that of peer None.
+        self._is_single = False
         self._burst: list[bytes] = []
         self._burst_peer: Peer = None
         self._ports: dict[Peer, Port] = {}
@@ -70,7 +73,7 @@ class Attachment:
         )
         self._is_full_reported = False
         self.counters: EndpointCounters = EndpointCounters(Counter())
-        self._former = [0, 0, 0, 0]  # frames, bytes, lost frames, bad bytes of former peers
+        self._former_totals = [0, 0, 0, 0]  # frames, bytes, lost frames and bad bytes of former peers
         self._reported_refusals: set[str] = set()
         self._gateway: SigningGateway | None = None
         if endpoint.signing is not None:
@@ -93,9 +96,10 @@ class Attachment:
 
     def statistics(self) -> EndpointStatistics:
         router, ports = self._switch.router, tuple(self._ports.values())
-        sums = list(self._former)
+        totals = list(self._former_totals)
         for framer in self._peers:
-            sums = [before + more for before, more in zip(sums, _counted(framer), strict=True)]
+            totals = [total + count for total, count in zip(totals, _totals(framer), strict=True)]
+        frames_in, bytes_in, lost, bad_bytes = totals
         systems = {source for port in ports if port.node is not None for source in router.senders_at(port.node)}
         dropped = {reason: count for reason, count in self.counters.dropped.items() if count}
         if self.link.dropped_writes:
@@ -105,12 +109,12 @@ class Attachment:
             address=self.link.address,
             is_open=self.is_open,
             peers=len(ports),
-            frames_in=sums[0],
-            bytes_in=sums[1],
+            frames_in=frames_in,
+            bytes_in=bytes_in,
             frames_out=self.counters.frames_out,
             bytes_out=self.counters.bytes_out,
-            lost=sums[2],
-            bad_bytes=sums[3],
+            lost=lost,
+            bad_bytes=bad_bytes,
             waiting=sum(port.waiting for port in ports),
             dropped=dropped,
             systems=tuple(sorted(systems)),
@@ -119,7 +123,8 @@ class Attachment:
     # -------------------------------------------------------------------- called by the link
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        # Hot path. The datagrams of one burst of a peer are processed together.
+        # Hot path. The datagrams of one burst of a peer are processed together. A datagram that does not begin with a
+        # frame is processed alone, because joined data is forwarded unchanged only if it consists of whole frames.
         if self._burst:
             if peer == self._burst_peer and data[:1] in _MAGICS:
                 self._burst.append(data)
@@ -143,20 +148,22 @@ class Attachment:
 
     def _receive(self, data: bytes, peer: Peer) -> None:
         try:
-            now, port_peer = self._now(), None if self._is_single else peer
+            now = self._now()
+            port_peer = None if self._is_single else peer
             framer = self._peers.framers.get(port_peer)
             is_whole = False  # True if the data consists of whole valid frames only
             if framer is not None:
-                had_waiting, bad_bytes = framer.waiting, framer.statistics.bad_bytes
+                waiting_before, bad_bytes_before = framer.waiting, framer.statistics.bad_bytes
                 frames = framer.receive(data, now)
-                is_whole = not (had_waiting or framer.waiting) and framer.statistics.bad_bytes == bad_bytes
+                has_partial_frame = bool(waiting_before or framer.waiting)
+                is_whole = not has_partial_frame and framer.statistics.bad_bytes == bad_bytes_before
             else:
                 framer, frames = self._peers.receive_unverified(port_peer, data, now)
                 self._report_full(framer, port_peer)
             if frames:
                 port = self._ports.get(port_peer) or self._add_port(port_peer)
-                self._switch.take(port, framer, frames, data if is_whole else None, now)
-                if port_peer != peer:  # this peer has answered a broadcast
+                self._switch.receive(port, framer, frames, data if is_whole else None, now)
+                if port_peer != peer:  # a peer of a udpbcast link, which has answered our broadcast
                     self.link.keep_peer(peer)
         except Exception as error:
             self._report(self, "internal_error", f"internal error of aerokit: {error!r}")
@@ -164,12 +171,12 @@ class Attachment:
     def peer_joined(self, peer: Peer) -> None:
         if peer not in self._ports:
             self._add_port(peer)
-            self._report(self, "client_joined", f"{_name(peer)} has connected")
+            self._report(self, "client_joined", f"{_client_name(peer)} has connected")
 
     def peer_left(self, peer: Peer) -> None:
         if peer in self._ports:
             self._forget(peer)
-            self._report(self, "client_left", f"{_name(peer)} has disconnected")
+            self._report(self, "client_left", f"{_client_name(peer)} has disconnected")
 
     def link_interrupted(self, error: LinkLost) -> None:
         self._on_down()
@@ -211,7 +218,7 @@ class Attachment:
             self.counters,
             endpoint=self.name,
             dialect=self._dialect,
-            hold_above=self._hold_above(),
+            queue_above_bytes=self._queue_above_bytes(),
             period=self.filters.period,
             report=partial(self._report, self),
             on_drop=self._on_drop,
@@ -223,11 +230,11 @@ class Attachment:
         self._switch.add(port)
         return port
 
-    def _hold_above(self) -> int:
+    def _queue_above_bytes(self) -> int:
         kind = self.link.address.partition(":")[0]
         if kind in UNBUFFERED_KINDS and isinstance(self.endpoint.address, str):
             return UNLIMITED
-        return _hold_above(self.link.address)
+        return _queue_above_bytes(self.link.address)
 
     def _forget(self, peer: Peer) -> None:
         self._forget_port(peer)
@@ -236,7 +243,9 @@ class Attachment:
     def _forget_port(self, peer: Peer) -> None:
         framer = self._peers.framers.get(peer)
         if framer is not None:
-            self._former = [a + b for a, b in zip(self._former, _counted(framer), strict=True)]
+            self._former_totals = [
+                total + count for total, count in zip(self._former_totals, _totals(framer), strict=True)
+            ]
         self._guard.forget(peer)
         port = self._ports.pop(peer, None)
         self._guard.is_shared = len(self._ports) > 1
@@ -254,7 +263,7 @@ class Attachment:
             self._report(self, "refused", text)
 
     def _report_peer(self, kind: HubEventKind, peer: Peer, text: str) -> None:
-        self._report(self, kind, f"{_name(peer)}: {text}")
+        self._report(self, kind, f"{_client_name(peer)}: {text}")
 
     def _report_full(self, framer: Framer, peer: Peer) -> None:
         is_rejected = framer.statistics.frames > 0 and peer not in self._peers.framers
@@ -263,16 +272,16 @@ class Attachment:
         self._is_full_reported = is_rejected
 
     def _on_drop(self, reason: str, frame: QueuedFrame) -> None:
-        if frame.kind is not MessageKind.ORDER:
+        if frame.kind is not MessageKind.ORDER:  # other frames are only counted
             return
         name = self._dialect[frame.message_id].NAME
-        waited = self._now() - frame.since
-        why = {"late": "it waited too long", "queue_full": "the queue is full"}.get(reason, "the link was lost")
+        waited_s = self._now() - frame.since
+        explanation = {"late": "it waited too long", "queue_full": "the queue is full"}.get(reason, "the link was lost")
         target = f"{frame.target[0]}/{frame.target[1]}"
-        self._report(self, "order_dropped", f"{name} for {target} was dropped after {waited:.1f} s: {why}")
+        self._report(self, "order_dropped", f"{name} for {target} was dropped after {waited_s:.1f} s: {explanation}")
 
 
-def _name(peer: Peer) -> str:
+def _client_name(peer: Peer) -> str:
     host, port = peer[:2] if isinstance(peer, tuple) and len(peer) > 1 else (peer, "")
     return f"client [{host}]:{port}" if ":" in str(host) else f"client {host}:{port}".rstrip(":")
 
@@ -282,16 +291,17 @@ def filters_of(endpoint: Endpoint, dialect: Dialect) -> Filters:
     return Filters(dialect, endpoint.only, endpoint.block, endpoint.rates)
 
 
-def _hold_above(address: str) -> int:
+def _queue_above_bytes(address: str) -> int:
     kinds = (part.split(":")[0] for part in address.removeprefix("shared:").split(" + "))
-    return min(HOLD_ABOVE.get(kind, DEFAULT_HOLD_ABOVE) for kind in kinds)
+    return min(QUEUE_ABOVE_BYTES.get(kind, DEFAULT_QUEUE_ABOVE_BYTES) for kind in kinds)
 
 
 def _keep_unknown(framer: Framer) -> None:
     framer.keep_unknown = True
 
 
-def _counted(framer: Framer) -> tuple[int, int, int, int]:
+def _totals(framer: Framer) -> tuple[int, int, int, int]:
+    """Return the framer's numbers of frames, bytes, lost frames and bad bytes."""
     counters = framer.statistics
     lost = sum(source.lost for source in counters.sources.values())
     return counters.frames, counters.bytes, lost, counters.bad_bytes

@@ -70,13 +70,13 @@ class Hub:
         """
         if isinstance(endpoints, str):
             raise InvalidArgument(f"endpoints = {endpoints!r} is not allowed: a list of addresses")
-        self._endpoints = [_endpoint(given) for given in endpoints]
+        self._endpoints = [_as_endpoint(endpoint) for endpoint in endpoints]
         for endpoint in self._endpoints:
             filters_of(endpoint, dialect)
         names = [endpoint.name for endpoint in self._endpoints if endpoint.name]
         for name in names:
             if names.count(name) > 1:
-                raise InvalidArgument(f"two endpoints have the name {name!r}")
+                raise InvalidArgument(f"two endpoints have the name {name!r}: give each its own name")
         self._dialect = dialect
         self._attachments: dict[str, Attachment] = {}
         self._listeners: list[Callable[[HubEvent], object]] = []
@@ -127,7 +127,7 @@ class Hub:
             ConnectionClosed: the hub or the given link is closed.
         """
         self._raise_unless_open()
-        return (await self._add(_endpoint(endpoint))).statistics()
+        return (await self._add(_as_endpoint(endpoint))).statistics()
 
     async def remove(self, name: str) -> None:
         """Close an endpoint and forget its senders.
@@ -142,7 +142,7 @@ class Hub:
             raise InvalidArgument(f"no endpoint is named {name!r}; endpoints: {', '.join(self._attachments) or 'none'}")
         attachment.close()
         self._report(attachment, "removed", f"{name} was removed")
-        await _closed([attachment])
+        await _wait_until_closed([attachment])
 
     async def share(self, connection: Connection, *, name: str = "program") -> EndpointStatistics:
         """Add an open connection of this program as an endpoint.
@@ -207,7 +207,7 @@ class Hub:
                 raise
             self._report(attachment, "lost", f"{error}; it is retried until it can be opened")
             self._background.start(lambda: self._retry_opening(attachment), "aerokit hub opening")
-        except BaseException:
+        except BaseException:  # cancelled, or the link object cannot be opened
             self._attachments.pop(attachment.name, None)
             raise
         return attachment
@@ -240,7 +240,7 @@ class Hub:
             if self._background is not None:
                 await self._background.aclose()
         finally:
-            await _closed(attachments)
+            await _wait_until_closed(attachments)
 
     async def _flush_recording(self) -> None:
         while True:
@@ -262,11 +262,12 @@ class Hub:
             except Exception:
                 logger.exception("listener %r raised an exception; the other listeners are called", listener)
 
-    def _on_change(self, kind: HubEventKind, source: int, port: Port, before: Port | None) -> None:
-        if before is not None and before.endpoint == port.endpoint and kind == "route_changed":
-            return  # reported by its IdentityGuard
+    def _on_change(self, kind: HubEventKind, source: int, port: Port, other_port: Port | None) -> None:
+        """Report an event of the router about the sender ``source`` (system id + 256 · component id)."""
+        if other_port is not None and other_port.endpoint == port.endpoint and kind == "route_changed":
+            return  # the endpoint's IdentityGuard has reported it
         ids = f"{source & 0xFF}/{source >> 8}"
-        other = "a removed endpoint" if before is None else before.endpoint
+        other = "a removed endpoint" if other_port is None else other_port.endpoint
         text = {
             "duplicate_sender": f"{ids} is received here and at {other}, where its messages are sent: two links to one"
             " vehicle, or two vehicles with the same ids",
@@ -283,15 +284,15 @@ class Hub:
         logger.error("internal error of aerokit's hub; its endpoints continue", exc_info=error)
 
 
-def _endpoint(given: str | Endpoint | Link) -> Endpoint:
-    return given if isinstance(given, Endpoint) else Endpoint(given)
+def _as_endpoint(endpoint: str | Endpoint | Link) -> Endpoint:
+    return endpoint if isinstance(endpoint, Endpoint) else Endpoint(endpoint)
 
 
 def _period(port: Port, message_id: int) -> float | None:
     return port.period(message_id)
 
 
-async def _closed(attachments: list[Attachment]) -> None:
+async def _wait_until_closed(attachments: list[Attachment]) -> None:
     """Wait until the links of these attachments are closed, for at most `CLOSE_TIMEOUT_S`."""
     with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT_S):
         for attachment in attachments:

@@ -77,9 +77,11 @@ class Filters:
             return None
         if any(fnmatchcase(name, pattern) for pattern in self._block):
             return None
-        matching = (hz for pattern, hz in self._rates.items() if fnmatchcase(name, pattern))
-        hz = self._rates.get(name) if name in ANSWERS else next(matching, None)
-        return 0.0 if hz is None else 1 / hz
+        if name in ANSWERS:
+            rate_hz = self._rates.get(name)
+        else:
+            rate_hz = next((hz for pattern, hz in self._rates.items() if fnmatchcase(name, pattern)), None)
+        return 0.0 if rate_hz is None else 1 / rate_hz
 
     def _check(self, field: str, pattern: str) -> None:
         names = [message_type.NAME for message_type in self._dialect]
@@ -103,26 +105,29 @@ class MessageKind(Enum):
 
 # Periodic messages that are complete in themselves and of which a sender has one instance. Messages with an instance
 # field (batteries, range finders, named values) and all others are never replaced.
-_PERIODIC = """
-    HEARTBEAT SYS_STATUS SYSTEM_TIME GPS_RAW_INT GPS2_RAW GPS_STATUS NAV_CONTROLLER_OUTPUT HIGH_LATENCY2
-    SCALED_IMU SCALED_IMU2 SCALED_IMU3 RAW_PRESSURE
-    SCALED_PRESSURE SCALED_PRESSURE2 SCALED_PRESSURE3 ATTITUDE ATTITUDE_QUATERNION ATTITUDE_QUATERNION_COV
-    ATTITUDE_TARGET LOCAL_POSITION_NED LOCAL_POSITION_NED_COV GLOBAL_POSITION_INT GLOBAL_POSITION_INT_COV
-    LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET POSITION_TARGET_LOCAL_NED POSITION_TARGET_GLOBAL_INT RC_CHANNELS
-    MISSION_CURRENT VFR_HUD ALTITUDE HOME_POSITION GPS_GLOBAL_ORIGIN EXTENDED_SYS_STATE ESTIMATOR_STATUS
-    EKF_STATUS_REPORT VIBRATION WIND WIND_COV AHRS AHRS2 AHRS3 HWSTATUS MEMINFO POWER_STATUS TERRAIN_REPORT
-    RANGEFINDER SIMSTATE SIM_STATE AOA_SSA PID_TUNING FENCE_STATUS RADIO_STATUS RADIO EFI_STATUS
-    AIRSPEED_AUTOCAL MOUNT_ORIENTATION CONTROL_SYSTEM_STATE HIGH_LATENCY LINK_NODE_STATUS
-"""
+_TELEMETRY = frozenset(
+    (
+        "HEARTBEAT", "SYS_STATUS", "SYSTEM_TIME", "GPS_RAW_INT", "GPS2_RAW", "GPS_STATUS",
+        "NAV_CONTROLLER_OUTPUT", "HIGH_LATENCY2", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_PRESSURE",
+        "SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3", "ATTITUDE", "ATTITUDE_QUATERNION",
+        "ATTITUDE_QUATERNION_COV", "ATTITUDE_TARGET", "LOCAL_POSITION_NED", "LOCAL_POSITION_NED_COV",
+        "GLOBAL_POSITION_INT", "GLOBAL_POSITION_INT_COV", "LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET",
+        "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT", "RC_CHANNELS", "MISSION_CURRENT", "VFR_HUD",
+        "ALTITUDE", "HOME_POSITION", "GPS_GLOBAL_ORIGIN", "EXTENDED_SYS_STATE", "ESTIMATOR_STATUS",
+        "EKF_STATUS_REPORT", "VIBRATION", "WIND", "WIND_COV", "AHRS", "AHRS2", "AHRS3", "HWSTATUS", "MEMINFO",
+        "POWER_STATUS", "TERRAIN_REPORT", "RANGEFINDER", "SIMSTATE", "SIM_STATE", "AOA_SSA", "PID_TUNING",
+        "FENCE_STATUS", "RADIO_STATUS", "RADIO", "EFI_STATUS", "AIRSPEED_AUTOCAL", "MOUNT_ORIENTATION",
+        "CONTROL_SYSTEM_STATE", "HIGH_LATENCY", "LINK_NODE_STATUS",
+    )
+)  # fmt: skip
 
-_TELEMETRY = frozenset(_PERIODIC.split())
-
-_ANSWERS = """
-    COMMAND_ACK MISSION_ACK MISSION_REQUEST MISSION_REQUEST_INT MISSION_REQUEST_LIST MISSION_REQUEST_PARTIAL_LIST
-    MISSION_CURRENT MISSION_ITEM_REACHED MISSION_CHECKSUM
-"""
-
-_NOT_ORDERS = frozenset(_ANSWERS.split())
+# Messages that match a pattern of `_ORDERS`, but only answer, ask or report.
+_NOT_ORDERS = frozenset(
+    (
+        "COMMAND_ACK", "MISSION_ACK", "MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_REQUEST_LIST",
+        "MISSION_REQUEST_PARTIAL_LIST", "MISSION_CURRENT", "MISSION_ITEM_REACHED", "MISSION_CHECKSUM",
+    )
+)  # fmt: skip
 
 _ORDERS = (
     "COMMAND_*", "SET_*", "MANUAL_*", "RC_CHANNELS_OVERRIDE", "MISSION_*", "PARAM_SET", "PARAM_EXT_SET", "*_SET_*",
@@ -133,11 +138,11 @@ _ORDERS = (
 
 
 @cache
-def kind_of(name: str, *, is_for_one: bool) -> MessageKind:
-    """Return the kind of a message by its name. ``is_for_one``: the frame has a target, so it is not telemetry."""
+def kind_of(name: str, *, has_target: bool) -> MessageKind:
+    """Return the kind of a message by its name. A frame with a target (``has_target``) is not telemetry."""
     if name not in _NOT_ORDERS and any(fnmatchcase(name, pattern) for pattern in _ORDERS):
         return MessageKind.ORDER
-    if name in _TELEMETRY and not is_for_one:
+    if name in _TELEMETRY and not has_target:
         return MessageKind.TELEMETRY
     return MessageKind.TRANSFER
 
@@ -195,7 +200,7 @@ class TargetFields:
         self.offsets: dict[int, FieldOffsets | None] = {}
         """Maps message ids to offsets; None means no target. Messages of other dialects are added on demand."""
         if dialect is STANDARD:
-            self.offsets.update(dict.fromkeys(dialect.rows))
+            self.offsets.update(dict.fromkeys(dialect.rows))  # None: no target, unless the table has the message
             for (system, component), message_ids in STANDARD_OFFSETS.items():
                 component = NO_FIELD if component is None else HEADER_LENGTH + component
                 self.offsets.update(dict.fromkeys(message_ids, (HEADER_LENGTH + system, component)))
@@ -214,7 +219,7 @@ class TargetFields:
     def is_order(self, message_id: int) -> bool:
         if self.offsets.get(message_id) is None:
             return False
-        return kind_of(self._dialect[message_id].NAME, is_for_one=True) is MessageKind.ORDER
+        return kind_of(self._dialect[message_id].NAME, has_target=True) is MessageKind.ORDER
 
     def target_of(self, frame: Frame) -> tuple[int, int]:
         """Return the system id and component id of a frame's target; 0 means all."""

@@ -44,7 +44,7 @@ class FrameQueue:
         # Frames in order. The key is sender and message for telemetry, and a negative number for other frames.
         self._frames: dict[int, QueuedFrame] = {}
         self._bytes = 0
-        self._count = 0
+        self._last_key = 0  # the last negative key
         self._orders = self._telemetry = 0  # numbers of queued frames, so that needless searches are skipped
 
     def __len__(self) -> int:
@@ -54,19 +54,19 @@ class FrameQueue:
         """Add a frame; ``key`` identifies its sender and message. Return dropped frames with the reason."""
         dropped: list[tuple[str, QueuedFrame]] = []
         if frame.kind is MessageKind.TELEMETRY:
-            before = self._frames.get(key)
-            if before is not None:
-                self._bytes += len(frame.raw) - len(before.raw)
+            replaced = self._frames.get(key)
+            if replaced is not None:
+                self._bytes += len(frame.raw) - len(replaced.raw)
                 self._frames[key] = frame
-                return [("superseded", before)]
+                return [("superseded", replaced)]
         else:
-            self._count -= 1
-            key = self._count
+            self._last_key -= 1  # a key of its own, so that no other frame replaces this one
+            key = self._last_key
         while self._is_full(len(frame.raw)):
             if not self._telemetry:
                 return [*dropped, ("queue_full", frame)]
-            oldest = next(key for key, queued in self._frames.items() if queued.kind is MessageKind.TELEMETRY)
-            dropped.append(("queue_full", self._take(oldest)))
+            oldest_key = next(at for at, queued in self._frames.items() if queued.kind is MessageKind.TELEMETRY)
+            dropped.append(("queue_full", self._remove(oldest_key)))
         self._frames[key] = frame
         self._bytes += len(frame.raw)
         self._orders += frame.kind is MessageKind.ORDER
@@ -74,6 +74,7 @@ class FrameQueue:
         return dropped
 
     def expire(self, now: float) -> list[tuple[str, QueuedFrame]]:
+        """Drop commands that have waited too long. Return them with the reason."""
         if not self._orders:
             return []
         late = [
@@ -81,11 +82,11 @@ class FrameQueue:
             for key, queued in self._frames.items()
             if queued.kind is MessageKind.ORDER and now - queued.since > ORDER_MAX_AGE_S
         ]
-        return [("late", self._take(key)) for key in late]
+        return [("late", self._remove(key)) for key in late]
 
     def next(self) -> bytes | None:
         """Remove and return the first frame, or None if the queue is empty. Call :meth:`expire` before."""
-        return self._take(next(iter(self._frames))).raw if self._frames else None
+        return self._remove(next(iter(self._frames))).raw if self._frames else None
 
     def clear(self) -> list[tuple[str, QueuedFrame]]:
         dropped = [("link_lost", frame) for frame in self._frames.values()]
@@ -96,7 +97,7 @@ class FrameQueue:
     def _is_full(self, size: int) -> bool:
         return len(self._frames) >= MAX_QUEUED_FRAMES or self._bytes + size > MAX_QUEUED_BYTES
 
-    def _take(self, key: int) -> QueuedFrame:
+    def _remove(self, key: int) -> QueuedFrame:
         frame = self._frames.pop(key)
         self._bytes -= len(frame.raw)
         self._orders -= frame.kind is MessageKind.ORDER
@@ -107,7 +108,8 @@ class FrameQueue:
 def _reframed(frame: Frame, crc_extra: bytes, *, flags: int) -> bytes:
     """Return the frame as MAVLink 2, with these incompatibility flags, without signature, and with a new checksum."""
     body = frame.body
-    payload = body[9:].rstrip(b"\0") or body[9:10]  # MAVLink 2 truncates trailing zeros, MAVLink 1 does not
+    # MAVLink 2 truncates trailing zeros (to one byte at least), MAVLink 1 does not.
+    payload = body[9:].rstrip(b"\0") or body[9:10]
     body = bytes((len(payload), flags)) + body[2:9] + payload
     return bytes((MAGIC_V2,)) + body + x25(body + crc_extra).to_bytes(2, "little")
 
@@ -127,6 +129,7 @@ class SigningGateway:
         self._extras, self._refused = crc_extras, refused
 
     def admitted(self, frame: Frame, unix_time: float) -> Frame | None:
+        """Verify a received frame. Return it without its signature, or None if it is refused."""
         try:
             refusal = self.signing.check(frame, unix_time)
         except Exception as error:  # allow_unsigned is a function of the program
@@ -173,7 +176,7 @@ class Port:
     """One peer of one endpoint.
 
     While the link accepts data, frames are collected in ``batch`` until the end of the loop iteration. While more than
-    ``hold_above`` bytes are unsent, frames wait in a `FrameQueue`. `UNLIMITED` turns this check off.
+    ``queue_above_bytes`` bytes are unsent, frames wait in a `FrameQueue`. `UNLIMITED` turns this check off.
 
     ``endpoint`` is the endpoint's name, ``period(message_id)`` is `Filters.period`. ``report(kind, text)`` publishes an
     event of the endpoint; ``on_drop(reason, frame)`` is called for each frame dropped from the queue.
@@ -190,7 +193,7 @@ class Port:
         *,
         endpoint: str,
         dialect: Dialect,
-        hold_above: int,
+        queue_above_bytes: int,
         period: Callable[[int], float | None],
         report: Callable[[HubEventKind, str], object],
         on_drop: Callable[[str, QueuedFrame], object],
@@ -216,13 +219,13 @@ class Port:
         """Number of frames in ``batch``, minus the number of its pieces."""
         self.node: RouterPort[Port] | None = None
         self._dialect = dialect
-        self._hold_above, self._may_hold = hold_above, hold_above < UNLIMITED
+        self._queue_above_bytes, self._may_queue = queue_above_bytes, queue_above_bytes < UNLIMITED
         self._on_drop = on_drop
         self._queue = FrameQueue()
         self._due: dict[int, float] = {}
 
     @property
-    def is_holding(self) -> bool:
+    def has_queued_frames(self) -> bool:
         return bool(self._queue)
 
     @property
@@ -234,35 +237,42 @@ class Port:
         """True if frames are written together, so that they may be collected in one piece."""
         return self.gateway is None and not self.writes_single_frames
 
-    def must_hold(self) -> bool:
-        return self._may_hold and (bool(self._queue) or self._is_full())
+    def must_queue(self) -> bool:
+        return self._may_queue and (bool(self._queue) or self._is_full())
 
-    def hold(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
+    def enqueue(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
         message_type = self._dialect.get(plan.message_id)
-        kind = (
-            MessageKind.TRANSFER if message_type is None else kind_of(message_type.NAME, is_for_one=plan.target[0] != 0)
-        )
+        kind = MessageKind.TRANSFER
+        if message_type is not None:
+            kind = kind_of(message_type.NAME, has_target=plan.target[0] != 0)
         self._drop(self._queue.put(QueuedFrame(raw, kind, plan.message_id, plan.target, now), plan.key))
 
     def is_due(self, key: int, period_s: float, now: float) -> bool:
+        """Return True if the rate limit allows a frame of this sender and message now. Else count it as dropped."""
         due = self._due.get(key)
         if due is not None and now < due:
             self.counters.dropped["rate_limited"] += 1
             return False
-        if due is None and len(self._due) >= MAX_RATE_LIMITS:
-            self._due.clear()
-        # Irregular messages keep their average rate, but a pause must not be followed by a burst.
-        self._due[key] = now + period_s if due is None else max(due, now - period_s) + period_s
+        if due is None:
+            if len(self._due) >= MAX_RATE_LIMITS:
+                self._due.clear()
+            self._due[key] = now + period_s
+        else:
+            # The next time counts from the last due time, so that irregular messages keep their average rate. It is at
+            # least `now`, so that no burst follows a pause.
+            self._due[key] = max(due, now - period_s) + period_s
         return True
 
     def flush(self, unix_time: float) -> None:
+        """Write the batch, signed if the endpoint signs."""
         batch, self.batch = self.batch, []
         if self.gateway is not None:
             batch = self._signed(batch, unix_time)
         counters, write, peer = self.counters, self.link.write, self.peer
         counters.frames_out += len(batch) + self.joined_frames
         self.joined_frames = 0
-        for piece in batch if len(batch) == 1 or self.writes_single_frames else joined(batch):
+        is_joined = len(batch) > 1 and not self.writes_single_frames
+        for piece in joined(batch) if is_joined else batch:
             counters.bytes_out += len(piece)
             write(piece, peer)
 
@@ -282,12 +292,12 @@ class Port:
         self._due.clear()
 
     def _is_full(self) -> bool:
-        return self.link.unsent_bytes_to(self.peer) > self._hold_above
+        return self.link.unsent_bytes_to(self.peer) > self._queue_above_bytes
 
     def _signed(self, batch: list[bytes], unix_time: float) -> list[bytes]:
         assert self.gateway is not None
         signed = [self.gateway.signed(raw, unix_time) for raw in batch]
-        self.counters.dropped["unsignable"] += sum(raw is None for raw in signed)
+        self.counters.dropped["unsignable"] += signed.count(None)
         return [raw for raw in signed if raw is not None]
 
     def _drop(self, dropped: list[tuple[str, QueuedFrame]]) -> None:

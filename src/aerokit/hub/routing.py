@@ -33,8 +33,8 @@ MAX_PLANS = 4096
 """Maximum number of cached plans per port."""
 
 _SETUP_SIGNING = 256
-_RADIOS = (109, 166)
-_NOBODY = Sender(0, 0, -math.inf)
+_RADIOS = (109, 166)  # RADIO_STATUS, RADIO
+_UNKNOWN_SENDER = Sender(0, 0, -math.inf)
 
 
 class ForwardingPlan(Generic[PortT]):
@@ -50,7 +50,7 @@ class ForwardingPlan(Generic[PortT]):
         outs: tuple[PortT, ...] = (),
         rate_limited: tuple[tuple[PortT, float], ...] = (),
         reason: str = "",
-        sender: Sender = _NOBODY,
+        sender: Sender = _UNKNOWN_SENDER,
     ) -> None:
         self.key: int = key
         """Key of sender and message, for any target."""
@@ -83,10 +83,12 @@ class RouterPort(Generic[PortT]):
         self.number: int = number
         """Unique number above 0."""
         self.plans: dict[int, ForwardingPlan[PortT]] = {}
+        """Maps message id, target and sender (as one number) to the plan for such frames that arrive at this port."""
         self.streams: dict[bytes, ForwardingPlan[PortT]] = {}
         """Maps sender and message, as bytes of a frame, to the plan for broadcasts of senders that this port reaches.
         """
         self.destinations: dict[tuple[PortT, ...], tuple[PortT, ...]] = {}
+        """Maps each tuple of ports to the equal tuple that all plans use."""
         self.echoes: dict[int, int] = {}
         """Maps senders to the number of returning frames minus the number of new frames at this port."""
         self.loop_until: float = -math.inf
@@ -121,11 +123,11 @@ class Router(Generic[PortT]):
     def __init__(self, targets: TargetFields, period: Callable[[PortT, int], float | None]) -> None:
         self._targets, self._period = targets, period
         self._offsets = targets.offsets
-        self._nodes: dict[int, RouterPort[PortT]] = {}
-        self._senders: dict[int, Sender] = {}
+        self._nodes: dict[int, RouterPort[PortT]] = {}  # by port number
+        self._senders: dict[int, Sender] = {}  # by system id + 256 · component id
         self._recent = RecentFrames()
-        self._count = 0
-        self._unproven: dict[int, None] = {}
+        self._port_count = 0  # number of ports created so far
+        self._unproven: dict[int, None] = {}  # senders without a HEARTBEAT, which may be noise
         self._swept_at = -math.inf
         self._duplicate: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="duplicate")
         self._loop: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="loop")
@@ -133,11 +135,11 @@ class Router(Generic[PortT]):
         self.on_vehicle: Callable[[PortT], object] | None = None
         """Called when an autopilot is received at a port for the first time."""
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
-        """Called with the kind of event, the sender, its port, and its former port (None: removed)."""
+        """Called with the kind of event, the sender, its port, and its former or other port (None: removed)."""
 
     def add(self, port: PortT) -> RouterPort[PortT]:
-        self._count += 1
-        node = self._nodes[self._count] = RouterPort(port, self._count)
+        self._port_count += 1
+        node = self._nodes[self._port_count] = RouterPort(port, self._port_count)
         self.forget_plans()
         return node
 
@@ -165,20 +167,22 @@ class Router(Generic[PortT]):
         recent, streams, number = self._recent, node.streams, node.number
         if late or node.echoes or now >= recent.ends_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES:
             return [self.route(node, frame, now, frame in late) for frame in frames]
-        newer, older, here, plans = recent.newer, recent.older, (number, self._count, now), []
+        newer, older, plans = recent.newer, recent.older, []
+        record = number, self._port_count, now  # for `RecentFrames`
         for frame in frames:
             body = frame.body
             plan = streams.get(body[4:9])
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
-                if is_new or (newer.get(identity) or older[identity])[0] == number:  # equal by chance
-                    newer[identity] = here
+                # An equal frame from the same port is another frame with the same number and checksum, by chance.
+                if is_new or (newer.get(identity) or older[identity])[0] == number:
+                    newer[identity] = record
                     plan.sender.received_at = now
                     plans.append(plan)
                     continue
             plans.append(self.route(node, frame, now))
-            if node.echoes:
+            if node.echoes:  # a frame came back: `route` must see every further frame, to detect a loop
                 streams = {}
         return plans
 
@@ -196,19 +200,20 @@ class Router(Generic[PortT]):
         if now >= recent.ends_at or len(recent.newer) >= MAX_RECENT_FRAMES:
             recent.start_generation(now)
         identity = source << 24 | body[3] << 16 | frame.checksum
-        before = recent.newer.get(identity) or recent.older.get(identity)
-        if before is None:
-            recent.newer[identity] = number, self._count, now
+        earlier = recent.newer.get(identity) or recent.older.get(identity)
+        if earlier is None:
+            recent.newer[identity] = number, self._port_count, now
             if node.echoes:
                 self._record_new(node, source)
-        elif self._is_copy(before, number, now, is_late):
+        elif self._is_copy(earlier, number, now, is_late):
             return self._duplicate
-        elif self._is_echo(before, number, now):
-            if self._is_loop(node, source, before[0], now):
+        elif self._is_echo(earlier, number, now):
+            first_port, port_count, _ = earlier
+            if self._is_loop(node, source, first_port, now):
                 return self._loop
-            recent.newer[identity] = *before[:2], now
+            recent.newer[identity] = first_port, port_count, now
         else:
-            recent.newer[identity] = number, self._count, now
+            recent.newer[identity] = number, self._port_count, now
         if sender.number == number:
             sender.received_at = now
         else:
@@ -233,6 +238,7 @@ class Router(Generic[PortT]):
     # ------------------------------------------------------------------------------------ senders
 
     def _add_sender(self, source: int, node: RouterPort[PortT], now: float) -> Sender:
+        """Return a new sender, which is remembered if there is room."""
         sender = Sender(source, node.number, now)
         if len(self._senders) < MAX_ROUTES or self._make_room(now):
             self._senders[source] = sender
@@ -241,6 +247,7 @@ class Router(Generic[PortT]):
         return sender
 
     def _make_room(self, now: float) -> bool:
+        """Forget a sender without heartbeats, or else all silent senders. Return True if there is room."""
         if self._unproven:
             source = next(iter(self._unproven))
             del self._unproven[source], self._senders[source]
@@ -252,48 +259,53 @@ class Router(Generic[PortT]):
         return len(self._senders) < MAX_ROUTES
 
     def _record_at_other_port(self, sender: Sender, node: RouterPort[PortT], now: float) -> None:
-        before = sender.number
+        former_number = sender.number
         if sender.record_at_other_port(node.number, now):
             self.forget_plans()
-        if sender.is_autopilot and sender.number != before:
-            self._report("route_changed", sender.source, node, before)
+        if sender.is_autopilot and sender.number != former_number:
+            self._report("route_changed", sender.source, node, former_number)
 
-    def _is_copy(self, before: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
+    def _is_copy(self, earlier: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
         """Return True if a frame is a copy of an earlier frame, not the first frame of a restarted program.
 
         A restarted program starts its sequence numbers again. The first command may equal an earlier command and must
         not be lost. It arrives at a new port after the former port was removed, or at the same port after a while.
         """
-        first, count, at = before
-        if first == number:
-            return is_late and now - at <= REPEAT_WINDOW_S
-        return first in self._nodes and number <= count and now - at <= DUPLICATE_WINDOW_S
+        first_port, port_count, received_at = earlier
+        if first_port == number:
+            return is_late and now - received_at <= REPEAT_WINDOW_S
+        existed_then = number <= port_count  # this port was not created after the earlier frame
+        return first_port in self._nodes and existed_then and now - received_at <= DUPLICATE_WINDOW_S
 
-    def _is_echo(self, before: tuple[int, int, float], number: int, now: float) -> bool:
+    def _is_echo(self, earlier: tuple[int, int, float], number: int, now: float) -> bool:
         """Return True if an equal frame arrived at another port before, be it by chance or because of a loop."""
-        first, count, at = before
-        return first != number and number <= count and now - at <= LOOP_WINDOW_S
+        first_port, port_count, received_at = earlier
+        return first_port != number and number <= port_count and now - received_at <= LOOP_WINDOW_S
 
-    def _is_loop(self, node: RouterPort[PortT], source: int, first: int, now: float) -> bool:
-        run = node.echoes[source] = min(node.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
-        if run < MIN_LOOP_FRAMES and now >= node.loop_until:
+    def _is_loop(self, node: RouterPort[PortT], source: int, first_port: int, now: float) -> bool:
+        """Count a returning frame. Return True if a loop is proven, now or during the last `LOOP_WINDOW_S`."""
+        count = node.echoes[source] = min(node.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
+        is_known = now < node.loop_until
+        if count < MIN_LOOP_FRAMES and not is_known:
             return False
-        if now >= node.loop_until:
-            self._report("loop", source, node, first)
+        if not is_known:
+            self._report("loop", source, node, first_port)
         node.loop_until = now + LOOP_WINDOW_S
         return True
 
     def _record_new(self, node: RouterPort[PortT], source: int) -> None:
-        run = node.echoes.pop(source, 0) - 1
-        if run > 0:
-            node.echoes[source] = run
+        """Record a new frame of a sender, which counts against the sender's returning frames."""
+        count = node.echoes.pop(source, 0) - 1
+        if count > 0:
+            node.echoes[source] = count
 
-    def _report(self, kind: HubEventKind, source: int, node: RouterPort[PortT], before: int) -> None:
+    def _report(self, kind: HubEventKind, source: int, node: RouterPort[PortT], other_number: int) -> None:
         if self.on_change is not None:
-            other = self._nodes.get(before)
-            self.on_change(kind, source, node.port, None if other is None else other.port)
+            other_node = self._nodes.get(other_number)
+            self.on_change(kind, source, node.port, None if other_node is None else other_node.port)
 
     def _record_heartbeat(self, sender: Sender, node: RouterPort[PortT], body: bytes) -> None:
+        """Record the type of a sender, and report an autopilot that is received at a port for the first time."""
         self._unproven.pop(sender.source, None)
         if sender.record_heartbeat(body):
             self.forget_plans()
@@ -313,30 +325,36 @@ class Router(Generic[PortT]):
         plan_key = message_id << 16 | source
         if message_id == _SETUP_SIGNING:
             return ForwardingPlan(plan_key, message_id, ids, reason="secret")
-        if ids[0]:
-            found = self._ports_to(*ids, source, node.number)
-            if not found:
-                # Not cached, because there are many unknown targets.
+        has_target = ids[0] != 0
+        if has_target:
+            numbers = self._ports_to(*ids, source, node.number)
+            if not numbers:
+                # This plan is not cached, because the number of unknown targets is not limited.
                 return ForwardingPlan(plan_key, message_id, ids, reason="no_route")
         else:
-            found = dict.fromkeys(self._nodes)
+            numbers = dict.fromkeys(self._nodes)
             if self._targets.is_order(message_id):
-                found = {number: None for number in found if not self._would_be_second(number)}
-        found.pop(node.number, None)
-        if message_id in _RADIOS:
-            found = {number: None for number in found if not self._has_autopilot(number)}
+                numbers = {number: None for number in numbers if not self._is_redundant(number)}
+        numbers.pop(node.number, None)
+        if message_id in _RADIOS:  # an autopilot would adapt its rates to a radio that is not its own
+            numbers = {number: None for number in numbers if not self._has_autopilot(number)}
         outs, rate_limited = [], []
-        for port in (self._nodes[number].port for number in found):
+        for number in numbers:
+            port = self._nodes[number].port
             period = self._period(port, message_id)
-            if period == 0 or (period is not None and ids[0]):
+            if period is None:
+                continue
+            if period == 0 or has_target:
                 outs.append(port)
-            elif period is not None:
+            else:
                 rate_limited.append((port, period))
         if len(node.plans) >= MAX_PLANS:
             node.forget_plans()
-        shared_outs, sender = node.destinations.setdefault(tuple(outs), tuple(outs)), self._senders.get(source, _NOBODY)
+        shared_outs = node.destinations.setdefault(tuple(outs), tuple(outs))  # one object for equal tuples
+        sender = self._senders.get(source, _UNKNOWN_SENDER)
         plan = ForwardingPlan(plan_key, message_id, ids, shared_outs, tuple(rate_limited), sender=sender)
         node.plans[key] = plan
+        # Heartbeats (0) and frames at other ports change what is known about their sender, so `route` must see them.
         if message_id and sender.number == node.number and self._offsets.get(message_id) is None:
             node.streams[source.to_bytes(2, "little") + message_id.to_bytes(3, "little")] = plan
         return plan
@@ -346,26 +364,24 @@ class Router(Generic[PortT]):
 
         A sender never gets its own frame (received at port ``here``), even if another port reaches the sender.
         """
-        own = self._senders.get(source)
-        exact = self._senders.get(system_id | component_id << 8) if component_id else None
-        if exact is not None:
-            return {here: None} if exact is own else dict.fromkeys(exact.destinations)
-        known = [sender for sender in self._senders.values() if sender.system_id == system_id]
-        autopilots = [sender for sender in known if sender.is_autopilot]
-        found: dict[int, None] = {}
-        for sender in sorted(known, key=lambda sender: not sender.is_autopilot):
-            # A component is already reached if one of its ports is chosen. Ports at which the autopilot is received,
-            # too, are skipped, because the autopilot would get the command twice.
-            is_reached = sender.is_vehicle and any(sender.is_at(number) for number in found)
-            if not is_reached:
-                found.update(
-                    (number, None)
-                    for number in ((here,) if sender is own else sender.destinations)
-                    if sender.is_autopilot or not any(autopilot.is_at(number) for autopilot in autopilots)
-                )
-        return found
+        origin = self._senders.get(source)
+        target = self._senders.get(system_id | component_id << 8) if component_id else None
+        if target is not None:
+            return {here: None} if target is origin else dict.fromkeys(target.destinations)
+        members = [sender for sender in self._senders.values() if sender.system_id == system_id]
+        autopilots = [member for member in members if member.is_autopilot]
+        numbers: dict[int, None] = {}
+        for member in sorted(members, key=lambda member: not member.is_autopilot):
+            is_reached = member.is_vehicle and any(member.is_at(number) for number in numbers)
+            if is_reached:
+                continue
+            for number in (here,) if member is origin else member.destinations:
+                # Through another port at which the autopilot is received, it would get the command twice.
+                if member.is_autopilot or not any(autopilot.is_at(number) for autopilot in autopilots):
+                    numbers[number] = None
+        return numbers
 
-    def _would_be_second(self, number: int) -> bool:
+    def _is_redundant(self, number: int) -> bool:
         """Return True if other ports reach all autopilots that are received at this port."""
         here = [sender for sender in self._senders.values() if sender.is_autopilot and sender.is_at(number)]
         return bool(here) and all(sender.number != number for sender in here)

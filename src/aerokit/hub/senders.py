@@ -35,23 +35,30 @@ MIN_LOOP_FRAMES = 8
 
 MAX_RECENT_FRAMES = 1 << 15
 
-# Offsets in the body of a HEARTBEAT.
+# Offsets in `Frame.body` of a HEARTBEAT, whose payload follows nine bytes of header.
 _TYPE = 9 + 4
 _AUTOPILOT = 9 + 5
-_STATION = int(MavType.GCS)
+_GROUND_STATION = int(MavType.GCS)
 _NO_AUTOPILOT = int(MavAutopilot.INVALID)
 
 
 def is_autopilot(body: bytes) -> bool:
-    return len(body) > _AUTOPILOT and body[_TYPE] != _STATION and body[_AUTOPILOT] != _NO_AUTOPILOT
+    return len(body) > _AUTOPILOT and body[_TYPE] != _GROUND_STATION and body[_AUTOPILOT] != _NO_AUTOPILOT
 
 
 class Sender:
     """One component (system id, component id), and the ports at which it was received."""
 
     __slots__ = (
-        *("component_id", "is_autopilot", "is_vehicle", "number", "ports", "received_at", "reported"),
-        *("source", "system_id"),
+        "component_id",
+        "is_autopilot",
+        "is_vehicle",
+        "number",
+        "ports",
+        "received_at",
+        "reported",
+        "source",
+        "system_id",
     )
 
     def __init__(self, source: int, number: int, now: float) -> None:
@@ -73,6 +80,7 @@ class Sender:
 
     @property
     def destinations(self) -> Iterable[int]:
+        """Numbers of the ports to which messages for this sender go."""
         return (self.number,) if self.is_vehicle else self.ports
 
     def is_at(self, number: int) -> bool:
@@ -90,14 +98,16 @@ class Sender:
         return is_new
 
     def record_heartbeat(self, body: bytes) -> bool:
+        """Record from a HEARTBEAT whether the sender is a vehicle or an autopilot. Return True if that has changed."""
         if len(body) <= _AUTOPILOT:
             return False
         before = self.is_vehicle, self.is_autopilot
-        self.is_vehicle = body[_TYPE] != _STATION
+        self.is_vehicle = body[_TYPE] != _GROUND_STATION
         self.is_autopilot = is_autopilot(body)
         return before != (self.is_vehicle, self.is_autopilot)
 
     def remove_port(self, number: int) -> bool:
+        """Forget a removed port. Return True if the sender was received at no other port."""
         self.reported.discard(number)
         self.ports.pop(number, None)
         if self.number == number and self.ports:
@@ -121,7 +131,8 @@ class RecentFrames:
 
     def start_generation(self, now: float) -> None:
         is_expired = now - self.ends_at >= LOOP_WINDOW_S
-        self.older, self.newer = {} if is_expired else self.newer, {}
+        self.older = {} if is_expired else self.newer
+        self.newer = {}
         self.ends_at = now + LOOP_WINDOW_S
 
 

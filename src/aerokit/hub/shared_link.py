@@ -103,7 +103,8 @@ class SharedLink(Link):
     def _on_frame(self, frame: Frame, peer: Peer) -> None:
         gateway = self._current_gateway()
         if self._receiver is not None:
-            self._receiver.bytes_received((frame if gateway is None else gateway.unsigned(frame)).raw, None)
+            unsigned = frame if gateway is None else gateway.unsigned(frame)
+            self._receiver.bytes_received(unsigned.raw, None)
 
     def _on_sent(self, raw: bytes) -> None:
         gateway = self._current_gateway()
@@ -132,15 +133,18 @@ class SharedLink(Link):
 
 
 def _frames(data: bytes) -> Iterator[bytes]:
+    """Split data of a hub, which consists of whole frames."""
     begin = 0
     while begin < len(data):
+        payload_length = data[begin + 1]
         if data[begin] == MAGIC_V1:
-            end = begin + 8 + data[begin + 1]
+            end = begin + 8 + payload_length  # 6 bytes of header, 2 of checksum
         else:
-            end = begin + 12 + data[begin + 1] + (SIGNATURE_LENGTH if data[begin + 2] else 0)
+            is_signed = data[begin + 2] != 0  # the incompatibility flags, of which only "signed" exists
+            end = begin + 12 + payload_length + (SIGNATURE_LENGTH if is_signed else 0)
         yield data[begin:end]
         begin = end
 
 
-def _ignore(frame: Frame, why: str) -> None:
+def _ignore(frame: Frame, reason: str) -> None:
     """Do nothing, because the connection verifies received frames."""

@@ -52,9 +52,9 @@ class Switch:
         self._on_error = on_error
         self.recording: Recording | None = None
         """Recording of every forwarded frame."""
-        self._dirty: list[Port] = []
+        self._ports_to_flush: list[Port] = []
         self._is_scheduled = False
-        self._holding: dict[Port, None] = {}
+        self._queueing_ports: dict[Port, None] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._poll_interval_s = MIN_POLL_INTERVAL_S
 
@@ -66,7 +66,7 @@ class Switch:
         port.node = self.router.add(port)
 
     def remove(self, port: Port) -> None:
-        self._holding.pop(port, None)
+        self._queueing_ports.pop(port, None)
         node, port.node = port.node, None
         if node is not None:
             self.router.remove(node)
@@ -76,12 +76,12 @@ class Switch:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self._dirty.clear()
-        self._holding.clear()
+        self._ports_to_flush.clear()
+        self._queueing_ports.clear()
 
-    def take(self, port: Port, framer: Framer, frames: list[Frame], data: bytes | None, now: float) -> None:
+    def receive(self, port: Port, framer: Framer, frames: list[Frame], data: bytes | None, now: float) -> None:
         """Forward frames received at a port. ``data``: these frames as received, None if there were other bytes."""
-        # Hot path.
+        # Hot path: local variables are faster than attributes.
         node, guard, peer = port.node, port.guard, port.peer
         if node is None or port.is_read_only:
             if guard is not None:
@@ -90,15 +90,19 @@ class Switch:
             port.counters.dropped["read_only"] += len(frames)
             return
         late = framer.late
-        if port.gateway is not None or (guard is not None and (guard.is_shared or 0 in map(_message_id, frames))):
-            count, (frames, late) = len(frames), self._admitted(port, framer, frames)
-            if port.gateway is not None or len(frames) != count:
+        is_checked = port.gateway is not None
+        if guard is not None and not is_checked:
+            is_checked = guard.is_shared or 0 in map(_message_id, frames)  # 0: HEARTBEAT
+        if is_checked:
+            received_count = len(frames)
+            frames, late = self._admitted(port, framer, frames)
+            if port.gateway is not None or len(frames) != received_count:
                 data = None
         plans = self.router.route_all(node, frames, now, late)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
             for frame, plan in zip(frames, plans, strict=True):
                 self._forward(port, frame.raw, plan, now)
-        if self._dirty:
+        if self._ports_to_flush:
             if len(frames) > MAX_BURST_FRAMES:
                 self.flush()
             elif not (self._is_scheduled or port.reports_bursts):
@@ -107,9 +111,9 @@ class Switch:
 
     def flush(self) -> None:
         self._is_scheduled = False
-        if not self._dirty:
+        if not self._ports_to_flush:
             return
-        dirty, self._dirty = self._dirty, []
+        dirty, self._ports_to_flush = self._ports_to_flush, []
         unix_time = self.unix_time()
         for port in dirty:
             if port.batch:
@@ -119,7 +123,7 @@ class Switch:
                     self._on_error(port, error)
 
     def _admitted(self, port: Port, framer: Framer, frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
-        """Return the frames that the sender may send, without signatures, and the out-of-order frames among them."""
+        """Return the frames that the sender may send, without signatures, and the out-of-order ones among them."""
         admitted: list[Frame] = []
         late: list[Frame] = []
         gateway, guard, peer = port.gateway, port.guard, port.peer
@@ -127,12 +131,14 @@ class Switch:
             frame = received if gateway is None else gateway.admitted(received, self.unix_time())
             if frame is None:
                 continue
-            if guard is None or not (guard.is_shared or frame.message_id == 0) or guard.admits(frame, framer, peer):
-                admitted.append(frame)
-                if received in framer.late:
-                    late.append(frame)
-            else:
+            # The guard records every heartbeat (0). A single peer has no rival, so its other frames need no check.
+            must_check = guard is not None and (guard.is_shared or frame.message_id == 0)
+            if guard is not None and must_check and not guard.admits(frame, framer, peer):
                 port.counters.dropped["foreign"] += 1
+                continue
+            admitted.append(frame)
+            if received in framer.late:
+                late.append(frame)
         return admitted, late
 
     def _forward_together(self, plans: list[ForwardingPlan[Port]], data: bytes) -> bool:
@@ -144,19 +150,20 @@ class Switch:
         if len(plans) > 1 and not (len(data) <= MAX_JOINED_BYTES and all(out.joins_frames for out in outs)):
             return False
         for out in outs:
-            if not out.batch and out.must_hold():
+            if not out.batch and out.must_queue():
                 return False
         for out in outs:
             if not out.batch:
-                self._dirty.append(out)
+                self._ports_to_flush.append(out)
             out.batch.append(data)
             out.joined_frames += len(plans) - 1
         return True
 
     def _forward(self, port: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
+        """Forward one frame. Whether a port must queue it is checked only for the first frame of a batch."""
         for out in plan.outs:
-            if batch := out.batch:
-                batch.append(raw)
+            if out.batch:
+                out.batch.append(raw)
             else:
                 self._start_batch(out, raw, plan, now)
         if plan.rate_limited:
@@ -169,16 +176,16 @@ class Switch:
     def _start_batch(self, out: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
         if out.node is None:
             return  # removed since the frame was routed
-        if out.must_hold():
-            out.hold(raw, plan, now)
-            if out not in self._holding:
-                self._holding[out] = None
+        if out.must_queue():
+            out.enqueue(raw, plan, now)
+            if out not in self._queueing_ports:
+                self._queueing_ports[out] = None
                 if self._timer is None:
                     self._poll_interval_s = MIN_POLL_INTERVAL_S
                     self._timer = self._loop.call_later(MIN_POLL_INTERVAL_S, self._poll)
         else:
             out.batch.append(raw)
-            self._dirty.append(out)
+            self._ports_to_flush.append(out)
 
     def _forward_limited(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
         for out, period_s in plan.rate_limited:
@@ -189,20 +196,21 @@ class Switch:
                     self._start_batch(out, raw, plan, now)
 
     def _poll(self) -> None:
+        """Write queued frames of full links that accept data again."""
         now, unix_time = self._clock(), self.unix_time()
         self._timer = None
         self._poll_interval_s = min(2 * self._poll_interval_s, MAX_POLL_INTERVAL_S)
-        for port in tuple(self._holding):
-            before = port.counters.frames_out
+        for port in tuple(self._queueing_ports):
+            frames_out_before = port.counters.frames_out
             try:
                 port.drain(now, unix_time)
             except Exception as error:
                 self._on_error(port, error)
-            if port.counters.frames_out > before:
+            if port.counters.frames_out > frames_out_before:
                 self._poll_interval_s = MIN_POLL_INTERVAL_S
-            if not port.is_holding:
-                del self._holding[port]
-        if self._holding:
+            if not port.has_queued_frames:
+                del self._queueing_ports[port]
+        if self._queueing_ports:
             self._timer = self._loop.call_later(self._poll_interval_s, self._poll)
 
 

@@ -11,7 +11,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,10 +28,10 @@ _MIN_VALUE, _MAX_VALUE = -(1 << 63), (1 << 64) - 1
 # Names used by message classes. A field of a private dialect with such a name gets a trailing underscore.
 _RESERVED = frozenset(
     (
-        *("ID", "NAME", "CRC_EXTRA", "FIELDS", "LENGTH", "BASE_LENGTH", "received_frame"),
-        *("decode", "decode_body", "encode", "to_dict", "self", "cls", "tuple"),
+        "ID", "NAME", "CRC_EXTRA", "FIELDS", "LENGTH", "BASE_LENGTH", "received_frame",
+        "decode", "decode_body", "encode", "to_dict", "self", "cls", "tuple",
     )
-)
+)  # fmt: skip
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 _FIELD_TYPE = re.compile(r"(\w+?)(?:_mavlink_version)?(?:\[([0-9]{1,3})\])?\Z")
 
@@ -92,26 +92,26 @@ class MessageDefinition:
     @property
     def wire_fields(self) -> tuple[FieldDefinition, ...]:
         """The fields in wire order: sorted by size of type, largest first, then extensions in their order."""
-        base = sorted((f for f in self.fields if not f.extension), key=lambda f: -SIZES[f.type])
-        return (*base, *(f for f in self.fields if f.extension))
+        base = sorted((field for field in self.fields if not field.extension), key=lambda field: -SIZES[field.type])
+        return (*base, *(field for field in self.fields if field.extension))
 
     @property
     def base_length(self) -> int:
         """Payload length without extensions, as in MAVLink 1."""
-        return sum(f.length for f in self.fields if not f.extension)
+        return sum(field.length for field in self.fields if not field.extension)
 
     @property
     def length(self) -> int:
         """Payload length with extensions."""
-        return sum(f.length for f in self.fields)
+        return sum(field.length for field in self.fields)
 
     @property
     def crc_extra(self) -> int:
         """Byte derived from the definition; the checksum of a frame fails if the sender has another definition."""
         text = self.name + " "
-        for f in self.wire_fields:
-            if not f.extension:
-                text += f"{f.type} {f.name} " + (chr(f.array_length) if f.array_length else "")
+        for field in self.wire_fields:
+            if not field.extension:
+                text += f"{field.type} {field.name} " + (chr(field.array_length) if field.array_length else "")
         crc = x25(text.encode("latin-1"))
         return (crc & 0xFF) ^ (crc >> 8)
 
@@ -162,13 +162,13 @@ class DialectDefinition:
     name: str
     messages: tuple[MessageDefinition, ...] = ()
     enums: tuple[EnumDefinition, ...] = ()
-    includes: tuple[str, ...] = field(default=())
+    includes: tuple[str, ...] = ()
 
 
 def cap_words(name: str) -> str:
     """Convert ``GLOBAL_POSITION_INT`` to ``GlobalPositionInt``."""
     words = "".join(part.capitalize() for part in name.split("_"))
-    return words + "_" if keyword.iskeyword(words) else words  # for None, True and False
+    return words + "_" if keyword.iskeyword(words) else words  # "None", "True" and "False" are keywords
 
 
 def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinition]:
@@ -179,20 +179,20 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
     Raises:
         InvalidArgument: a file is missing, is larger than 16 MB, or is not MAVLink XML.
     """
-    found: dict[str, DialectDefinition] = {}
-    pending: set[str] = set()
+    dialects: dict[str, DialectDefinition] = {}
+    pending: set[str] = set()  # files whose includes are being read, because files may include each other
 
     def visit(file: Path) -> None:
-        if file.name in found or file.name in pending:
+        if file.name in dialects or file.name in pending:
             return
         pending.add(file.name)
         dialect = read_xml(file)
         for include in dialect.includes:
             visit(_find_include(include, file, search))
-        found[file.name] = dialect
+        dialects[file.name] = dialect
 
     visit(path)
-    return list(found.values())
+    return list(dialects.values())
 
 
 def read_xml(path: Path) -> DialectDefinition:
@@ -240,8 +240,8 @@ def _find_include(include: str, file: Path, search: Sequence[Path]) -> Path:
     for folder in folders:
         if os.path.isfile(folder / include):  # unlike Path.is_file, os.path.isfile does not raise for long names
             return folder / include
-    looked = ", ".join(str(folder) for folder in folders)
-    raise InvalidArgument(f"{file.name} includes {include}, which is in none of: {looked}")
+    searched = ", ".join(str(folder) for folder in folders)
+    raise InvalidArgument(f"{file.name} includes {include}, which is in none of: {searched}")
 
 
 def _message(node: Element, origin: str) -> MessageDefinition:
@@ -272,20 +272,22 @@ def _message(node: Element, origin: str) -> MessageDefinition:
 
 
 def _field(node: Element, extension: bool, message: str) -> FieldDefinition:
-    found = _FIELD_TYPE.match(node.attrib["type"])
-    if found is None or found[1] not in SIZES or found[2] == "0":
+    # The field mavlink_version of HEARTBEAT has a type of its own, and is always 3.
+    match = _FIELD_TYPE.match(node.attrib["type"])
+    if match is None or match[1] not in SIZES or match[2] == "0":
         raise ValueError(f"unknown field type {node.attrib['type']!r}")
+    type_, array_length = match[1], int(match[2] or 0)
     return FieldDefinition(
         name=_identifier(node.attrib["name"]),
-        type=found[1],
-        array_length=int(found[2] or 0),
+        type=type_,
+        array_length=array_length,
         units=node.get("units", ""),
         enum=node.get("enum", ""),
         invalid=node.get("invalid", ""),
         description=_text(node),
         extension=extension,
         default=3 if node.attrib["type"] == "uint8_t_mavlink_version" else None,
-        carries_bytes=carries_bytes(message, node.attrib["name"], found[1]),
+        carries_bytes=carries_bytes(message, node.attrib["name"], type_),
     )
 
 
@@ -298,6 +300,7 @@ def _enum(node: Element, origin: str) -> EnumDefinition:
     entries: list[EntryDefinition] = []
     highest = 0
     for child in node.findall("entry"):
+        # Without a value, the entry follows the highest one, as in pymavlink's mavparse.py.
         value = _integer(child.attrib["value"]) if "value" in child.attrib else highest + 1
         highest = max(highest, value)
         entries.append(
@@ -354,10 +357,10 @@ def _remarks(node: Element) -> tuple[str, ...]:
     remarks: list[str] = []
     for child in node:
         if child.tag in ("deprecated", "superseded"):
-            since, by, why = child.get("since", ""), child.get("replaced_by", ""), _text(child)
+            since, replacement, reason = child.get("since", ""), child.get("replaced_by", ""), _text(child)
             remark = child.tag.capitalize() + (f" since {since}" if since else "")
-            remark += f", replaced by {by}." if by else "."
-            remarks.append(f"{remark} {why}".strip())
+            remark += f", replaced by {replacement}." if replacement else "."
+            remarks.append(f"{remark} {reason}".strip())
         elif child.tag == "wip":
             remarks.append("Work in progress: may change.")
     return tuple(remarks)
@@ -367,15 +370,18 @@ def _remarks(node: Element) -> tuple[str, ...]:
 
 
 def _common_prefix(enum: str, names: list[str]) -> str:
+    """Return the enum's name if most entries begin with it, else the words with which all entries begin."""
     if not names:
         return ""
-    own = enum + "_"
-    if sum(name.startswith(own) for name in names) * 2 > len(names):
-        return own
-    split = [name.split("_")[:-1] for name in names] if len(names) > 1 else [enum.split("_")]
-    split.append(names[0].split("_")[:-1])
+    enum_prefix = enum + "_"
+    if sum(name.startswith(enum_prefix) for name in names) * 2 > len(names):
+        return enum_prefix
+    # The last word of an entry is never part of the prefix. A single entry is compared with the enum's name.
+    split_names = [name.split("_")[:-1] for name in names]
+    if len(names) == 1:
+        split_names.append(enum.split("_"))
     common: list[str] = []
-    for words in zip(*split):  # noqa: B905 - the shortest ends it
+    for words in zip(*split_names):  # noqa: B905 - the shortest ends it
         if len(set(words)) > 1:
             break
         common.append(words[0])
@@ -385,9 +391,9 @@ def _common_prefix(enum: str, names: list[str]) -> str:
 def _member_name(enum: str, prefix: str, name: str) -> str:
     if not name.startswith(prefix):  # the entry lacks the first words of the enum's name
         words = enum.split("_")
-        tails = ("_".join(words[i:]) + "_" for i in range(1, len(words)))
-        prefix = next((tail for tail in tails if name.startswith(tail)), "")
-    rest = name[len(prefix) :]
-    if rest[:1].isdigit():
-        rest = prefix.rstrip("_").rpartition("_")[2] + "_" + rest
-    return rest + "_" if keyword.iskeyword(rest) or rest == "mro" else rest
+        shorter_prefixes = ("_".join(words[i:]) + "_" for i in range(1, len(words)))
+        prefix = next((shorter for shorter in shorter_prefixes if name.startswith(shorter)), "")
+    member = name[len(prefix) :]
+    if member[:1].isdigit():  # a Python name cannot begin with a digit: keep the last word of the prefix
+        member = prefix.rstrip("_").rpartition("_")[2] + "_" + member
+    return member + "_" if keyword.iskeyword(member) or member == "mro" else member

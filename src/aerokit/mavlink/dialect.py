@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.frame import Frame
 
-Row = tuple[int, int, int]
+Row = tuple[int, int, int]  # CRC_EXTRA, payload length without extensions, payload length with extensions
 
 
 class Dialect:
@@ -147,8 +147,8 @@ class _Standard(Dialect):
         return super().by_name(name) if message_class is None else message_class
 
     def enum(self, name: str) -> type[Any]:
-        found = getattr(enums, _cap_words(name), None)
-        return super().enum(name) if found is None else found
+        enum_type = getattr(enums, _cap_words(name), None)
+        return super().enum(name) if enum_type is None else enum_type
 
 
 class _Extended(Dialect):
@@ -162,16 +162,18 @@ class _Extended(Dialect):
         return first[message_id] if message_id in first else second[message_id]
 
     def enum(self, name: str) -> type[Any]:
-        found: list[type[Any]] = []
+        enum_types: list[type[Any]] = []
         for part in self._parts:
             try:
-                found.append(part.enum(name))
+                enum_types.append(part.enum(name))
             except InvalidArgument:
                 continue
-        if len(found) < 2 or found[1].__members__.keys() <= found[0].__members__.keys():
-            return found[0] if found else super().enum(name)
+        if not enum_types:
+            return super().enum(name)
+        if len(enum_types) == 1 or enum_types[1].__members__.keys() <= enum_types[0].__members__.keys():
+            return enum_types[0]
         if name not in self._enums:
-            self._enums[name] = _merge_enums(*found)
+            self._enums[name] = _merge_enums(*enum_types)
         return self._enums[name]
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _HEADER_V2 = Struct("<BBBBBBHB").pack  # without the magic byte
 _MAGIC_V1, _MAGIC_V2 = bytes((MAGIC_V1,)), bytes((MAGIC_V2,))
-_BYTES = tuple(bytes((number,)) for number in range(256))
+_BYTES = tuple(bytes((message_id,)) for message_id in range(256))
 
 
 class FrameEncoder:
@@ -71,21 +71,22 @@ class FrameEncoder:
             if compiled is not None:
                 self.sequence = (self.sequence + 1) & 0xFF
                 return compiled if signing is None else compiled + signing.sign(compiled, now)
-            layout_of(type(message))  # compiles the layout for the next message of this type
+            # None: there is no layout yet. Make it for the next message of this type.
+            layout_of(type(message))
         payload = message.encode()
-        number = message.ID
+        message_id = message.ID
         if self._version == 2:
             payload = payload.rstrip(b"\0") or payload[:1]  # the standard keeps the first byte
             flags = 0 if signing is None else SIGNED
             source = self.system_id, self.component_id
-            body = _HEADER_V2(len(payload), flags, 0, self.sequence, *source, number & 0xFFFF, number >> 16)
+            body = _HEADER_V2(len(payload), flags, 0, self.sequence, *source, message_id & 0xFFFF, message_id >> 16)
             body, magic = body + payload, _MAGIC_V2
         else:
-            if number > 255:
-                raise InvalidArgument(f"{message.NAME} has id {number}, but MAVLink 1 has no ids above 255")
+            if message_id > 255:
+                raise InvalidArgument(f"{message.NAME} has id {message_id}, but MAVLink 1 has no ids above 255")
             payload = payload[: message.BASE_LENGTH]
             source = self.system_id, self.component_id
-            body, magic = bytes((len(payload), self.sequence, *source, number)) + payload, _MAGIC_V1
+            body, magic = bytes((len(payload), self.sequence, *source, message_id)) + payload, _MAGIC_V1
         self.sequence = (self.sequence + 1) & 0xFF
         frame = magic + body + x25(body + _BYTES[message.CRC_EXTRA]).to_bytes(2, "little")
         return frame if signing is None else frame + signing.sign(frame, now)

@@ -27,7 +27,7 @@ SIGNATURE_LENGTH = 13
 class Frame(FrameFields):
     """One frame with a valid checksum. Treat it as immutable, because all receivers share it."""
 
-    # No constructor, for speed: the framer sets the attributes, and properties compute the rest.
+    # There is no constructor, for speed: the framer sets the attributes, and properties compute further values.
     if not TYPE_CHECKING:  # type checkers see the attributes of the base class
         __slots__ = ()
 
@@ -51,12 +51,13 @@ class Frame(FrameFields):
         frame = cls()
         frame._raw = raw
         frame.received_at = received_at
-        upto = raw[1] + (6 if raw[0] == MAGIC_V1 else 10)
-        frame.checksum = int.from_bytes(raw[upto : upto + 2], "little")
+        payload_end = raw[1] + (6 if raw[0] == MAGIC_V1 else 10)
+        frame.checksum = int.from_bytes(raw[payload_end : payload_end + 2], "little")
         if raw[0] == MAGIC_V1:
-            frame.body = bytes((raw[1], 0, 0, *raw[2:6], 0, 0)) + raw[6:upto]
+            # The MAVLink 1 header in the layout of MAVLink 2.
+            frame.body = bytes((raw[1], 0, 0, *raw[2:6], 0, 0)) + raw[6:payload_end]
         else:
-            frame.body = raw[1:upto]
+            frame.body = raw[1:payload_end]
         frame.system_id, frame.component_id = frame.body[4:6]
         frame.message_id = int.from_bytes(frame.body[6:9], "little")
         return frame
@@ -120,7 +121,7 @@ def x25_in_python() -> Callable[[bytes], int]:
     table: list[int] = []
     for byte in range(256):
         for _ in range(8):
-            byte = (byte >> 1) ^ 0x8408 if byte & 1 else byte >> 1
+            byte = (byte >> 1) ^ 0x8408 if byte & 1 else byte >> 1  # the reversed polynomial of CRC-16/MCRF4XX
         table.append(byte)
 
     def x25(data: bytes) -> int:

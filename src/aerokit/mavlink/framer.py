@@ -45,8 +45,8 @@ _UNKNOWN = 3  # looks like a whole frame of an unknown message
 _BAD_CRC = 4
 _NOISE = 5
 
-# Begin, end, message id, sequence, source.
-_Found = tuple[int, int, int, int, int]
+# Position of a valid frame, and parts of its header: begin, end, message id, sequence number, source.
+_ValidFrame = tuple[int, int, int, int, int]
 
 # State of the data that is kept: how far it was examined, candidates (begin, verdict, size at which to examine again),
 # and positions of bad checksums. This state avoids examining the same bytes again while further bytes arrive one by
@@ -94,14 +94,14 @@ class PythonFramer:
             # Most datagrams are a single valid frame in sequence. For these, this path is a sixth faster than the loop
             # below.
             magic, length, flags, sequence, key, message_id = _HEADER_V2(data)
-            upto = 10 + length
-            end = upto + (2 + SIGNATURE_LENGTH if flags else 2)
+            payload_end = 10 + length
+            end = payload_end + (2 + SIGNATURE_LENGTH if flags else 2)
             if magic == MAGIC_V2 and flags <= SIGNED and end == size:
                 message_id &= 0xFFFFFF
                 try:
                     source = self._sources[key]
-                    body = data[1:upto]
-                    (checksum,) = _CHECKSUM(data, upto)
+                    body = data[1:payload_end]
+                    (checksum,) = _CHECKSUM(data, payload_end)
                     if source.expected & 0xFF == sequence and x25(body + self._extras[message_id]) == checksum:
                         source.expected += 1
                         if self.wanted is not None and message_id not in self.wanted:
@@ -132,10 +132,10 @@ class PythonFramer:
                 magic, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
                 if good := magic == MAGIC_V2 and flags <= SIGNED:
                     message_id &= 0xFFFFFF
-                    upto = begin + 10 + length
-                    end = upto + 2
-                    body = data[begin + 1 : upto]
-                    (checksum,) = _CHECKSUM(data, upto)
+                    payload_end = begin + 10 + length
+                    end = payload_end + 2
+                    body = data[begin + 1 : payload_end]
+                    (checksum,) = _CHECKSUM(data, payload_end)
                     good = x25(body + extras[message_id]) == checksum
                     if flags:
                         end += SIGNATURE_LENGTH
@@ -180,7 +180,7 @@ class PythonFramer:
                 frames.append(frame)
             begin = end
         if out_of_order:
-            self._sort_out(frames, out_of_order)
+            self._fill_late_and_foreign(frames, out_of_order)
         return frames
 
     def reset(self) -> None:
@@ -200,20 +200,24 @@ class PythonFramer:
         """Number of bytes kept because they may become a frame; at most a few hundred."""
         return len(self._rest)
 
-    def _sort_out(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
+    def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
         # Unwanted frames are not in the list, so the list may have a different frame at that position.
-        for place, verdict, which in out_of_order:
-            if place < len(frames):
-                frame = frames[place]
-                if frame.sequence << 16 | frame.component_id << 8 | frame.system_id == which:
-                    (self.foreign if verdict == OTHERS else self.late).append(frame)
+        for position, verdict, identity in out_of_order:
+            if position < len(frames):
+                frame = frames[position]
+                if frame.sequence << 16 | frame.component_id << 8 | frame.system_id != identity:
+                    continue
+                if verdict == OTHERS:
+                    self.foreign.append(frame)
+                else:
+                    self.late.append(frame)
 
     # -------------------------------------------------------------------------------- slow path
 
-    def _search(self, data: bytes, begin: int, scan: _ScanState) -> _Found | None:
+    def _search(self, data: bytes, begin: int, scan: _ScanState) -> _ValidFrame | None:
         """Return the next valid frame from ``begin`` on, or keep possible beginnings of frames in ``_rest``."""
         size = len(data)
-        hold = -1  # position from which data is kept
+        keep_from = -1  # position from which data is kept
         unknown = unknown_end = -1  # a whole frame of an unknown message, unless it contains a valid frame
         examined, candidates, bad_crcs = scan
         pending: list[tuple[int, int, int]] = []
@@ -223,10 +227,10 @@ class PythonFramer:
         for here, verdict, end in chain(candidates, new, ((size, _NOISE, size),)):
             if unknown >= 0 and here >= unknown_end:
                 if unknown_end == size or data[unknown_end] in _MAGICS:
-                    self._skip(begin, unknown, bad_crcs)
+                    self._count_skipped(begin, unknown, bad_crcs)
                     self._skip_unknown(data, unknown, unknown_end)
                     begin = unknown_end
-                    hold, pending = -1, []
+                    keep_from, pending = -1, []
                     bad_crcs = [place for place in bad_crcs if place >= begin]
                 unknown = -1
             if here >= size:
@@ -234,22 +238,22 @@ class PythonFramer:
             if end <= size and verdict != _UNKNOWN:
                 verdict, end, found = self._examine(data, here)
                 if verdict == _GOOD:
-                    self._skip(begin, here, bad_crcs)
+                    self._count_skipped(begin, here, bad_crcs)
                     return found
             if verdict == _BAD_CRC:
                 bad_crcs.append(here)
             elif verdict != _NOISE:
                 pending.append((here, verdict, end))
             if verdict == _WAIT:
-                hold = _earliest(hold, unknown, here)
+                keep_from = _earliest(keep_from, unknown, here)
                 reached = here + 1
                 break
-            if verdict == _IMPLAUSIBLE and hold < 0:
-                hold = here
-            elif verdict == _UNKNOWN and hold < 0 and unknown < 0:
+            if verdict == _IMPLAUSIBLE and keep_from < 0:
+                keep_from = here
+            elif verdict == _UNKNOWN and keep_from < 0 and unknown < 0:
                 unknown, unknown_end = here, end
-        keep = size if hold < 0 else hold
-        self._skip(begin, keep, bad_crcs)
+        keep = size if keep_from < 0 else keep_from
+        self._count_skipped(begin, keep, bad_crcs)
         self._rest = data[keep:]
         self._scan = (
             reached - keep,
@@ -276,23 +280,21 @@ class PythonFramer:
         if source is not None and source.expected & 0xFF == sequence:
             source.skip(1)
 
-    def _skip(self, begin: int, end: int, bad_crcs: list[int]) -> None:
+    def _count_skipped(self, begin: int, end: int, bad_crcs: list[int]) -> None:
         # Count bytes outside frames. Bytes that are kept are examined, and counted, later.
         self.statistics.bad_bytes += end - begin
         if bad_crcs:
             self.statistics.bad_crcs += sum(place < end for place in bad_crcs)
 
-    def _examine(self, data: bytes, begin: int) -> tuple[int, int, _Found | None]:
+    def _examine(self, data: bytes, begin: int) -> tuple[int, int, _ValidFrame | None]:
         """Return (verdict, end, frame if valid) for the magic byte at ``begin``."""
         size = len(data)
         if data[begin] == MAGIC_V2:
+            if size - begin < 3:  # the flags have not arrived yet
+                return _WAIT, begin + 3, None
             if size - begin < _MIN_LENGTH_V2:
-                plausible = size - begin < 3 or data[begin + 2] <= SIGNED
-                return (
-                    (_WAIT if plausible else _NOISE),
-                    begin + (3 if size - begin < 3 else _MIN_LENGTH_V2),
-                    None,
-                )
+                are_flags_known = data[begin + 2] <= SIGNED
+                return (_WAIT if are_flags_known else _NOISE), begin + _MIN_LENGTH_V2, None
             _, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
             if flags & ~SIGNED:
                 return _NOISE, size, None
@@ -312,17 +314,17 @@ class PythonFramer:
             return _NOISE, size, None  # MAVLink 1 neither truncates payloads nor allows unknown extensions
         if end > size:
             return (_WAIT if length <= full_length else _IMPLAUSIBLE), end, None
-        upto = body + length
-        if x25(data[begin + 1 : upto] + bytes((extra,))) != _CHECKSUM(data, upto)[0]:
+        payload_end = body + length
+        if x25(data[begin + 1 : payload_end] + bytes((extra,))) != _CHECKSUM(data, payload_end)[0]:
             return _BAD_CRC, end, None
         return _GOOD, end, (begin, end, message_id, sequence, key)
 
 
-def _earliest(hold: int, unknown: int, here: int) -> int:
-    """Return the start of the data to keep: the earliest candidate for a frame, at ``here`` or before."""
-    if unknown >= 0:  # `unknown` is set only while `hold` is not, so it is earlier
+def _earliest(keep_from: int, unknown: int, here: int) -> int:
+    """Return the start of the data to keep: the earliest candidate for a frame, at ``here`` or before (-1: none)."""
+    if unknown >= 0:  # `unknown` is set only while `keep_from` is not, so it is earlier
         return unknown
-    return here if hold < 0 else hold
+    return here if keep_from < 0 else keep_from
 
 
 if TYPE_CHECKING or wire is None:
@@ -338,9 +340,13 @@ else:
             self._out_of_order: list[tuple[int, int, int]] = []
 
         def _find(self, data: bytes, begin: int, kept: int, now: float, frames: list[Frame]) -> int | None:
-            # `kept` is 2 if `_scan` describes the kept data, and 1 if the kept data is the beginning of one plausible
-            # frame.
-            scan = self._scan if kept == 2 else (1, [(0, _WAIT, 0)], []) if kept else _NEW_SCAN
+            # `kept` is 2 if `_scan` describes the kept data, 1 if that data is the beginning of one plausible frame,
+            # and 0 if no data was kept.
+            scan = _NEW_SCAN
+            if kept == 2:
+                scan = self._scan
+            elif kept == 1:
+                scan = (1, [(0, _WAIT, 0)], [])
             found = self._search(data, begin, scan)
             if self._unknown:
                 frames += self._take_unknown(now)
@@ -355,7 +361,7 @@ else:
 
         def _sort_out_of_order(self, frames: list[Frame]) -> None:
             out_of_order, self._out_of_order = self._out_of_order, []
-            self._sort_out(frames, out_of_order)
+            self._fill_late_and_foreign(frames, out_of_order)
 
         def _clear_out_of_order(self) -> None:
             self.late, self.foreign, self._out_of_order = [], [], []

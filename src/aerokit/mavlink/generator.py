@@ -46,7 +46,7 @@ DefinedT = TypeVar("DefinedT", EnumDefinition, MessageDefinition)
 
 
 def read_additions() -> list[DialectDefinition]:
-    """Read the additions, each file separately."""
+    """Read the XML files in the folder ``additions``."""
     return [read_xml(UNION_FOLDER / f"{stem}.xml") for stem in ("minimal", "common", "development")]
 
 
@@ -56,9 +56,9 @@ def with_added_messages(
     """Return pymavlink's messages, supplemented by the additions, followed by the new messages of the additions."""
     merged = {message.id: message for message in messages}
     for added in (message for dialect in additions for message in dialect.messages):
-        known = merged.get(added.id)
-        if known is not None:
-            added = _settled(replace(known, fields=_fields(known, added)), added)
+        existing = merged.get(added.id)
+        if existing is not None:
+            added = _with_first_origin(replace(existing, fields=_fields(existing, added)), added)
         merged[added.id] = added
     return list(merged.values())
 
@@ -71,46 +71,50 @@ def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[Dialec
     """
     merged = {enum.name: enum for enum in enums}
     for added in (enum for dialect in additions for enum in dialect.enums):
-        known = merged.get(added.name)
-        if known is not None:
-            entries = _entries(known, added)
-            added = _settled(replace(known, entries=entries, own_prefix=known.prefix), added)
+        existing = merged.get(added.name)
+        if existing is not None:
+            entries = _entries(existing, added)
+            added = _with_first_origin(replace(existing, entries=entries, own_prefix=existing.prefix), added)
         merged[added.name] = added
     return list(merged.values())
 
 
-def _settled(known: DefinedT, added: DefinedT) -> DefinedT:
-    home = min(
-        known.origin,
+def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
+    """Return ``existing`` with the origin that comes first in `STANDARD_FILES`, and with the added remarks."""
+    origin = min(
+        existing.origin,
         added.origin,
         key=lambda stem: STANDARD_FILES.index(stem) if stem in STANDARD_FILES else len(STANDARD_FILES),
     )
-    return replace(known, origin=home, remarks=added.remarks or known.remarks)
+    return replace(existing, origin=origin, remarks=added.remarks or existing.remarks)
 
 
-def _fields(known: MessageDefinition, added: MessageDefinition) -> tuple[FieldDefinition, ...]:
-    fields = {field.name: field for field in known.fields}
+def _fields(existing: MessageDefinition, added: MessageDefinition) -> tuple[FieldDefinition, ...]:
+    fields = {field.name: field for field in existing.fields}
     for field in added.fields:
-        before = fields.get(field.name)
-        if before is not None:
-            field = replace(before, units=field.units, enum=field.enum, invalid=field.invalid)
+        existing_field = fields.get(field.name)
+        if existing_field is not None:
+            field = replace(existing_field, units=field.units, enum=field.enum, invalid=field.invalid)
         fields[field.name] = field
     return tuple(fields.values())
 
 
-def _entries(known: EnumDefinition, added: EnumDefinition) -> tuple[EntryDefinition, ...]:
-    theirs = {entry.name: entry for entry in known.entries}
-    ours = {entry.name: _entry(theirs.get(entry.name, entry), entry) for entry in added.entries}
-    return tuple(sorted({**ours, **theirs, **ours}.values(), key=lambda entry: entry.value))
+def _entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[EntryDefinition, ...]:
+    by_name = {entry.name: entry for entry in existing.entries}
+    merged = {entry.name: _entry(by_name.get(entry.name, entry), entry) for entry in added.entries}
+    for name, entry in by_name.items():
+        merged.setdefault(name, entry)
+    # Sorting is stable, so of several names for one value the added (standard) name comes first.
+    return tuple(sorted(merged.values(), key=lambda entry: entry.value))
 
 
-def _entry(known: EntryDefinition, added: EntryDefinition) -> EntryDefinition:
-    params = {param[0]: param for param in (*known.params, *added.params)}
+def _entry(existing: EntryDefinition, added: EntryDefinition) -> EntryDefinition:
+    params = {param[0]: param for param in (*existing.params, *added.params)}  # by number
     return replace(
-        known,
+        existing,
         value=added.value,
-        params=tuple(params[index] for index in sorted(params)),
-        remarks=added.remarks or known.remarks,
+        params=tuple(params[number] for number in sorted(params)),
+        remarks=added.remarks or existing.remarks,
     )
 
 
@@ -278,8 +282,8 @@ def fingerprint(folder: Path | None = None) -> str:
 
 def generated_fingerprint() -> str:
     """Return the hash of the XML files from which the committed modules were generated."""
-    found = re.search(_MARK + "([0-9a-f]+)", (FOLDER / "messages" / "__init__.py").read_text(encoding="utf-8"))
-    return found[1] if found else ""
+    match = re.search(_MARK + "([0-9a-f]+)", (FOLDER / "messages" / "__init__.py").read_text(encoding="utf-8"))
+    return match[1] if match else ""
 
 
 def definitions(folder: Path | None = None) -> tuple[list[MessageDefinition], list[EnumDefinition]]:
@@ -300,12 +304,12 @@ def generate(folder: Path | None = None) -> dict[str, str]:
     files["messages/__init__.py"], files["messages/__init__.pyi"] = _messages_init(messages)
     files["enums/__init__.py"], files["enums/__init__.pyi"] = _enums_init(enums)
     for module in (*MODULES, COMMON_MORE):
-        own_messages = [message for message in messages if _module_of(message) == module]
-        files[f"messages/{module}.py"] = _messages_module(module, own_messages)
+        module_messages = [message for message in messages if _module_of(message) == module]
+        files[f"messages/{module}.py"] = _messages_module(module, module_messages)
     for module, stems in MODULES.items():
-        own = [enum for enum in enums if enum.origin in stems]
-        files[f"enums/{module}.py"] = _enums_module(module, stems, own)
-        files[f"enums/{module}.pyi"] = _enums_stub(module, own)
+        module_enums = [enum for enum in enums if enum.origin in stems]
+        files[f"enums/{module}.py"] = _enums_module(module, stems, module_enums)
+        files[f"enums/{module}.pyi"] = _enums_stub(module, module_enums)
     header = _HEADER.format(fingerprint(folder))
     return {path: header + text for path, text in sorted(files.items())}
 
@@ -318,8 +322,9 @@ def differences(folder: Path | None = None) -> list[str]:
         for package in ("messages", "enums")
         for path in (FOLDER / package).glob("*.py*")
     }
-    wrong = [path for path, text in files.items() if path not in present or _read(path) != text]
-    return sorted({*wrong, *(present - set(files))})
+    different = {path for path, text in files.items() if path not in present or _read(path) != text}
+    superfluous = present - set(files)
+    return sorted(different | superfluous)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -337,10 +342,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if fingerprint() != generated_fingerprint():
         sys.stdout.write("skipped: the XML of the installed pymavlink differs from that of the committed modules\n")
         return 0
-    wrong = differences()
-    texts = [f"differs: {path}\n" for path in wrong] or ["the committed modules are up to date\n"]
-    sys.stdout.writelines(texts)
-    return 1 if wrong else 0
+    paths = differences()
+    sys.stdout.writelines(f"differs: {path}\n" for path in paths)
+    if not paths:
+        sys.stdout.write("the committed modules are up to date\n")
+    return 1 if paths else 0
 
 
 # ------------------------------------------------------------------------------------------- files
@@ -358,7 +364,7 @@ def _read(path: str) -> str:
     return (FOLDER / path).read_text(encoding="utf-8")
 
 
-def _more(stems: Sequence[str]) -> str:
+def _other_files(stems: Sequence[str]) -> str:
     return f" (and {', '.join(stems[1:])})" if len(stems) > 1 else ""
 
 
@@ -366,7 +372,7 @@ def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
     text = "\n\n".join(render_message(message) for message in messages)
     helpers = "".join(f", {name}" for name in ("pack_bytes", "pack_items", "pack_text") if f"{name}(" in text)
     stems = MODULES.get(module, MODULES["common"])
-    head = _MESSAGES_HEAD.format(name=stems[0], more=_more(stems), helpers=helpers)
+    head = _MESSAGES_HEAD.format(name=stems[0], more=_other_files(stems), helpers=helpers)
     if "Sequence[" not in text:
         head = head.replace("    from collections.abc import Sequence\n\n", "")
     return head + _all(message.class_name for message in messages) + "\n" + text
@@ -384,7 +390,7 @@ def _messages_init(messages: Sequence[MessageDefinition]) -> tuple[str, str]:
 
 def _enums_module(module: str, stems: Sequence[str], enums: Sequence[EnumDefinition]) -> str:
     rows = "".join(render_enum_row(enum) for enum in enums)
-    return _ENUMS_HEAD.format(name=module, more=_more(stems)) + rows + _ENUMS_TAIL
+    return _ENUMS_HEAD.format(name=module, more=_other_files(stems)) + rows + _ENUMS_TAIL
 
 
 def _enums_stub(module: str, enums: Sequence[EnumDefinition]) -> str:

@@ -76,7 +76,17 @@ INTEGER_RANGES = {
 class Field:
     """Description of one field of a message in the standard."""
 
-    __slots__ = (*("array_length", "description", "enum", "extension", "invalid", "is_text", "name", "type", "units"),)
+    __slots__ = (
+        "array_length",
+        "description",
+        "enum",
+        "extension",
+        "invalid",
+        "is_text",
+        "name",
+        "type",
+        "units",
+    )
 
     def __init__(
         self,
@@ -128,7 +138,8 @@ class Field:
             return f"must be a sequence of at most {self.array_length} numbers"
         if size > self.array_length:
             return f"has {size} elements, at most {self.array_length} fit"
-        return next((p for p in (_number_problem(item, self.type) for item in value) if p), None)
+        problems = (_number_problem(item, self.type) for item in value)
+        return next((problem for problem in problems if problem), None)
 
 
 class _Fields:
@@ -155,30 +166,33 @@ def offset_of(message_type: type[Message], field: str) -> int:
 
 def _wire_rows(message_type: type[Message]) -> list[tuple[Any, ...]]:
     """Return the rows of ``_FIELDS`` in the order of the fields on the wire."""
+    # A row has the arguments of `Field`: row[1] is the type, row[7] is True for extensions.
     base = sorted((row for row in message_type._FIELDS if not row[7]), key=lambda row: -SIZES[row[1]])
     return [*base, *(row for row in message_type._FIELDS if row[7])]
 
 
 def layout_of(message_type: type[Message]) -> Any:
     """Return the layout that compiled code uses for a generated class, created on first use; None for other classes."""
-    own = message_type.__dict__
-    if "_LAYOUT" not in own:
-        is_generated = wire is not None and {"_FIELDS", "decode_body", "encode"} <= own.keys()
-        message_type._LAYOUT = _new_layout(message_type) if is_generated else None
+    own_attributes = message_type.__dict__  # without those of base classes
+    if "_LAYOUT" not in own_attributes:
+        is_generated = {"_FIELDS", "decode_body", "encode"} <= own_attributes.keys()
+        message_type._LAYOUT = _new_layout(message_type) if wire is not None and is_generated else None
     return message_type._LAYOUT
 
 
 def _new_layout(message_type: type[Message]) -> Any:
-    rows = tuple((row[0], _kind(row), row[2]) for row in _wire_rows(message_type))
+    rows = tuple((row[0], _wire_code(row), row[2]) for row in _wire_rows(message_type))  # name, code, array length
     numbers = message_type.ID, message_type.CRC_EXTRA, message_type.LENGTH, message_type.BASE_LENGTH
     return wire.layout(message_type, *numbers, rows)
 
 
-def _kind(row: tuple[Any, ...]) -> str:
-    kind, array_length = row[1:3]
-    if kind == "char":
-        return "p" if row[8:] == (True,) else "s"
-    return "p" if kind == "uint8_t" and array_length else STRUCT_CODES[kind]
+def _wire_code(row: tuple[Any, ...]) -> str:
+    """Return the code of a field in ``_wire.c``: "s" for a text, "p" for bytes, else the code of the module struct."""
+    type_, array_length = row[1:3]
+    carries_bytes = row[8:] == (True,)
+    if type_ == "char":
+        return "p" if carries_bytes else "s"
+    return "p" if type_ == "uint8_t" and array_length else STRUCT_CODES[type_]
 
 
 def decoder_of(message_type: type[MessageT]) -> Callable[[bytes, Frame | None], MessageT]:
@@ -256,6 +270,7 @@ class Message:
         return f"{type(self).__name__}({fields})"
 
     def _encode_error(self) -> InvalidArgument:
+        """Return the error for the first field with an invalid value."""
         for field in self.FIELDS:
             value = getattr(self, field.name, None)
             problem = field.problem(value)
@@ -298,14 +313,16 @@ def pack_items(value: Sequence[float], size: int) -> Sequence[float]:
 
 
 def _same(left: Any, right: Any) -> bool:
-    if left == right or (left != left and right != right):
+    are_both_nan = left != left and right != right
+    if left == right or are_both_nan:
         return True
     if isinstance(left, tuple) and isinstance(right, tuple) and len(left) == len(right):
-        return all(_same(a, b) for a, b in zip(left, right))  # noqa: B905 - same length
+        return all(map(_same, left, right))
     return False
 
 
 def _number_problem(value: Any, kind: str) -> str | None:
+    """Explain why a value does not fit into this type, or return None. The module struct decides what is a number."""
     if kind in INTEGER_RANGES:
         low, high = INTEGER_RANGES[kind]
         try:
@@ -344,9 +361,9 @@ class _Flags(enum.IntFlag):
     # Python caches every combination of flags. Received values would fill that cache without limit.
     @classmethod
     def _missing_(cls, value: object) -> Any:
-        made = super()._missing_(value)
+        combination = super()._missing_(value)
         cls._value2member_map_.pop(value, None)
-        return made
+        return combination
 
 
 def make_enum(
@@ -364,11 +381,11 @@ def make_enum(
         TypeError, ValueError: a name of an enum that ``is_external`` is a duplicate or reserved.
     """
     base: Any = _Flags if bitmask else enum.IntEnum
-    made: type[Any]
+    enum_type: type[Any]
     if _simple_enum is not None and not is_external:
         body = {"__module__": module, "__qualname__": name, "__doc__": doc, **dict(members)}
-        made = _simple_enum(base)(type(name, (), body))
+        enum_type = _simple_enum(base)(type(name, (), body))
     else:
-        made = base(name, list(members), module=module, qualname=name)
-        made.__doc__ = doc
-    return made
+        enum_type = base(name, list(members), module=module, qualname=name)
+        enum_type.__doc__ = doc
+    return enum_type

@@ -58,19 +58,19 @@ class MessageFactory(_MAVLink):
             dialect: Any = mavutil.mavlink
             function = getattr(dialect.MAVLink, name, None)
             if function is not None:
-                return function.__get__(self)
+                return function.__get__(self)  # as a method of this object, although it is one of another class
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
 
 def _accept_text(encode: Callable[..., Any]) -> Callable[..., Any]:
-    # pymavlink accepts only bytes.
+    # pymavlink accepts only bytes in text fields.
 
     @wraps(encode)
     def encode_text(self: MessageFactory, *args: Any, **kwargs: Any) -> Any:
-        converted = [_as_bytes(value) for value in args]
-        named = {name: _as_bytes(value) for name, value in kwargs.items()}
+        converted_args = [_as_bytes(value) for value in args]
+        converted_kwargs = {name: _as_bytes(value) for name, value in kwargs.items()}
         try:
-            return encode(self, *converted, **named)
+            return encode(self, *converted_args, **converted_kwargs)
         except AttributeError:
             raise InvalidArgument(f"{encode.__name__}: a text must be str or bytes") from None
 

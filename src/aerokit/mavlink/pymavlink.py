@@ -58,9 +58,9 @@ def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
 
 
 def _class_of(message: Any) -> type[Message]:
-    given: Any = type(message)
-    if hasattr(given, "ordered_fieldnames") and hasattr(given, "crc_extra"):
-        return _counterpart(int(given.id), int(given.crc_extra), given)
+    message_type: Any = type(message)
+    if hasattr(message_type, "ordered_fieldnames") and hasattr(message_type, "crc_extra"):
+        return _counterpart(int(message_type.id), int(message_type.crc_extra), message_type)
     try:
         return STANDARD.by_name(message.get_type())
     except AttributeError:
@@ -68,16 +68,16 @@ def _class_of(message: Any) -> type[Message]:
 
 
 @cache
-def _counterpart(message_id: int, crc_extra: int, given: Any) -> type[Message]:
+def _counterpart(message_id: int, crc_extra: int, pymavlink_class: Any) -> type[Message]:
     """Return the standard's class if it has the same wire format, else a class created from pymavlink's class."""
-    if message_id < 0 or not given.ordered_fieldnames:
-        raise InvalidArgument(f"{given.__name__} is not a message that can be sent")
+    if message_id < 0 or not pymavlink_class.ordered_fieldnames:
+        raise InvalidArgument(f"{pymavlink_class.__name__} is not a message that can be sent")
     standard = STANDARD.get(message_id)
     if standard is not None and crc_extra == standard.CRC_EXTRA:
         return standard
     from aerokit.mavlink.runtime_dialect import class_from_pymavlink
 
-    return class_from_pymavlink(given, STANDARD)
+    return class_from_pymavlink(pymavlink_class, STANDARD)
 
 
 # ----------------------------------------------------------------------------------------- values
@@ -97,13 +97,16 @@ def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
 
 
 def _has(message: Any, name: str) -> bool:
-    # hasattr alone would not do, because every class of pymavlink has an attribute ``id``.
+    """Return True if the message has a value for an extension field."""
+    # hasattr is not enough for pymavlink's messages: each of their classes has an attribute ``id``, and a message may
+    # have an extension field of this name.
     if name in getattr(message, "__dict__", ()):
         return True
     return hasattr(message, name) and not hasattr(type(message), "ordered_fieldnames")
 
 
 def _converted(message_class: type[Message], field: Field, value: Any) -> Any:
+    """Convert a value of pymavlink to the type of aerokit's field."""
     if field.is_text:
         return _text(value)
     if field.type == "char" and isinstance(value, str):
@@ -123,8 +126,8 @@ def _packed(message_class: type[Message], field: Field, items: list[Any]) -> byt
     try:
         return bytes(items)
     except (TypeError, ValueError):
-        wrong = next((at for at, item in enumerate(items) if not _is_byte(item)), 0)
-        raise _error(message_class, field, items, f"element {wrong} must be in 0..255") from None
+        position = next((index for index, item in enumerate(items) if not _is_byte(item)), 0)
+        raise _error(message_class, field, items, f"element {position} must be in 0..255") from None
 
 
 def _is_byte(value: Any) -> bool:
@@ -164,6 +167,7 @@ def _original_text(message: Any, name: str) -> Any:
 
 
 def _text(value: Any) -> Any:
+    """Convert a text to str without trailing NULs. Other values are returned for `Message.encode` to reject."""
     if isinstance(value, str):
         return value.rstrip("\0")
     if not isinstance(value, (bytes, bytearray, memoryview)):
@@ -215,6 +219,7 @@ def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: 
 
 @cache
 def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
+    """Return the decoder of the first pymavlink dialect that has the message with the definition of the standard."""
     row = STANDARD.rows.get(message_id)
     for module in _dialects(preferred):
         message_class = module.mavlink_map.get(message_id)
@@ -222,7 +227,8 @@ def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
             continue
         if row is None:
             return _checked(message_class, _decoder_for(message_class))
-        if message_class.crc_extra == row[0]:
+        crc_extra, *_ = row
+        if message_class.crc_extra == crc_extra:
             return _decoder_for(message_class)
     return _unknown
 
@@ -250,11 +256,12 @@ def _decoder_for(message_class: Any) -> Decoder:
         fields["_frame"] = frame
         fields["_timestamp"] = timestamp
         if arrays:
-            values = [values[at] if width == 1 else list(values[at : at + width]) for at, width in arrays]
+            values = [values[start] if width == 1 else list(values[start : start + width]) for start, width in arrays]
         fields.update(zip(names, values))  # noqa: B905 - same length
         for name, raw_name in texts:
             raw = fields[raw_name] = fields[raw_name].rstrip(b"\0")
-            fields[name] = (raw.partition(b"\0")[0] if b"\0" in raw else raw).decode("ascii", "replace")
+            text_bytes = raw.partition(b"\0")[0] if b"\0" in raw else raw
+            fields[name] = text_bytes.decode("ascii", "replace")
         return message
 
     return decode
@@ -268,14 +275,15 @@ class _Layout:
         self.names: list[str] = []  # in wire order; a text field has the name of its raw bytes
         self.arrays: list[tuple[int, int]] = []  # position and width of each field; empty if no field is an array
         self.texts: list[tuple[str, str]] = []  # name of each text field, and the name of its raw bytes
-        at = 0
+        position = 0
         for name, width in zip(message_class.ordered_fieldnames, message_class.lengths):  # noqa: B905
-            if isinstance(zeros[at], bytes):
+            is_text = isinstance(zeros[position], bytes)
+            if is_text:
                 self.texts.append((name, f"_{name}_raw"))
-            self.names.append(f"_{name}_raw" if isinstance(zeros[at], bytes) else name)
-            self.arrays.append((at, width))
-            at += width
-        if at == len(self.names):
+            self.names.append(f"_{name}_raw" if is_text else name)
+            self.arrays.append((position, width))
+            position += width
+        if position == len(self.names):
             self.arrays = []
 
 
@@ -293,7 +301,7 @@ class _Received:
     def __getattr__(self, name: str) -> Any:
         if name not in LAZY_ATTRIBUTES:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        value = self.__dict__[name] = getattr(self, f"create{name}")()
+        value = self.__dict__[name] = getattr(self, f"create{name}")()  # `_header` is made by `create_header`
         return value
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -351,15 +359,16 @@ def _restored(message_class: Any, state: dict[str, Any]) -> Any:
 def _checked(message_class: Any, decode: Decoder) -> Decoder:
     # The framer could not verify a message that the standard does not have, but the program's dialect can.
 
-    def decode_if_right(frame: Frame, timestamp: float) -> Any:
+    def decode_if_valid(frame: Frame, timestamp: float) -> Any:
         raw = frame.raw
-        is_right = x25(raw[1 : -_length_after_payload(frame)] + bytes((message_class.crc_extra,))) == frame.checksum
-        return (decode if is_right else _unknown)(frame, timestamp)
+        is_valid = x25(raw[1 : -_length_after_payload(frame)] + bytes((message_class.crc_extra,))) == frame.checksum
+        return decode(frame, timestamp) if is_valid else _unknown(frame, timestamp)
 
-    return decode_if_right
+    return decode_if_valid
 
 
 def _unknown(frame: Frame, timestamp: float) -> Any:
+    """Return pymavlink's message for a frame that cannot be decoded."""
     module: Any = import_module("pymavlink.dialects.v20.ardupilotmega")
     message = module.MAVLink_unknown(frame.message_id, bytearray(frame.raw))
     header = message.get_header()

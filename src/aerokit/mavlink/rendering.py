@@ -28,7 +28,7 @@ def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
         f"class {message.class_name}(Message):",
     ]
     lines += _docstring(_message_doc(message) if docs else [f"{message.name} ({message.id})."], "    ")
-    names = [f.attribute for f in message.fields]
+    names = [field.attribute for field in message.fields]
     lines += ["", *_tuple("__slots__", names), *_tuple("__match_args__", names)]
     lines += [
         f"    ID: ClassVar[int] = {message.id}",
@@ -37,12 +37,12 @@ def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
         f"    LENGTH: ClassVar[int] = {message.length}",
         f"    BASE_LENGTH: ClassVar[int] = {message.base_length}",
         "    _FIELDS = (",
-        *(f"        {_field_row(f)}," for f in message.fields),
+        *(f"        {_field_row(field)}," for field in message.fields),
         "    )",
     ]
-    for f in message.fields:
-        lines += ["", f"    {f.attribute}: {_annotation(f)}"]
-        lines += _docstring([_field_doc(f)], "    ") if docs else []
+    for field in message.fields:
+        lines += ["", f"    {field.attribute}: {_annotation(field)}"]
+        lines += _docstring([_field_doc(field)], "    ") if docs else []
     lines += ["", *_init(message), "", *_decode(message), "", *_encode(message)]
     return "\n".join(lines) + "\n"
 
@@ -83,19 +83,19 @@ def _enum_doc(enum: EnumDefinition) -> list[str]:
     return [first, *enum.remarks, _page(enum.origin, enum.name)]
 
 
-def _field_doc(f: FieldDefinition) -> str:
-    parts = [_sentence(f.description)] if f.description else []
-    if f.array_length:
-        parts.append(f"Type: {f.type}[{f.array_length}].")
+def _field_doc(field: FieldDefinition) -> str:
+    parts = [_sentence(field.description)] if field.description else []
+    if field.array_length:
+        parts.append(f"Type: {field.type}[{field.array_length}].")
     else:
-        parts.append(f"Type: {f.type}.")
-    if f.units:
-        parts.append(f"Unit: {f.units}.")
-    if f.enum:
-        parts.append(f"Values: {f.enum}.")
-    if f.invalid:
-        parts.append(f"Unknown: {f.invalid}.")
-    if f.extension:
+        parts.append(f"Type: {field.type}.")
+    if field.units:
+        parts.append(f"Unit: {field.units}.")
+    if field.enum:
+        parts.append(f"Values: {field.enum}.")
+    if field.invalid:
+        parts.append(f"Unknown: {field.invalid}.")
+    if field.extension:
         parts.append("Extension, absent in MAVLink 1.")
     return " ".join(parts)
 
@@ -116,7 +116,7 @@ def _sentence(text: str) -> str:
 
 def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
     texts = [text.replace("\\", "\\\\").replace('"""', "'''") for text in paragraphs if text]
-    if texts and texts[-1].endswith('"'):
+    if texts and texts[-1].endswith('"'):  # this quotation mark would belong to the closing quotes
         texts[-1] += " "
     wrapped: list[str] = []
     for number, text in enumerate(texts):
@@ -152,67 +152,73 @@ def _filled(head: str, items: list[str], tail: str, indent: str) -> list[str]:
     return [head, *(f"{indent}    {line}" for line in lines), f"{indent}{tail}"]
 
 
-def _field_row(f: FieldDefinition) -> str:
-    texts = ", ".join(_quoted(text) for text in (f.units, f.enum, f.invalid, f.description))
-    more = ", True" if f.carries_bytes else ""
-    return f'({_quoted(f.attribute)}, "{f.type}", {f.array_length}, {texts}, {f.extension}{more})'
+def _field_row(field: FieldDefinition) -> str:
+    texts = ", ".join(_quoted(text) for text in (field.units, field.enum, field.invalid, field.description))
+    carries_bytes = ", True" if field.carries_bytes else ""
+    return (
+        f'({_quoted(field.attribute)}, "{field.type}", {field.array_length}, {texts}, {field.extension}{carries_bytes})'
+    )
 
 
-def _code(f: FieldDefinition) -> str:
-    if f.type == "char" or (f.type == "uint8_t" and f.array_length):
-        return f"{f.array_length or 1}s"
-    return f"{f.array_length or ''}{STRUCT_CODES[f.type]}"
+def _code(field: FieldDefinition) -> str:
+    """Return the part of a struct format for one field."""
+    if field.type == "char" or (field.type == "uint8_t" and field.array_length):
+        return f"{field.array_length or 1}s"
+    return f"{field.array_length or ''}{STRUCT_CODES[field.type]}"
 
 
 def _format(message: MessageDefinition) -> str:
-    return "<" + "".join(_code(f) for f in message.wire_fields)
+    return "<" + "".join(_code(field) for field in message.wire_fields)
 
 
-def _is_tuple(f: FieldDefinition) -> bool:
-    return bool(f.array_length) and f.type not in ("char", "uint8_t")
+def _is_tuple(field: FieldDefinition) -> bool:
+    return bool(field.array_length) and field.type not in ("char", "uint8_t")
 
 
-def _annotation(f: FieldDefinition, *, argument: bool = False) -> str:
-    if f.is_text:
+def _annotation(field: FieldDefinition, *, argument: bool = False) -> str:
+    """Return the type of an attribute, or of the constructor's ``argument``, which may be any sequence."""
+    if field.is_text:
         return "str"
-    if f.is_bytes:
+    if field.is_bytes:
         return "bytes"
-    number = "float" if f.type in ("float", "double") else "int"
-    if not f.array_length:
+    number = "float" if field.type in ("float", "double") else "int"
+    if not field.array_length:
         return number
     return f"Sequence[{number}]" if argument else f"tuple[{number}, ...]"
 
 
-def _default(f: FieldDefinition) -> str:
-    if f.default is not None:
-        return f" = {f.default}"
-    if not f.extension:
+def _default(field: FieldDefinition) -> str:
+    """Return `` = value`` for a field that a program may omit, i.e. an extension field; else an empty text."""
+    if field.default is not None:
+        return f" = {field.default}"
+    if not field.extension:
         return ""
-    if f.is_text:
+    if field.is_text:
         return ' = ""'
-    if f.array_length:
-        return f" = bytes({f.array_length})" if f.is_bytes else f" = (0,) * {f.array_length}"
+    if field.array_length:
+        return f" = bytes({field.array_length})" if field.is_bytes else f" = (0,) * {field.array_length}"
     return " = 0"
 
 
 def _init(message: MessageDefinition) -> list[str]:
-    # Parameters after a parameter with a default need a default, too. Parameters without a default become keyword-only.
+    # In Python, a parameter without a default cannot follow one with a default unless it is keyword-only.
     arguments: list[str] = []
     optional = False
-    for f in message.fields:
-        default = _default(f)
+    for field in message.fields:
+        default = _default(field)
         if optional and not default and "*" not in arguments:
             arguments.append("*")
         optional = optional or bool(default)
-        arguments.append(f"{f.attribute}: {_annotation(f, argument=True)}{default}")
+        arguments.append(f"{field.attribute}: {_annotation(field, argument=True)}{default}")
     lines = _filled("    def __init__(", ["self", *arguments], ") -> None:", "    ")
-    for f in message.fields:
-        value = f"tuple({f.attribute})" if _is_tuple(f) else f.attribute
-        lines.append(f"        self.{f.attribute} = {value}")
+    for field in message.fields:
+        value = f"tuple({field.attribute})" if _is_tuple(field) else field.attribute
+        lines.append(f"        self.{field.attribute} = {value}")
     return [*lines, "        self.received_frame: Frame | None = None"]
 
 
 def _decode(message: MessageDefinition) -> list[str]:
+    """Render ``decode_body``, which unpacks all fields in one statement, and then converts arrays and texts."""
     unpacked = f"_S{message.id}.unpack_from(body, {HEADER_LENGTH})"
     lines = [
         "    @classmethod",
@@ -223,34 +229,35 @@ def _decode(message: MessageDefinition) -> list[str]:
     if not message.fields:
         return [*lines, "        return self"]
     fields = message.wire_fields
-    if any(_is_tuple(f) and f.array_length > _MAX_UNPACKED_LENGTH for f in fields):
+    if any(_is_tuple(field) and field.array_length > _MAX_UNPACKED_LENGTH for field in fields):
         return [*lines, *_decode_by_index(fields, unpacked), "        return self"]
     targets: list[str] = []
-    after: list[str] = []
-    for number, f in enumerate(fields):
-        if _is_tuple(f):
-            parts = [f"v{number}_{i}" for i in range(f.array_length)]
+    conversions: list[str] = []
+    for number, field in enumerate(fields):
+        if _is_tuple(field):
+            parts = [f"v{number}_{i}" for i in range(field.array_length)]
             targets += parts
             comma = "," if len(parts) == 1 else ""
-            after.append(f"        self.{f.attribute} = ({', '.join(parts)}{comma})")
-        elif f.is_text:
+            conversions.append(f"        self.{field.attribute} = ({', '.join(parts)}{comma})")
+        elif field.is_text:
             targets.append(f"v{number}")
-            after.append(f"        self.{f.attribute} = {_text(f'v{number}')}")
+            conversions.append(f"        self.{field.attribute} = {_text(f'v{number}')}")
         else:
-            targets.append(f"self.{f.attribute}")
+            targets.append(f"self.{field.attribute}")
     lines += _filled("        (", targets, f") = {unpacked}", "        ")
-    return [*lines, *after, "        return self"]
+    return [*lines, *conversions, "        return self"]
 
 
 def _decode_by_index(fields: Iterable[FieldDefinition], unpacked: str) -> list[str]:
+    """Render the statements for a message with long arrays, which are slices of the unpacked values."""
     lines = [f"        values = {unpacked}"]
     index = 0
-    for f in fields:
-        if _is_tuple(f):
-            value, count = f"values[{index}:{index + f.array_length}]", f.array_length
+    for field in fields:
+        if _is_tuple(field):
+            value, count = f"values[{index}:{index + field.array_length}]", field.array_length
         else:
             value, count = f"values[{index}]", 1
-        lines.append(f"        self.{f.attribute} = {_text(value) if f.is_text else value}")
+        lines.append(f"        self.{field.attribute} = {_text(value) if field.is_text else value}")
         index += count
     return lines
 
@@ -261,14 +268,14 @@ def _text(value: str) -> str:
 
 def _encode(message: MessageDefinition) -> list[str]:
     arguments: list[str] = []
-    for f in message.wire_fields:
-        value = f"self.{f.attribute}"
-        if f.is_text:
-            value = f"pack_text({value}, {f.array_length or 1})"
-        elif f.is_bytes:
-            value = f"pack_bytes({value}, {f.array_length})"
-        elif f.array_length:
-            value = f"*pack_items({value}, {f.array_length})"
+    for field in message.wire_fields:
+        value = f"self.{field.attribute}"
+        if field.is_text:
+            value = f"pack_text({value}, {field.array_length or 1})"
+        elif field.is_bytes:
+            value = f"pack_bytes({value}, {field.array_length})"
+        elif field.array_length:
+            value = f"*pack_items({value}, {field.array_length})"
         arguments.append(value)
     return [
         "    def encode(self) -> bytes:",

@@ -52,10 +52,10 @@ def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> Load
     """Load a pymavlink dialect; see `Dialect.from_pymavlink`."""
     if isinstance(module, str):
         module = _import(module)
-    known: dict[int, Any] | None = getattr(module, "mavlink_map", None)
-    if known is None:
+    classes: dict[int, Any] | None = getattr(module, "mavlink_map", None)
+    if classes is None:
         raise InvalidArgument(f"{module.__name__} is not a pymavlink dialect: it has no mavlink_map")
-    definitions = [_message(cls) for _, cls in sorted(known.items()) if cls.id >= 0]
+    definitions = [_message(cls) for _, cls in sorted(classes.items()) if cls.id >= 0]
     enums = [_enum(name, entries) for name, entries in getattr(module, "enums", {}).items()]
     name = module.__name__.rpartition(".")[2]
     return _load(name, definitions, [enum for enum in enums if enum.entries], standard)
@@ -95,10 +95,10 @@ def _load(
 ) -> LoadedDialect:
     by_id: dict[int, MessageDefinition] = {}
     for definition in definitions:
-        other = by_id.setdefault(definition.id, definition)
-        if other != definition and (other.name, other.crc_extra) != (definition.name, definition.crc_extra):
+        earlier = by_id.setdefault(definition.id, definition)
+        if earlier != definition and (earlier.name, earlier.crc_extra) != (definition.name, definition.crc_extra):
             raise InvalidArgument(
-                f"message id {definition.id} is defined twice in {name}: {other.name} in {other.origin},"
+                f"message id {definition.id} is defined twice in {name}: {earlier.name} in {earlier.origin},"
                 f" {definition.name} in {definition.origin}"
             )
     classes = [_standard_class(definition, standard) or compile_message(definition) for definition in by_id.values()]
@@ -126,9 +126,9 @@ def _standard_class(definition: MessageDefinition, standard: Standard) -> type[M
     if row is None or row[:2] != (definition.crc_extra, definition.base_length):
         return None
     generated = standard[definition.id]
-    fields = [(f.attribute, f.type, f.array_length) for f in definition.fields]
-    known = [(f.name, f.type, f.array_length) for f in generated.FIELDS[: len(fields)]]
-    return generated if definition.name == generated.NAME and known == fields else None
+    fields = [(field.attribute, field.type, field.array_length) for field in definition.fields]
+    generated_fields = [(field.name, field.type, field.array_length) for field in generated.FIELDS[: len(fields)]]
+    return generated if definition.name == generated.NAME and generated_fields == fields else None
 
 
 # -------------------------------------------------------------------------------- pymavlink modules
@@ -138,7 +138,7 @@ def _import(name: str) -> ModuleType:
         try:
             return import_module(candidate)
         except ModuleNotFoundError as error:
-            if error.name is None or not candidate.startswith(error.name):
+            if error.name is None or not candidate.startswith(error.name):  # the candidate imports a missing module
                 raise
     raise InvalidArgument(f"no pymavlink dialect {name!r}: tried {', '.join(candidates)}")
 
@@ -151,7 +151,7 @@ def _message(cls: Any) -> MessageDefinition:
         array_length = int(cls.array_lengths[order.index(name)])
         units = getattr(cls, "fieldunits_by_name", {}).get(name, "")
         enum = getattr(cls, "fieldenums_by_name", {}).get(name, "")
-        default = 3 if name == "mavlink_version" else None
+        default = 3 if name == "mavlink_version" else None  # the field of HEARTBEAT, which is always 3
         is_bytes = carries_bytes(message_name, name, kind)
         fields.append(FieldDefinition(name, kind, array_length, units, enum, default=default, carries_bytes=is_bytes))
     description = " ".join((cls.__doc__ or "").split())
@@ -164,20 +164,24 @@ def _message(cls: Any) -> MessageDefinition:
 def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra: int) -> MessageDefinition:
     # pymavlink's classes do not mark extensions, but CRC_EXTRA and the wire order determine them.
     fields = definition.fields
-    for base in range(len(fields), -1, -1):
+    for base_count in range(len(fields), -1, -1):
         guess = MessageDefinition(
             definition.id,
             definition.name,
-            tuple(replace(f, extension=i >= base) for i, f in enumerate(fields)),
+            tuple(replace(field, extension=i >= base_count) for i, field in enumerate(fields)),
             definition.description,
             definition.origin,
         )
-        if guess.crc_extra == crc_extra and [f.name for f in guess.wire_fields] == order:
+        if guess.crc_extra == crc_extra and [field.name for field in guess.wire_fields] == order:
             return guess
     raise InvalidArgument(f"{definition.name}: CRC_EXTRA {crc_extra} matches none of its field orders")
 
 
 def _enum(name: str, entries: dict[int, Any]) -> EnumDefinition:
     end_marker = f"{name}_ENUM_END"
-    kept = [EntryDefinition(e.name, value, e.description) for value, e in entries.items() if e.name != end_marker]
-    return EnumDefinition(name, tuple(kept))
+    definitions = [
+        EntryDefinition(entry.name, value, entry.description)
+        for value, entry in entries.items()
+        if entry.name != end_marker
+    ]
+    return EnumDefinition(name, tuple(definitions))

@@ -174,15 +174,15 @@ class Signing:
         if keep is not None:
             self._timestamp_file = TimestampFile(keep, LAST_TIMESTAMP)
             self.timestamp = max(self.timestamp, self._timestamp_file.timestamp)
-        self._keyed = sha256(key.secret)
+        self._keyed = sha256(key.secret)  # copied for each signature, because a signature hashes the key first
         self.streams: dict[tuple[int, int, int], int] = {}
         """Last timestamp of each (system id, component id, link id), shared by all links with the same key."""
 
     def for_link(self, link_id: int) -> Signing:
         """Create signing for another link (0–255) with the same key. Replays across these links are detected."""
-        other = Signing(self.key, link_id=link_id, timestamp=self.timestamp, allow_unsigned=self.allow_unsigned)
-        other.streams, other._timestamp_file = self.streams, self._timestamp_file
-        return other
+        signing = Signing(self.key, link_id=link_id, timestamp=self.timestamp, allow_unsigned=self.allow_unsigned)
+        signing.streams, signing._timestamp_file = self.streams, self._timestamp_file
+        return signing
 
     def timestamp_now(self, now: float = 0.0) -> int:
         """Return the timestamp of a frame signed at ``now`` (seconds since 1970; 0 without a clock)."""
@@ -200,8 +200,8 @@ class Signing:
         if stamp > LAST_TIMESTAMP:
             raise InvalidArgument(f"the timestamps of {self.key!r} are exhausted: use another key")
         self._advance(stamp + 1)
-        place = bytes((self.link_id,)) + stamp.to_bytes(6, "little")
-        return place + self._hash(frame + place)
+        link_and_timestamp = bytes((self.link_id,)) + stamp.to_bytes(6, "little")
+        return link_and_timestamp + self._hash(frame + link_and_timestamp)
 
     def accepts(self, frame: Frame, now: float = 0.0) -> bool:
         """Return True if a frame has a valid signature, or needs none. Other frames are counted as refused."""
@@ -245,6 +245,7 @@ class Signing:
         return refusal
 
     def _refusal(self, frame: Frame, now: float) -> Refusal | None:
+        """Return why a frame has no valid signature, or None. Has no side effects."""
         if not frame.incompat_flags & SIGNED:
             return Refusal.UNSIGNED
         if not self.has_signed(frame):
@@ -305,7 +306,7 @@ class TimestampFile:
         """Timestamp in the file; 0 if there is no file."""
         self.error: OSError | None = None
         """Error of the last write; None if it succeeded."""
-        self._write(self.timestamp)
+        self._write(self.timestamp)  # raises now if the file cannot be written later
 
     def reserve(self, timestamp: int, ahead: int) -> None:
         """Ensure that the stored timestamp is later than ``timestamp``: if needed, write ``timestamp + ahead``."""

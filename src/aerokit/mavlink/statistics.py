@@ -10,13 +10,13 @@ _SILENCE_S = 10.0
 
 _MAX_UNKNOWN_IDS = 64
 _HALF = 128  # sequence numbers wrap at 256, so a number up to 127 further on is ahead, any other is behind
-_WINDOW = (1 << _HALF) - 1
+_WINDOW = (1 << _HALF) - 1  # mask of the bits in `_missing`
 _MAX_STEP = 4  # sequence numbers of consecutive frames of one stream rarely differ by more
 _MAX_GAP = 16  # a frame after a larger gap may belong to another stream
 _MIN_ALTERNATIONS = 10  # two streams that alternate this often have different senders
-_EXPIRY_S = 5.0
+_EXPIRY_S = 5.0  # after this time, a second stream and its alternations are forgotten
 _STREAM_TIMEOUT_S = 1.5  # no autopilot is silent for this long
-_MIN_RETURNS = 3
+_MIN_RETURNS = 3  # this many frames that continue the previous stream show that it has not ended
 
 # Results of :meth:`SourceStatistics.out_of_order`.
 IN_ORDER, LATE, OTHERS = range(3)
@@ -32,22 +32,22 @@ class SourceStatistics(SourceFields):
     expected: int
 
     __slots__ = (
-        "_double_at",
+        "_advanced_at",
+        "_alternated_at",
+        "_alternations",
+        "_last_expected",
         "_late_at",
         "_late_run",
         "_late_sequence",
         "_missing",
         "_missing_at",
-        "_moved_at",
-        "_other",
         "_other_at",
         "_other_count",
+        "_other_expected",
         "_returns",
-        "_seen",
-        "_since",
         "_skipped_over",
-        "_turns",
-        "_without",
+        "_stream_start",
+        "_unreceived",
         "component_id",
         "lost",
         "system_id",
@@ -69,19 +69,20 @@ class SourceStatistics(SourceFields):
         """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
         # How far `expected` has advanced without a received frame. `received` is derived from both numbers, so that
         # counting a frame needs a single addition.
-        self._without = sequence
+        self._unreceived = sequence
         self._missing = 0  # bit n is set if the frame n + 1 before `_missing_at` is missing
         self._missing_at = sequence
-        self._late_sequence = self._late_at = -1
-        self._other = -1  # next sequence number of another stream with the same ids; -1 if there is none
-        self._since = 0  # value of `received` at the beginning of the current stream
-        self._turns, self._double_at = 0, 0.0
-        self._seen, self._moved_at = sequence, 0.0
+        self._late_sequence = self._late_at = -1  # number of the last repeated frame, and `received` at that time
+        self._other_expected = -1  # next sequence number of another stream with the same ids; -1 if there is none
+        self._stream_start = 0  # value of `received` at the beginning of the current stream
+        self._alternations, self._alternated_at = 0, 0.0
+        # `expected` at the last call of `out_of_order`, and the time at which a call found it advanced.
+        self._last_expected, self._advanced_at = sequence, 0.0
 
     @property
     def received(self) -> int:
         """Number of frames received, including those that the framer does not pass on."""
-        return self.expected - self._without
+        return self.expected - self._unreceived
 
     @property
     def loss(self) -> float:
@@ -91,7 +92,7 @@ class SourceStatistics(SourceFields):
 
     def has_duplicates(self, now: float) -> bool:
         """Return True if two senders used these ids within the last seconds."""
-        return self._turns >= _MIN_ALTERNATIONS and now - self._double_at < _EXPIRY_S
+        return self._alternations >= _MIN_ALTERNATIONS and now - self._alternated_at < _EXPIRY_S
 
     def out_of_order(self, sequence: int, now: float) -> int:
         """Process a frame whose sequence number is not `expected`.
@@ -99,18 +100,18 @@ class SourceStatistics(SourceFields):
         Return `IN_ORDER` if the frame is the newest of its sender (after lost frames or a reboot), `LATE` if it was
         overtaken or repeated, `OTHERS` if it belongs to another stream.
         """
-        if self.expected != self._seen:
-            self._seen, self._moved_at = self.expected, now
+        if self.expected != self._last_expected:
+            self._last_expected, self._advanced_at = self.expected, now
         ahead = (sequence - self.expected) & 0xFF
-        if self._other >= 0 and (sequence - self._other) & 0xFF < _MAX_STEP:
+        if self._other_expected >= 0 and (sequence - self._other_expected) & 0xFF < _MAX_STEP:
             if now - self._other_at < _EXPIRY_S:
                 return self._continue_other(sequence, now)
-            self._other = -1
+            self._other_expected = -1
         if ahead < _HALF:
-            self._gap(ahead, sequence, now)
+            self._on_gap(ahead, sequence, now)
             return IN_ORDER
         if self._was_missing(256 - ahead):
-            self._without -= 1
+            self._unreceived -= 1
             self.lost -= 1
             return LATE
         return self._on_repeated(sequence, now)
@@ -118,29 +119,33 @@ class SourceStatistics(SourceFields):
     def skip(self, count: int) -> None:
         """Advance by ``count`` numbers that are neither received nor lost, for messages that cannot be verified."""
         self.expected += count
-        self._without += count
+        self._unreceived += count
 
-    def _gap(self, ahead: int, sequence: int, now: float) -> None:
+    def _on_gap(self, ahead: int, sequence: int, now: float) -> None:
+        """Process a frame after ``ahead`` missing frames, which count as lost until they arrive late."""
         self.lost += ahead
         if ahead > _MAX_GAP:
             self._begin_stream(now)
             self._skipped_over = ahead
-        self._missing = self._shifted(ahead + 1) | ((1 << ahead) - 1) << 1 & _WINDOW
+        missing_bits = ((1 << ahead) - 1) << 1  # bit 0 is this frame
+        self._missing = self._shifted(ahead + 1) | missing_bits & _WINDOW
         self.skip(ahead)
         self.expected += 1
         self._missing_at = self.expected
 
     def _begin_stream(self, now: float) -> None:
         # Keep the position of the previous stream for a while, in case that stream continues.
-        self._other, self._other_count = self.expected & 0xFF, self.received - self._since
+        self._other_expected, self._other_count = self.expected & 0xFF, self.received - self._stream_start
         self._other_at = now
-        self._since, self._returns, self._skipped_over = self.received, 0, 0
+        self._stream_start, self._returns, self._skipped_over = self.received, 0, 0
 
     def _shifted(self, further: int) -> int:
+        """Return the bits of `_missing`, relative to ``further`` numbers after `expected`."""
         distance = self.expected - self._missing_at + further
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
     def _was_missing(self, behind: int) -> bool:
+        """Return True if the frame ``behind`` numbers before `expected` counted as lost. It no longer does."""
         self._missing, self._missing_at = self._shifted(0), self.expected
         bit = 1 << behind - 1
         was_missing = bool(self._missing & bit)
@@ -150,51 +155,60 @@ class SourceStatistics(SourceFields):
     def _on_repeated(self, sequence: int, now: float) -> int:
         # A single frame like this is a repetition. Several in direct succession mean that the sender rebooted.
         follows = sequence == (self._late_sequence + 1) & 0xFF
-        self._late_run = self._late_run + 1 if follows and self._late_at == self.received else 0
+        is_direct_succession = follows and self._late_at == self.received
+        self._late_run = self._late_run + 1 if is_direct_succession else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
-        if self._late_run >= (3 if is_near else 1):
+        min_run = 3 if is_near else 1  # a link may repeat a few recent frames, but not old ones
+        if self._late_run >= min_run:
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
-        self._take_turns(now, 1 if follows else -self._turns)
-        self._without -= 1
+        # Repeated frames in sequence may be those of a second sender. Otherwise the count starts again from 0.
+        self._count_alternations(now, 1 if follows else -self._alternations)
+        self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._late_sequence, self._late_at = sequence, self.received
         return OTHERS if self.has_duplicates(now) else LATE
 
     def _continue_at(self, sequence: int) -> None:
+        """Make a frame with this number the newest one, without counting the numbers before it as lost."""
         self.skip((sequence - self.expected) & 0xFF)
         self.expected += 1
         self._missing, self._missing_at, self._skipped_over = 0, self.expected, 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
         # The other stream counts as the sender if it has more frames, or if the current stream has timed out.
-        count, was_first = self.received - self._since, self._other_count > self.received - self._since
-        is_over = now - self._moved_at > _STREAM_TIMEOUT_S
-        self._take_turns(now, 1)
-        self._returns += was_first
+        count = self.received - self._stream_start
+        is_other_longer = self._other_count > count
+        is_over = now - self._advanced_at > _STREAM_TIMEOUT_S
+        self._count_alternations(now, 1)
+        if is_other_longer:
+            self._returns += 1
         if is_over or self._returns >= _MIN_RETURNS:
-            self._swap(sequence, now, count, self._other_count if was_first else 0)
+            self._swap(sequence, now, count, self._other_count if is_other_longer else 0)
             return IN_ORDER
-        if was_first and self._was_missing((self.expected - sequence) & 0xFF or 256):
+        if is_other_longer and self._was_missing((self.expected - sequence) & 0xFF or 256):
             self.lost -= 1
             self._skipped_over -= 1
-        self._other, self._other_count = (sequence + 1) & 0xFF, self._other_count + 1
+        self._other_expected, self._other_count = (sequence + 1) & 0xFF, self._other_count + 1
         self._other_at = now
-        self._without -= 1
-        self._since += 1
-        return LATE if was_first else OTHERS
+        self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
+        self._stream_start += 1  # the frame does not count for the current stream
+        return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, count: int, other_count: int) -> None:
-        self.lost = max(0, self.lost - self._skipped_over)  # the difference is below 0 if skipped frames arrived late
-        self._other, self._other_count, self._other_at = self.expected & 0xFF, count, now
-        self._since, self._returns = self.received - other_count, 0
+        """Make the other stream the sender's stream, and the current stream the other one."""
+        # The gap before the current stream was no loss. The difference is below 0 if frames of the gap arrived late.
+        self.lost = max(0, self.lost - self._skipped_over)
+        self._other_expected, self._other_count, self._other_at = self.expected & 0xFF, count, now
+        self._stream_start, self._returns = self.received - other_count, 0
         self._continue_at(sequence)
 
-    def _take_turns(self, now: float, count: int) -> None:
-        if now - self._double_at > _EXPIRY_S:
-            self._turns = 0
-        self._turns = max(0, self._turns + count)
-        self._double_at = now
+    def _count_alternations(self, now: float, count: int) -> None:
+        """Add to the number of times that two streams have alternated, within the last `_EXPIRY_S`."""
+        if now - self._alternated_at > _EXPIRY_S:
+            self._alternations = 0
+        self._alternations = max(0, self._alternations + count)
+        self._alternated_at = now
 
     def __repr__(self) -> str:
         return f"<{self.system_id}/{self.component_id}: {self.received} received, {self.lost} lost>"
@@ -271,8 +285,8 @@ class FramerStatistics(CounterFields):
         self.sources: dict[tuple[int, int], SourceStatistics] = {}
         """Counters by (system id, component id), for the first 1024 of 65,536 possible senders."""
         self._by_key: dict[int, SourceStatistics] = {}
-        self._last_received: dict[int, int] = {}
-        self._others = 0
+        self._last_received: dict[int, int] = {}  # key → `received` at the last call of `discard_silent`
+        self._others = 0  # frames of senders without counters of their own
 
     @property
     def frames(self) -> int:
@@ -305,9 +319,9 @@ class FramerStatistics(CounterFields):
     def unknown(self, message_id: int) -> None:
         """Count a frame of an unknown message."""
         self.unknown_ids += 1
-        seen = self.unknown_messages
-        if message_id in seen or len(seen) < _MAX_UNKNOWN_IDS:
-            seen[message_id] = seen.get(message_id, 0) + 1
+        counts = self.unknown_messages
+        if message_id in counts or len(counts) < _MAX_UNKNOWN_IDS:
+            counts[message_id] = counts.get(message_id, 0) + 1
 
     def __repr__(self) -> str:
         names = ("bytes", "frames", "bad_bytes", "bad_crcs", "unknown_ids")

@@ -24,7 +24,8 @@ _MAX_RECORD = 8 + 280
 # set.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100; a larger number is not a timestamp
-_LAST = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]  # a time with these or smaller first bytes is before _LAST_TIME
+# A time whose first two bytes are these or smaller is before _LAST_TIME.
+_MAX_TIME_PREFIX = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]
 
 
 def read_tlog(source: str | PathLike[str] | BinaryIO) -> Iterator[tuple[float, bytes]]:
@@ -45,15 +46,16 @@ _compiled: Any = None if wire is None else wire.tlog_records
 
 def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
     begin: int
-    data, begin, ended, earliest = b"", 0, False, 0
+    data, begin, is_at_end, min_time = b"", 0, False, 0
     end: int | None
     while True:
-        if not ended and len(data) - begin < 2 * _MAX_RECORD:  # room for a record and the header of the next record
+        # A record, and the header of the next record, must be in `data`.
+        if not is_at_end and len(data) - begin < 2 * _MAX_RECORD:
             block = file.read(_BLOCK)
-            ended = not block
+            is_at_end = not block
             data, begin = data[begin:] + block, 0
             continue
-        if _compiled is not None and not earliest:
+        if _compiled is not None and not min_time:
             records, begin = _compiled(data, begin)
             if records:
                 yield from records
@@ -62,30 +64,30 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
         try:
             end = begin + 20 + data[begin + 9]
             if (
-                earliest
+                min_time
                 or data[begin + 8] != MAGIC_V2
                 or data[end + 8] != MAGIC_V2
                 or data[begin + 10]
                 or data[end + 10]
-                or data[begin : begin + 2] > _LAST
-                or data[end : end + 2] > _LAST
+                or data[begin : begin + 2] > _MAX_TIME_PREFIX
+                or data[end : end + 2] > _MAX_TIME_PREFIX
             ):
-                end = _record_end(data, begin, earliest)
-        except IndexError:
-            end = _record_end(data, begin, earliest)
+                end = _record_end(data, begin, min_time)
+        except IndexError:  # the last record, or garbage
+            end = _record_end(data, begin, min_time)
         if end is None:
             if len(data) - begin <= 8:
                 return
-            begin, earliest = begin + 1, _FIRST_TIME
+            begin, min_time = begin + 1, _FIRST_TIME  # search for the next record
             continue
         yield _TIME.unpack_from(data, begin)[0] / 1e6, data[begin + 8 : end]
-        begin, earliest = end, 0
+        begin, min_time = end, 0
 
 
-def _record_end(data: bytes, begin: int, earliest: int) -> int | None:
+def _record_end(data: bytes, begin: int, min_time: int) -> int | None:
     """Return the end of the record at ``begin``. None if no complete record begins there, or its time is too early."""
     end = _frame_end(data, begin)
-    if end is None or end > len(data) or _TIME.unpack_from(data, begin)[0] < earliest:
+    if end is None or end > len(data) or _TIME.unpack_from(data, begin)[0] < min_time:
         return None
     if len(data) - end <= 8 or _frame_end(data, end) is not None:
         return end
@@ -103,14 +105,15 @@ def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
 
 def _frame_end(data: bytes, begin: int) -> int | None:
     """Return the end of a frame according to its header, which may be beyond the data. None if there is no header."""
-    at = begin + 8
-    if len(data) - at < 3 or data[at] not in _MAGICS or _TIME.unpack_from(data, begin)[0] > _LAST_TIME:
+    start = begin + 8  # the frame follows the time, which has 8 bytes
+    if len(data) - start < 3 or data[start] not in _MAGICS or _TIME.unpack_from(data, begin)[0] > _LAST_TIME:
         return None
-    if data[at] == MAGIC_V1:
-        return at + 8 + data[at + 1]
-    if data[at + 2] > SIGNED:
+    magic, payload_length, flags = data[start : start + 3]
+    if magic == MAGIC_V1:
+        return start + 8 + payload_length
+    if flags > SIGNED:
         return None
-    return at + 12 + data[at + 1] + (SIGNATURE_LENGTH if data[at + 2] else 0)
+    return start + 12 + payload_length + (SIGNATURE_LENGTH if flags else 0)
 
 
 class TlogWriter:

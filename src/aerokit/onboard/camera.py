@@ -249,7 +249,7 @@ class CameraAdapter(CameraDevice):
         async def take() -> None:
             shot = None
             try:
-                photo = await self._call(self._camera.take_photo, len(self.captures.images))
+                photo = await self._call(self._camera.take_photo, self.captures.image_count)
                 shot = _shot(photo, time_boot_ms, unix_time)
             except Exception as error:
                 self._host.report_error("take_photo", error)

@@ -1,4 +1,4 @@
-"""Command handlers of a component, which may be coroutines: progress, cancellation and results."""
+"""Runs the command handlers of a component (functions or coroutine functions): progress, cancellation, results."""
 
 from __future__ import annotations
 

@@ -148,23 +148,28 @@ def add_gripper(
 
 
 def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> None:
-    """Serve ARM_AUTHORIZATION_REQUEST."""
+    """Serve ARM_AUTHORIZATION_REQUEST.
+
+    ``authorize`` returns the seconds for which arming is allowed, or a CommandResult, and raises an error to deny it.
+    """
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
         try:
             # PX4 sends 0 instead of its system id (ArmAuthorization.cpp).
-            seconds = await services.commands.call(authorize, system_id or request.sender[0])
+            answer = await services.commands.call(authorize, system_id or request.sender[0])
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")
             result = result_of(error)
             # NONE says that the reason is in the status text, GENERIC that there is no specific reason.
             reason = MavArmAuthDeniedReason.NONE if result == MavResult.DENIED else MavArmAuthDeniedReason.GENERIC
             return CommandResult(MavResult.DENIED, detail=reason)
-        if isinstance(seconds, CommandResult):
-            return seconds
-        if not 0 < seconds <= MAX_AUTHORIZATION_S:
-            raise ValueError(f"the authorizer returned {seconds!r}, not 1 to {MAX_AUTHORIZATION_S} seconds")
+        if isinstance(answer, CommandResult):
+            return answer
+        if not 0 < answer <= MAX_AUTHORIZATION_S:
+            raise ValueError(
+                f"the authorizer returned {answer!r}; it must be above 0 and at most {MAX_AUTHORIZATION_S} s"
+            )
         # The standard puts the seconds into `progress`; PX4 reads them from `result_param2` (ArmAuthorization.cpp).
-        return CommandResult(MavResult.ACCEPTED, progress=math.ceil(seconds), detail=math.ceil(seconds))
+        return CommandResult(MavResult.ACCEPTED, progress=math.ceil(answer), detail=math.ceil(answer))
 
     services.commands.add(MavCmd.ARM_AUTHORIZATION_REQUEST, arm_authorization)

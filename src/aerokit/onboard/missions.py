@@ -55,15 +55,16 @@ class ComponentMissions:
     ) -> Callable[[str, tuple[MissionItem, ...]], Any]:
         """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
-        To refuse a list, the function returns a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes the result
-        INVALID and a status text. It may be a coroutine function. An empty list is a request to clear the list.
+        To refuse a list, the function returns False or a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes
+        the result INVALID and a status text. It may be a coroutine function. An empty list is a request to clear the
+        list.
         """
         self._on_upload = function
         return function
 
     def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
-        """Decorator: ``function(index)`` continues the mission at an item. Without such a function, requests to do so
-        are refused.
+        """Decorator: ``function(index)`` continues the mission at an item. Requests to do so are refused if it returns
+        False or raises, and without such a function.
         """
         self._on_current = function
         return function
@@ -129,11 +130,10 @@ class ComponentMissions:
         if self._on_current is None:
             return False
         try:
-            self._on_current(index)
+            return self._on_current(index) is not False
         except Exception as error:
             self._report_refusal("set_current", error)
             return False
-        return True
 
     def _do_set_current(self, request: CommandRequest, index: int) -> None:
         if not self._server.set_current(index):
@@ -141,7 +141,9 @@ class ComponentMissions:
 
 
 def _result_of(verdict: object) -> int:
-    """Return the MAV_MISSION_RESULT that a function returned; ACCEPTED for all other values, bools included."""
+    """Return the MAV_MISSION_RESULT that a function returned; DENIED for False, ACCEPTED for all other values."""
+    if verdict is False:
+        return MavMissionResult.DENIED
     if isinstance(verdict, int) and not isinstance(verdict, bool):
         return int(verdict)
     return MavMissionResult.ACCEPTED

@@ -36,7 +36,7 @@ class AdaptiveWindow:
         self._size = float(start)
         self._min_size, self._max_size = min_size, max_size
         self._fastest_s: float | None = None
-        self._loss = 0.0
+        self._loss = 0.0  # share of lost requests, averaged over about the last 16
 
     @property
     def size(self) -> int:
@@ -48,8 +48,9 @@ class AdaptiveWindow:
         self._size = max(self._size, min(size, self._max_size / 2))
 
     def on_answer(self, seconds: float | None) -> None:
-        """Record an answer. ``seconds`` is the time since its request; None if it may answer one of several
-        transmissions.
+        """Record an answer.
+
+        ``seconds`` is the time since its request; None if the answer may be to one of several transmissions.
         """
         self._loss -= self._loss / 16
         if seconds is None:
@@ -66,7 +67,7 @@ class AdaptiveWindow:
         self._loss += (1.0 - self._loss) / 16
         if self._loss > 0.75:
             self._size = max(self._min_size, self._size / 2)
-            self._loss = 0.5
+            self._loss = 0.5  # so that only further losses halve the size again
 
 
 class _Block:
@@ -92,8 +93,9 @@ class BlockRequests:
         self._blocks: dict[int, _Block] = {}
         self._sent_count = 0
         self._timeouts = 0
-        self._busy_until = self._free_at = float("-inf")
-        self._is_held_back = False
+        self._busy_until = float("-inf")
+        self._next_send_at = float("-inf")  # earliest time for a request beyond the first `burst_size`
+        self._must_wait_to_send = False  # True if waiting requests fit into the window, but it is too early
 
     def __len__(self) -> int:
         return len(self._waiting) + len(self._in_flight)
@@ -102,8 +104,8 @@ class BlockRequests:
     def deadline(self) -> float | None:
         """Time at which an answer is overdue or another request may be sent; None while no request is in flight."""
         overdue_at = min((self._due_at(block) for block in self._in_flight.values()), default=None)
-        if self._is_held_back and overdue_at is not None:
-            return min(overdue_at, self._free_at)
+        if self._must_wait_to_send and overdue_at is not None:
+            return min(overdue_at, self._next_send_at)
         return overdue_at
 
     def request(self, offset: int) -> None:
@@ -133,7 +135,7 @@ class BlockRequests:
         if block is None:
             return
         if sent_at is None:
-            sent_at = self._answered_sending(block, now)
+            sent_at = self._sent_at_of_answer(block, now)
         self._timeouts = 0
         if sent_at is None or sent_at <= self._busy_until:
             self.window.on_answer(None)
@@ -143,7 +145,7 @@ class BlockRequests:
         if block.attempts == 1:
             self._requeue_overtaken(block.number)
 
-    def _answered_sending(self, block: _Block, now: float) -> float | None:
+    def _sent_at_of_answer(self, block: _Block, now: float) -> float | None:
         """Return the time of the transmission that was answered; None if it may be one of several."""
         if block.attempts == 1:
             return block.sent_at
@@ -155,16 +157,17 @@ class BlockRequests:
         """Return the offsets to request now, retries first, and count them as sent. ``limit`` restricts the window."""
         overdue = [offset for offset, block in self._in_flight.items() if self._due_at(block) <= now]
         self._requeue(overdue)
-        self._timeouts += bool(overdue)
+        if overdue:
+            self._timeouts += 1
         size = self.window.size if limit is None else min(limit, self.window.size)
         due: list[int] = []
-        self._is_held_back = False
+        self._must_wait_to_send = False
         while self._waiting and len(self._in_flight) < size:
             if len(self._in_flight) >= self._burst_size:
-                if now < self._free_at:
-                    self._is_held_back = True
+                if now < self._next_send_at:
+                    self._must_wait_to_send = True
                     break
-                self._free_at = now + self._spacing_s
+                self._next_send_at = now + self._spacing_s
             offset = next(iter(self._waiting))
             del self._waiting[offset]
             self._send(offset, now)
@@ -172,8 +175,8 @@ class BlockRequests:
         return due
 
     def _due_at(self, block: _Block) -> float:
-        backoff = max(1, self._timeouts - TIMEOUTS_BEFORE_BACKOFF)
-        return max(block.sent_at, self._busy_until) + self._round_trip.timeout_s(backoff)
+        backoff_attempt = max(1, self._timeouts - TIMEOUTS_BEFORE_BACKOFF)
+        return max(block.sent_at, self._busy_until) + self._round_trip.timeout_s(backoff_attempt)
 
     def _send(self, offset: int, now: float) -> None:
         self._sent_count += 1
@@ -223,7 +226,7 @@ class Reassembly:
         self.gaps: dict[int, None] = {}
         """Offsets of the missing blocks before ``tail``, in order."""
         self._write = write
-        self._ahead: dict[int, bytes] = {}
+        self._ahead: dict[int, bytes] = {}  # blocks after a gap, which are not written yet
         self._bytes_ahead = 0
 
     @property
@@ -274,13 +277,14 @@ class Reassembly:
         ranges: list[tuple[int, int]] = []
         for offset in self.gaps:
             length = self.block_size if self.end is None else min(self.block_size, self.end - offset)
-            if ranges and sum(ranges[-1]) == offset:
-                ranges[-1] = (ranges[-1][0], ranges[-1][1] + length)
+            start, size_so_far = ranges[-1] if ranges else (0, 0)
+            if ranges and start + size_so_far == offset:
+                ranges[-1] = (start, size_so_far + length)
             else:
                 ranges.append((offset, length))
         if self.end is None:
-            rest = 0 if size is None else max(0, size - self.tail)
-            ranges.append((self.tail, rest))
+            remaining = 0 if size is None else max(0, size - self.tail)
+            ranges.append((self.tail, remaining))
         return tuple(ranges)
 
     def _is_missing(self, offset: int) -> bool:

@@ -74,7 +74,10 @@ def max_attempts(command: int, params: Sequence[float]) -> int:
     if command not in UNREPEATABLE_COMMANDS:
         return MAX_ATTEMPTS
     _, condition = UNREPEATABLE_COMMANDS[command]
-    return 1 if condition is None or params[condition[0]] == condition[1] else MAX_ATTEMPTS
+    if condition is None:
+        return 1
+    index, value = condition
+    return 1 if params[index] == value else MAX_ATTEMPTS
 
 
 BROADCAST = 0
@@ -184,7 +187,7 @@ class CommandExchange(Exchange[CommandAck]):
     expects: tuple[type[Message], ...] = (CommandAck,)
 
     # set by start()
-    _started: float
+    _started_at: float
     _sent_at: float
 
     def __init__(
@@ -210,25 +213,26 @@ class CommandExchange(Exchange[CommandAck]):
             is_unrepeatable = attempts == 1
         if attempt_timeout is None:
             attempt_timeout = ATTEMPT_TIMEOUT_S * (MAX_ATTEMPTS if is_unrepeatable else 1)
-        attempt_timeout = max(attempt_timeout, min_timeout_s) if attempt_timeout > 0 else attempt_timeout
+        if attempt_timeout > 0:  # otherwise it is refused below
+            attempt_timeout = max(attempt_timeout, min_timeout_s)
         if attempts < 1:
             raise InvalidArgument(f"attempts = {attempts} is not allowed: at least 1")
         for name, seconds in (("attempt_timeout", attempt_timeout), ("progress_timeout", progress_timeout)):
             if not seconds > 0:
                 raise InvalidArgument(f"{name} = {seconds!r} is not allowed: above 0")
         self._message = message
-        self._own = (own_system, own_component)
+        self._own_ids = (own_system, own_component)
         self._attempts, self._attempt_timeout = attempts, attempt_timeout
         self._progress_timeout, self._on_progress = progress_timeout, on_progress
         self._earlier_answers, self._acks_per_sending = earlier_answers, acks_per_sending
         self._order_status = order_status
         self._is_sent = is_sent
-        self._sent = 0
-        self._answers = 0
+        self._sent_count = 0
+        self._answer_count = 0
         self._in_progress = False
 
     def start(self, now: float) -> None:
-        self._started = now
+        self._started_at = now
         self._send(now)
         if self._is_sent:
             self._outbox.clear()
@@ -237,9 +241,13 @@ class CommandExchange(Exchange[CommandAck]):
         """Process a COMMAND_ACK. Other messages are ignored."""
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
-        is_earlier = self._sent == 1 < self._attempts and self._answers < self._earlier_answers
-        self._answers += message.result != MavResult.IN_PROGRESS
-        if is_earlier:
+        # A command that may be sent only once does not ignore acknowledgements, because if it ignored its own, there
+        # would be no second one.
+        may_ignore = self._sent_count == 1 and self._attempts > 1
+        is_to_earlier_command = may_ignore and self._answer_count < self._earlier_answers
+        if message.result != MavResult.IN_PROGRESS:
+            self._answer_count += 1
+        if is_to_earlier_command:
             return
         if message.result == MavResult.IN_PROGRESS:
             self._report_progress(message, now)
@@ -252,13 +260,14 @@ class CommandExchange(Exchange[CommandAck]):
     def pending_answers(self) -> int:
         """Number of acknowledgements that may still arrive. The next command with the same MAV_CMD must ignore them."""
         # As in receive(), every acknowledgement belongs to this command once it was repeated.
-        earlier = self._earlier_answers if self._sent == 1 else 0
-        return max(0, self._sent * self._acks_per_sending - max(0, self._answers - earlier))
+        ignored_answers = self._earlier_answers if self._sent_count == 1 else 0
+        own_answers = max(0, self._answer_count - ignored_answers)
+        return max(0, self._sent_count * self._acks_per_sending - own_answers)
 
     @property
     def answers(self) -> int:
         """Number of acknowledgements received, including those to earlier commands with the same MAV_CMD."""
-        return self._answers
+        return self._answer_count
 
     def expire(self, now: float) -> None:
         """Repeat the command. Fail after the last attempt, or when progress reports have stopped."""
@@ -268,28 +277,28 @@ class CommandExchange(Exchange[CommandAck]):
             self._fail(CommandTimeout(self._timeout_text(now)))
         elif self._order_status is not None:
             self._expire_order(self._order_status, now)
-        elif self._sent < self._attempts:
+        elif self._sent_count < self._attempts:
             self._send(now)
         else:
             self._fail(CommandTimeout(self._timeout_text(now)))
 
     def _expire_order(self, order_status: OrderStatus, now: float) -> None:
-        # Until this time, an order that has not ended is repeated after each new HEARTBEAT.
-        until = self._started + self._attempts * self._attempt_timeout
+        give_up_at = self._started_at + self._attempts * self._attempt_timeout
         if order_status.end:
             self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {order_status.end}"))
             return
-        earliest = self._sent_at + MIN_RESEND_FRACTION * self._attempt_timeout
-        if self._sent < self._attempts and order_status.heartbeat_at >= earliest:
+        # A HEARTBEAT since this time shows that the vehicle still receives, or that its link is back.
+        min_heartbeat_at = self._sent_at + MIN_RESEND_FRACTION * self._attempt_timeout
+        if self._sent_count < self._attempts and order_status.heartbeat_at >= min_heartbeat_at:
             self._send(now)
             return
-        if now >= until:
+        if now >= give_up_at:
             self._fail(CommandTimeout(self._timeout_text(now) + self._why_not_repeated()))
         else:
-            self.deadline = min(now + POLL_INTERVAL_S, until)
+            self.deadline = min(now + POLL_INTERVAL_S, give_up_at)
 
     def _why_not_repeated(self) -> str:
-        if self._sent < self._attempts:
+        if self._sent_count < self._attempts:
             return "; not sent again: no HEARTBEAT received since then"
         if self._attempts == 1 and max_attempts(self._message.command, _params_of(self._message)) == 1:
             effect, _ = UNREPEATABLE_COMMANDS[self._message.command]
@@ -297,11 +306,11 @@ class CommandExchange(Exchange[CommandAck]):
         return ""
 
     def _send(self, now: float) -> None:
-        self._outbox.append(self._with_confirmation(self._sent))
-        self._sent += 1
+        self._outbox.append(self._with_confirmation(self._sent_count))
+        self._sent_count += 1
         self._sent_at = now
         wait_s = self._attempt_timeout
-        if self._order_status is not None:
+        if self._order_status is not None:  # `_expire_order` then checks for a HEARTBEAT, or that the order has ended
             wait_s = min(MIN_RESEND_FRACTION * wait_s, ATTEMPT_TIMEOUT_S)
         self.deadline = now + wait_s
 
@@ -315,7 +324,7 @@ class CommandExchange(Exchange[CommandAck]):
 
     def _is_ours(self, ack: CommandAck) -> bool:
         # Acknowledgements in MAVLink 1, and of old firmware, have no targets.
-        own_system, own_component = self._own
+        own_system, own_component = self._own_ids
         frame, component = ack.received_frame, self._message.target_component
         return (
             ack.command == self._message.command
@@ -331,10 +340,10 @@ class CommandExchange(Exchange[CommandAck]):
             self._on_progress(ack.progress if 0 < ack.progress <= 100 else None)
 
     def _timeout_text(self, now: float) -> str:
-        name, seconds = command_name(self._message.command), now - self._started
+        name, seconds = command_name(self._message.command), now - self._started_at
         if self._in_progress:
             return f"{name} was in progress, then no COMMAND_ACK for {self._progress_timeout:g} s"
-        times = "once" if self._sent == 1 else f"{self._sent} times"
+        times = "once" if self._sent_count == 1 else f"{self._sent_count} times"
         return f"no COMMAND_ACK for {name}, sent {times} within {seconds:.1f} s"
 
 

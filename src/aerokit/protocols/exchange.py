@@ -101,8 +101,8 @@ DEVIATIONS = 4.0
 # Jitter that even regular answers have, from the vehicle's main loop and the resolution of the clock.
 JITTER_S = 0.03
 
-BACKOFF = 1.5
-MAX_BACKOFFS = 30
+BACKOFF = 1.5  # each further attempt waits longer by this factor
+MAX_BACKOFFS = 30  # limits the exponent, so that the power does not overflow
 
 
 class RoundTrip:
@@ -138,11 +138,12 @@ class RoundTrip:
         because the link may be congested or down.
         """
         if self.smoothed_s is None:
-            first = min(1.0, self._max_s)
+            first_s = min(1.0, self._max_s)
         else:
-            first = self.smoothed_s + max(DEVIATIONS * self._deviation_s, JITTER_S)
-        backed_off = max(first, self._min_s) * BACKOFF ** min(max(0, attempt - 2), MAX_BACKOFFS)
-        return min(backed_off, max(self._max_s, first))
+            first_s = self.smoothed_s + max(DEVIATIONS * self._deviation_s, JITTER_S)
+        backed_off_s = max(first_s, self._min_s) * BACKOFF ** min(max(0, attempt - 2), MAX_BACKOFFS)
+        # The maximum must not be shorter than a slow link needs for a normal answer.
+        return min(backed_off_s, max(self._max_s, first_s))
 
 
 # If this many messages in a row are missing, the vehicle has stopped sending: radios hardly ever lose so many.
@@ -158,8 +159,8 @@ class MessageStream:
     def __init__(self, round_trip: RoundTrip) -> None:
         self._round_trip = round_trip
         self._interval = RoundTrip(min_s=0.001)
-        self._received_at: float | None = None
-        self._last_at = 0.0
+        self._received_at: float | None = None  # time of the last message since the request; None: none yet
+        self._last_at = 0.0  # time of the request or of the last message after it
         self.failures: int = 0
         """Number of consecutive requests that no message followed. The owner of this object counts them."""
 
@@ -171,10 +172,10 @@ class MessageStream:
     @property
     def due_at(self) -> float:
         """Time at which the stream counts as ended, or as not started, unless a message arrives earlier."""
-        silence = self._round_trip.timeout_s(max(1, self.failures - 1))
+        silence_s = self._round_trip.timeout_s(max(1, self.failures - 1))
         if self._received_at is not None and self._interval.smoothed_s is not None:
-            silence += max(SILENT_MESSAGES * self._interval.smoothed_s, self._interval.timeout_s())
-        return self._last_at + silence
+            silence_s += max(SILENT_MESSAGES * self._interval.smoothed_s, self._interval.timeout_s())
+        return self._last_at + silence_s
 
     def on_request(self, now: float) -> None:
         """Record that the request for the stream is sent now."""
@@ -219,15 +220,15 @@ _MAX_RANGES = 10
 
 def format_ranges(numbers: Iterable[int]) -> str:
     """Format numbers as ranges: ``3, 7–12``. After ten ranges, the text only says how many more there are."""
-    found: list[tuple[int, int]] = []
+    ranges: list[tuple[int, int]] = []  # (first, last)
     for number in sorted(numbers):
-        if found and number == found[-1][1] + 1:
-            found[-1] = (found[-1][0], number)
+        if ranges and number == ranges[-1][1] + 1:
+            ranges[-1] = (ranges[-1][0], number)
         else:
-            found.append((number, number))
-    text = ", ".join(str(low) if low == high else f"{low}–{high}" for low, high in found[:_MAX_RANGES])
-    more = len(found) - _MAX_RANGES
-    return f"{text} and {more} more ranges" if more > 0 else text
+            ranges.append((number, number))
+    text = ", ".join(str(first) if first == last else f"{first}–{last}" for first, last in ranges[:_MAX_RANGES])
+    omitted = len(ranges) - _MAX_RANGES
+    return f"{text} and {omitted} more ranges" if omitted > 0 else text
 
 
 OnProgress = Callable[[TransferProgress], None]
@@ -303,7 +304,7 @@ class StaleAnswerFilter:
 
     def __init__(self, round_trip: RoundTrip) -> None:
         self._round_trip = round_trip
-        self._early: dict[str, set[float]] = {}
+        self._early: dict[str, set[float]] = {}  # name → send times of the requests that were answered too early
 
     def is_stale(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
         """Return True if an answer at ``now`` cannot belong to the request for ``name`` sent at ``sent_at``."""
@@ -312,6 +313,6 @@ class StaleAnswerFilter:
             return False
         if attempts == 1:
             self._round_trip.add_sample(elapsed_s)  # the vehicle may be this fast: accept the next answer
-        early = self._early.setdefault(name, set())
-        early.add(sent_at)
-        return len(early) <= MAX_EARLY_ANSWERS
+        early_requests = self._early.setdefault(name, set())
+        early_requests.add(sent_at)
+        return len(early_requests) <= MAX_EARLY_ANSWERS

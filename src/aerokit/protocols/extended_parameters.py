@@ -40,7 +40,7 @@ SettingAnswer = Setting | ParameterRejected | ParameterTimeout
 """Answer to one request: the setting as the component reports it, or the error."""
 
 UNKNOWN_INDEX = 0xFFFF
-MAX_QUIET_S = 1.1
+MAX_QUIET_S = 1.1  # silence after which the stream of the list has stopped in any case
 READ_WINDOW = 10
 # Seconds to wait after PARAM_ACK_IN_PROGRESS before the value is requested.
 PROGRESS_TIMEOUT_S = 5.0
@@ -100,6 +100,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             self._end_stream()
 
     def _on_value(self, setting: Setting, index: int, count: int, now: float) -> None:
+        """Store a value of the stream, or the answer to a request. Request the indices that the stream has left out."""
         if self._is_streaming and index >= self._next:
             for missing in range(self._next, index):
                 self._window.request(missing)
@@ -175,7 +176,7 @@ class SettingReads(NamedReads[Setting]):
         if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
             self._count_probe()
             self._window.on_answer(PROBE, now)
-            unanswered = [other for other in self._names if other not in self._answers and other != name]
+            unanswered = [asked for asked in self._names if asked not in self._answers and asked != name]
             self._reject_unknown(unanswered, now)
         if name and name in self._window:
             self._window.on_answer(name, now)
@@ -216,7 +217,7 @@ class SettingWrite(Transfer[Setting]):
         self._is_writing = False
         self._sent_at = 0.0
         self._attempts = 0  # number of transmissions of the current request
-        self._writes = 0
+        self._writes = 0  # number of PARAM_EXT_SET messages sent
 
     def start(self, now: float) -> None:
         self._start_clock(now)
@@ -252,7 +253,7 @@ class SettingWrite(Transfer[Setting]):
             self._measure(now)
             self._finish(reported)
         elif self._is_stale(now):
-            return  # the answer is for another station
+            return  # the answer came too early for our request, so it is for another station
         elif result == ParamAck.IN_PROGRESS:
             self._progress_at = now
             self._is_writing = True
@@ -264,6 +265,7 @@ class SettingWrite(Transfer[Setting]):
             self._fail(ParameterRejected(f"{self._name} was refused: {reason}", name=self._name, code=result))
 
     def _on_unexpected_value(self, reported: Setting, now: float) -> None:
+        """Handle another value than the requested one: write or read again until it is conclusive."""
         self._unexpected.add(reported)
         is_unchanged = self._before is not None and settings_equal(reported.value, self._before)
         if not self._unexpected.are_conclusive(is_unchanged=is_unchanged):
@@ -302,5 +304,5 @@ class SettingWrite(Transfer[Setting]):
         return self._stale_answers.is_stale(self._name, self._sent_at, now, attempts=self._attempts)
 
 
-def _is_same(one: Setting, other: Setting) -> bool:
-    return settings_equal(one.value, other.value)
+def _is_same(first: Setting, second: Setting) -> bool:
+    return settings_equal(first.value, second.value)

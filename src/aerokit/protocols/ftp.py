@@ -121,12 +121,14 @@ class FtpMessage(Snapshot):
 
     @classmethod
     def decode(cls, payload: bytes, *, cut: bool = True) -> Self:
-        """Decode a payload without validating it. ``data`` is cut to ``size`` bytes, or with ``cut=False`` to 239
-        bytes.
+        """Decode a payload without validating it.
+
+        ``data`` is cut to ``size`` bytes, or with ``cut=False`` to 239 bytes.
         """
         payload = payload.ljust(PAYLOAD_SIZE, b"\0")
         sequence, session, opcode, size, request_opcode, burst_complete, offset = HEADER.unpack_from(payload)
-        data = payload[HEADER.size : HEADER.size + size if cut else PAYLOAD_SIZE]
+        data_end = HEADER.size + size if cut else PAYLOAD_SIZE
+        data = payload[HEADER.size : data_end]
         return cls(sequence, opcode, session, size, request_opcode, burst_complete != 0, offset, data)
 
     def encode(self) -> bytes:
@@ -164,13 +166,13 @@ def path_bytes(path: str) -> bytes:
         InvalidArgument: the path is empty, not encodable as UTF-8, contains NUL, or is longer than 238 bytes.
     """
     if not isinstance(path, str):
-        raise InvalidArgument(f"path = {path!r} is not allowed: a string")
+        raise InvalidArgument(f"path = {path!r} is not allowed: it must be a string")
     try:
         encoded = path.encode()
     except UnicodeEncodeError:
-        raise InvalidArgument(f"path = {path!r} is not allowed: a string that UTF-8 can encode") from None
+        raise InvalidArgument(f"path = {path!r} cannot be encoded as UTF-8") from None
     if not encoded or b"\0" in encoded:
-        raise InvalidArgument(f"path = {path!r} is not allowed: a non-empty string without NUL")
+        raise InvalidArgument(f"path = {path!r} is not allowed: it must be a non-empty string without NUL")
     if len(encoded) > PATH_SIZE:
         raise InvalidArgument(
             f"path = {path!r} is not allowed: {len(encoded)} bytes, at most {PATH_SIZE} fit into a message"
@@ -191,24 +193,25 @@ def file_error(request_opcode: int, path: str, code: int, errno: int | None) -> 
 
 ResultT = TypeVar("ResultT")
 
-SEQUENCES = 0x10000
+SEQUENCE_COUNT = 0x10000
 
-SESSIONS = 255
+MAX_SESSION = 255
 
 # The vehicle reads or saves the whole file before it answers these requests.
 SLOW_REQUESTS = (MavFtpOpcode.CALCFILECRC, MavFtpOpcode.TERMINATESESSION)
 SLOW_ANSWER_S = 0.25
 
+# Maximum number of times that a request gets a new sequence number.
 MAX_RENUMBERED = 3
 
 # Number of attempts after which retries back off. Fewer do not count, because radios lose single frames.
 ATTEMPTS_BEFORE_BACKOFF = 3
 
-NEED_SESSION = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)
+SESSION_OPCODES = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)
 
-# Answers to NEED_SESSION requests while no file is open: INVALIDSESSION from PX4, FILENOTFOUND from ArduPilot. After
-# PX4 has answered FILEEXISTS once, it gives this answer for any refusal, until an operation fails with an errno.
-NO_SESSION = (MavFtpErr.INVALIDSESSION, MavFtpErr.FILENOTFOUND, MavFtpErr.FILEEXISTS)
+# Answers to these requests while no file is open: INVALIDSESSION from PX4, FILENOTFOUND from ArduPilot. After PX4 has
+# answered FILEEXISTS once, it gives this answer for any refusal, until an operation fails with an errno.
+NO_SESSION_ERRORS = (MavFtpErr.INVALIDSESSION, MavFtpErr.FILENOTFOUND, MavFtpErr.FILEEXISTS)
 
 
 class FtpSessionLost(FileError):
@@ -240,13 +243,13 @@ class FtpClient:
 
     def next_sequence(self, replies: int = 1) -> int:
         """Return the sequence number of a new request. The next ``replies`` numbers are reserved for its replies."""
-        sequence = self._sequence % SEQUENCES
+        sequence = self._sequence % SEQUENCE_COUNT
         self._sequence = sequence + replies
         return sequence
 
     def next_session(self) -> int:
         """Return a new session number, 1–255. ArduPilot uses this number; PX4 answers with its own number, always 0."""
-        self._session = self._session % SESSIONS + 1
+        self._session = self._session % MAX_SESSION + 1
         return self._session
 
     def message(self, request: FtpMessage) -> FileTransferProtocol:
@@ -255,10 +258,8 @@ class FtpClient:
 
     def is_for_us(self, message: FileTransferProtocol) -> bool:
         """Return True if the message is addressed to this client or to all."""
-        return message.target_system in (0, self.source_system) and message.target_component in (
-            0,
-            self.source_component,
-        )
+        is_our_system = message.target_system in (0, self.source_system)
+        return is_our_system and message.target_component in (0, self.source_component)
 
 
 class FtpExchange(Transfer[ResultT]):
@@ -287,7 +288,7 @@ class FtpExchange(Transfer[ResultT]):
 
     def _refused(self, reply: FtpMessage) -> FileError:
         error = file_error(reply.request_opcode, self._path, reply.error_code, reply.errno)
-        if reply.request_opcode in NEED_SESSION and error.code in NO_SESSION:
+        if reply.request_opcode in SESSION_OPCODES and error.code in NO_SESSION_ERRORS:
             return FtpSessionLost(str(error), path=error.path, code=error.code)
         return error
 
@@ -369,9 +370,9 @@ class FtpRequest(FtpExchange[FtpMessage]):
         self.deadline: float | None = min(now + timeout_s, self._idle_deadline)
 
     def _receive_reply(self, reply: FtpMessage, now: float) -> None:
-        if reply.sequence != (self._request.sequence + 1) % SEQUENCES:
+        if reply.sequence != (self._request.sequence + 1) % SEQUENCE_COUNT:
             self._receive_other(reply, now)
-        elif reply.request_opcode != self._request.opcode:
+        elif reply.request_opcode != self._request.opcode:  # a repeated reply to an earlier request
             self._renumber(now)
         else:
             if self.attempts == 1 and self._request.opcode not in SLOW_REQUESTS:
@@ -388,7 +389,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._wait(now)
 
     def _receive_other(self, reply: FtpMessage, now: float) -> None:
-        # ArduPilot finishes a burst before it processes the next request.
+        # ArduPilot finishes a burst before it processes the next request, so a block of the burst shows that it works.
         if self._request.opcode == MavFtpOpcode.TERMINATESESSION and reply.session == self._request.session:
             self._progress_at = now
             self._wait(now)

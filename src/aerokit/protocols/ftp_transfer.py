@@ -15,13 +15,14 @@ Behaviour of servers (ArduPilot 4.7, PX4 1.17) that determines this design:
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.errors import FileTimeout, RemoteProtocolError
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.protocols.blocks import BlockRequests
 from aerokit.protocols.exchange import RoundTrip, TransferOptions
-from aerokit.protocols.ftp import DATA_SIZE, SEQUENCES, FtpClient, FtpExchange, FtpMessage
+from aerokit.protocols.ftp import DATA_SIZE, SEQUENCE_COUNT, FtpClient, FtpExchange, FtpMessage
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -36,19 +37,21 @@ WINDOW_DURING_BURST = 4
 # If more blocks than this are missing, they are requested before the next burst, because all blocks after the first
 # missing one are held in memory.
 MAX_GAPS = 512
+# Number of blocks that ArduPilot sends in one burst.
 BURST_BLOCKS = 500
+# After a block of a burst, the server counts as busy for this many intervals between blocks.
 BUSY_BLOCKS = 3
 # Seconds to wait for the first block; even a slow radio carries a few blocks in this time.
 FIRST_BLOCK_TIMEOUT_S = 0.5
-SHORT_FILE = 20 * DATA_SIZE
+SHORT_FILE = 20 * DATA_SIZE  # bytes
 MAX_REPEATED_BURSTS = 3
 # Maximum number of bursts whose blocks may still arrive.
 MAX_BURSTS = 32
 # The sequence number of a block that is farther away than this is ambiguous.
-MAX_BLOCK_DISTANCE = SEQUENCES // 2 * DATA_SIZE
-# If this many blocks in a row are missing, the burst has not started (first number) or has ended (second number):
-# radios hardly ever lose so many.
-FIRST_BLOCKS, SILENT_BLOCKS = 4, 10
+MAX_BLOCK_DISTANCE = SEQUENCE_COUNT // 2 * DATA_SIZE
+# If more blocks than this are missing in a row, the burst has not started (first number) or has ended (second number),
+# because radios hardly ever lose so many.
+MAX_LOST_FIRST_BLOCKS, MAX_LOST_BLOCKS = 4, 10
 
 
 def is_virtual(path: str) -> bool:
@@ -57,7 +60,8 @@ def is_virtual(path: str) -> bool:
 
 
 class _SentRequest(NamedTuple):
-    # Each transmission has its own sequence number, so that every answer measures the round trip.
+    """One transmission. Each has its own sequence number, so that every answer measures the round trip."""
+
     offset: int
     at: float
 
@@ -69,22 +73,23 @@ class _Burst(NamedTuple):
 
     def blocks_before(self, reply: FtpMessage) -> int:
         """Return the number of blocks sent before this reply to the burst."""
-        return (reply.sequence - self.sequence - 1) % SEQUENCES
+        return (reply.sequence - self.sequence - 1) % SEQUENCE_COUNT
 
     def contains(self, reply: FtpMessage) -> bool:
         """Return True if sequence number and offset of this block both fit the burst."""
-        blocks, rest = divmod(reply.offset - self.offset, DATA_SIZE)
-        return rest == 0 and blocks >= 0 and blocks % SEQUENCES == self.blocks_before(reply)
+        blocks, remainder = divmod(reply.offset - self.offset, DATA_SIZE)
+        return remainder == 0 and blocks >= 0 and blocks % SEQUENCE_COUNT == self.blocks_before(reply)
 
     def end(self, reply: FtpMessage) -> int | None:
         """Return the end of the file according to this NAK, or None if it does not belong to the burst."""
         blocks = self.blocks_before(reply)
         if blocks == 0:
             return self.offset
-        last = self.offset + (blocks - 1) * DATA_SIZE
-        if not last <= reply.offset <= last + DATA_SIZE:
+        last_offset = self.offset + (blocks - 1) * DATA_SIZE
+        if not last_offset <= reply.offset <= last_offset + DATA_SIZE:
             return None
-        return reply.offset if reply.offset > last else last + DATA_SIZE
+        # The NAK has the offset of the end of the file. After a full block, ArduPilot sends the block's start instead.
+        return reply.offset if reply.offset > last_offset else last_offset + DATA_SIZE
 
 
 class FtpDownload(FtpExchange[int]):
@@ -110,7 +115,7 @@ class FtpDownload(FtpExchange[int]):
         super().__init__(client, path, **options)
         self._into, self._session = into, session
         self._size = None if is_virtual(path) or size == 0 else size
-        self._scanned = into.position
+        self._scanned = into.position  # the gaps before this offset were requested
         self._requests = BlockRequests(self.round_trip)
         self._reads: dict[int, _SentRequest] = {}  # requests by sequence number
         self._bursts: list[_Burst] = []
@@ -120,8 +125,8 @@ class FtpDownload(FtpExchange[int]):
         self._blocks_sent: dict[int, int] = {}  # sequence number of each burst → its highest block number
         self._supports_bursts = True
         self._burst_at = 0.0
-        self._last_block: tuple[_Burst | None, float, int] = (None, 0.0, -1)
-        self._interval = RoundTrip(min_s=0.001)
+        self._last_block: tuple[_Burst | None, float, int] = (None, 0.0, -1)  # burst, time, number in the burst
+        self._interval = RoundTrip(min_s=0.001)  # between two blocks of a burst
 
     def start(self, now: float) -> None:
         """Request the first burst, and the blocks that are already known to be missing."""
@@ -143,13 +148,15 @@ class FtpDownload(FtpExchange[int]):
         if reply.request_opcode == MavFtpOpcode.BURSTREADFILE:
             self._receive_burst(reply, now)
         elif reply.request_opcode == MavFtpOpcode.READFILE:
-            sent = self._reads.pop((reply.sequence - 1) % SEQUENCES, None)
+            # A reply has the sequence number of its request plus 1.
+            sent = self._reads.pop((reply.sequence - 1) % SEQUENCE_COUNT, None)
             if sent is not None:
                 self._receive_read(sent, reply, now)
         if not self.done:
             self._proceed(now)
 
     def _receive_burst(self, reply: FtpMessage, now: float) -> None:
+        """Process a block of a burst, or its end. Replies to earlier bursts may still arrive."""
         for burst in reversed(self._bursts):
             if reply.is_ack and burst.contains(reply):
                 self._on_block(burst, reply, now)
@@ -174,14 +181,16 @@ class FtpDownload(FtpExchange[int]):
         # Known blocks of a repeated burst count as progress too, but only for a limited number of bursts.
         if number > self._blocks_sent.get(burst.sequence, -1) and self._repeated_bursts <= MAX_REPEATED_BURSTS:
             self._blocks_sent[burst.sequence], self._progress_at = number, now
-        last, previous_at, previous = self._last_block
+        last_burst, last_at, last_number = self._last_block
         # Only the first burst measures the round trip, because a later burst may have to wait for the end of an earlier
         # one.
-        if last is None and number == 0 and len(self._bursts) == 1:
+        if last_burst is None and number == 0 and len(self._bursts) == 1:
             self.round_trip.add_sample(now - burst.sent_at)
-        elif last is burst and number > previous:
-            self._interval.add_sample((now - previous_at) / (number - previous))
-        self._last_block = (burst, now, max(number, previous) if last is burst else number)
+        elif last_burst is burst and number > last_number:
+            self._interval.add_sample((now - last_at) / (number - last_number))
+        if last_burst is burst:
+            number = max(number, last_number)
+        self._last_block = (burst, now, number)
 
     def _stop_bursting(self) -> None:
         self._is_bursting = False
@@ -190,6 +199,7 @@ class FtpDownload(FtpExchange[int]):
             self._requests.window.widen(self.round_trip.smoothed_s / self._interval.smoothed_s)
 
     def _end_burst(self, burst: _Burst, end: int, reply: FtpMessage) -> None:
+        """Handle the NAK that ends a burst. Only the latest burst can fail the download."""
         is_latest = burst is self._bursts[-1]
         if is_latest:
             self._failed_bursts = 0
@@ -204,9 +214,10 @@ class FtpDownload(FtpExchange[int]):
     def _receive_read(self, sent: _SentRequest, reply: FtpMessage, now: float) -> None:
         offset = sent.offset
         self._requests.on_answer(offset, now, sent_at=sent.at)
+        is_end = reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset)
         if reply.is_ack and reply.data:
             self._add(offset, reply.data, now)
-        elif reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset):
+        elif is_end:  # an ACK without data, or EOF
             self._end_at(offset)
         else:
             self._fail(self._refused(reply))
@@ -225,7 +236,7 @@ class FtpDownload(FtpExchange[int]):
 
     def _add(self, offset: int, data: bytes, now: float) -> None:
         if self._size is not None:
-            data = data[: self._size - offset]  # the file may have grown
+            data = data[: self._size - offset]  # The file may have grown; later blocks are ignored before.
         try:
             is_new = self._into.add(offset, data)
         except Exception as error:  # the disk is full, for example
@@ -286,7 +297,7 @@ class FtpDownload(FtpExchange[int]):
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
         # The sequence numbers of the replies are reserved. Otherwise a server might mistake a later request for this
         # one, and repeat its last reply.
-        sequence = self._client.next_sequence(min(blocks + 3, SEQUENCES // 2))
+        sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
         self._bursts = [*self._bursts[1 - MAX_BURSTS :], _Burst(sequence, offset, now)]
         self._is_bursting, self._burst_at = True, now
         self._repeated_bursts += 1
@@ -295,14 +306,15 @@ class FtpDownload(FtpExchange[int]):
     @property
     def _burst_due_at(self) -> float:
         """Time at which the burst counts as ended, or as not started, unless a block arrives earlier."""
-        silence = self.round_trip.timeout_s(1 + self._failed_bursts)
+        silence_s = self.round_trip.timeout_s(1 + self._failed_bursts)
         if self._interval.smoothed_s is None:
             if self._size is not None and self._size > SHORT_FILE:  # Repeating the burst of a long file is expensive.
-                silence = max(silence, FIRST_BLOCK_TIMEOUT_S)
+                silence_s = max(silence_s, FIRST_BLOCK_TIMEOUT_S)
         else:
-            blocks = SILENT_BLOCKS if self._last_block[0] is self._bursts[-1] else FIRST_BLOCKS
-            silence += max(blocks * self._interval.smoothed_s, self._interval.timeout_s())
-        return self._burst_at + silence
+            has_started = self._last_block[0] is self._bursts[-1]
+            max_lost = MAX_LOST_BLOCKS if has_started else MAX_LOST_FIRST_BLOCKS
+            silence_s += max(max_lost * self._interval.smoothed_s, self._interval.timeout_s())
+        return self._burst_at + silence_s
 
     def _set_deadline(self) -> None:
         deadline = self._idle_deadline
@@ -320,6 +332,7 @@ class FtpDownload(FtpExchange[int]):
         return self._size if self._into.end is None else self._into.end
 
     def _end(self) -> None:
+        """Finish at the end of the file, which must be at the size that the server reported (unless estimated)."""
         end = self._into.position
         if self._size is None:
             self._finish(end)
@@ -364,10 +377,11 @@ class FtpUpload(FtpExchange[None]):
     def expire(self, now: float) -> None:
         if self._is_idle(now):
             missing = tuple((offset, len(self._block(offset))) for offset in self._unwritten)
+            block_count = math.ceil(len(self._data) / DATA_SIZE)
             self._fail(
                 FileTimeout(
                     f"write {self._path}: no block acknowledged for {self._idle_timeout_s:g} s;"
-                    f" {len(missing)} of {-(-len(self._data) // DATA_SIZE)} blocks missing",
+                    f" {len(missing)} of {block_count} blocks missing",
                     missing=missing,
                 )
             )
@@ -377,7 +391,8 @@ class FtpUpload(FtpExchange[None]):
     def _receive_reply(self, reply: FtpMessage, now: float) -> None:
         if reply.request_opcode != MavFtpOpcode.WRITEFILE:
             return
-        sent = self._writes.pop((reply.sequence - 1) % SEQUENCES, None)
+        # A reply has the sequence number of its request plus 1.
+        sent = self._writes.pop((reply.sequence - 1) % SEQUENCE_COUNT, None)
         if sent is None or sent.offset not in self._unwritten:
             return
         if not reply.is_ack:

@@ -14,6 +14,7 @@ Behaviour of vehicles (ArduPilot 4.7, PX4 1.17) that determines this design:
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from aerokit.errors import FileTimeout, RemoteProtocolError
@@ -41,7 +42,7 @@ FIRST_RANGE, MIN_RANGE, MAX_RANGE = 512, 64, 40_000
 # Gaps of at least this many blocks are requested as ranges.
 LONG_GAP = 8
 
-# A range lasts at least this many round trips, so that the pause after it is negligible.
+# Ranges grow until they last this many round trips, so that the pause after a range is negligible.
 MIN_RANGE_ROUND_TRIPS = 60
 
 MAX_EARLY_ENDS = 3
@@ -73,8 +74,8 @@ class LogDownload(Transfer[int]):
         self._stream = MessageStream(self.round_trip)
         self._is_streaming = False
         self._range_end = into.position
-        self._latest = self._range_end
-        # in blocks
+        self._latest = self._range_end  # the largest offset received in the current range
+        # Maximum size of a range, and the sizes of the current range as requested and as received, in blocks.
         self._range, self._requested, self._received = FIRST_RANGE, 0, 0
         self._early_ends = 0
         self._has_checked_gaps = True
@@ -89,7 +90,8 @@ class LogDownload(Transfer[int]):
         if message.id != self._id or not self._is_from_target(message) or not self._is_plausible(message.ofs):
             return
         end = message.ofs + message.count
-        if message.count < LOG_BLOCK and end < self._size:
+        is_end_too_early = message.count < LOG_BLOCK and end < self._size
+        if is_end_too_early:
             self._end_early(end)
         else:
             self._on_block(message, now)
@@ -140,6 +142,7 @@ class LogDownload(Transfer[int]):
             self._send_end()
 
     def _proceed(self, now: float) -> None:
+        """Finish, or request the gaps of the last range, or the next range."""
         into = self._into
         if into.position >= self._size:
             self._finish(into.position)
@@ -165,9 +168,11 @@ class LogDownload(Transfer[int]):
             self._request(offset, LOG_BLOCK)
 
     def _first_long_gap(self) -> tuple[int, int] | None:
+        """Return start and end of the first gap of at least `LONG_GAP` blocks."""
         start = end = -1
         for offset in self._into.gaps:
-            if offset != end:
+            is_new_gap = offset != end
+            if is_new_gap:
                 if end - start >= LONG_GAP * LOG_BLOCK:
                     break
                 start = offset
@@ -178,7 +183,7 @@ class LogDownload(Transfer[int]):
         """Request a range, or the first part of a range that is too long."""
         self._adapt_range()
         self._range_end = min(start + self._range * LOG_BLOCK, end, self._size)
-        self._requested = -(-(self._range_end - start) // LOG_BLOCK)
+        self._requested = math.ceil((self._range_end - start) / LOG_BLOCK)
         self._latest, self._received = start - LOG_BLOCK, 0
         self._is_streaming, self._has_checked_gaps = True, False
         self._stream.on_request(now)
@@ -191,8 +196,8 @@ class LogDownload(Transfer[int]):
         if self._received < self._requested / 2:
             self._range = max(self._range // 2, MIN_RANGE)
         elif self._requested >= self._range and self._stream.interval_s:
-            longest = MIN_RANGE_ROUND_TRIPS * self.round_trip.timeout_s() / self._stream.interval_s
-            self._range = min(2 * self._range, max(int(longest), FIRST_RANGE), MAX_RANGE)
+            useful_blocks = MIN_RANGE_ROUND_TRIPS * self.round_trip.timeout_s() / self._stream.interval_s
+            self._range = min(2 * self._range, max(int(useful_blocks), FIRST_RANGE), MAX_RANGE)
 
     def _request(self, offset: int, count: int) -> None:
         self._outbox.append(LogRequestData(self.target_system, self.target_component, self._id, offset, count))

@@ -61,7 +61,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
     expects: tuple[type[Message], ...] = (MissionCount, MissionItemInt, MissionItem, MissionAck)
 
     # set by start()
-    _list_at: float
+    _list_requested_at: float
     _received_at: float
 
     def __init__(
@@ -81,7 +81,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._items: dict[int, Item] = {}
         self._count: int | None = None
         self._opaque_id = 0
-        self._next = 0
+        self._next = 0  # position in `_indices` of the item to request next
         self._requested_at: dict[int, float] = {}
         self._request_counts: dict[int, int] = {}
         self._busy_until: float | None = None
@@ -110,7 +110,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         elif self._count is None:
             self._attempt += 1
             self._request_list(now)
-        elif now - self._received_at >= TRANSFER_EXPIRY_S:
+        elif now - self._received_at >= TRANSFER_EXPIRY_S:  # the vehicle may have dropped the transfer
             self._restart_after_error(now)
         else:
             for seq in [seq for seq in self._requested_at if self._due_at(seq) <= now]:
@@ -127,8 +127,9 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def _on_count(self, message: MissionCount, now: float) -> None:
         opaque_id = message.opaque_id
         if self._count is None:
-            if self._attempt == 1 and not self._restarts and self._window > 1:  # PX4 repeats MISSION_COUNT
-                self.round_trip.add_sample(now - self._list_at)
+            # With PX4 (window 1), this may be a repeated MISSION_COUNT, which does not measure the round trip.
+            if self._attempt == 1 and not self._restarts and self._window > 1:
+                self.round_trip.add_sample(now - self._list_requested_at)
             if not opaque_id or opaque_id != self._opaque_id:
                 self._items.clear()
         elif message.count == self._count and opaque_id == self._opaque_id:
@@ -137,7 +138,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
             self._items.clear()
             self._discard_requests()
         self._count, self._opaque_id, self._busy_until = message.count, opaque_id, None
-        self._indices = range(self._count) if self._only is None else [n for n in self._only if n < message.count]
+        self._indices = range(self._count) if self._only is None else [seq for seq in self._only if seq < self._count]
         self._report_progress(now, len(self._items), len(self._indices))
         self._proceed(now)
 
@@ -156,9 +157,9 @@ class MissionDownload(MissionExchange[DownloadResult]):
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
-            # An ERROR that arrives earlier than this answers a previous message, for example a repeated item of an
-            # upload.
-            if now - self._list_at >= MIN_ROUND_TRIP_FRACTION * (self.round_trip.smoothed_s or 0.0):
+            # An ERROR that arrives earlier answers a message before the request for the list, for example a repeated
+            # item of an upload.
+            if now - self._list_requested_at >= MIN_ROUND_TRIP_FRACTION * (self.round_trip.smoothed_s or 0.0):
                 self._restart_after_error(now)
         elif result not in (
             MavMissionResult.ACCEPTED,
@@ -176,7 +177,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
             return
         self._discard_requests()
         self._count = None
-        self._progress_at = now  # the vehicle answers
+        self._progress_at = now  # the vehicle answers, so the transfer is not idle
         self.deadline = now + BUSY_RETRY_INTERVAL_S
 
     def _restart_after_error(self, now: float) -> None:
@@ -205,20 +206,21 @@ class MissionDownload(MissionExchange[DownloadResult]):
             return
         while self._next < len(self._indices) and len(self._requested_at) < self._window:
             seq = self._indices[self._next]
-            if self._window == 1 or seq not in self._items:
+            needs_sequence = self._window == 1  # PX4 does not allow leaving out items that we already have
+            if needs_sequence or seq not in self._items:
                 self._request(seq, now)
             self._next += 1
         self._wait_for_items(now)
 
     def _request(self, seq: int, now: float) -> None:
-        kind = MissionRequestInt if self._uses_int else MissionRequest
-        self._outbox.append(kind(self.target_system, self.target_component, seq, self.mission_type))
+        request_type = MissionRequestInt if self._uses_int else MissionRequest
+        self._outbox.append(request_type(self.target_system, self.target_component, seq, self.mission_type))
         self._requested_at[seq] = now
         self._request_counts[seq] = self._request_counts.get(seq, 0) + 1
 
     def _request_list(self, now: float) -> None:
         self._outbox.append(MissionRequestList(self.target_system, self.target_component, self.mission_type))
-        self._list_at = now
+        self._list_requested_at = now
         self._wait(now)
 
     def _due_at(self, seq: int) -> float:
@@ -231,7 +233,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
     # ------------------------------------------------------------------------------------ end
 
     def _end(self) -> None:
-        # PX4 accepts no upload until it has received an acknowledgement or 5 s have passed, so it gets two.
+        # PX4 accepts no upload until it has received an acknowledgement or 5 s have passed. It gets two, because one
+        # may be lost.
         self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * (2 if self._window == 1 else 1)
         items = tuple(self._items[seq] for seq in self._indices)
         self._finish(DownloadResult(items, self._count or 0, self._opaque_id))

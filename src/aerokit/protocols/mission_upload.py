@@ -97,24 +97,26 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _reset(self) -> None:
         self._is_accepted = False
-        # The vehicle has all items before _confirmed; all items before _sent were sent at least once.
-        self._confirmed = self._sent = self._first
+        # The vehicle has all items before `_confirmed_end`. All items before `_sent_end` were sent at least once.
+        self._confirmed_end = self._sent_end = self._first
         self._sent_at: dict[int, float] = {}
         self._send_counts: dict[int, int] = {}
-        self._requested: set[int] = set()
-        self._error_at: float | None = None
+        self._requested: set[int] = set()  # items that the vehicle has requested at least once
+        self._error_at: float | None = None  # time of a first ERROR, after which an item is repeated
         self._was_tail_repeated = False
         self._attempt = 1
 
     @property
     def may_have_changed_items(self) -> bool:
         """True if the vehicle may have overwritten old items. False until the vehicle has requested an item."""
-        return self.was_started and not (self._is_partial and self._sent == self._first + 1)
+        # If a partial upload fails after its first item alone, the vehicle has refused this item and replaced nothing.
+        has_sent_only_first = self._is_partial and self._sent_end == self._first + 1
+        return self.was_started and not has_sent_only_first
 
     @property
     def was_sent_completely(self) -> bool:
         """True if all items were sent, so that the vehicle may have them regardless of its answers."""
-        return self.was_started and self._sent == self._end
+        return self.was_started and self._sent_end == self._end
 
     # --------------------------------------------------------------------------------- events
 
@@ -128,7 +130,8 @@ class MissionUpload(MissionExchange[UploadResult]):
             return
         silence_s, self._received_at = now - self._received_at, now
         if isinstance(message, MissionAck):
-            if message.type == MavMissionResult.ERROR and self._is_accepted and silence_s >= TRANSFER_EXPIRY_S:
+            has_expired = self._is_accepted and silence_s >= TRANSFER_EXPIRY_S
+            if message.type == MavMissionResult.ERROR and has_expired:
                 self._restart(now)
             else:
                 self._on_ack(message, now)
@@ -143,8 +146,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._attempt += 1
         if not self._is_accepted:
             self._announce(now)
-        elif self._sent < self._end:
-            self._send_window(now, ahead=int(self._window > 1))
+        elif self._sent_end < self._end:
+            self._send_window(now, ahead=1 if self._window > 1 else 0)  # with a window of 1, each item is requested
         elif self._attempt % 2 == 0:  # a vehicle that has all items confirms again on the last item
             self._send(self._end - 1, now)
         else:
@@ -161,28 +164,29 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _on_request(self, seq: int, now: float) -> None:
         # A request for an item beyond the next one is left over from another transfer.
-        if seq > self._sent:
+        if seq > self._sent_end:
             return
         if not self._is_accepted:
             self._is_accepted = True
             self.was_started = True
             self._busy_until = None
             self._report_progress(now, 0, len(self._items))
-        if seq > self._confirmed:
+        if seq > self._confirmed_end:
             self._advance(seq, now)
-        elif seq < self._confirmed:
+        elif seq < self._confirmed_end:
             self._send(seq, now, again=True)  # This is an old request, or the vehicle has restarted the transfer.
         elif seq in self._requested:
             self._send_window(now)  # the item was lost, and the vehicle ignored the items after it
         self._requested.add(seq)
-        while self._sent < min(self._end, self._confirmed + self._window):
-            self._send(self._sent, now)
+        while self._sent_end < min(self._end, self._confirmed_end + self._window):
+            self._send(self._sent_end, now)
         self._wait(now)
 
     def _advance(self, seq: int, now: float) -> None:
+        """Record that the vehicle has all items before ``seq``."""
         if self._send_counts.get(seq - 1) == 1:
             self._measure(now - self._sent_at[seq - 1])
-        self._confirmed = seq
+        self._confirmed_end = seq
         self._attempt = 1
         self._error_at = None
         self._report_progress(now, seq - self._first, len(self._items))
@@ -197,7 +201,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _on_ack(self, ack: MissionAck, now: float) -> None:
         result = ack.type
         if result == MavMissionResult.ACCEPTED:
-            if self._is_accepted and self._sent == self._end:
+            if self._is_accepted and self._sent_end == self._end:  # otherwise it is the answer to an earlier upload
                 self._succeed(not self._was_tail_repeated, ack.opaque_id, now)
         elif result == MavMissionResult.INVALID_SEQUENCE:
             if self._is_accepted:
@@ -213,6 +217,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def _is_partial_refusal(self) -> bool:
+        """True if an ERROR refuses MISSION_WRITE_PARTIAL_LIST."""
         return self._is_partial and not self._is_accepted
 
     def _on_error(self, now: float) -> None:
@@ -223,10 +228,11 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._wait_while_busy(now)
         elif self._error_at is None:
             self._error_at = now
-            self._send(self._end - 1 if self._sent == self._end else self._confirmed, now, again=True)
+            are_all_sent = self._sent_end == self._end
+            self._send(self._end - 1 if are_all_sent else self._confirmed_end, now, again=True)
             self._wait(now)
         elif now - self._error_at >= IN_FLIGHT_ROUND_TRIPS * (self.round_trip.smoothed_s or 0.0):
-            if self._sent == self._end:
+            if self._sent_end == self._end:
                 self._succeed(False, 0, now)
             else:
                 self._refuse(MavMissionResult.ERROR)
@@ -237,11 +243,11 @@ class MissionUpload(MissionExchange[UploadResult]):
         if now + BUSY_RETRY_INTERVAL_S > self._busy_until:
             self._refuse(MavMissionResult.ERROR)
         else:
-            self._progress_at = now  # the vehicle answers
+            self._progress_at = now  # the vehicle answers, so the transfer is not idle
             self._wait(now, BUSY_RETRY_INTERVAL_S)
 
     def _restart(self, now: float) -> None:
-        # The vehicle's transfer expired. Before the first request, this message ends an older transfer.
+        # The vehicle's transfer has expired. If it has requested no item yet, an older transfer has expired.
         if not self._is_accepted:
             return
         if self._is_partial or self._restarts >= MAX_RESTARTS:
@@ -252,16 +258,16 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._announce(now)
 
     def _refuse(self, result: int) -> None:
-        self.is_refusal_ambiguous = self._sent - self._confirmed > 1
-        self._reject(result, seq=self._confirmed if self._is_accepted else None)
+        self.is_refusal_ambiguous = self._sent_end - self._confirmed_end > 1
+        self._reject(result, seq=self._confirmed_end if self._is_accepted else None)
 
     def _succeed(self, is_confirmed: bool, opaque_id: int, now: float) -> None:
         self._report_progress(now, len(self._items), len(self._items))
-        self._finish(UploadResult(is_confirmed, opaque_id, max(0, self._confirmed - self.offset)))
+        self._finish(UploadResult(is_confirmed, opaque_id, max(0, self._confirmed_end - self.offset)))
 
     def _time_out(self, now: float) -> None:
         self._outbox += self.cancellation()
-        missing = range(max(self._confirmed, self.offset), self._end)
+        missing = range(max(self._confirmed_end, self.offset), self._end)
         details = f"items {format_ranges(missing)} were not confirmed" if self._is_accepted else "no item was requested"
         self._fail(
             MissionTimeout(
@@ -286,19 +292,19 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
         """Repeat all unconfirmed items and send ``ahead`` more items, because requests may have been lost."""
-        if self._sent == self._end and self._sent - self._confirmed > 1:
+        if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
             # PX4 takes any repeated item for the last item of the mission.
             self._was_tail_repeated = True
-        upto = max(self._sent, min(self._sent + ahead, self._confirmed + self._window + 1, self._end))
-        for seq in range(self._confirmed, upto):
+        new_end = min(self._sent_end + ahead, self._confirmed_end + self._window + 1, self._end)
+        for seq in range(self._confirmed_end, max(self._sent_end, new_end)):
             self._send(seq, now, again=True)
 
     def _send(self, seq: int, now: float, *, again: bool = False) -> None:
         if again and self._is_in_flight(seq, now):
             return
-        as_message = to_wire_float if self._as_float else to_wire
+        make_message = to_wire_float if self._as_float else to_wire
         self._outbox.append(
-            as_message(
+            make_message(
                 self._items[seq - self._first],
                 seq,
                 target_system=self.target_system,
@@ -308,12 +314,12 @@ class MissionUpload(MissionExchange[UploadResult]):
         )
         self._sent_at[seq] = now
         self._send_counts[seq] = self._send_counts.get(seq, 0) + 1
-        self._sent = max(self._sent, seq + 1)
+        self._sent_end = max(self._sent_end, seq + 1)
 
     def _is_in_flight(self, seq: int, now: float) -> bool:
+        # An item in flight is not repeated: the vehicle answers a duplicate item with another request, and each such
+        # request would cause a whole window of items to be sent again.
         sent_at, round_trip_s = self._sent_at.get(seq), self.round_trip.smoothed_s
-        # The vehicle answers a duplicate item with another request. Without this limit, each such request would cause
-        # a whole window of items to be sent again.
         if round_trip_s is None:
             round_trip_s = self.round_trip.timeout_s()
         return sent_at is not None and now - sent_at < IN_FLIGHT_ROUND_TRIPS * round_trip_s

@@ -41,7 +41,8 @@ BUSY_TIMEOUT_S = 9.0
 
 BUSY_RETRY_INTERVAL_S = 1.0
 
-FEW_ATTEMPTS, SAME_ATTEMPTS = 5, 7
+# The time-out grows up to attempt 5, stays the same for 7 attempts, and then grows again.
+GROWING_ATTEMPTS, CONSTANT_ATTEMPTS = 5, 7
 
 # After this many seconds without messages, the vehicle may have dropped the transfer: PX4 does after 5 s, ArduPilot
 # after 8 s.
@@ -93,7 +94,7 @@ class MissionExchange(Transfer[ResultT]):
         super().__init__(target_system, target_component, **options)
         self.mission_type = mission_type
         self.offset = offset
-        self._own = (own_system, own_component)
+        self._own_system, self._own_component = own_system, own_component
         self._attempt = 1
 
     @property
@@ -111,8 +112,8 @@ class MissionExchange(Transfer[ResultT]):
     def _is_ours(self, message: Message) -> bool:
         return (
             self._is_from_target(message)
-            and getattr(message, "target_system", 0) in (0, self._own[0])
-            and getattr(message, "target_component", 0) in (0, self._own[1])
+            and getattr(message, "target_system", 0) in (0, self._own_system)
+            and getattr(message, "target_component", 0) in (0, self._own_component)
             and getattr(message, "mission_type", self.mission_type) == self.mission_type
         )
 
@@ -120,15 +121,15 @@ class MissionExchange(Transfer[ResultT]):
         self.deadline: float | None = now + (self._timeout_s(self._attempt) if seconds is None else seconds)
 
     def _timeout_s(self, attempt: int) -> float:
-        # The timeout grows during the first few attempts and after many attempts. In between it does not, because small
-        # messages do not congest a link.
-        return self.round_trip.timeout_s(min(attempt, max(FEW_ATTEMPTS, attempt - SAME_ATTEMPTS)))
+        # A few losses do not lengthen the time-out further, because small messages do not congest a link.
+        backoff_attempt = min(attempt, max(GROWING_ATTEMPTS, attempt - CONSTANT_ATTEMPTS))
+        return self.round_trip.timeout_s(backoff_attempt)
 
     def _reject(self, result: int, *, seq: int | None = None) -> None:
         item = None if seq is None or seq < self.offset else seq - self.offset
-        where = "" if item is None else f" item {item}"
-        meaning = RESULTS.get(MavMissionResult(result), "") if result in RESULTS else f"result {result}"
-        self._fail(MissionRejected(f"{self.kind}: the vehicle refused{where}: {meaning}", result=result, item=item))
+        subject = "" if item is None else f" item {item}"
+        reason = RESULTS.get(result, f"result {result}")
+        self._fail(MissionRejected(f"{self.kind}: the vehicle refused{subject}: {reason}", result=result, item=item))
 
 
 class MissionClear(MissionExchange[None]):
@@ -234,23 +235,26 @@ class SetCurrentItem(Transfer[None]):
                 )
             )
         elif self._order_status is not None and self._order_status.heartbeat_at < self._sent_at:
-            self.deadline = now + POLL_INTERVAL_S
+            self.deadline = now + POLL_INTERVAL_S  # the vehicle is silent: wait for its HEARTBEAT
         else:
             self._send(now)
 
     def _has_passed(self, seq: int) -> bool:
         """Return True if the vehicle has passed our item, and has not just continued from the reported item."""
         last = self._reported
-        return last is not None and (last <= self._seq < seq or self._seq < seq < last)
+        if last is None:
+            return False
+        has_moved_on = last <= self._seq < seq
+        has_jumped_back = self._seq < seq < last  # it jumped back to our item or before, and has passed it since
+        return has_moved_on or has_jumped_back
 
     def _send(self, now: float) -> None:
         self._attempts += 1
         self._sent_at = now
         self._outbox.append(MissionSetCurrent(self.target_system, self.target_component, self._seq))
-        self.deadline: float | None = now + min(
-            max(self.round_trip.timeout_s(), MISSION_CURRENT_INTERVAL_S),
-            max(self._started_at + self._idle_timeout_s - now, 0.01),
-        )
+        timeout_s = max(self.round_trip.timeout_s(), MISSION_CURRENT_INTERVAL_S)
+        remaining_s = max(self._started_at + self._idle_timeout_s - now, 0.01)
+        self.deadline: float | None = now + min(timeout_s, remaining_s)
 
 
 _CHECKSUM_ITEM = struct.Struct("<BHB4fiif")

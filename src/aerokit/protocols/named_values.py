@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 ValueT = TypeVar("ValueT")
 ResultT = TypeVar("ResultT")
 
-# The stream of a list has stopped when nothing arrives for this multiple of its longest pause so far.
+# The stream of a list has stopped when nothing arrives for this many times its longest pause so far.
 PAUSES = 4
 # Seconds in which a list may start. It is not requested again earlier, because that would restart it.
 MIN_START_TIMEOUT_S = 0.3
@@ -54,8 +54,8 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         self._count: int | None = None
         self._next = 0  # the index that the stream should send next
         self._is_streaming = False
-        self._quiet_at: float | None = None
-        self._last_at = self._pause_s = 0.0
+        self._quiet_at: float | None = None  # time at which the stream has stopped if no message arrives before
+        self._last_at = self._pause_s = 0.0  # time of the stream's last message, and its longest pause
         self._attempts = self._refreshes = 0
 
     def expire(self, now: float) -> None:
@@ -209,7 +209,11 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
 
 
 class NamedReads(NamedRequests[ValueT]):
-    """Read some values by name. If the `PROBE` is answered, but a name is not, its result is a ParameterRejected."""
+    """Read some values by name.
+
+    A name that is not answered results in a ParameterRejected if the component answered `PROBE`, a request that every
+    component with parameters answers.
+    """
 
     unknown_text: ClassVar[str]  # for example "the vehicle has no parameter"
     _is_probe_wanted = False
@@ -220,8 +224,10 @@ class NamedReads(NamedRequests[ValueT]):
         """Return the request for one value, by name or by index."""
 
     def _request(self, name: str) -> list[Message]:
-        self._probes_sent += name == PROBE
-        return [self._read_request(name, PROBE_INDEX if name == PROBE else BY_NAME)]
+        if name == PROBE:
+            self._probes_sent += 1
+            return [self._read_request(name, PROBE_INDEX)]
+        return [self._read_request(name, BY_NAME)]
 
     def _overdue(self, now: float) -> list[str]:
         return [name for name in self._window.overdue(now) if name != PROBE]
@@ -233,7 +239,8 @@ class NamedReads(NamedRequests[ValueT]):
         self._is_probe_wanted = False
 
     def _count_probe(self) -> None:
-        self._probes_answered = min(self._probes_answered + 1, self._probes_sent)  # duplicate answers do not count
+        # Duplicate answers do not count.
+        self._probes_answered = min(self._probes_answered + 1, self._probes_sent)
 
     def _reject_unknown(self, names: Iterable[str], now: float) -> None:
         for name in names:
@@ -242,10 +249,14 @@ class NamedReads(NamedRequests[ValueT]):
                 self._settle(name, ParameterRejected(text, name=name), now)
 
     def _loss_probability(self, attempts: int) -> float:
-        """Estimate the probability that the answers to ``attempts`` requests were all lost (rule of succession)."""
+        """Estimate the probability that the answers to ``attempts`` requests were all lost.
+
+        The losses of probes give the probability of each loss, by Laplace's rule of succession.
+        """
+        if not self._probes_answered:
+            return 1.0
         lost = self._probes_sent - self._probes_answered
-        chances = ((lost + 1 + i) / (self._probes_sent + 2 + i) for i in range(attempts))
-        return math.prod(chances) if self._probes_answered else 1.0
+        return math.prod((lost + 1 + i) / (self._probes_sent + 2 + i) for i in range(attempts))
 
 
 class UnexpectedAnswers(Generic[ValueT]):
@@ -269,4 +280,5 @@ class UnexpectedAnswers(Generic[ValueT]):
 
     def are_conclusive(self, *, is_unchanged: bool) -> bool:
         """Return True if the last answer is final. ``is_unchanged``: its value is the one from before the write."""
-        return len(self._answers) >= (ANSWERS_TO_SETTLE_UNCHANGED if is_unchanged else ANSWERS_TO_SETTLE)
+        needed = ANSWERS_TO_SETTLE_UNCHANGED if is_unchanged else ANSWERS_TO_SETTLE
+        return len(self._answers) >= needed

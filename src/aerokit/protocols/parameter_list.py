@@ -45,8 +45,8 @@ MAX_TICK_S = 1.1
 # little.
 NEAR_END = 20
 
-# After this many values, the stream counts as started, and the list is not requested again.
-STARTED = 2
+# After this many values of the stream, it counts as started, and the list is not requested again.
+MIN_STREAMED = 2
 
 # Number of PARAM_ERROR messages after which an index counts as nonexistent.
 MAX_REFUSALS = 2
@@ -73,11 +73,11 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._bytewise = bytewise
-        self._names: dict[str, Parameter] = {}
-        self._refusals: dict[int, int] = {}
-        self._streamed_count: int | None = None
-        self._needs_check = False
-        self._streamed = 0
+        self._names: dict[str, Parameter] = {}  # latest value of each name
+        self._refusals: dict[int, int] = {}  # index → number of PARAM_ERROR messages
+        self._streamed_count: int | None = None  # number of parameters according to the stream
+        self._needs_check = False  # True to look for missing indices
+        self._streamed = 0  # number of values of the stream
 
     # ---------------------------------------------------------------------------- as an exchange
 
@@ -104,12 +104,13 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     # ------------------------------------------------------------------------------------ answers
 
     def _on_value(self, message: ParamValue, now: float) -> None:
+        """Process a value: of the stream, the answer to a request, or (index 65535) one outside the list."""
         index = message.param_index
         if index == UNKNOWN_INDEX or message.param_id == HASH_NAME:
             self._on_uncounted_value(message, now)
             return
         is_streamed = self._is_streaming and index >= self._next
-        self._note_count(message.param_count, is_streamed)
+        self._record_count(message.param_count, is_streamed)
         if is_streamed:
             self._on_streamed_value(index, now)
         else:
@@ -118,17 +119,17 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._quiet_at = now + self._quiet_s()
         parameter = parameter_of(message, self._bytewise)
         if parameter.name not in self._names and len(self._names) >= MAX_PARAMETERS:
-            return
+            return  # a limit for the memory that a faulty vehicle can fill
         self._names[parameter.name] = parameter
         self._store(index, parameter, message.param_count, now)
 
     def _on_uncounted_value(self, message: ParamValue, now: float) -> None:
         # This is not part of the list: another client has set the parameter, or it is the hash, after which the list
         # starts.
-        self._note_count(message.param_count, False)
+        self._record_count(message.param_count, False)
         if message.param_id == HASH_NAME:
             self._last_at = now
-            self._quiet_at = now + self._quiet_s() if self._is_streaming else None
+            self._quiet_at = (now + self._quiet_s()) if self._is_streaming else None
         elif message.param_id in self._names:
             reported = parameter_of(message, self._bytewise)
             self._names[reported.name] = merge_update(self._names[reported.name], reported, self._bytewise)
@@ -141,24 +142,27 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             return
         self._refusals[index] = self._refusals.get(index, 0) + 1
         if self._refusals[index] >= MAX_REFUSALS and self._count is not None:
-            for beyond in range(index, self._count):
-                self._window.discard(beyond)
+            for nonexistent in range(index, self._count):
+                self._window.discard(nonexistent)
             self._count = min(self._count, index)
 
-    def _note_count(self, count: int, is_streamed: bool) -> None:
-        # ArduPilot's stream always has the count from its start, so its count is compared only with that of the stream.
-        if count == (self._streamed_count if is_streamed else self._count):
-            return
+    def _record_count(self, count: int, is_streamed: bool) -> None:
+        # ArduPilot's stream keeps the count from its start, although the number may change meanwhile. A streamed count
+        # is therefore compared only with the previous one of the stream.
         if is_streamed:
+            is_unchanged = count == self._streamed_count
             self._streamed_count = count
-        self._count, self._needs_check = count, True
+        else:
+            is_unchanged = count == self._count
+        if not is_unchanged:
+            self._count, self._needs_check = count, True
 
     def _on_streamed_value(self, index: int, now: float) -> None:
         """Request missing indices before this one, and measure the pauses of the stream."""
         for missing in range(self._next, min(index, self._count or 0)):
             self._window.request(missing)
         if self._streamed:
-            self._pause_s = max(now - self._last_at, 0.98 * self._pause_s)
+            self._pause_s = max(now - self._last_at, 0.98 * self._pause_s)  # a long pause is slowly forgotten
         self._next = index + 1
         self._streamed += 1
         self._last_at = now
@@ -178,7 +182,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         return ParamRequestRead(self.target_system, self.target_component, "", index)
 
     def _on_quiet(self, now: float) -> None:
-        if self._streamed < STARTED and (self._count is None or self._count > STARTED):
+        if self._streamed < MIN_STREAMED and (self._count is None or self._count > MIN_STREAMED):
             self._send_list_request(now)
             return
         self._end_stream()
@@ -192,7 +196,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         Answers to requests also count as messages, because they delay the stream.
         """
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
-        if self._streamed < STARTED:  # the only value may be the answer to the request by index
+        if self._streamed < MIN_STREAMED:  # the only value may be the answer to the request by index
             return max(seconds, MIN_START_TIMEOUT_S)
         return seconds if self._is_near_end else max(seconds, MAX_TICK_S)
 
@@ -216,11 +220,11 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         if count is None or len(self._received) < count:
             return
         parameters = [self._received[index][0] for index in range(count) if index in self._received]
-        names = {parameter.name for parameter in parameters}
-        adds_up = len(names) == count == len(self._names)
         if len(parameters) != count:
             return
-        if not adds_up and self._drop_stale(count):
+        names = {parameter.name for parameter in parameters}
+        is_consistent = len(names) == count == len(self._names)  # each name has exactly one index
+        if not is_consistent and self._drop_stale(count):
             self._needs_check = True
         else:
             self._finish(ParameterTable(self._in_order(parameters, names)))
@@ -228,7 +232,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     def _in_order(self, parameters: list[Parameter], names: set[str]) -> list[Parameter]:
         """Sort parameters by index, each name once with its latest value. Names without an index come last."""
         ordered = dict.fromkeys(parameter.name for parameter in parameters)
-        if self._refreshes == 0:
+        if self._refreshes == 0:  # otherwise the list has changed, and other names may no longer exist
             ordered.update(dict.fromkeys(name for name in self._names if name not in names))
         table = []
         for index, name in enumerate(ordered):

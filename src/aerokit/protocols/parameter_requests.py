@@ -137,7 +137,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
         self._probe = self._is_probe_wanted = probe
         self._possibly_stale = dict(possibly_stale)
         self._refused: set[str] = set()
-        self._alternatives = {name: tuple(others) for name, others in alternatives.items()}
+        self._alternatives = {name: tuple(names_of_same) for name, names_of_same in alternatives.items()}
 
     def _read_request(self, name: str, index: int) -> Message:
         return ParamRequestRead(self.target_system, self.target_component, name, index)
@@ -148,7 +148,8 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             self._is_probe_wanted = True
 
     def _on_value(self, message: ParamValue, now: float) -> None:
-        if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
+        is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE)
+        if is_probe_answer:
             self._count_probe()
             overtaken = self._window.on_answer(PROBE, now, overtaken=1)
             self._reject_unknown(overtaken, now)
@@ -157,18 +158,18 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
         if name and name in self._window:
             self._window.on_answer(name, now)
             reported = parameter_of(message, self._bytewise)
-            old = self._possibly_stale.pop(name, None)
-            if old is not None and same_value(old, reported.value):
-                self._window.request(name)
+            old_value = self._possibly_stale.pop(name, None)
+            if old_value is not None and same_value(old_value, reported.value):
+                self._window.request(name)  # it may be a delayed message: read once more
             else:
                 self._settle(name, reported, now)
                 self._reject_alternatives(name, now)
 
     def _reject_alternatives(self, name: str, now: float) -> None:
-        for other in self._alternatives.get(name, ()):
-            if other in self._names and other not in self._answers:
-                text = f"the vehicle has no parameter {other}; its name on this vehicle is {name}"
-                self._settle(other, ParameterRejected(text, name=other), now)
+        for alternative in self._alternatives.get(name, ()):
+            if alternative in self._names and alternative not in self._answers:
+                text = f"the vehicle has no parameter {alternative}; its name on this vehicle is {name}"
+                self._settle(alternative, ParameterRejected(text, name=alternative), now)
 
     def _on_error(self, message: ParamError, now: float) -> None:
         # PX4 also answers DOES_NOT_EXIST if it has no room to send the value, so the request is repeated once.
@@ -202,7 +203,7 @@ class ParameterWrites(ParameterRequests):
         self,
         target_system: int,
         target_component: int,
-        wanted: Iterable[Parameter],
+        requested: Iterable[Parameter],
         *,
         bytewise: bool,
         before: Mapping[str, float] = MappingProxyType({}),
@@ -210,11 +211,11 @@ class ParameterWrites(ParameterRequests):
         own_system: int = 0,
         **options: Unpack[TransferOptions],
     ) -> None:
-        self._wanted = {parameter.name: parameter for parameter in wanted}
+        self._requested = {parameter.name: parameter for parameter in requested}
         super().__init__(
             target_system,
             target_component,
-            self._wanted,
+            self._requested,
             bytewise=bytewise,
             window=WRITE_WINDOW,
             own_system=own_system,
@@ -222,34 +223,40 @@ class ParameterWrites(ParameterRequests):
         )
         self._before = dict(before)
         self._recent = set(recent)
-        self._to_set = set(self._wanted)  # names whose next request is a PARAM_SET
+        self._to_set = set(self._requested)  # names whose next request is a PARAM_SET
         self._unexpected: dict[str, UnexpectedAnswers[Parameter]] = {}
         self._stale_answers = StaleAnswerFilter(self.round_trip)
 
     def _request(self, name: str) -> list[Message]:
-        wanted, unexpected = self._wanted[name], self._unexpected.get(name)
+        requested, unexpected = self._requested[name], self._unexpected.get(name)
         read = ParamRequestRead(self.target_system, self.target_component, name, BY_NAME)
         if name not in self._to_set:
             return [read]
         self._to_set.remove(name)
-        write = set_message(self.target_system, self.target_component, name, wanted.value, wanted.type, self._bytewise)
-        return [write, read] if unexpected else [write]
+        write = set_message(
+            self.target_system, self.target_component, name, requested.value, requested.type, self._bytewise
+        )
+        if unexpected:
+            # The vehicle has answered an earlier write with another value. The read gets an answer even if the vehicle
+            # ignores this write.
+            return [write, read]
+        return [write]
 
     def _on_value(self, message: ParamValue, now: float) -> None:
         name = message.param_id
         if not self._window.attempts(name):
-            return  # This name was not requested yet.
-        wanted = self._wanted[name]
-        reported = self._with_integer_type(parameter_of(message, self._bytewise), wanted.type)
+            return  # An answer to another station: the write of this name was not sent yet.
+        requested = self._requested[name]
+        reported = self._with_integer_type(parameter_of(message, self._bytewise), requested.type)
         unexpected = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))
-        is_as_requested = same_value(reported.value, wanted.value)
+        is_as_requested = same_value(reported.value, requested.value)
         if is_as_requested and name in self._recent:
-            self._recent.remove(name)
+            self._recent.remove(name)  # this may be the answer to the write a moment ago: read once more
             unexpected.add(reported)
             self._window.on_answer(name, now)
             self._window.request(name)
             return
-        if is_as_requested and (reported.type == wanted.type or unexpected.ends_with(reported)):
+        if is_as_requested and (reported.type == requested.type or unexpected.ends_with(reported)):
             self._window.on_answer(name, now)
             self._settle(name, reported, now)
             return
@@ -277,5 +284,5 @@ class ParameterWrites(ParameterRequests):
         return f"PARAM_SET of {name} was not confirmed, sent {self._window.attempts(name)} times"
 
 
-def _is_same(one: Parameter, other: Parameter) -> bool:
-    return same_value(one.value, other.value) and one.type == other.type
+def _is_same(first: Parameter, second: Parameter) -> bool:
+    return same_value(first.value, second.value) and first.type == second.type

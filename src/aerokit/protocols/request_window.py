@@ -41,7 +41,8 @@ class _Request:
 class RequestWindow(Generic[KeyT]):
     """Requests by key. ``size`` requests are in flight, or more while that does not delay their answers.
 
-    A request is repeated when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
+    With ``duplicate_last``, the last few requests are sent twice from their third attempt on. A request is repeated
+    when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
     """
 
     def __init__(self, round_trip: RoundTrip, *, size: int = DEFAULT_SIZE, duplicate_last: bool = True) -> None:
@@ -49,10 +50,11 @@ class RequestWindow(Generic[KeyT]):
         self._fastest_s = math.inf
         self._duplicate_last = duplicate_last
         self._answered_at = self._silent_until = -math.inf
-        self._silences = 0
+        self._silences = 0  # time-outs of the whole link since the last answer
         self._waiting: dict[KeyT, None] = {}
         self._in_flight: dict[KeyT, _Request] = {}  # in the order in which they were sent
-        self._requests: dict[KeyT, _Request] = {}
+        self._requests: dict[KeyT, _Request] = {}  # sent at least once, not answered
+        # Answered after a repetition: seconds from the first transmission to the answer, which may answer either.
         self._ambiguous: dict[KeyT, float] = {}
         self._sent_count = 0
 
@@ -93,8 +95,9 @@ class RequestWindow(Generic[KeyT]):
         self._requests.pop(key, None)
 
     def on_answer(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
-        """Record an answer. Return the requests that were sent at least ``overtaken`` places earlier, which count as
-        lost.
+        """Record an answer. Return the requests that count as lost.
+
+        These are the requests that were sent at least ``overtaken`` places before the answered request.
         """
         request = self._requests.pop(key, None)
         self._waiting.pop(key, None)
@@ -108,17 +111,18 @@ class RequestWindow(Generic[KeyT]):
         elif not request.was_duplicated:
             self._ambiguous[key] = now - request.first_at
         lost = []
-        for other_key, other in self._in_flight.items():
-            if other.number > request.first_number - overtaken:
+        for key_in_flight, request_in_flight in self._in_flight.items():
+            if request_in_flight.number > request.first_number - overtaken:
                 break
-            lost.append(other_key)
+            lost.append(key_in_flight)
         self._requeue(lost)
         return lost
 
     def take_due(self, now: float) -> list[KeyT]:
         """Return the keys to request now, some of them twice, and count these requests as sent."""
         overdue = self.overdue(now)
-        if any(self._in_flight[key].sent_at >= self._answered_at for key in overdue):
+        is_silent = any(self._in_flight[key].sent_at >= self._answered_at for key in overdue)  # no answer since then
+        if is_silent:
             self._on_silence(now)
         self._requeue(overdue)
         due: list[KeyT] = []
@@ -135,7 +139,7 @@ class RequestWindow(Generic[KeyT]):
         return due
 
     def _on_silence(self, now: float) -> None:
-        # The link may be down because nothing arrives, so fewer requests are sent at a time, and less often.
+        # Nothing arrives, so the link may be down. Fewer requests are sent at a time, and less often.
         self._limit = self._size
         if now >= self._silent_until:
             self._silences += 1

@@ -59,27 +59,27 @@ def rtcm_messages(data: bytes) -> list[bytes]:
     Raises:
         InvalidArgument: ``data`` is empty, or a message is incomplete, damaged, or longer than 720 bytes.
     """
-    found: list[bytes] = []
+    messages: list[bytes] = []
     begin = 0
-    while begin < len(data) or not found:
+    while begin < len(data) or not messages:  # empty data is refused, too
         size = _frame_size(data, begin) if len(data) - begin > HEADER_SIZE else None
-        where = f"rtcm (byte {begin} of {len(data)})"
+        subject = f"rtcm (byte {begin} of {len(data)})"
         if size is None:
-            raise InvalidArgument(f"{where} is not allowed: not the start of an RTCM 3 message, which is 0xD3")
+            raise InvalidArgument(f"{subject} is not allowed: not the start of an RTCM 3 message, which is 0xD3")
         frame = data[begin : begin + size]
         if len(frame) < size:
             raise InvalidArgument(
-                f"{where} is not allowed: the message has {size} bytes, but only {len(frame)} were given"
+                f"{subject} is not allowed: the message has {size} bytes, but only {len(frame)} were given"
             )
         if crc24q(frame):
-            raise InvalidArgument(f"{where} is not allowed: the CRC-24Q of the message is wrong")
+            raise InvalidArgument(f"{subject} is not allowed: the CRC-24Q of the message is wrong")
         if size > MAX_MESSAGE_SIZE:
             raise InvalidArgument(
-                f"{where} is not allowed: the message has {size} bytes, but GPS_RTCM_DATA carries {MAX_MESSAGE_SIZE}"
+                f"{subject} is not allowed: the message has {size} bytes, but GPS_RTCM_DATA carries {MAX_MESSAGE_SIZE}"
             )
-        found.append(frame)
+        messages.append(frame)
         begin += size
-    return found
+    return messages
 
 
 class RtcmReader:
@@ -97,8 +97,10 @@ class RtcmReader:
         buffer, begin = self._buffer + data, 0
         while True:
             start = buffer.find(PREAMBLE, begin)
-            self.skipped_bytes += (len(buffer) if start < 0 else start) - begin
-            begin = len(buffer) if start < 0 else start
+            if start < 0:
+                start = len(buffer)
+            self.skipped_bytes += start - begin
+            begin = start
             if len(buffer) - begin < HEADER_SIZE:
                 break
             size = _frame_size(buffer, begin)
@@ -116,9 +118,9 @@ class RtcmReader:
 def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:
     """Return one RTCM message of 1 to 720 bytes as GPS_RTCM_DATA messages.
 
-    Flags: bit 0 is set for a fragment, bits 1 and 2 are the fragment number, bits 3 to 7 the sequence number. A
-        receiver considers a message complete after four fragments, or after a fragment that is not full. If a message
-        has fewer than four fragments and the last one is full, an empty fragment follows.
+    Bit 0 of the flags is set for a fragment, bits 1 and 2 are the fragment number, bits 3 to 7 the sequence number. A
+    receiver considers a message complete after four fragments, or after a fragment that is not full. If a message has
+    fewer than four fragments and the last one is full, an empty fragment follows.
     """
     from aerokit.mavlink.messages import GpsRtcmData
 

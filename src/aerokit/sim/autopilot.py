@@ -81,7 +81,7 @@ class VehicleSigning:
         self._streams = {}
         self.load()
 
-    def _on_setup(self, message: SetupSigning, _: Channel) -> None:
+    def _on_setup(self, message: SetupSigning, _channel: Channel) -> None:
         if not self.may_change():
             return
         self.key = SigningKey(message.secret_key) if any(message.secret_key) else None
@@ -109,7 +109,7 @@ class ReceivedCorrections:
         self._vehicle = vehicle
         self.messages: list[bytes] = []
         self._received_at = -math.inf
-        self._sequence, self._pieces = -1, dict[int, bytes]()
+        self._sequence, self._fragments = -1, dict[int, bytes]()
         vehicle.on(GpsRtcmData, lambda message, _: self._on_fragment(message))
 
     @property
@@ -118,18 +118,19 @@ class ReceivedCorrections:
 
     def _on_fragment(self, message: GpsRtcmData) -> None:
         data = bytes(message.data[: message.len])
-        if not message.flags & 1:
+        is_fragmented, fragment_id, sequence = message.flags & 1, message.flags >> 1 & 3, message.flags >> 3
+        if not is_fragmented:
             self._add(data)
             return
-        number, sequence = message.flags >> 1 & 3, message.flags >> 3
-        if sequence != self._sequence or number in self._pieces:
-            self._pieces.clear()
-        self._sequence, self._pieces[number] = sequence, data
-        is_full = len(self._pieces) == MAX_FRAGMENTS
-        is_ended = is_full or any(len(piece) < FRAGMENT_SIZE for piece in self._pieces.values())
-        if is_ended and len(self._pieces) == max(self._pieces) + 1:
-            self._add(b"".join(self._pieces[index] for index in range(len(self._pieces))))
-            self._pieces.clear()
+        if sequence != self._sequence or fragment_id in self._fragments:
+            self._fragments.clear()
+        self._sequence, self._fragments[fragment_id] = sequence, data
+        # A fragment that is not full is the last one; there is none if the message fills all fragments.
+        has_short = any(len(fragment) < FRAGMENT_SIZE for fragment in self._fragments.values())
+        has_last = has_short or len(self._fragments) == MAX_FRAGMENTS
+        if has_last and len(self._fragments) == max(self._fragments) + 1:
+            self._add(b"".join(self._fragments[index] for index in range(len(self._fragments))))
+            self._fragments.clear()
 
     def _add(self, message: bytes) -> None:
         self.messages.append(message)
@@ -138,7 +139,7 @@ class ReceivedCorrections:
 
 
 # FIRMWARE_VERSION_TYPE by the suffix of the version.
-_RELEASES = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "": 255, "official": 255}
+_RELEASE_TYPES = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "": 255, "official": 255}
 
 
 class SimulatedAutopilot(SimulatedVehicle):
@@ -205,8 +206,9 @@ class SimulatedAutopilot(SimulatedVehicle):
     def version_number(self) -> int:
         """Firmware version as AUTOPILOT_VERSION packs it."""
         numbers, _, release = self.version.partition("-")
-        major, minor, patch = (int(part) for part in (*numbers.split("."), "0", "0")[:3])
-        return major << 24 | minor << 16 | patch << 8 | _RELEASES.get(release, 0)
+        padded = (*numbers.split("."), "0", "0")  # "4.7" means 4.7.0.
+        major, minor, patch = (int(number) for number in padded[:3])
+        return major << 24 | minor << 16 | patch << 8 | _RELEASE_TYPES.get(release, 0)
 
     def serve_timesync(self) -> None:
         self.on(m.Timesync, self._on_timesync)
@@ -272,11 +274,10 @@ class SimulatedBattery:
 
     def drain(self, current_a: float, dt: float) -> None:
         self.current_a = current_a
-        used_mah = current_a * dt / 3.6
+        used_mah = current_a * dt / 3.6  # 3.6 As are 1 mAh.
         self.consumed_mah += used_mah
         self.consumed_wh += used_mah * self.voltage_v / 1000.0
-        left_mah = self._charge_mah - used_mah
-        self._charge_mah = left_mah if left_mah > 0.0 else 0.0
+        self._charge_mah = max(0.0, self._charge_mah - used_mah)
 
     def _resting_cell_volts(self) -> float:
         percent = 100.0 * self._charge_mah / self.capacity_mah

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Container, Hashable, Iterable
+from collections.abc import Container, Hashable, Iterable
 from heapq import heappop, heappush, heapreplace
 from typing import Any, TypeVar
 
@@ -24,32 +24,36 @@ def fitted(message: MessageT) -> MessageT:
 
     Values of a wrong type are not changed, so that encoding them reveals the bug.
     """
-    found = copy.copy(message)
-    for field in found.FIELDS:
-        value = getattr(found, field.name)
+    fitting = copy.copy(message)
+    for field in fitting.FIELDS:
+        value = getattr(fitting, field.name)
         if field.problem(value) is not None:
-            setattr(found, field.name, _fit_field(field, value))
-    return found
+            setattr(fitting, field.name, _fit_field(field, value))
+    return fitting
 
 
 def _fit_field(field: Field, value: Any) -> Any:
+    if field.type == "char" and isinstance(value, str) and field.is_text:
+        max_bytes = field.array_length or 1
+        return value.encode(errors="replace")[:max_bytes].decode(errors="ignore")
     if field.type == "char":
-        if not field.is_text:
-            return value[: field.array_length] if isinstance(value, bytes) else value
-        is_text = isinstance(value, str)
-        return value.encode(errors="replace")[: field.array_length or 1].decode(errors="ignore") if is_text else value
-    fit = _fit_function(field.type)
-    return tuple(map(fit, value)) if isinstance(value, tuple) else fit(value)
+        return value[: field.array_length] if isinstance(value, bytes) and not field.is_text else value
+    if isinstance(value, tuple):
+        return tuple(_fit_number(field.type, element) for element in value)
+    return _fit_number(field.type, value)
 
 
-def _fit_function(kind: str) -> Callable[[Any], Any]:
-    if kind in INTEGER_RANGES:
-        low, high = INTEGER_RANGES[kind]
-        return lambda value: max(low, min(high, value)) if isinstance(value, int) else value
-    return lambda value: math.copysign(math.inf, value) if kind == "float" and abs(value) > _MAX_FLOAT32 else value
+def _fit_number(type_: str, value: Any) -> Any:
+    if type_ in INTEGER_RANGES:
+        low, high = INTEGER_RANGES[type_]
+        return max(low, min(high, value)) if isinstance(value, int) else value
+    if type_ == "float" and abs(value) > _MAX_FLOAT32:
+        return math.copysign(math.inf, value)
+    return value
 
 
 MAX_PEERS = 256
+"""Peers whose partial frames a `MessageReader` keeps; beyond this number, the oldest peer is forgotten."""
 
 
 class MessageReader:
@@ -76,15 +80,15 @@ class SharedMessageReader(MessageReader):
 
     def __init__(self) -> None:
         super().__init__(None)
-        self._read: list[Message] | None = None
+        self._cached: list[Message] | None = None
 
     def messages(self, data: bytes, now: float, peer: Hashable) -> list[Message]:
-        if self._read is None:
-            self._read = super().messages(data, now, peer)
-        return self._read
+        if self._cached is None:
+            self._cached = super().messages(data, now, peer)
+        return self._cached
 
     def forget(self) -> None:
-        self._read = None
+        self._cached = None
 
 
 class Streams:
@@ -95,6 +99,8 @@ class Streams:
     def __init__(self) -> None:
         self.next_due: float = math.inf
         """Time of the next message; infinity when nothing is streamed."""
+        # Interval and token by message id. Every change of an interval has a new token: entries of the heap with
+        # another token are obsolete.
         self._intervals: dict[int, tuple[float, int]] = {}
         # (due time, token, message id, time of the first message, number of messages since then)
         self._heap: list[tuple[float, int, int, float, int]] = []
@@ -108,7 +114,7 @@ class Streams:
         else:
             self._intervals[message_id] = (interval_s, self._token)
             heappush(self._heap, (now, self._token, message_id, now, 0))
-        self.take_due(-math.inf)
+        self._update_next_due()
 
     def interval(self, message_id: int) -> float:
         """Return the interval in seconds; 0 if the message is not streamed."""
@@ -124,7 +130,10 @@ class Streams:
             (due + seconds, token, message_id, start + seconds, count)
             for due, token, message_id, start, count in self._heap
         ]
-        self.take_due(-math.inf)
+        self._update_next_due()
+
+    def _update_next_due(self) -> None:
+        self.take_due(-math.inf)  # Nothing is due at this time, so this only updates the time.
 
     def take_due(self, now: float) -> list[int]:
         """Return the message ids that are due, and schedule each again."""
@@ -132,8 +141,8 @@ class Streams:
         heap, intervals = self._heap, self._intervals
         while heap:
             due, token, message_id, start, count = heap[0]
-            current = intervals.get(message_id)
-            if current is None or current[1] != token:  # The stream was stopped or replaced.
+            interval, current_token = intervals.get(message_id, (0.0, None))
+            if token != current_token:  # The stream was stopped or replaced.
                 heappop(heap)
                 continue
             if due > now:
@@ -141,11 +150,11 @@ class Streams:
                 return ids
             ids.append(message_id)
             # Rounded, so that streams of different rates are due at the same instants.
-            following = round(start + (count + 1) * current[0], 9)
+            following = round(start + (count + 1) * interval, 9)
             if following > now:
                 heapreplace(heap, (following, token, message_id, start, count + 1))
-            else:
-                heapreplace(heap, (now + current[0], token, message_id, now, 1))
+            else:  # The stream is late: it starts again now.
+                heapreplace(heap, (now + interval, token, message_id, now, 1))
         self.next_due = math.inf
         return ids
 
@@ -160,7 +169,7 @@ class Channel:
         self.version = version
         self.streams: Streams = Streams()
         self._wanted = wanted
-        self._own = (system_id, component_id)
+        self._own_ids = (system_id, component_id)
         self.reader: MessageReader = MessageReader(wanted)
         """Decodes incoming bytes; vehicles on one link may share a reader."""
         self._encoders: dict[tuple[int, int], FrameEncoder] = {}
@@ -188,7 +197,7 @@ class Channel:
         """Return a frame with the sender's next sequence number; empty if MAVLink 1 has no such message."""
         if self.version == 1 and message.ID > 255:
             return b""
-        sender = self._own if sender is None else sender
+        sender = self._own_ids if sender is None else sender
         encoder = self._encoders.get(sender)
         if encoder is None:
             encoder = self._encoders[sender] = FrameEncoder(*sender, version=self.version)
@@ -235,15 +244,13 @@ class Channel:
 
 def datagrams(pieces: Iterable[bytes]) -> list[bytes]:
     """Join pieces into as few datagrams as possible."""
-    found: list[bytes] = []
-    size = 0
-    together: list[bytes] = []
-    for data in pieces:
-        if together and size + len(data) > _DATAGRAM_SIZE:
-            found.append(b"".join(together))
-            together, size = [], 0
-        together.append(data)
-        size += len(data)
-    if together:
-        found.append(b"".join(together))
-    return found
+    joined: list[bytes] = []
+    datagram = b""
+    for piece in pieces:
+        if datagram and len(datagram) + len(piece) > _DATAGRAM_SIZE:
+            joined.append(datagram)
+            datagram = b""
+        datagram += piece
+    if datagram:
+        joined.append(datagram)
+    return joined

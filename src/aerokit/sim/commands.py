@@ -35,7 +35,7 @@ class CommandServer(commands.CommandDispatcher):
         self._vehicle = vehicle
 
     def dispatch(self, command: ReceivedCommand) -> None:
-        fault = self._vehicle.faults.take(command.command)
+        fault = self._vehicle.faults.next_command_fault(command.command)
         if fault is not None and fault.ignore:
             return
         if fault is not None and fault.refuse_with is not None:
@@ -53,9 +53,9 @@ class CommandServer(commands.CommandDispatcher):
         """Send the acknowledgement, modified by ``fault``."""
         fault = CommandFault() if fault is None else fault
         if fault.progress:
-            without = CommandFault(acks=fault.acks, delay_s=fault.delay_s)
+            final_fault = CommandFault(acks=fault.acks, delay_s=fault.delay_s)
             progress = CommandProgress(fault.progress, fault.progress_interval_s, result)
-            self.report(command, progress, lambda: self._answer_with(command, result, without))
+            self.report(command, progress, lambda: self._answer_with(command, result, final_fault))
             return
         for _ in range(fault.acks):
             if fault.delay_s > 0:
@@ -66,7 +66,7 @@ class CommandServer(commands.CommandDispatcher):
 
 PositionTarget = SetPositionTargetLocalNed | SetPositionTargetGlobalInt
 
-# Arithmetic on plain integers is ten times as fast as on flags.
+# Bits of the three axes. Plain integers, because arithmetic on flags takes ten times as long.
 _POSITION = (int(Mask.X_IGNORE), int(Mask.Y_IGNORE), int(Mask.Z_IGNORE))
 _VELOCITY = (int(Mask.VX_IGNORE), int(Mask.VY_IGNORE), int(Mask.VZ_IGNORE))
 _ACCELERATION = (int(Mask.AX_IGNORE), int(Mask.AY_IGNORE), int(Mask.AZ_IGNORE))
@@ -113,14 +113,16 @@ class Setpoint:
 
     def axes(self, position: Ned) -> tuple[Ned, Ned, Ned]:
         """Return position, velocity and acceleration; an axis is NaN if it is ignored or not finite."""
-        vectors = ((position, _POSITION), (self.velocity, _VELOCITY), (self.acceleration, _ACCELERATION))
-        p, v, a = (self._masked(vector, bits) for vector, bits in vectors)
-        return p, v, a
+        return (
+            self._masked(position, _POSITION),
+            self._masked(self.velocity, _VELOCITY),
+            self._masked(self.acceleration, _ACCELERATION),
+        )
 
-    def _masked(self, vector: Ned, bits: tuple[int, int, int]) -> Ned:
+    def _masked(self, vector: Ned, ignore_bits: tuple[int, int, int]) -> Ned:
         x, y, z = (
-            math.nan if self.mask & bit or not math.isfinite(value) else value
-            for value, bit in zip(vector, bits, strict=True)
+            math.nan if self.mask & ignore_bit or not math.isfinite(value) else value
+            for value, ignore_bit in zip(vector, ignore_bits, strict=True)
         )
         return (x, y, z)
 

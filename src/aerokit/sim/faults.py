@@ -72,7 +72,7 @@ class Faults:
     mute_parameters: set[str] = field(default_factory=set)
     commands: dict[int, CommandFault] = field(default_factory=dict)
 
-    if not TYPE_CHECKING:  # a type checker reports misspelled names, so hide this method from it
+    if not TYPE_CHECKING:  # A type checker that sees this method does not report misspelled names.
 
         def __setattr__(self, name: str, value: object) -> None:
             # A misspelled fault would otherwise be accepted and change nothing.
@@ -107,8 +107,9 @@ class Faults:
         """Return True if this message is lost while being sent; decrements the counters."""
         if self.silent or (self.heartbeats_stopped and message.ID == Heartbeat.ID):
             return True
-        if left := self.lost_messages.get(message.ID, 0):
-            self.lost_messages[message.ID] = left - 1
+        remaining = self.lost_messages.get(message.ID, 0)
+        if remaining:
+            self.lost_messages[message.ID] = remaining - 1
             return True
         if self.drop_outgoing > 0:
             self.drop_outgoing -= 1
@@ -143,7 +144,7 @@ class Faults:
         else:
             self.commands.pop(command, None)
 
-    def take(self, command: int) -> CommandFault | None:
+    def next_command_fault(self, command: int) -> CommandFault | None:
         """Return the fault to apply to this command now, or None; decrements its ``times``."""
         fault = self.commands.get(command)
         if fault is not None and fault.times is not None:

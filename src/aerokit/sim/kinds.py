@@ -40,8 +40,8 @@ def kind_class(name: str) -> type[SimulatedVehicle]:
             f"vehicle = {short_repr(name)} is not one of: {', '.join(_KINDS)}{did_you_mean(name, _KINDS)}"
         )
     module, class_name = _KINDS[name]
-    found: type[SimulatedVehicle] = getattr(import_module(module), class_name)
-    return found
+    vehicle_class: type[SimulatedVehicle] = getattr(import_module(module), class_name)
+    return vehicle_class
 
 
 def simulated(name: str, **options: Any) -> SimulatedVehicle:
@@ -57,8 +57,7 @@ _TIMEOUT_PARAMETERS = (
     "FS_GCS_TIMEOUT", "FS_LONG_TIMEOUT", "FS_PILOT_TIMEOUT", "GUID_TIMEOUT", "RC_OVERRIDE_TIME",
     "DISARM_DELAY", "COM_DISARM_PRFLT", "COM_DL_LOSS_T", "COM_OBC_LOSS_T", "COM_OF_LOSS_T", "COM_RC_LOSS_T",
 )  # fmt: skip
-# DISARM_DELAY is an INT8.
-_INT8_MAX = 127.0
+_INT8_MAX = 127.0  # limit of DISARM_DELAY
 
 
 def scale_timeouts(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leave: Collection[str] = ()) -> None:
@@ -79,5 +78,5 @@ def scale_timeouts(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leav
 def _scale(parameters: SimParameters, speedup: float, leave: Collection[str]) -> None:
     for name in _TIMEOUT_PARAMETERS:
         if name in parameters and name not in leave:
-            longer = parameters[name] * speedup
-            parameters[name] = min(longer, _INT8_MAX) if name == "DISARM_DELAY" else longer
+            scaled = parameters[name] * speedup
+            parameters[name] = min(scaled, _INT8_MAX) if name == "DISARM_DELAY" else scaled

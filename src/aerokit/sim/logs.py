@@ -43,15 +43,15 @@ class SimulatedLog:
 
     def make(self) -> bytes:
         """Return the content. The contents of two logs with the same seed are equal up to the shorter length."""
-        words = -(-self.size // 4)
-        return (SAMPLE_LOG + random.Random(self._noise).randbytes(4 * words))[: self.size]
+        words = -(-self.size // 4)  # rounded up
+        return (SAMPLE_LOG + random.Random(self._content_seed).randbytes(4 * words))[: self.size]
 
     def grown(self, count: int, time_utc: int) -> SimulatedLog:
         """Return this log extended by ``count`` bytes."""
-        return SimulatedLog(self.size + count, time_utc, self._noise)
+        return SimulatedLog(self.size + count, time_utc, self._content_seed)
 
     @property
-    def _noise(self) -> int:
+    def _content_seed(self) -> int:
         return self.size * 31 + self.time_utc if self.seed is None else self.seed
 
 
@@ -78,7 +78,7 @@ class LogServer:
         self._erase_files, self._append_to_file = erase_files, append_to_file
         self._outgoing: deque[Callable[[], Message]] = deque()
         self._channel: Channel | None = None
-        self._transfer = 0
+        self._transfer_number = 0
         self._content: tuple[int, bytes] = (-1, b"")
         vehicle.on(LogRequestList, self._on_list)
         vehicle.on(LogRequestData, self._on_data)
@@ -91,7 +91,8 @@ class LogServer:
         return bool(self._outgoing)
 
     def restart(self) -> None:
-        self._transfer += 1
+        """Abort the running transfer."""
+        self._transfer_number += 1
         self._outgoing.clear()
 
     def _on_list(self, request: LogRequestList, channel: Channel) -> None:
@@ -117,9 +118,9 @@ class LogServer:
 
     def write_on(self, count: int, time_utc: int) -> None:
         """Extend the newest log by ``count`` bytes and update its time."""
-        before = self.logs[-1]
-        self.logs[-1] = before.grown(count, time_utc)
-        self._append_to_file(len(self.logs) - 1, self.logs[-1].make()[before.size :])
+        old = self.logs[-1]
+        self.logs[-1] = old.grown(count, time_utc)
+        self._append_to_file(len(self.logs) - 1, self.logs[-1].make()[old.size :])
 
     def blocks(self, number: int, log_id: int, offset: int, count: int) -> list[Callable[[], Message]]:
         """Return functions that create the LOG_DATA blocks of a range, or one empty block for a range without data."""
@@ -133,10 +134,10 @@ class LogServer:
         self.restart()
         self._outgoing.extend(messages)
         self._channel = channel
-        self._send_next(self._transfer)
+        self._send_next(self._transfer_number)
 
     def _send_next(self, transfer: int) -> None:
-        if transfer != self._transfer:
+        if transfer != self._transfer_number:  # This transfer was aborted.
             return
         for _ in range(min(self.burst, len(self._outgoing))):
             self._vehicle.send(self._outgoing.popleft()(), self._channel)
@@ -168,10 +169,11 @@ class ArduPilotLogServer(LogServer):
         if self.is_busy:
             self._vehicle.info("Log download in progress")
             return
-        count = len(self.logs)
-        first, last = (max(1, request.start), min(count, request.end)) if count else (0, 0)
-        numbers = range(first, last + 1) if first <= last else range(0)
-        self.transfer([lambda n=n: self._entry(n, last) for n in numbers], channel)  # type: ignore[misc]
+        first, last = max(1, request.start), min(len(self.logs), request.end)
+        if not self.logs:  # The answer is then a single empty entry with number 0.
+            first = last = 0
+        numbers = range(first, last + 1)
+        self.transfer([lambda number=number: self._entry(number, last) for number in numbers], channel)  # type: ignore[misc]
 
     def _entry(self, number: int, last: int) -> LogEntry:
         if number == 0:
@@ -217,7 +219,7 @@ class Px4LogServer(LogServer):
         count = len(self.logs)
         last = count if request.end == 0xFFFF else request.end
         numbers = range(request.start, count)
-        self.transfer([lambda n=n: self._entry(n, last) for n in numbers], channel)  # type: ignore[misc]
+        self.transfer([lambda number=number: self._entry(number, last) for number in numbers], channel)  # type: ignore[misc]
 
     def _entry(self, number: int, last: int) -> LogEntry:
         log = self.logs[number]
@@ -228,8 +230,8 @@ class Px4LogServer(LogServer):
         if not is_available or request.ofs >= self.logs[request.id].size:
             self.restart()
             return
-        whole = -(-request.count // _BLOCK) * _BLOCK or _BLOCK
-        self.transfer(self.blocks(request.id, request.id, request.ofs, whole), channel)
+        whole_blocks = max(1, -(-request.count // _BLOCK))  # rounded up
+        self.transfer(self.blocks(request.id, request.id, request.ofs, whole_blocks * _BLOCK), channel)
 
 
 def _block(data: bytes, log_id: int, start: int, end: int) -> LogData:

@@ -55,7 +55,7 @@ _FILES = {
     "fence.dat": MavMissionType.FENCE,
     "rally.dat": MavMissionType.RALLY,
 }
-# Zero bytes between the parts of an incomplete upload decode as this item.
+# A part of a file that was not received consists of zero bytes, which decode as this item.
 _EMPTY = MissionItem(0, 0, autocontinue=False)
 _PLACEHOLDER_SIZE = 1 << 20
 
@@ -112,6 +112,8 @@ class _Writer(UploadedFile):
             items = unpack_items(bytes(self.content[: header.length]))
         except (RemoteProtocolError, InvalidArgument):
             raise FileFault(EINVAL) from None
+        # ArduPilot counts the items by the length of the file, and rejects an item of zero bytes
+        # (AP_Filesystem_Mission.cpp, finish_upload).
         if len(self.content) >= header.length + MissionItemInt.LENGTH or _EMPTY in items:
             raise FileFault(EINVAL)
         clear = not header.options & NO_CLEAR

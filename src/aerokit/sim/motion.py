@@ -77,9 +77,11 @@ HOME = (-35.363261, 149.165230, 584.09)
 GRAVITY_M_S2 = 9.80665
 _DRAG_PER_S = 0.33  # Deceleration divided by airspeed: a 450 mm quadrotor leans 20 degrees at 10 m/s.
 _VELOCITY_TIME_CONSTANT_S = 0.3
-_LEAN_KEPT_PER_S = (1.0 - 0.02 / 0.15) ** 50  # A time constant of 0.15 s.
+# Part of a lean error that remains after a second: 50 steps of 0.02 s with a time constant of 0.15 s.
+_LEAN_KEPT_PER_S = (1.0 - 0.02 / 0.15) ** 50
 _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
+BRAKING_SHARE = 0.7  # Share of the acceleration limit with which a vehicle plans to brake; the rest is a reserve.
 _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
 # Limits of steady motion, for which steps of 0.1 s suffice. In such a step, a constant jerk of 4 m/s³ changes the
 # position by jerk · 0.1³ / 6, which is less than 1 mm. Touchdown does not count as steady, so its time and speed come
@@ -102,16 +104,19 @@ def _clamp(value: float, limit: float) -> float:
 
 def velocity_to_landing_target(north: float, east: float) -> tuple[float, float]:
     """Return the horizontal velocity (m/s) of a precision landing whose target is this many metres away."""
-    share = min(_APPROACH_PER_S, _MAX_APPROACH_M_S / max(math.hypot(north, east), 1e-6))
-    return (north * share, east * share)
+    gain_per_s = min(_APPROACH_PER_S, _MAX_APPROACH_M_S / max(math.hypot(north, east), 1e-6))
+    return (north * gain_per_s, east * gain_per_s)
 
 
 def approach_speed(distance: float, gain: float, deceleration: float) -> float:
-    """Return the highest speed at which a vehicle can still stop at a point ``distance`` metres away."""
-    linear = deceleration / (gain * gain)
-    if distance <= linear:
+    """Return the highest speed at which a vehicle can still stop at a point ``distance`` metres away.
+
+    The speed is ``gain`` times the distance near the point, and the square-root curve of constant deceleration beyond.
+    """
+    linear_distance = deceleration / (gain * gain)
+    if distance <= linear_distance:
         return distance * gain
-    return math.sqrt(2.0 * deceleration * (distance - linear / 2.0))
+    return math.sqrt(2.0 * deceleration * (distance - linear_distance / 2.0))
 
 
 @dataclass
@@ -170,9 +175,11 @@ class Motion:
         """Vertical speed at the last touchdown."""
         self._gust_north = self._gust_east = 0.0
         self._jerk_m_s3 = math.inf
-        self._wanted = (0.0, 0.0, 0.0)
-        self._leaning: tuple[float, float] | None = None
-        self._accelerating = False
+        # Target velocity or acceleration (north, east, down).
+        self._target = (0.0, 0.0, 0.0)
+        self._target_is_acceleration = False
+        # Target roll and pitch, which replace the horizontal part of the target unless they are None.
+        self._target_lean: tuple[float, float] | None = None
         self._wanted_yaw: float | None = None
         self._wanted_yaw_rate = 0.0
 
@@ -183,15 +190,20 @@ class Motion:
 
     def seek_velocity(self, north: float, east: float, down: float) -> None:
         """Fly at this velocity (m/s)."""
-        self._wanted, self._leaning, self._accelerating = (north, east, down), None, False
+        self._set_target((north, east, down))
 
     def seek_acceleration(self, north: float, east: float, down: float) -> None:
         """Apply this acceleration (m/s²) until the next target."""
-        self._wanted, self._leaning, self._accelerating = (north, east, down), None, True
+        self._set_target((north, east, down), is_acceleration=True)
 
     def seek_attitude(self, roll: float, pitch: float, velocity_down: float) -> None:
         """Hold these angles (rad) and this vertical speed."""
-        self._wanted, self._leaning, self._accelerating = (0.0, 0.0, velocity_down), (roll, pitch), False
+        self._set_target((0.0, 0.0, velocity_down), lean=(roll, pitch))
+
+    def _set_target(
+        self, target: Ned, *, is_acceleration: bool = False, lean: tuple[float, float] | None = None
+    ) -> None:
+        self._target, self._target_is_acceleration, self._target_lean = target, is_acceleration, lean
 
     def seek_position(
         self, north: float, east: float, down: float, *, speed: float, climb: float, descent: float
@@ -201,9 +213,9 @@ class Motion:
         distance = math.hypot(offset_north, offset_east)
         scale = 0.0
         if distance > 1e-6:
-            deceleration = 0.7 * self.limits.acceleration_m_s2
+            deceleration = BRAKING_SHARE * self.limits.acceleration_m_s2
             scale = min(speed, approach_speed(distance, 1.0, deceleration)) / distance
-        vertical = approach_speed(abs(offset_down), 1.0, 0.7 * self.limits.vertical_acceleration_m_s2)
+        vertical = approach_speed(abs(offset_down), 1.0, BRAKING_SHARE * self.limits.vertical_acceleration_m_s2)
         vertical = min(vertical, descent if offset_down > 0 else climb)
         self.seek_velocity(offset_north * scale, offset_east * scale, math.copysign(vertical, offset_down))
 
@@ -265,7 +277,7 @@ class Motion:
         self.velocity_north = self.velocity_east = self.velocity_down = 0.0
         self.acceleration_north = self.acceleration_east = self.acceleration_down = 0.0
         self.roll = self.pitch = self.roll_rate = self.pitch_rate = self.yaw_rate = 0.0
-        self._wanted, self._leaning, self._accelerating = (0.0, 0.0, 0.0), None, False
+        self._set_target((0.0, 0.0, 0.0))
         self._wanted_yaw, self._wanted_yaw_rate = None, 0.0
 
     def _update_gusts(self, dt: float) -> None:
@@ -275,28 +287,26 @@ class Motion:
 
     def _commanded_acceleration(self) -> tuple[float, float, float]:
         limits = self.limits
-        wanted_north, wanted_east, wanted_down = self._wanted
-        down = wanted_down
-        if not self._accelerating:
-            down = (wanted_down - self.velocity_down) / _VELOCITY_TIME_CONSTANT_S
+        north, east, down = self._target
+        if not self._target_is_acceleration:
+            north = (north - self.velocity_north) / _VELOCITY_TIME_CONSTANT_S
+            east = (east - self.velocity_east) / _VELOCITY_TIME_CONSTANT_S
+            down = (down - self.velocity_down) / _VELOCITY_TIME_CONSTANT_S
         down = _clamp(down, limits.vertical_acceleration_m_s2)
-        if self._leaning is not None:
-            north, east = self._acceleration_from_lean(*self._leaning)
-            return north, east, down
-        north, east = wanted_north, wanted_east
-        if not self._accelerating:
-            north = (wanted_north - self.velocity_north) / _VELOCITY_TIME_CONSTANT_S
-            east = (wanted_east - self.velocity_east) / _VELOCITY_TIME_CONSTANT_S
-        size = math.hypot(north, east)
-        if size > limits.acceleration_m_s2:
-            north, east = north * limits.acceleration_m_s2 / size, east * limits.acceleration_m_s2 / size
+        if self._target_lean is not None:
+            roll, pitch = self._target_lean
+            return (*self._acceleration_from_lean(roll, pitch), down)
+        horizontal = math.hypot(north, east)
+        if horizontal > limits.acceleration_m_s2:
+            north = north * limits.acceleration_m_s2 / horizontal
+            east = east * limits.acceleration_m_s2 / horizontal
         return north, east, down
 
     def _acceleration_from_lean(self, roll: float, pitch: float) -> tuple[float, float]:
-        lean = self.limits.lean_rad
+        max_lean = self.limits.lean_rad
         forward, right = (
-            -GRAVITY_M_S2 * math.tan(_clamp(pitch, lean)),
-            GRAVITY_M_S2 * math.tan(_clamp(roll, lean)),
+            -GRAVITY_M_S2 * math.tan(_clamp(pitch, max_lean)),
+            GRAVITY_M_S2 * math.tan(_clamp(roll, max_lean)),
         )
         cos_yaw, sin_yaw = math.cos(self.yaw), math.sin(self.yaw)
         drag_north, drag_east = self._drag()

@@ -46,7 +46,7 @@ class ParameterServer(servers.ParameterProtocolServer):
     def clamped(self, name: str, value: float) -> float:
         """Apply `Faults.parameter_limits` to a value."""
         low, high = self._vehicle.faults.parameter_limits.get(name, (value, value))
-        return max(low, min(high, value)) if value == value else value
+        return value if math.isnan(value) else max(low, min(high, value))
 
 
 _QUEUE_DEPTH = 20
@@ -102,8 +102,10 @@ class ArduPilotParameterServer(ParameterServer):
             return
         self._vehicle.call_later(_READ_PERIOD_S, self._read_next)
         request, channel = self._reads.popleft()
-        names, index = self._parameters.names, request.param_index
-        name = request.param_id if index == -1 else names[index] if 0 <= index < len(names) else ""
+        name, index = request.param_id, request.param_index
+        if index != -1:
+            names = self._parameters.names
+            name = names[index] if 0 <= index < len(names) else ""
         if name in self._parameters:
             self.send(name, index & 0xFFFF, channel)
         elif self.errors:
@@ -195,11 +197,11 @@ class Px4ParameterServer(ParameterServer):
             self._refuse(sender_of(request), name, _UNUSED_INDEX, code, channel)
             return
         value = value_of(request, bytewise=True)
-        before = parameters[name]
+        previous = parameters[name]
         if name not in self._vehicle.faults.read_only_parameters:
             parameters[name] = self.clamped(name, value)
         self.send(name, parameters.index(name), channel)
-        if parameters[name] != before and value == value:
+        if parameters[name] != previous and not math.isnan(value):
             self._vehicle.call_later(_SECOND_ECHO_S, lambda: self.send(name, parameters.index(name), None))
 
     def _error_for(self, name: str, type_: int) -> int | None:

@@ -58,7 +58,7 @@ class SimParameters:
 
     def __init__(self, rows: Iterable[SimParameter]) -> None:
         self._rows: dict[str, SimParameter | str] = {row.name: row for row in rows}
-        self._switched = {row.name: row.switch for row in self._all() if row.switch is not None}
+        self._switches = {row.name: row.switch for row in self._all() if row.switch is not None}
         self._names: tuple[str, ...] | None = None
         self._indices: dict[str, int] = {}
 
@@ -73,7 +73,9 @@ class SimParameters:
             lines = _select_lines(lines, frozenset(used), count)
         parameters = cls(())
         parameters._rows = {line.partition(",")[0]: line for line in lines}
-        parameters._switched = dict(filter(None, map(_switched, lines)))
+        parameters._switches = {
+            line.partition(",")[0]: switch for line in lines if (switch := _switch_of(line)) is not None
+        }
         return parameters
 
     def __getitem__(self, name: str) -> float:
@@ -89,8 +91,8 @@ class SimParameters:
         """Set a value; raises KeyError for an unknown name."""
         row = self.row(name)
         row.value = stored(value, row.type)
-        if name in self._switched.values():
-            self._names = None
+        if name in self._switches.values():
+            self._names = None  # to be listed again, as parameters may appear or disappear
 
     def change(self, values: Mapping[str, float]) -> None:
         """Set several parameters.
@@ -116,14 +118,14 @@ class SimParameters:
     def names(self) -> tuple[str, ...]:
         """Names that a list contains, in the vehicle's order; the position is ``param_index``."""
         if self._names is None:
-            off = {name for name, switch in self._switched.items() if not self[switch]}
-            self._names = tuple(name for name in self._rows if name not in off)
+            hidden = {name for name, switch in self._switches.items() if not self[switch]}
+            self._names = tuple(name for name in self._rows if name not in hidden)
             self._indices = {name: index for index, name in enumerate(self._names)}
         return self._names
 
     def index(self, name: str) -> int:
         """Return the position in ``names``; raises KeyError for a name that is not listed."""
-        _ = self.names
+        _ = self.names  # updates the indices
         return self._indices[name]
 
     def type(self, name: str) -> int:
@@ -146,7 +148,7 @@ class SimParameters:
 
     def remove(self, name: str) -> None:
         del self._rows[name]
-        self._switched.pop(name, None)
+        self._switches.pop(name, None)
         self._names = None
 
     def _all(self) -> Iterator[SimParameter]:
@@ -164,27 +166,31 @@ def stored(value: float, type_: int) -> float:
 def _row(fields: list[str]) -> SimParameter:
     name, type_, value = fields[0], int(fields[1]), float(fields[2])
     default = float(fields[3]) if len(fields) > 3 else value
-    extra = fields[4] if len(fields) > 4 else None
-    switch = None if extra == _VOLATILE else extra
-    return SimParameter(name, type_, stored(value, type_), stored(default, type_), extra == _VOLATILE, switch)
+    switch_or_mark = fields[4] if len(fields) > 4 else None
+    is_volatile = switch_or_mark == _VOLATILE
+    switch = None if is_volatile else switch_or_mark
+    return SimParameter(name, type_, stored(value, type_), stored(default, type_), is_volatile, switch)
 
 
-def _switched(line: str) -> tuple[str, str] | None:
-    """Return the name and switch of a line, or None if it has no switch."""
+def _switch_of(line: str) -> str | None:
+    """Return the switch of a line, or None if it has none."""
     if line.count(",") < 4 or line.endswith("," + _VOLATILE):
         return None
-    return line.partition(",")[0], line.rpartition(",")[2]
+    return line.rpartition(",")[2]
 
 
 def _select_lines(lines: list[str], used: frozenset[str], count: int) -> list[str]:
+    """Return the lines of all parameters in ``used``, and the first others without a switch up to ``count`` lines."""
     is_used = [line.partition(",")[0] in used for line in lines]
-    others = max(0, count - sum(is_used))
-    chosen: list[str] = []
-    for line, needed in zip(lines, is_used, strict=True):
-        if needed or (others > 0 and _switched(line) is None):
-            chosen.append(line)
-            others -= not needed
-    return chosen
+    others_left = max(0, count - sum(is_used))
+    selected: list[str] = []
+    for line, is_line_used in zip(lines, is_used, strict=True):
+        if is_line_used:
+            selected.append(line)
+        elif others_left > 0 and _switch_of(line) is None:
+            selected.append(line)
+            others_left -= 1
+    return selected
 
 
 _NAME = "param.pck"
@@ -232,6 +238,7 @@ class _Reader(FileHandle):
         if self._with_defaults > 1 or max(self._start, self._count) >= 0xFFFF:
             raise FileFault(EINVAL)
         self._block = block or 0
+        # Only PX4 has a fixed block size, and only PX4 keeps a value and its default in one block.
         self._whole_defaults = block is not None
         self._content: bytes | None = None
 
@@ -289,15 +296,15 @@ class _Writer(UploadedFile):
             raise FileFault(EINVAL) from None
 
     def _read_rows(self, content: bytes, count: int) -> None:
-        position, last = HEADER.size, b""
+        position, previous_name = HEADER.size, b""  # An entry omits what its name has in common with the previous one.
         for _ in range(count):
-            entry = read_entry(content, position, last) if position < len(content) else None
+            entry = read_entry(content, position, previous_name) if position < len(content) else None
             if entry is None or entry.default is not None:
                 raise FileFault(EINVAL)
             name = entry.name.decode("ascii", "replace")
             if name in self._parameters:
                 self._apply(name, entry.value)
-            position, last = entry.end, entry.name
+            position, previous_name = entry.end, entry.name
 
 
 def _query(path: str) -> dict[str, int]:

@@ -71,7 +71,7 @@ class SimulatorServer:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_due = self._timer_at = 0.0
         self._exit = AsyncExitStack()
-        # The task that entered the block. A test fixture's task may end before the block does.
+        # The task that entered the block, to be cancelled if a vehicle fails.
         self._owner: asyncio.Task[Any] | None = None
         self._cancels_owner = False
         self.on_datagram: Callable[[float, bytes, bool], object] | None = None
@@ -95,7 +95,7 @@ class SimulatorServer:
         if self._loop is not None:
             raise BusyError("this SimulatorServer was already started; create a new one")
         self._loop, self._owner = asyncio.get_running_loop(), asyncio.current_task()
-        add_source = getattr(self._loop, "add_event_source", None)
+        add_source = getattr(self._loop, "add_event_source", None)  # None unless it is a `VirtualClockLoop`
         if add_source is None and len(self.vehicles) > _BATCH_THRESHOLD:
             self._min_wait_s = max(_MIN_WAIT_S, _BATCH_INTERVAL_S / self._speedup)
         self._started_at = self._loop.time()
@@ -170,6 +170,7 @@ class SimulatorServer:
         for link in self._links:
             link.close()
         owner = self._owner
+        # The task may be done: a fixture can enter the block in one task and leave it in another.
         if owner is not None and not owner.done() and owner is not asyncio.current_task():
             self._cancels_owner = owner.cancel()
 
@@ -204,6 +205,7 @@ class SimulatorServer:
             self.on_datagram(now, data, False)
         try:
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
+                # A timer that fired early, or another vehicle's action, may have advanced this vehicle beyond now.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
             port.reader.forget()
@@ -321,9 +323,9 @@ async def simulated_link(
 
     ``latency_s`` delays both directions, in seconds of the loop's clock.
     """
-    near, far = memory_link_pair(latency_s=latency_s)
-    async with SimulatorServer(vehicles, far, speedup=speedup):
-        yield near
+    near_end, far_end = memory_link_pair(latency_s=latency_s)
+    async with SimulatorServer(vehicles, far_end, speedup=speedup):
+        yield near_end
 
 
 @asynccontextmanager

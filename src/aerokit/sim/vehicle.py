@@ -33,6 +33,11 @@ _TEXT_SIZE = 50
 Handler = Callable[[Any, Channel], None]
 
 
+def _whole_ticks(seconds: float) -> int:
+    """Return the number of complete ticks; a rounding error does not lose one."""
+    return int(seconds / TICK_S + 1e-6)
+
+
 class MessageHost(ServerHost, Protocol):
     """Interface of a vehicle or component that its protocol servers use."""
 
@@ -133,27 +138,26 @@ class SimulatedVehicle:
         messages = channel.messages(data, now, peer)
         if not messages:
             return
+        # A message may end steady flight: the long tick ends before it, and a short tick follows it.
         self._tick_until(now)
         for message in messages:
             if sender_of(message) != (self.system_id, self.component_id):
                 self._handle(message, channel)
-        self._plan_tick(1)
+        self._schedule_tick(1)
         self.step(now)
 
     def step(self, now: float) -> None:
         """Run everything that is due up to ``now``."""
-        if not self._is_on and math.isnan(self.booted_at):
+        if not self._is_on and math.isnan(self.booted_at):  # It was never on.
             self.now = now
             self.power_on()
         if self.faults.frozen:
             self._skip_to(now)
             return
         while (due := self.next_due) <= now:
-            if due > self.now:
-                self.now = due
+            self.now = max(due, self.now)
             self._run_due(due)
-        if now > self.now:
-            self.now = now
+        self.now = max(now, self.now)
 
     @property
     def next_due(self) -> float:
@@ -166,8 +170,9 @@ class SimulatedVehicle:
         if self._timers and self._timers[0][0] < due:
             due = self._timers[0][0]
         for channel in self.channels:
-            if (stream := channel.streams.next_due) < due:
-                due = stream
+            stream_due = channel.streams.next_due
+            if stream_due < due:
+                due = stream_due
         return due
 
     def take_outbox(self) -> bytes:
@@ -247,15 +252,15 @@ class SimulatedVehicle:
         self.call_at(self.now + delay, action)
 
     def every(self, interval: float, action: Callable[[], None], *, first: float | None = None) -> None:
-        """Call a function periodically until a reboot."""
+        """Call a function every ``interval`` seconds until a reboot; ``first`` is the delay of the first call."""
         start = self.now + (interval if first is None else first)
-        boot = self.booted_at
+        booted_at = self.booted_at
         count = 0
 
         def repeat() -> None:
             nonlocal count
             count += 1
-            if boot == self.booted_at:
+            if booted_at == self.booted_at:  # The vehicle did not reboot since.
                 self.call_at(round(start + count * interval, _DUE_DECIMALS), repeat)
             action()
 
@@ -266,11 +271,11 @@ class SimulatedVehicle:
         if ticking == (self._ticks_from != math.inf):
             return
         # Counted from the boot, so that ticks, timers and streams are due at the same instants.
-        passed = int(self.uptime / TICK_S + 1e-6) * TICK_S if ticking else math.inf
-        self._ticks_from, self._ticks_done = self.booted_at + passed, 0
-        self._plan_tick(1)
+        self._ticks_from = self.booted_at + _whole_ticks(self.uptime) * TICK_S if ticking else math.inf
+        self._ticks_done = 0
+        self._schedule_tick(1)
 
-    def _plan_tick(self, ticks: int) -> None:
+    def _schedule_tick(self, ticks: int) -> None:
         """Schedule the next tick after this many intervals; it may come earlier."""
         self._next_tick = round(self._ticks_from + (self._ticks_done + ticks) * TICK_S, _DUE_DECIMALS)
 
@@ -278,16 +283,17 @@ class SimulatedVehicle:
         """Advance to ``now`` by a single tick that stands for all ticks since the last one."""
         if now < self._ticks_from:
             return
-        ticks = int((now - self._ticks_from) / TICK_S + 1e-6) - self._ticks_done
+        ticks = _whole_ticks(now - self._ticks_from) - self._ticks_done
         if ticks > 0:
             self._ticks_done += ticks
             self.tick(ticks * TICK_S)
-            self._plan_tick(_STEADY_TICKS if self.is_steady else 1)
+            self._schedule_tick(_STEADY_TICKS if self.is_steady else 1)
 
     def _run_due(self, due: float) -> None:
         self._tick_until(due)
         while self._timers and self._timers[0][0] <= due:
-            heappop(self._timers)[2]()
+            _, _, action = heappop(self._timers)
+            action()
         for channel in self.channels:
             if channel.streams.next_due <= due:
                 for message_id in channel.streams.take_due(due):
@@ -297,15 +303,15 @@ class SimulatedVehicle:
 
     def _skip_to(self, now: float) -> None:
         """Advance the time and delay all events equally, like a program that hung."""
-        late = now - self.now
-        if late <= 0:
+        delay = now - self.now
+        if delay <= 0:
             return
         self.now = now
-        self._timers = [(when + late, count, action) for when, count, action in self._timers]
-        self._ticks_from += late
-        self._plan_tick(1)
+        self._timers = [(when + delay, count, action) for when, count, action in self._timers]
+        self._ticks_from += delay
+        self._schedule_tick(1)
         for channel in self.channels:
-            channel.streams.postpone(late)
+            channel.streams.postpone(delay)
 
     def on(self, message_class: type[Message], handler: Handler) -> None:
         """Handle messages of a class that are addressed to this vehicle."""
@@ -345,7 +351,7 @@ class SimulatedVehicle:
         self.send_chunks(severity, text, self._text_id)
 
     def send_chunks(self, severity: int, text: str, text_id: int) -> None:
-        """Send STATUSTEXTs with a common id; the last chunk has fewer than 50 characters."""
+        """Send STATUSTEXTs with a common id. The last chunk has fewer than 50 characters, which marks the end."""
         self._record_text(severity, text)
         chunks = [text[start : start + _TEXT_SIZE] for start in range(0, len(text) + 1, _TEXT_SIZE)]
         self.send_parts([Statustext(severity, chunk, text_id, number) for number, chunk in enumerate(chunks)])

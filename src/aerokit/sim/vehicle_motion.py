@@ -19,6 +19,7 @@ _PITCH_TIME_CONSTANT_S = 0.3
 _TURN_GAIN_PER_S = 0.8
 _HEIGHT_GAIN_PER_S = 0.4
 _ANGLE_OF_ATTACK_RAD = math.radians(2.0)
+_GLIDE_SPEED_FACTOR = 1.3  # Airspeed without power, relative to the minimum airspeed.
 _STOPPED_M_S = 0.3
 
 
@@ -54,7 +55,7 @@ class FixedWing(Motion):
 
     def __init__(self, rng: random.Random, wing: WingLimits | None = None, wind: SimulatedWind | None = None) -> None:
         super().__init__(rng, wind=wind)
-        self.wing: WingLimits = wing if wing is not None else WingLimits()
+        self.wing_limits: WingLimits = wing if wing is not None else WingLimits()
         self.throttle: float = 0.0
         """Engine throttle, 0 to 1."""
         self._speed = 0.0
@@ -64,19 +65,21 @@ class FixedWing(Motion):
 
     def bank_and_climb(self, airspeed: float, bank: float, climb: float) -> None:
         """Hold airspeed (m/s), bank angle (rad, positive right) and climb rate (m/s)."""
-        limit = self.wing.bank_rad
+        limit = self.wing_limits.bank_rad
         self._wanted_airspeed = airspeed
         self._wanted_bank = max(-limit, min(limit, bank))
-        self._wanted_climb = max(-self.wing.sink_m_s, min(self.wing.climb_m_s, climb))
+        self._wanted_climb = max(-self.wing_limits.sink_m_s, min(self.wing_limits.climb_m_s, climb))
 
     def head(self, course: float, airspeed: float, climb: float, *, turn_rate: float = 0.0) -> None:
         """Fly a ground course (rad from north) with wind correction; ``turn_rate`` is its change in rad/s."""
-        speed = max(self._speed, self.wing.airspeed_min_m_s)
-        north, east = self._air_movement()
-        across = -north * math.sin(course) + east * math.cos(course)
-        heading = course - math.asin(max(-0.9, min(0.9, across / speed)))
-        rate = turn_rate + _TURN_GAIN_PER_S * wrap_pi(heading - self.yaw)
-        self.bank_and_climb(airspeed, math.atan(speed * rate / GRAVITY_M_S2), climb)
+        speed = max(self._speed, self.wing_limits.airspeed_min_m_s)
+        wind_north, wind_east = self._air_movement()
+        crosswind = -wind_north * math.sin(course) + wind_east * math.cos(course)
+        # Limited, so that the plane still has a heading in a crosswind that is faster than the plane.
+        wind_correction = math.asin(max(-0.9, min(0.9, crosswind / speed)))
+        heading = course - wind_correction
+        heading_rate = turn_rate + _TURN_GAIN_PER_S * wrap_pi(heading - self.yaw)
+        self.bank_and_climb(airspeed, math.atan(speed * heading_rate / GRAVITY_M_S2), climb)
 
     def fly_to(self, north: float, east: float, down: float, *, airspeed: float) -> None:
         """Fly towards a point and over it."""
@@ -85,14 +88,14 @@ class FixedWing(Motion):
 
     def circle(self, north: float, east: float, down: float, *, radius: float, airspeed: float) -> None:
         """Circle a point with this radius in metres; a negative radius is counter-clockwise."""
-        size, way = max(1.0, abs(radius)), math.copysign(1.0, radius)
+        radius, turn_sign = max(1.0, abs(radius)), math.copysign(1.0, radius)
         distance = math.hypot(north - self.north, east - self.east)
-        inward = math.atan2(east - self.east, north - self.north)
-        # Far away, fly straight to the edge of the circle; on the circle, along its tangent.
-        share = max(-1.0, min(1.0, (distance - size) / size))
-        course = inward - way * (math.pi / 2) * (1.0 - share)
-        rate = way * self.ground_speed_m_s / size if distance < 1.5 * size else 0.0
-        self.head(course, airspeed, self.climb_to(down), turn_rate=rate)
+        course_to_centre = math.atan2(east - self.east, north - self.north)
+        # Far away, fly straight to the centre; on the circle, along its tangent; in between, mix the two.
+        share_to_centre = max(-1.0, min(1.0, (distance - radius) / radius))
+        course = course_to_centre - turn_sign * (math.pi / 2) * (1.0 - share_to_centre)
+        turn_rate = turn_sign * self.ground_speed_m_s / radius if distance < 1.5 * radius else 0.0
+        self.head(course, airspeed, self.climb_to(down), turn_rate=turn_rate)
 
     def roll_out(self) -> None:
         """Stop on the ground."""
@@ -111,14 +114,14 @@ class FixedWing(Motion):
         if self.wind.gusts_m_s > 0.0:
             self._update_gusts(dt)
         was_on_ground = self.is_on_ground
-        before = (self.velocity_north, self.velocity_east, self.velocity_down)
+        velocity_before = (self.velocity_north, self.velocity_east, self.velocity_down)
         if was_on_ground and not self._lifts_off(powered=powered):
             self._roll_on_ground(dt, powered=powered)
         else:
             self._fly(dt, powered=powered)
             if self.is_on_ground and self.velocity_down >= 0.0 and not was_on_ground:
                 self._touch_down()
-        self._differentiate(before, dt)
+        self._set_acceleration(velocity_before, dt)
 
     def settle(self) -> None:
         super().settle()
@@ -126,12 +129,12 @@ class FixedWing(Motion):
         self.roll_out()
 
     def _lifts_off(self, *, powered: bool) -> bool:
-        return powered and self._wanted_climb > 0.0 and self._speed >= self.wing.airspeed_min_m_s
+        return powered and self._wanted_climb > 0.0 and self._speed >= self.wing_limits.airspeed_min_m_s
 
     def _roll_on_ground(self, dt: float, *, powered: bool) -> None:
-        wanted = self._wanted_airspeed if powered else 0.0
-        self._approach_speed(wanted, dt)
-        self.throttle = 1.0 if powered and wanted > self._speed else 0.0
+        wanted_speed = self._wanted_airspeed if powered else 0.0
+        self._approach_speed(wanted_speed, dt)
+        self.throttle = 1.0 if powered and wanted_speed > self._speed else 0.0
         self.roll = self.pitch = 0.0
         self.roll_rate = self.pitch_rate = self.yaw_rate = 0.0
         self.velocity_north, self.velocity_east = self._along_nose(self._speed)
@@ -139,23 +142,24 @@ class FixedWing(Motion):
         self._advance(dt)
 
     def _fly(self, dt: float, *, powered: bool) -> None:
-        wing = self.wing
+        wing = self.wing_limits
         wanted_climb = self._wanted_climb if powered else -wing.glide_sink_m_s
-        wanted = max(wing.airspeed_min_m_s, min(wing.airspeed_max_m_s, self._wanted_airspeed))
-        self._approach_speed(wanted if powered else 1.3 * wing.airspeed_min_m_s, dt)
+        wanted_speed = max(wing.airspeed_min_m_s, min(wing.airspeed_max_m_s, self._wanted_airspeed))
+        self._approach_speed(wanted_speed if powered else _GLIDE_SPEED_FACTOR * wing.airspeed_min_m_s, dt)
         self._bank(self._wanted_bank if powered else 0.0, dt)
-        rate = (-wanted_climb - self.velocity_down) / _CLIMB_TIME_CONSTANT_S
+        acceleration_down = (-wanted_climb - self.velocity_down) / _CLIMB_TIME_CONSTANT_S
         limit = wing.vertical_acceleration_m_s2
-        self.velocity_down += max(-limit, min(limit, rate)) * dt
-        self._tilt(dt)
-        level = math.sqrt(max(0.0, self._speed * self._speed - self.velocity_down * self.velocity_down))
+        self.velocity_down += max(-limit, min(limit, acceleration_down)) * dt
+        self._pitch(dt)
+        horizontal_speed = math.sqrt(max(0.0, self._speed * self._speed - self.velocity_down * self.velocity_down))
         air_north, air_east = self._air_movement()
-        north, east = self._along_nose(level)
+        north, east = self._along_nose(horizontal_speed)
         self.velocity_north: float = north + air_north
         self.velocity_east: float = east + air_east
         self._advance(dt)
-        climb_share = -self.velocity_down / wing.climb_m_s
-        self.throttle = max(0.0, min(1.0, 0.45 + 0.5 * climb_share)) if powered else 0.0
+        # 45 % holds the altitude, 95 % climbs at the maximum rate.
+        throttle = 0.45 + 0.5 * -self.velocity_down / wing.climb_m_s
+        self.throttle = max(0.0, min(1.0, throttle)) if powered else 0.0
 
     def _touch_down(self) -> None:
         self.impact_speed_m_s: float = self.velocity_down
@@ -165,8 +169,8 @@ class FixedWing(Motion):
         self.roll = self.pitch = 0.0
 
     def _approach_speed(self, wanted: float, dt: float) -> None:
-        down = self.wing.roll_out_m_s2 if self.is_on_ground else self.wing.acceleration_m_s2
-        self._speed += max(-down * dt, min(self.wing.acceleration_m_s2 * dt, wanted - self._speed))
+        deceleration = self.wing_limits.roll_out_m_s2 if self.is_on_ground else self.wing_limits.acceleration_m_s2
+        self._speed += max(-deceleration * dt, min(self.wing_limits.acceleration_m_s2 * dt, wanted - self._speed))
 
     def _bank(self, wanted: float, dt: float) -> None:
         step = (wanted - self.roll) * min(1.0, dt / _BANK_TIME_CONSTANT_S)
@@ -175,7 +179,7 @@ class FixedWing(Motion):
         self.yaw_rate: float = GRAVITY_M_S2 * math.tan(self.roll) / max(self._speed, 1.0)
         self.yaw: float = wrap_pi(self.yaw + self.yaw_rate * dt)
 
-    def _tilt(self, dt: float) -> None:
+    def _pitch(self, dt: float) -> None:
         slope = math.asin(max(-0.7, min(0.7, -self.velocity_down / max(self._speed, 1.0))))
         step = (slope + _ANGLE_OF_ATTACK_RAD - self.pitch) * min(1.0, dt / _PITCH_TIME_CONSTANT_S)
         self.pitch += step
@@ -192,10 +196,11 @@ class FixedWing(Motion):
         self.east += self.velocity_east * dt
         self.down += self.velocity_down * dt
 
-    def _differentiate(self, before: tuple[float, float, float], dt: float) -> None:
-        self.acceleration_north: float = (self.velocity_north - before[0]) / dt
-        self.acceleration_east: float = (self.velocity_east - before[1]) / dt
-        self.acceleration_down: float = (self.velocity_down - before[2]) / dt
+    def _set_acceleration(self, velocity_before: tuple[float, float, float], dt: float) -> None:
+        north, east, down = velocity_before
+        self.acceleration_north: float = (self.velocity_north - north) / dt
+        self.acceleration_east: float = (self.velocity_east - east) / dt
+        self.acceleration_down: float = (self.velocity_down - down) / dt
 
 
 _SPEED_TIME_CONSTANT_S = 0.3
@@ -232,32 +237,34 @@ class GroundMotion(Motion):
         self.speed_m_s = 0.0
         """Forward speed; negative is backwards."""
         self._wanted_speed = 0.0
-        self._rate = 0.0
-        self._heading: float | None = None
+        self._wanted_turn_rate = 0.0
+        self._wanted_heading: float | None = None
+        """Replaces the turn rate, unless it is None."""
 
     def stop(self) -> None:
         self.drive(0.0, 0.0)
 
     def drive(self, speed: float, turn_rate: float) -> None:
         """Drive at this speed (m/s, negative backwards) and turn rate (rad/s)."""
-        self._wanted_speed, self._rate, self._heading = speed, turn_rate, None
+        self._wanted_speed, self._wanted_turn_rate, self._wanted_heading = speed, turn_rate, None
 
     def head(self, speed: float, heading: float) -> None:
         """Drive at this speed towards this heading (rad)."""
-        self._wanted_speed, self._rate, self._heading = speed, 0.0, heading
+        self._wanted_speed, self._wanted_turn_rate, self._wanted_heading = speed, 0.0, heading
 
     def drive_to(self, north: float, east: float, *, speed: float, stops: bool = True, backwards: bool = False) -> None:
         """Drive to a point at up to this speed (m/s); with ``stops`` the rover brakes and stops at the point."""
-        north, east = north - self.north, east - self.east
-        distance = math.hypot(north, east)
+        offset_north, offset_east = north - self.north, east - self.east
+        distance = math.hypot(offset_north, offset_east)
         if stops:
             speed = min(speed, approach_speed(distance, 1.0, self.wheels.acceleration_m_s2))
-        course = math.atan2(east, north)
+        course = math.atan2(offset_east, offset_north)
         if backwards:
             self.head(-speed, course + math.pi)
             return
-        off = abs(wrap_pi(course - self.yaw))
-        self.head(min(speed, _SLOW_M_S) if off > _SLOW_TURN_ERROR_RAD else speed, course)
+        if abs(wrap_pi(course - self.yaw)) > _SLOW_TURN_ERROR_RAD:  # The point is behind the rover.
+            speed = min(speed, _SLOW_M_S)
+        self.head(speed, course)
 
     @property
     def airspeed_m_s(self) -> float:
@@ -268,10 +275,10 @@ class GroundMotion(Motion):
         """Advance by ``dt`` seconds; an unpowered rover rolls to a stop."""
         rate = self._turn_rate()
         self._accelerate(self._curve_speed(rate) if powered else 0.0, dt)
-        middle = self.yaw + 0.5 * rate * dt
+        mean_yaw = self.yaw + 0.5 * rate * dt
         self.yaw: float = wrap_pi(self.yaw + rate * dt)
         self.yaw_rate: float = rate
-        north, east = self.speed_m_s * math.cos(middle), self.speed_m_s * math.sin(middle)
+        north, east = self.speed_m_s * math.cos(mean_yaw), self.speed_m_s * math.sin(mean_yaw)
         self.acceleration_north: float = (north - self.velocity_north) / dt
         self.acceleration_east: float = (east - self.velocity_east) / dt
         self.velocity_north: float = north
@@ -285,13 +292,14 @@ class GroundMotion(Motion):
         self.stop()
 
     def _turn_rate(self) -> float:
-        wheels, rate = self.wheels, self._rate
-        if self._heading is not None:
-            rate = _HEADING_GAIN_PER_S * wrap_pi(self._heading - self.yaw)
+        wheels, rate = self.wheels, self._wanted_turn_rate
+        if self._wanted_heading is not None:
+            rate = _HEADING_GAIN_PER_S * wrap_pi(self._wanted_heading - self.yaw)
         limit = min(wheels.turn_rate_rad_s, abs(self.speed_m_s) / wheels.turn_radius_m)
         return max(-limit, min(limit, rate))
 
     def _curve_speed(self, rate: float) -> float:
+        """Return the wanted speed, reduced to what the sideways acceleration allows at this turn rate."""
         limit = self.wheels.top_speed_m_s
         if rate:
             limit = min(limit, max(_SLOW_M_S, self.wheels.sideways_m_s2 / abs(rate)))
@@ -300,9 +308,9 @@ class GroundMotion(Motion):
     def _accelerate(self, wanted: float, dt: float) -> None:
         change = (wanted - self.speed_m_s) * min(1.0, dt / _SPEED_TIME_CONSTANT_S)
         limit = self.wheels.acceleration_m_s2 * dt
-        braking = abs(wanted) < abs(self.speed_m_s)
-        if braking:
-            limit *= 2.0
+        is_braking = abs(wanted) < abs(self.speed_m_s)
+        if is_braking:
+            limit *= 2.0  # Brakes are stronger than the engine.
         self.speed_m_s += max(-limit, min(limit, change))
 
 
@@ -355,12 +363,13 @@ class UnderwaterMotion(Motion):
 
     def step(self, dt: float, *, powered: bool = True) -> None:
         """Advance by ``dt`` seconds; an unpowered submarine rises."""
-        lift = -self.buoyancy_m_s2 - _DRAG_PER_S * self.velocity_down
+        floating_down = -self.buoyancy_m_s2 - _DRAG_PER_S * self.velocity_down
         if powered:
-            north, east, down = self._commanded_acceleration()
-            down = lift if self._is_floating else down
+            north, east, commanded_down = self._commanded_acceleration()
+            down = floating_down if self._is_floating else commanded_down
         else:
-            north, east, down = -_DRAG_PER_S * self.velocity_north, -_DRAG_PER_S * self.velocity_east, lift
+            north, east = -_DRAG_PER_S * self.velocity_north, -_DRAG_PER_S * self.velocity_east
+            down = floating_down
         self._integrate(north, east, down, dt)
         self._turn(dt, powered=powered)
 

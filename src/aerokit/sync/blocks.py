@@ -63,7 +63,7 @@ class BlockingContext:
     Using one with ``await`` or ``async with`` closes it and raises TypeError.
     """
 
-    _opened_by: str  # name of the function
+    _opened_by: str  # name of the function that opens this object
 
     def close(self) -> None:
         """Close the object. Idempotent."""
@@ -95,13 +95,13 @@ class BlockingContext:
         )
 
 
-A = TypeVar("A")
+AsyncT = TypeVar("AsyncT")
 
 T = TypeVar("T")
 
 EnteredT = TypeVar("EnteredT")
 
-IteratorA = TypeVar("IteratorA", bound="AsyncIterator[Any]")
+IteratorT = TypeVar("IteratorT", bound="AsyncIterator[Any]")
 
 ItemT = TypeVar("ItemT")
 
@@ -112,20 +112,21 @@ ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")
 TwinT = TypeVar("TwinT", bound="ConnectionTwin | VehicleTwin")
 
 
-class TwinOf(ReadOnly, Generic[A]):
+class TwinOf(ReadOnly, Generic[AsyncT]):
     """Blocking twin of an asynchronous object, whose methods it calls on the loop thread."""
 
-    def __init__(self, loop: LoopThread, aio: A) -> None:
+    def __init__(self, loop: LoopThread, aio: AsyncT) -> None:
         self._loop, self._aio = loop, aio
 
     @property
-    def aio(self) -> A:
+    def aio(self) -> AsyncT:
         """The asynchronous object, for code that runs on the loop."""
         self._loop.feed()
         return self._aio
 
     @contextmanager
     def _block(self, block: AbstractContextManager[T]) -> Iterator[T]:
+        """Enter and exit a synchronous context manager on the loop."""
         entered = self._loop.enter_sync(block)
         try:
             yield entered
@@ -142,7 +143,7 @@ class TwinOf(ReadOnly, Generic[A]):
 
 
 class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
-    """Reading takes a snapshot on the caller's thread; it sends nothing and does not wait for the loop."""
+    """Twin of a state cell. Reading takes a snapshot on the caller's thread, without waiting for the loop."""
 
     def __repr__(self) -> str:
         return repr(self.aio)
@@ -161,7 +162,7 @@ class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
             return self.aio[key]  # raises TypeError with a suggestion
 
 
-class IteratorTwin(TwinOf[IteratorA], Generic[IteratorA, ItemT]):
+class IteratorTwin(TwinOf[IteratorT], Generic[IteratorT, ItemT]):
     """Twin of an asynchronous iterator over items."""
 
     def __iter__(self) -> Self:
@@ -170,16 +171,16 @@ class IteratorTwin(TwinOf[IteratorA], Generic[IteratorA, ItemT]):
     def __next__(self) -> ItemT:
         items = self.aio
 
-        async def read() -> tuple[ItemT, ...]:  # a coroutine cannot raise StopAsyncIteration
+        async def read() -> tuple[ItemT, ...]:  # empty at the end: a coroutine cannot raise StopAsyncIteration
             try:
                 return (await items.__anext__(),)
             except StopAsyncIteration:
                 return ()
 
-        found = self._loop.run(read)
-        if not found:
+        item_or_nothing = self._loop.run(read)
+        if not item_or_nothing:
             raise StopIteration
-        return found[0]
+        return item_or_nothing[0]
 
 
 class ChangesTwin(IteratorTwin["Changes[T]", T], Generic[T]):
@@ -206,7 +207,7 @@ class BlockTwin(TwinOf[BlockT]):
         return self
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
-        exit_block: Any = self.aio.__aexit__  # the blocks name its parameters differently
+        exit_block: Any = self.aio.__aexit__  # Any, because its parameters have other names in each class
         self._loop.run(exit_block, exc_type, exc, traceback)
 
 
@@ -221,7 +222,7 @@ class MeasurementTwin(BlockTwin["MeasurementStream[T]"], Generic[T]):
 class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
     """Gimbals by device id; ``T`` is the twin of a gimbal."""
 
-    if TYPE_CHECKING:  # generated
+    if TYPE_CHECKING:  # the generated twin defines these
 
         @property
         def ids(self) -> tuple[int, ...]:
@@ -279,9 +280,9 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
 
     _opened_by = "open_connection"
 
-    def __init__(self, loop: LoopThread, aio: Connection, held: OpenContext[Connection] | None = None) -> None:
+    def __init__(self, loop: LoopThread, aio: Connection, context: OpenContext[Connection] | None = None) -> None:
         super().__init__(loop, aio)
-        self._held = held
+        self._context = context
 
     def vehicles(self) -> Iterator[VehicleFound]:
         """Yield each autopilot once: those found so far, then new ones, until the connection ends.
@@ -289,22 +290,22 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
         Raises:
             ConnectionClosed, LinkLost: the connection ended.
         """
-        found = self.aio.vehicles()
+        discoveries = self.aio.vehicles()
         try:
-            while True:
-                yield self._loop.run(found.__anext__)
+            while True:  # until the connection's end raises its error
+                yield self._loop.run(discoveries.__anext__)
         finally:
             with contextlib.suppress(ConnectionClosed):
-                self._loop.run(found.aclose)
+                self._loop.run(discoveries.aclose)
 
     def close(self) -> None:
         """Close the connection and end the loop thread. Idempotent. Waiting calls raise ConnectionClosed.
 
         A connection that ``connect`` opened for a vehicle closes with the vehicle.
         """
-        if self._held is not None:
+        if self._context is not None:
             try:
-                self._held.close()
+                self._context.close()
             finally:
                 self._loop.close()
 
@@ -312,14 +313,14 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
 class OpenedTwin(TwinOf[T], BlockingContext):
     """Twin of an object whose context is open on the loop thread, which ends with it if it was started for it."""
 
-    def __init__(self, loop: LoopThread, held: OpenContext[T], *, owns_loop: bool) -> None:
-        super().__init__(loop, held.value)
-        self._held, self._owns_loop = held, owns_loop
+    def __init__(self, loop: LoopThread, context: OpenContext[T], *, owns_loop: bool) -> None:
+        super().__init__(loop, context.value)
+        self._context, self._owns_loop = context, owns_loop
 
     def close(self) -> None:
         """Close the context and end the loop thread. Idempotent."""
         try:
-            self._held.close()
+            self._context.close()
         finally:
             if self._owns_loop:
                 self._loop.close()
@@ -343,8 +344,8 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
             except ConnectionClosed:
                 original = read()  # the loop has ended
             vars(self).setdefault(key, twin(self._loop, original))
-        made: T = vars(self)[key]
-        return made
+        part: T = vars(self)[key]
+        return part
 
     def close(self) -> None:
         """Disconnect: close the link and end the loop thread. Idempotent. Waiting calls raise ConnectionClosed.
@@ -354,9 +355,10 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
         super().close()
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
-        holds = self.aio.is_hold_pending
+        is_hold_pending = self.aio.is_hold_pending
         self.close()
-        if exc is not None and not holds:  # the asynchronous side did not see the exception
+        # The asynchronous context would warn about the exception, but did not get it.
+        if exc is not None and not is_hold_pending:
             warn_if_left_flying(self.aio)
 
     def __repr__(self) -> str:
@@ -373,16 +375,16 @@ def opened(
     is_connection = isinstance(address, ConnectionTwin)
     loop = address._loop if is_connection else LoopThread()
     try:
-        held: OpenContext[Any] = loop.open_context(open_async(address.aio if is_connection else address, **options))
+        context: OpenContext[Any] = loop.open_context(open_async(address.aio if is_connection else address, **options))
     except BaseException as error:
         if not is_connection:
             loop.close()
-        if isinstance(error, KeyboardInterrupt):  # the places where this library waited do not help a user
+        if isinstance(error, KeyboardInterrupt):  # without the traceback of this library, which does not help a user
             raise error.with_traceback(None) from error.__cause__
         raise
     if not is_connection:
-        connection: Connection = getattr(held.value, "connection", held.value)
+        connection: Connection = getattr(context.value, "connection", context.value)
         connection._use_activity_monitor(loop.activity)
     if issubclass(twin, VehicleTwin):
-        return twin(loop, held, owns_loop=not is_connection)
-    return twin(loop, held.value, held)
+        return twin(loop, context, owns_loop=not is_connection)
+    return twin(loop, context.value, context)

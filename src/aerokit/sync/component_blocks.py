@@ -75,11 +75,11 @@ def opened_component(
     is_shared = isinstance(connection, ConnectionTwin)
     loop = connection._loop if is_shared else LoopThread()
     try:
-        link = connection.aio if is_shared else connection
-        held: OpenContext[Any] = loop.open_context(open_async(address, connection=link, **options))
-        loop.call(held.value._use_threads)
+        async_connection = connection.aio if is_shared else connection
+        context: OpenContext[Any] = loop.open_context(open_async(address, connection=async_connection, **options))
+        loop.call(context.value._use_threads)
     except BaseException:
         if not is_shared:
             loop.close()
         raise
-    return twin(loop, held, owns_loop=not is_shared)
+    return twin(loop, context, owns_loop=not is_shared)

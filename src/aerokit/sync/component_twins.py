@@ -164,14 +164,15 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
     ) -> Callable[[str, tuple[MissionItem, ...]], Any]:
         """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
-        To refuse a list, the function returns a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes the result
-        INVALID and a status text. It may be a coroutine function. An empty list is a request to clear the list.
+        To refuse a list, the function returns False or a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes
+        the result INVALID and a status text. It may be a coroutine function. An empty list is a request to clear the
+        list.
         """
         return self._loop.call(self.aio.on_upload, function)
 
     def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
-        """Decorator: ``function(index)`` continues the mission at an item. Without such a function, requests to do so
-        are refused.
+        """Decorator: ``function(index)`` continues the mission at an item. Requests to do so are refused if it returns
+        False or raises, and without such a function.
         """
         return self._loop.call(self.aio.on_set_current, function)
 

@@ -35,7 +35,7 @@ class _Borrowed(Generic[T]):
 
 
 class SelectionTwin(TwinOf[SelectionT]):
-    """``vehicles`` are blocking twins; ``member.vehicle`` is asynchronous, for code on the loop."""
+    """Twin of a selection of vehicles. ``vehicles`` are twins, ``member.vehicle`` is the asynchronous object."""
 
     @cached_property
     def vehicles(self) -> Mapping[str, Vehicle]:
@@ -73,10 +73,10 @@ class FleetTwin(OpenedTwin["AsyncFleet"]):
         super().close()
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
-        left = [vehicle for vehicle in self.aio.vehicles.values() if not vehicle.is_hold_pending]
+        without_hold = [vehicle for vehicle in self.aio.vehicles.values() if not vehicle.is_hold_pending]
         self.close()
-        if exc is not None:  # the asynchronous side did not see the exception
-            for vehicle in left:
+        if exc is not None:  # the asynchronous context would warn about it, but did not get it
+            for vehicle in without_hold:
                 warn_if_left_flying(vehicle)
 
 
@@ -87,25 +87,28 @@ def opened_fleet(
     **options: Any,
 ) -> FleetT:
     """Open a fleet on a new loop thread, or on that of the connections and vehicles passed as sources."""
-    given = [entry for source in sources for entry in (source.values() if isinstance(source, Mapping) else (source,))]
-    loops = {entry._loop for entry in given if isinstance(entry, (ConnectionTwin, VehicleTwin))}
+    entries: list[Any] = []
+    for source in sources:
+        entries += source.values() if isinstance(source, Mapping) else (source,)
+    loops = {entry._loop for entry in entries if isinstance(entry, (ConnectionTwin, VehicleTwin))}
     if len(loops) > 1:
         raise InvalidArgument(
             "sources: these connections run on different loops; pass addresses, or open all vehicles on one connection"
         )
     loop = next(iter(loops), None) or LoopThread()
     try:
-        held: OpenContext[Any] = loop.open_context(open_async(*map(_original, sources), **options))
+        context: OpenContext[Any] = loop.open_context(open_async(*map(_original, sources), **options))
     except BaseException:
         if not loops:
             loop.close()
         raise
-    for connection in held.value._context.networks.values():
+    for connection in context.value._context.networks.values():
         connection._use_activity_monitor(loop.activity)
-    return twin(loop, held, owns_loop=not loops)
+    return twin(loop, context, owns_loop=not loops)
 
 
 def _original(source: Any) -> Any:
+    """Return the asynchronous object of a twin, or the source itself; also inside a mapping."""
     if isinstance(source, Mapping):
         return {name: _original(entry) for name, entry in source.items()}
     return source.aio if isinstance(source, TwinOf) else source

@@ -38,14 +38,14 @@ if TYPE_CHECKING:
 WIDTH = 120  # the line length of `ruff format`, whose style the output follows
 
 
-def outer(annotation: ast.expr | None) -> str:
+def outer_name(annotation: ast.expr | None) -> str:
     """Return the name in an annotation, without its subscript."""
     while isinstance(annotation, ast.Subscript):
         annotation = annotation.value
     return annotation.id if isinstance(annotation, ast.Name) else ""
 
 
-def optional(annotation: ast.expr | None) -> ast.expr | None:
+def without_none(annotation: ast.expr | None) -> ast.expr | None:
     """Return the part of an annotation before ``| None``, or None."""
     if isinstance(annotation, ast.BinOp) and isinstance(annotation.op, ast.BitOr):
         last = annotation.right
@@ -53,21 +53,22 @@ def optional(annotation: ast.expr | None) -> ast.expr | None:
     return None
 
 
-def forwarded(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
+def forwarded_arguments(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
     """Return the arguments of a forwarding call, without ``self``."""
     positional = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args)]
     positional = [argument for argument in positional if argument != "self"]
-    star = [f"*{node.args.vararg.arg}"] if node.args.vararg else []
-    rest = [f"**{node.args.kwarg.arg}"] if node.args.kwarg else []
-    return positional + star + [f"{argument.arg}={argument.arg}" for argument in node.args.kwonlyargs] + rest
+    var_positional = [f"*{node.args.vararg.arg}"] if node.args.vararg else []
+    keyword_only = [f"{argument.arg}={argument.arg}" for argument in node.args.kwonlyargs]
+    var_keyword = [f"**{node.args.kwarg.arg}"] if node.args.kwarg else []
+    return positional + var_positional + keyword_only + var_keyword
 
 
-def source(node: ast.expr) -> str:
+def source_of(node: ast.expr) -> str:
     text = ast.unparse(node)
     return text if '"' in text else text.replace("'", '"')
 
 
-def call(function: str, arguments: Sequence[str], indent: str = "        ") -> str:
+def render_call(function: str, arguments: Sequence[str], indent: str = "        ") -> str:
     """Return a call; one argument per line if it would be too long."""
     line = f"{function}({', '.join(arguments)})"
     if len(indent) + len(line) < WIDTH:  # a comma may follow
@@ -75,27 +76,30 @@ def call(function: str, arguments: Sequence[str], indent: str = "        ") -> s
     return f"{function}(\n" + "".join(f"{indent}    {argument},\n" for argument in arguments) + f"{indent})"
 
 
-def function(
+def render_function(
     node: ast.FunctionDef | ast.AsyncFunctionDef, returns: ast.expr | None, text: str | None, body: str
 ) -> str:
-    gives = "" if returns is None else f" -> {source(returns)}"
-    line = f"    def {node.name}({', '.join(arguments_of(node.args))}){gives}:\n"
-    if len(line) > WIDTH + 1:
-        line = f"    def {node.name}(\n"
-        line += _lines(arguments_of(node.args), "        ") + f"    ){gives}:\n"
-    return f"{line}{docstring(text)}        {body}\n"
+    return_annotation = "" if returns is None else f" -> {source_of(returns)}"
+    signature = f"    def {node.name}({', '.join(arguments_of(node.args))}){return_annotation}:\n"
+    if len(signature) > WIDTH + 1:  # WIDTH without the line end
+        signature = f"    def {node.name}(\n"
+        signature += _lines(arguments_of(node.args), "        ") + f"    ){return_annotation}:\n"
+    return f"{signature}{render_docstring(text)}        {body}\n"
 
 
 def arguments_of(arguments: ast.arguments) -> list[str]:
+    """Return the source of the arguments of a definition, one text for each."""
     positional = [*arguments.posonlyargs, *arguments.args]
-    lacking: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults))
-    found = [_argument(*pair) for pair in zip(positional, [*lacking, *arguments.defaults])]  # noqa: B905
+    no_defaults: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults))
+    texts = [_argument(*pair) for pair in zip(positional, [*no_defaults, *arguments.defaults])]  # noqa: B905
     if arguments.vararg is not None:
-        found.append("*" + _argument(arguments.vararg, None))
+        texts.append("*" + _argument(arguments.vararg, None))
     elif arguments.kwonlyargs:
-        found.append("*")
-    found += [_argument(*pair) for pair in zip(arguments.kwonlyargs, arguments.kw_defaults)]  # noqa: B905
-    return found + (["**" + _argument(arguments.kwarg, None)] if arguments.kwarg else [])
+        texts.append("*")
+    texts += [_argument(*pair) for pair in zip(arguments.kwonlyargs, arguments.kw_defaults)]  # noqa: B905
+    if arguments.kwarg is not None:
+        texts.append("**" + _argument(arguments.kwarg, None))
+    return texts
 
 
 def _lines(arguments: Iterable[str], indent: str) -> str:
@@ -110,12 +114,12 @@ def _lines(arguments: Iterable[str], indent: str) -> str:
 
 
 def _argument(argument: ast.arg, default: ast.expr | None) -> str:
-    kind = "" if argument.annotation is None else f": {source(argument.annotation)}"
-    value = "" if default is None else f"{' = ' if kind else '='}{source(default)}"
-    return f"{argument.arg}{kind}{value}"
+    annotation = "" if argument.annotation is None else f": {source_of(argument.annotation)}"
+    equals = " = " if annotation else "="
+    return f"{argument.arg}{annotation}" + ("" if default is None else f"{equals}{source_of(default)}")
 
 
-def docstring(text: str | None, indent: str = "        ") -> str:
+def render_docstring(text: str | None, indent: str = "        ") -> str:
     if not text:
         return ""
     lines = text.splitlines()
@@ -175,88 +179,104 @@ class Page:
     for_types: set[tuple[str, str]] = field(default_factory=set)
 
     def __post_init__(self) -> None:
-        self._homes: dict[str, tuple[str, str]] = {}
+        self._import_sources: dict[str, tuple[str, str]] = {}  # name → module, and name in this module
         self._twins = {twin.name for twin in TWINS}
-        self._elsewhere = {twin.name: twin.page for twin in TWINS if twin.page != self.name}
+        self._page_of_other_twins = {twin.name: twin.page for twin in TWINS if twin.page != self.name}
 
-    def need(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
+    def import_names_in(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
         """Import the names in an expression that comes from these modules."""
         for part in ast.walk(node) if node is not None else ():
             text = part.value if isinstance(part, ast.Constant) and isinstance(part.value, str) else None
             if isinstance(part, ast.Name):
-                self._need_name(part.id, modules, at_run_time)
+                self._import_name(part.id, modules, at_run_time)
             elif text is not None and text.isidentifier() and not at_run_time:
-                self._need_name(text, modules, at_run_time)
+                self._import_name(text, modules, at_run_time)
 
-    def _need_name(self, name: str, modules: tuple[str, ...], at_run_time: bool) -> None:
-        if name in self._elsewhere and self._elsewhere[name] == "twins":
+    def _import_name(self, name: str, modules: tuple[str, ...], at_run_time: bool) -> None:
+        if name in self._page_of_other_twins and self._page_of_other_twins[name] == "twins":
             self.at_run_time.add(("aerokit.sync.twins", name))
             return
         if name in self._twins or name in TYPE_VARIABLES or hasattr(builtins, name):
             return
-        where = next((found[name] for found in map(imports_of, modules) if name in found), (modules[0], name))
-        where = self._homes.setdefault(where[1] or name, where)  # several modules may export a name
-        (self.at_run_time if at_run_time else self.for_types).add(where)
+        imports = (imports_of(module) for module in modules)
+        origin = next((imported[name] for imported in imports if name in imported), (modules[0], name))
+        origin = self._import_sources.setdefault(origin[1] or name, origin)  # several modules may export a name
+        if at_run_time:
+            self.at_run_time.add(origin)
+        else:
+            self.for_types.add(origin)
 
-    def need_literals(self, node: ast.AST | None, module: str) -> None:
+    def import_literals_in(self, node: ast.AST | None, module: str) -> None:
         """Import Literals at run time: ``checked`` knows classes by their names, but needs the values of a Literal."""
         for part in ast.walk(node) if node is not None else ():
-            where = imports_of(module).get(part.id, (module, part.id)) if isinstance(part, ast.Name) else ("", "")
-            if where[0].startswith("aerokit."):
-                found = getattr(importlib.import_module(where[0]), where[1], None)
-                if get_origin(found) is Literal:
-                    self.at_run_time.add(where)
+            if not isinstance(part, ast.Name):
+                continue
+            origin_module, origin_name = imports_of(module).get(part.id, (module, part.id))
+            if origin_module.startswith("aerokit."):
+                imported = getattr(importlib.import_module(origin_module), origin_name, None)
+                if get_origin(imported) is Literal:
+                    self.at_run_time.add((origin_module, origin_name))
 
-    def returned(self, expression: str, returns: ast.expr | None) -> str:
+    def wrapped_in_twin(self, expression: str, returns: ast.expr | None) -> str:
         """Return the expression, wrapped in a twin if its type has one."""
-        name, maybe = outer(returns), outer(optional(returns))
-        if maybe in self._twins:
-            return f"None if {expression} is None else {maybe}(self._loop, {expression})"
+        name, optional_name = outer_name(returns), outer_name(without_none(returns))
+        if optional_name in self._twins:
+            return f"None if {expression} is None else {optional_name}(self._loop, {expression})"
         return f"{name}(self._loop, {expression})" if name in self._twins else expression
 
-    def member(self, twin: Twin, member: ClassMember) -> str:
-        self.need(member.returns, member.module)
+    def render_member(self, twin: Twin, member: ClassMember) -> str:
+        """Return the source of the twin of a member, and import what it needs."""
+        self.import_names_in(member.returns, member.module)
         node, name = member.node, member.name
         if node is None or not {"property", "cached_property"}.isdisjoint(decorators_of(node)):
-            return self._value(twin, member)
-        those = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
-        for argument in (*those, node.args.vararg, node.args.kwarg):
-            self.need(argument.annotation if argument else None, member.module)
+            return self._property_twin(twin, member)
+        named_arguments = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
+        for argument in (*named_arguments, node.args.vararg, node.args.kwarg):
+            self.import_names_in(argument.annotation if argument else None, member.module)
         for default in (*node.args.defaults, *node.args.kw_defaults):
-            self.need(default, member.module, at_run_time=True)
-        arguments = forwarded(node)
+            self.import_names_in(default, member.module, at_run_time=True)
+        arguments = forwarded_arguments(node)
         if "contextmanager" in decorators_of(node):
-            self.for_types.add(("contextlib", "AbstractContextManager"))
-            inner = node.returns.slice if isinstance(node.returns, ast.Subscript) else ast.Constant(None)
-            kind = ast.Subscript(ast.Name("AbstractContextManager"), inner)
-            block = f"self.aio.{name}({', '.join(arguments)})"
-            is_twin = outer(inner) in self._twins
-            body = f"return self._twin_block({outer(inner)}, {block})" if is_twin else f"return self._block({block})"
-            return function(node, kind, member.text, body)
+            return self._render_context_manager(node, member, arguments)
         called = f"self.aio.{name}"
         if name not in twin.direct:
             run = "run" if isinstance(node, ast.AsyncFunctionDef) else "call"
             called, arguments = f"self._loop.{run}", [called, *arguments]
-        if outer(node.returns) in self._twins:
-            made = call(called, arguments, "            ")
-            body = call(f"return {outer(node.returns)}", ["self._loop", made])
+        if outer_name(node.returns) in self._twins:
+            result = render_call(called, arguments, "            ")
+            body = render_call(f"return {outer_name(node.returns)}", ["self._loop", result])
         else:
-            is_none = isinstance(node.returns, ast.Constant) and node.returns.value is None
-            body = call(called if is_none else f"return {called}", arguments)
-        return function(node, node.returns, member.text, body)
+            returns_none = isinstance(node.returns, ast.Constant) and node.returns.value is None
+            body = render_call(called if returns_none else f"return {called}", arguments)
+        return render_function(node, node.returns, member.text, body)
 
-    def _value(self, twin: Twin, member: ClassMember) -> str:
+    def _render_context_manager(
+        self, node: ast.FunctionDef | ast.AsyncFunctionDef, member: ClassMember, arguments: Sequence[str]
+    ) -> str:
+        """Return the source for a method that is a generator in a ``contextmanager`` decorator."""
+        self.for_types.add(("contextlib", "AbstractContextManager"))
+        yielded = node.returns.slice if isinstance(node.returns, ast.Subscript) else ast.Constant(None)
+        returns = ast.Subscript(ast.Name("AbstractContextManager"), yielded)
+        block = f"self.aio.{member.name}({', '.join(arguments)})"
+        if outer_name(yielded) in self._twins:
+            body = f"return self._twin_block({outer_name(yielded)}, {block})"
+        else:
+            body = f"return self._block({block})"
+        return render_function(node, returns, member.text, body)
+
+    def _property_twin(self, twin: Twin, member: ClassMember) -> str:
+        """Return the source of a property. It is cached if its value is a twin, so that each access gives the same."""
         name, read = member.name, f"self.aio.{member.name}"
         if name in twin.called:
             read = f"self._loop.call(lambda: {read})"
-        wrapped = self.returned(read, member.returns)
+        wrapped = self.wrapped_in_twin(read, member.returns)
         if name in twin.parts:
-            wrapped = f'self._part("{name}", {outer(member.returns)})'
+            wrapped = f'self._part("{name}", {outer_name(member.returns)})'
         decorator = "property" if wrapped == read or name in twin.parts else "cached_property"
         if member.returns is None:
             raise ValueError(f"the type of {twin.name}.{name} is not annotated")
-        kind = source(member.returns)
-        return f"    @{decorator}\n    def {name}(self) -> {kind}:\n{docstring(member.text)}        return {wrapped}\n"
+        signature = f"    @{decorator}\n    def {name}(self) -> {source_of(member.returns)}:\n"
+        return f"{signature}{render_docstring(member.text)}        return {wrapped}\n"
 
 
 TYPE_VARIABLES = {
@@ -269,6 +289,7 @@ TYPE_VARIABLES = {
 
 
 def generate(name: str = "twins") -> str:
+    """Return the source of one file."""
     page, twins = Page(name), [twin for twin in TWINS if twin.page == name]
     classes = [_class(page, twin) for twin in twins]
     functions = [_opener(page, path) for path in FUNCTIONS[name]]
@@ -281,15 +302,16 @@ def generate(name: str = "twins") -> str:
     variables = TYPE_VARIABLES if name == "twins" else {}
     page.for_types |= {("aerokit.mavlink.message", "Message"), ("aerokit.events", "Event")}
     for path in FUNCTIONS[name]:
-        module, _, name = path.rpartition(".")
-        page.at_run_time.add((module, f"{name} as {name}_async"))
+        module, _, function_name = path.rpartition(".")
+        page.at_run_time.add((module, f"{function_name} as {function_name}_async"))
     page.for_types -= page.at_run_time
     text = HEAD if variables else HEAD.replace("import TYPE_CHECKING, TypeVar", "import TYPE_CHECKING")
     if "@cached_property" not in "".join(classes):
         text = text.replace("from functools import cached_property\n", "")
     head = text + _import_lines(page.at_run_time, "") + "\nif TYPE_CHECKING:\n"
     head += _import_lines(page.for_types, "    ") + "\n"
-    head += "__all__ = [\n" + "".join(f'    "{name}",\n' for name in names) + "]\n" + "\n" * bool(variables)
+    head += "__all__ = [\n" + "".join(f'    "{exported}",\n' for exported in names) + "]\n"
+    head += "\n" if variables else ""
     for variable, bound in variables.items():
         head += f'{variable} = TypeVar("{variable}"{f", bound={bound}" if bound else ""})\n'
     return head + "\n\n" + "\n\n".join([*classes, *functions])
@@ -302,28 +324,30 @@ def _class(page: Page, twin: Twin) -> str:
         base += f'["Async{twin.name}"]'
     if twin.inherits:
         base += f", {twin.inherits}"
-    text = docstring(inspect.getdoc(original), "    ")
-    members = "\n".join(page.member(twin, member) for member in members_of(twin))
-    return "\n".join([f"class {twin.name}({base}):\n{text}", *([members] if members else [])])
+    text = render_docstring(inspect.getdoc(original), "    ")
+    members = "\n".join(page.render_member(twin, member) for member in members_of(twin))
+    definition = f"class {twin.name}({base}):\n{text}"
+    return f"{definition}\n{members}" if members else definition
 
 
 def _opener(page: Page, path: str) -> str:
+    """Return the source of a function such as ``connect``, which opens the twin on a loop thread."""
     module, _, name = path.rpartition(".")
     node = function_node(module, name)
     for argument in (*node.args.args, *node.args.kwonlyargs, node.args.vararg):
-        page.need(argument.annotation if argument else None, (module,))
-        page.need_literals(argument.annotation if argument else None, module)
+        page.import_names_in(argument.annotation if argument else None, (module,))
+        page.import_literals_in(argument.annotation if argument else None, module)
     for default in (*node.args.defaults, *node.args.kw_defaults):
-        page.need(default, (module,), at_run_time=True)
+        page.import_names_in(default, (module,), at_run_time=True)
     assert isinstance(node.returns, ast.Subscript)
-    kind = ast.unparse(node.returns.slice)
-    lines = _lines(arguments_of(node.args), "    ")
-    given = "".join(f"        {argument.lstrip('*')},\n" for argument in forwarded(node))
-    opens = OPENERS[page.name][1]
+    twin_name = ast.unparse(node.returns.slice)
+    parameters = _lines(arguments_of(node.args), "    ")
+    arguments = "".join(f"        {argument.lstrip('*')},\n" for argument in forwarded_arguments(node))
+    _, opener = OPENERS[page.name]
     text = (ast.get_docstring(node) or "").replace("``async with``", "``with``")
     return (
-        f"@checked\ndef {name}(\n{lines}) -> {kind}:\n{docstring(text, '    ')}"
-        f"    return {opens}(\n        {kind},\n        {name}_async,\n{given}    )\n"
+        f"@checked\ndef {name}(\n{parameters}) -> {twin_name}:\n{render_docstring(text, '    ')}"
+        f"    return {opener}(\n        {twin_name},\n        {name}_async,\n{arguments}    )\n"
     )
 
 
@@ -338,33 +362,35 @@ def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
 
 
 def _from_lines(module: str, names: set[tuple[str, str]], indent: str) -> str:
-    found = sorted((name for other, name in names if other == module and name), key=_by_kind)
-    joined = [name for name in found if " as " not in name]
-    lines = {name: f"{indent}from {module} import {name}\n" for name in found if name not in joined}
-    if joined:
-        line = f"{indent}from {module} import {', '.join(joined)}\n"
-        if len(line) > WIDTH + 1:
-            line = f"{indent}from {module} import (\n{_lines(joined, indent + '    ')}{indent})\n"
-        lines[joined[0]] = line
-    return "".join(lines[name] for name in sorted(lines, key=_by_kind))
+    imported = sorted((name for name_module, name in names if name_module == module and name), key=_by_kind)
+    plain_names = [name for name in imported if " as " not in name]
+    # First imported name → import statement. Each name with "as" has a statement of its own.
+    statements = {name: f"{indent}from {module} import {name}\n" for name in imported if name not in plain_names}
+    if plain_names:
+        statement = f"{indent}from {module} import {', '.join(plain_names)}\n"
+        if len(statement) > WIDTH + 1:
+            statement = f"{indent}from {module} import (\n{_lines(plain_names, indent + '    ')}{indent})\n"
+        statements[plain_names[0]] = statement
+    return "".join(statements[name] for name in sorted(statements, key=_by_kind))
 
 
 def _by_kind(name: str) -> tuple[bool, bool, str]:
+    """Return the sort key of ruff's import order: constants, then classes, then functions."""
     return not name.isupper(), name[0].islower(), name.lower()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m aerokit.sync.generator")
     parser.add_argument("--check", action="store_true", help="compare with the committed file, write nothing")
-    is_check, code = parser.parse_args(arguments).check, 0
+    is_check, exit_code = parser.parse_args(arguments).check, 0
     for name, file in FILES.items():
         text = generate(name)
         if not is_check:
             file.write_text(text, encoding="utf-8", newline="\n")
         elif not file.is_file() or file.read_text(encoding="utf-8") != text:
             sys.stdout.write(f"differs: sync/{file.name}; python -m aerokit.sync.generator writes it\n")
-            code = 1
-    return code
+            exit_code = 1
+    return exit_code
 
 
 if __name__ == "__main__":

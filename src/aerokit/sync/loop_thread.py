@@ -66,7 +66,7 @@ class LoopThread:
             atexit.register(self._calls.finish, self._thread)
         except (OSError, RuntimeError) as error:
             self._abort()
-            # Thread.start waits with a Condition: see ThreadFuture
+            # Thread.start waits with a Condition, in which Ctrl-C becomes a RuntimeError; see ThreadFuture.
             if isinstance(error.__context__, KeyboardInterrupt):
                 raise error.__context__ from None
             raise _not_started(error) from error
@@ -110,7 +110,8 @@ class LoopThread:
             self.wait_for(call)
         except BaseException as error:
             is_shielded = interrupt_timeout_s is None
-            if is_shielded and isinstance(error, KeyboardInterrupt):  # perhaps before the function was started
+            if is_shielded and isinstance(error, KeyboardInterrupt):
+                # Ctrl-C may have come before the function was started. Starting a call twice has no effect.
                 call = call or _Call(functools.partial(function, *args, **kwargs))
                 with contextlib.suppress(AerokitError):
                     self._start(call)
@@ -120,7 +121,8 @@ class LoopThread:
                 while call.is_scheduled and not call.wait(wait_s):
                     if not is_shielded or not self._thread.is_alive():
                         break
-                if is_shielded and (failure := call.pop_exception()) is not None:
+                failure = call.pop_exception() if is_shielded else None
+                if failure is not None:
                     raise error from failure
             raise
         finally:
@@ -273,6 +275,8 @@ class OpenContext(Generic[T]):
 
 
 class _ContextTask(Generic[T]):
+    """Enters a context manager, sets ``opened``, and exits the context manager when ``close`` is set."""
+
     def __init__(self, context: AbstractAsyncContextManager[T]) -> None:
         self._context = context
         self.opened: ThreadFuture[T] = ThreadFuture()
@@ -288,6 +292,8 @@ class _ContextTask(Generic[T]):
 
 
 class _AsyncContext(AbstractAsyncContextManager[T]):
+    """A synchronous context manager as an asynchronous one."""
+
     def __init__(self, context: AbstractContextManager[T]) -> None:
         self._context = context
 
@@ -303,7 +309,7 @@ class _Calls:
 
     def __init__(self) -> None:
         self.context = contextvars.Context()
-        self.is_aborted = False  # LoopThread.__init__ failed
+        self.is_aborted = False  # True if LoopThread.__init__ failed
         self._end = asyncio.Event()
         self._tasks: dict[asyncio.Task[None], _Call[Any]] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -315,12 +321,13 @@ class _Calls:
         return self._process == os.getpid()
 
     def begin(self, call: _Call[Any]) -> None:
+        """Run a call in a new task, unless it has started."""
         if call.has_started:
             return
         call.has_started = True
         task = asyncio.get_running_loop().create_task(call.run())
         self._tasks[task] = call
-        # Finishes a call that was cancelled before its first step; others have finished already.
+        # This finishes a call that was cancelled before its first step. Other calls have finished already.
         task.add_done_callback(lambda task: self._tasks.pop(task).finish())
 
     def end_soon(self, function: Callable[[], object] | None = None) -> None:
@@ -335,6 +342,7 @@ class _Calls:
         thread.join(CLOSE_TIMEOUT_S)
 
     async def run(self, started: ThreadFuture[asyncio.AbstractEventLoop]) -> None:
+        """Keep the loop running until `end_soon`, then cancel all calls. The main function of the thread's loop."""
         self.context = contextvars.copy_context()
         self._loop = asyncio.get_running_loop()
         started.set_result(self._loop)
@@ -360,7 +368,7 @@ class _Call(ThreadFuture[T]):
         super().__init__()
         self._function = function
         self._cancellation = Cancellation()
-        self.is_scheduled = False  # scheduled on the loop
+        self.is_scheduled = False  # True once the loop was told to start it
         self.has_started = False
 
     def cancel(self) -> None:
@@ -382,6 +390,7 @@ class _Call(ThreadFuture[T]):
 
 
 def _run(calls: _Calls, started: ThreadFuture[asyncio.AbstractEventLoop]) -> None:
+    """Run the loop; the thread's target function. An error before the start goes to ``started``."""
     try:
         anyio.run(calls.run, started)
     except BaseException as error:
@@ -393,7 +402,7 @@ def _run(calls: _Calls, started: ThreadFuture[asyncio.AbstractEventLoop]) -> Non
 
 
 def _not_started(error: Exception) -> LinkOpenError:
-    reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-    failed = LinkOpenError(f"the event loop's thread cannot start: {reason}")
-    failed.errno = error.errno if isinstance(error, OSError) else None
-    return failed
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    link_error = LinkOpenError(f"the event loop's thread cannot start: {reason}")
+    link_error.errno = error.errno if isinstance(error, OSError) else None
+    return link_error

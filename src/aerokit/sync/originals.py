@@ -155,13 +155,13 @@ def tree(module: str) -> ast.Module:
 @cache
 def imports_of(module: str) -> dict[str, tuple[str, str]]:
     """Return the imports of a module: each local name, with the module and the name there."""
-    found: dict[str, tuple[str, str]] = {}
+    imports: dict[str, tuple[str, str]] = {}
     for node in ast.walk(tree(module)):
         if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
+            imports |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
         elif isinstance(node, ast.Import):
-            found |= {alias.asname or alias.name: (alias.name, "") for alias in node.names}
-    return found
+            imports |= {alias.asname or alias.name: (alias.name, "") for alias in node.names}
+    return imports
 
 
 def _class_node(cls: type) -> ast.ClassDef:
@@ -183,20 +183,20 @@ class ClassMember:
     node: ast.FunctionDef | ast.AsyncFunctionDef | None
     returns: ast.expr | None
     text: str | None
-    is_cell: bool = False  # a declared state
+    is_cell: bool = False  # True for a declared state
 
 
 def members_of(twin: Twin) -> list[ClassMember]:
     """Return the members to generate, inherited ones included, in the order of their first definition."""
     cls = _class_of(twin)
-    inherited = next((_class_of(other).__mro__ for other in TWINS if other.name == twin.inherits), ())
-    found: dict[str, ClassMember] = {}
+    classes_of_base_twin = next((_class_of(base).__mro__ for base in TWINS if base.name == twin.inherits), ())
+    members: dict[str, ClassMember] = {}
     fill = _type_argument_filler(cls)
     for base in reversed(cls.__mro__):
-        if base.__module__.startswith("aerokit.") and base not in inherited:
-            found |= {member.name: fill(member) for member in _own(base)}
-    wanted = twin.only or {name for name in found if not name.startswith("_")} | twin.special
-    return [member for name, member in found.items() if name in wanted and name not in twin.without]
+        if base.__module__.startswith("aerokit.") and base not in classes_of_base_twin:
+            members |= {member.name: fill(member) for member in _own_members(base)}
+    selected = twin.only or {name for name in members if not name.startswith("_")} | twin.special
+    return [member for name, member in members.items() if name in selected and name not in twin.without]
 
 
 def _class_of(twin: Twin) -> type:
@@ -225,7 +225,8 @@ def _type_argument_filler(cls: type) -> Callable[[ClassMember], ClassMember]:
     return fill
 
 
-def _own(cls: type) -> Iterator[ClassMember]:
+def _own_members(cls: type) -> Iterator[ClassMember]:
+    """Yield methods, public attributes that ``__init__`` sets, and declared states, but no inherited members."""
     body = _class_node(cls).body
     for index, node in enumerate(body):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
@@ -236,8 +237,8 @@ def _own(cls: type) -> Iterator[ClassMember]:
         elif isinstance(node, ast.AnnAssign) and _is_state(node.annotation):
             assert isinstance(node.target, ast.Name)
             assert isinstance(node.annotation, ast.Subscript)
-            kind = ast.Subscript(ast.Name("StateCell"), node.annotation.slice)
-            yield ClassMember(node.target.id, (cls.__module__,), None, kind, _text_below(body, index), is_cell=True)
+            type_ = ast.Subscript(ast.Name("StateCell"), node.annotation.slice)
+            yield ClassMember(node.target.id, (cls.__module__,), None, type_, _text_below(body, index), is_cell=True)
 
 
 def _attributes(init: ast.FunctionDef, module: tuple[str, ...]) -> Iterator[ClassMember]:
@@ -248,12 +249,12 @@ def _attributes(init: ast.FunctionDef, module: tuple[str, ...]) -> Iterator[Clas
             target = node.targets[0]
         if not isinstance(target, ast.Attribute) or target.attr.startswith("_"):
             continue
-        kind: ast.expr | None = None
+        type_: ast.expr | None = None
         if isinstance(node, ast.AnnAssign):
-            kind = node.annotation
+            type_ = node.annotation
         elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Call):
-            kind = node.value.func
-        yield ClassMember(target.attr, module, None, kind, _text_below(init.body, index))
+            type_ = node.value.func
+        yield ClassMember(target.attr, module, None, type_, _text_below(init.body, index))
 
 
 def _text_below(body: Sequence[ast.stmt], index: int) -> str | None:

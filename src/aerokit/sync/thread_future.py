@@ -20,7 +20,7 @@ class ThreadFuture(Generic[T]):
     """
 
     def __init__(self) -> None:
-        self._gate = threading.Lock()
+        self._gate = threading.Lock()  # held until the future is done
         self._gate.acquire()
         self._values: tuple[T, ...] = ()
         self._error: BaseException | None = None
@@ -60,7 +60,7 @@ class ThreadFuture(Generic[T]):
         return self._values[0]
 
     def pop_exception(self) -> BaseException | None:
-        # Keeping the error would make a reference cycle: its traceback refers to this object.
+        """Return the error and forget it: its traceback refers to this object, which would be a reference cycle."""
         error, self._error = self._error, None
         return error
 

@@ -1075,7 +1075,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Args:
             target: the position.
             wait: False: return when the manager has accepted the order.
-            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
 
         Raises:
@@ -1103,7 +1103,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Args:
             system_id: MAVLink system id of the other vehicle, 1 to 255.
             wait: False: return when the manager has accepted the order.
-            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
 
         Raises:
@@ -1144,7 +1144,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
                 then turns with the vehicle, so a yaw from north is right only at the time of the order.
             frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards.
             wait: False: return when the manager has accepted the order.
-            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
 
         Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. If the manager denies it, aerokit claims control until
@@ -3089,7 +3089,7 @@ class Camera(TwinOf["AsyncCamera"]):
             x: 0 (left) to 1 (right).
             y: 0 (top) to 1 (bottom).
             radius: radius of the object as a fraction of the image width, 0 (one pixel) to 1.
-            status_hz: rate of ``camera.tracking``, above 0 to 50.
+            status_hz: rate of ``camera.tracking``, above 0 and at most 50.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
@@ -3110,7 +3110,7 @@ class Camera(TwinOf["AsyncCamera"]):
             top: 0 to 1.
             right: 0 to 1, right of ``left``.
             bottom: 0 to 1, below ``top``.
-            status_hz: rate of ``camera.tracking``, above 0 to 50.
+            status_hz: rate of ``camera.tracking``, above 0 and at most 50.
         """
         self._loop.run(self.aio.track_rectangle, left, top, right, bottom, status_hz=status_hz)
 
@@ -3145,7 +3145,7 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.zoom_to, percent)
 
     def zoom_to_focal_length(self, millimetres: float) -> None:
-        """Zoom to a focal length, above 0 to 10,000 mm; errors as for :meth:`zoom_step`."""
+        """Zoom to a focal length, above 0 and at most 10,000 mm; errors as for :meth:`zoom_step`."""
         self._loop.run(self.aio.zoom_to_focal_length, millimetres)
 
     def zooming(self, speed: float = 1.0) -> CameraBlock:
@@ -3179,7 +3179,7 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.focus_to, percent)
 
     def focus_at(self, metres: float) -> None:
-        """Focus at a distance, above 0 to 100,000 m; errors as for :meth:`focus_step`."""
+        """Focus at a distance, above 0 and at most 100,000 m; errors as for :meth:`focus_step`."""
         self._loop.run(self.aio.focus_at, metres)
 
     def auto_focus(self, kind: AutoFocus = "auto") -> None:

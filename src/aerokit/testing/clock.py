@@ -45,9 +45,9 @@ import anyio
 
 T = TypeVar("T")
 
-# Iterations and events of event sources between two polls.
+# The selector is polled once in this many iterations and runs of event sources.
 _POLL_EVERY = 64
-# With more timers than this, mostly cancelled ones, asyncio's own iteration discards the cancelled timers.
+# With more timers than this, most of them cancelled, asyncio's own iteration runs to discard the cancelled ones.
 _MANY_TIMERS = 100
 
 DEADLOCK_TIMEOUT_S = 10.0
@@ -66,14 +66,15 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     def __init__(self, *, deadlock_timeout_s: float = DEADLOCK_TIMEOUT_S) -> None:
         self._now = 0.0
-        self._outside_calls = self._turns = 0
+        self._executor_calls = self._iterations = 0
         self._deadlock_timeout_s = deadlock_timeout_s
         self._sources: list[tuple[Callable[[], float], asyncio.Handle]] = []
         super().__init__(_JumpingSelector(self))
         selector: selectors.BaseSelector = self._selector  # type: ignore[attr-defined]
-        self._selected: Mapping[Any, Any] = selector.get_map()
-        self._own_selected = len(self._selected)  # just the loop's self-pipe
-        self._clock_resolution = 1e-9  # A rounding error in now + (when - now) must not miss a timer.
+        self._registered: Mapping[Any, Any] = selector.get_map()
+        self._own_registered_count = len(self._registered)  # just the loop's self-pipe
+        # asyncio waits for `when - now`, so the clock may end a rounding error before `when`; the timer is due then.
+        self._clock_resolution = 1e-9
 
     def time(self) -> float:
         """Return the virtual seconds since the loop was created."""
@@ -92,23 +93,22 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     def _run_once(self) -> None:
         """Run one iteration of the loop. Without sockets, poll only now and then, for signals and other threads."""
-        self._turns += 1
+        self._iterations += 1
         ready, timers = self._ready, self._scheduled  # type: ignore[attr-defined]
-        if (
-            self._turns >= _POLL_EVERY
-            or not self._is_alone
-            or (not ready and not self._run_sources() and self._next_timer() == math.inf)
-            or _MANY_TIMERS < len(timers) < 2 * self._timer_cancelled_count  # type: ignore[attr-defined]
-        ):
-            self._turns = 0
+        needs_poll = self._iterations >= _POLL_EVERY or not self._can_skip_polls
+        if not needs_poll and not ready:
+            has_event = self._run_sources() or self._next_timer() != math.inf
+            needs_poll = not has_event  # Only a signal or another thread can wake the loop, or it is deadlocked.
+        if needs_poll or _MANY_TIMERS < len(timers) < 2 * self._timer_cancelled_count:  # type: ignore[attr-defined]
+            self._iterations = 0
             super()._run_once()  # type: ignore[misc]
             return
         if not ready:
-            # Event sources have run until the next poll, or the last event was run and there is no timer.
-            if self._turns >= _POLL_EVERY or self._next_timer() == math.inf:
+            # Event sources have run and did not make a callback ready. The next iteration polls or looks again.
+            if self._iterations >= _POLL_EVERY or self._next_timer() == math.inf:
                 return
             self._now = max(self._now, self._next_timer())
-        self._ready_sources()
+        self._schedule_sources_before_timer()
         end = self._now + self._clock_resolution
         while timers and timers[0]._when < end:
             timer = heappop(timers)
@@ -120,10 +120,10 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
                 handle._run()
 
     @property
-    def _is_alone(self) -> bool:
+    def _can_skip_polls(self) -> bool:
         """True if neither sockets nor threads nor the debug mode need asyncio's own iteration."""
-        is_watched = self._outside_calls or self._stopping or self._debug  # type: ignore[attr-defined]
-        return not is_watched and len(self._selected) == self._own_selected
+        is_watched = self._executor_calls or self._stopping or self._debug  # type: ignore[attr-defined]
+        return not is_watched and len(self._registered) == self._own_registered_count
 
     def _next_timer(self) -> float:
         """Return the time of the first timer, infinity without timers. Discard cancelled timers before it."""
@@ -139,25 +139,25 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         Return True if any ran.
         """
         sources, ready, has_run = self._sources, self._ready, False  # type: ignore[attr-defined]
-        is_alone = self._is_alone
+        can_skip_polls = self._can_skip_polls
         while sources and not ready:
-            due, handle = math.inf, sources[0][1]
-            for next_due, candidate in sources:
-                if (when := next_due()) < due:
-                    due, handle = when, candidate
-            if not due + self._clock_resolution < self._next_timer():
+            earliest_due, earliest = math.inf, sources[0][1]
+            for next_due, handle in sources:
+                due = next_due()
+                if due < earliest_due:
+                    earliest_due, earliest = due, handle
+            if earliest_due + self._clock_resolution >= self._next_timer():
                 break
-            if due > self._now:
-                self._now = due
-            handle._run()
+            self._now = max(self._now, earliest_due)
+            earliest._run()
             has_run = True
-            self._turns += 1
-            if self._turns >= _POLL_EVERY or not is_alone:  # Sockets are polled before every jump.
+            self._iterations += 1
+            if self._iterations >= _POLL_EVERY or not can_skip_polls:  # Sockets are polled before every jump.
                 break
         return has_run
 
-    def _ready_sources(self) -> None:
-        """If a timer is due, make the event sources of this instant ready. They run before the timer."""
+    def _schedule_sources_before_timer(self) -> None:
+        """If a timer is due, schedule the event sources of the same instant, so that they run before the timer."""
         timers, end = self._scheduled, self._now + self._clock_resolution  # type: ignore[attr-defined]
         if timers and timers[0]._when < end:
             self._ready.extend(handle for next_due, handle in self._sources if next_due() < end)  # type: ignore[attr-defined]
@@ -165,29 +165,32 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
     def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  # type: ignore[override]
         """Run ``func`` on a thread; the clock stands still until it returns."""
         future = super().run_in_executor(executor, func, *args)
-        self._outside_calls += 1
-        future.add_done_callback(self._outside_call_done)
+        self._executor_calls += 1
+        future.add_done_callback(self._on_executor_call_done)
         return future
 
     async def shutdown_default_executor(self, timeout: float | None = None) -> None:
-        """Join the threads of the executor, in real time."""
-        self._outside_calls += 1
+        """Join the threads of the executor, in real time.
+
+        ``timeout``, which Python 3.12 and later pass, is ignored, because it would count virtual seconds.
+        """
+        self._executor_calls += 1
         try:
             await super().shutdown_default_executor()
         finally:
-            self._outside_calls -= 1
+            self._executor_calls -= 1
 
     def wait_for_events(self, poll: Callable[[float], list[Any]], timeout: float | None) -> list[Any]:
         """Replace the selector's wait for ``timeout`` virtual seconds; None waits without a limit."""
         events = self._wait(poll, timeout)
-        self._ready_sources()
+        self._schedule_sources_before_timer()
         return events
 
     def _wait(self, poll: Callable[[float], list[Any]], timeout: float | None) -> list[Any]:
         events = poll(0)
         if events or (timeout is not None and timeout <= 0):
             return events
-        if self._outside_calls:
+        if self._executor_calls:
             return self._wait_in_real_time(poll)
         if self._run_sources():
             return []
@@ -200,8 +203,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         self._now += timeout
         return []
 
-    def _outside_call_done(self, _future: asyncio.Future[Any]) -> None:
-        self._outside_calls -= 1
+    def _on_executor_call_done(self, _future: asyncio.Future[Any]) -> None:
+        self._executor_calls -= 1
 
     def _wait_in_real_time(self, poll: Callable[[float], list[Any]]) -> list[Any]:
         events = poll(self._deadlock_timeout_s)
@@ -212,10 +215,10 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return events
 
     def _may_be_woken(self) -> bool:
-        return len(self._selected) != self._own_selected or threading.active_count() > 1
+        return len(self._registered) != self._own_registered_count or threading.active_count() > 1
 
     def _deadlock(self, reason: str) -> str:
-        waiting = "".join(f"\n  - {_where(task)}" for task in asyncio.all_tasks(self))
+        waiting = "".join(f"\n  - {_name_and_line(task)}" for task in asyncio.all_tasks(self))
         return f"at {self._now} virtual seconds: {reason}; waiting tasks:{waiting or ' none'}"
 
 
@@ -233,7 +236,7 @@ def run_virtual(coroutine: Coroutine[Any, Any, T]) -> T:
     try:
         return anyio.run(main, backend_options={"loop_factory": VirtualClockLoop})
     finally:
-        coroutine.close()
+        coroutine.close()  # It may not have started, if the event loop could not be created.
 
 
 VIRTUAL_BACKEND: tuple[str, dict[str, object]] = ("asyncio", {"loop_factory": VirtualClockLoop})
@@ -256,12 +259,13 @@ class _JumpingSelector(selectors.DefaultSelector):
         super().close()
 
 
-def _where(task: asyncio.Task[Any]) -> str:
-    """Return the name of a task and the line at which it waits."""
-    place = ""
-    step: object = task.get_coro()
-    while isinstance(step, CoroutineType):
-        if step.cr_frame is not None:
-            place = f" at {step.cr_frame.f_code.co_filename}:{step.cr_frame.f_lineno} in {step.__qualname__}"
-        step = step.cr_await
-    return task.get_name() + place
+def _name_and_line(task: asyncio.Task[Any]) -> str:
+    """Return the name of a task and the line at which its innermost coroutine waits."""
+    line = ""
+    awaited: object = task.get_coro()
+    while isinstance(awaited, CoroutineType):
+        frame = awaited.cr_frame
+        if frame is not None:
+            line = f" at {frame.f_code.co_filename}:{frame.f_lineno} in {awaited.__qualname__}"
+        awaited = awaited.cr_await
+    return task.get_name() + line

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 _MAX_TEXTS = 6
 
 
-def failure_report(flown: Iterable[SimulatedFleet | Flight | ServedFlight], test: str, directory: str | None) -> str:
+def failure_report(opened: Iterable[SimulatedFleet | Flight | ServedFlight], test: str, directory: str | None) -> str:
     """Return the lines of the report on each vehicle.
 
     With ``directory``, also save a picture of all tracks there, named after the test, and recordings with their
     reports.
     """
-    flights = _flatten(flown)
+    flights = _flatten(opened)
     lines = [line for flight in flights for line in _describe(flight)]
     if directory is not None:
         lines.append(_picture(flights, test, Path(directory)))
@@ -32,10 +32,10 @@ def failure_report(flown: Iterable[SimulatedFleet | Flight | ServedFlight], test
     return "\n".join(lines)
 
 
-def _flatten(flown: Iterable[SimulatedFleet | Flight | ServedFlight]) -> list[Flight | ServedFlight]:
+def _flatten(opened: Iterable[SimulatedFleet | Flight | ServedFlight]) -> list[Flight | ServedFlight]:
     flights: list[Flight | ServedFlight] = []
-    for flight in flown:
-        flights += flight if isinstance(flight, SimulatedFleet) else [flight]
+    for fleet_or_flight in opened:
+        flights += fleet_or_flight if isinstance(fleet_or_flight, SimulatedFleet) else [fleet_or_flight]
     return flights
 
 

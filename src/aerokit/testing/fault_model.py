@@ -105,34 +105,31 @@ class FaultyPath:
         return arrivals
 
     def _carry_frame(self, frame: bytes, now: float) -> list[tuple[float, bytes]]:
-        # Each frame consumes the same number of random numbers. A change of one share therefore does not change which
-        # frames have other faults.
-        model, draws = self.model, [self._chance() for _ in range(5)]
-        lost, doubled = draws[0] < model.loss, draws[1] < model.duplication
-        held, bad, jitter = (
-            draws[2] < model.reordering,
-            draws[3] < model.corruption,
-            draws[4] * model.jitter_s,
-        )
+        # Every frame draws these five random numbers, even if it is lost. A change of one share therefore does not
+        # change which frames have other faults.
+        model, chance = self.model, self._chance
+        is_lost, is_duplicated = chance() < model.loss, chance() < model.duplication
+        is_reordered, is_corrupted = chance() < model.reordering, chance() < model.corruption
+        jitter = chance() * model.jitter_s
         self.frames += 1
         self.bytes += len(frame)
-        left_at = self._transmit(len(frame), now)
-        if left_at is None:
+        sent_at = self._transmit(len(frame), now)
+        if sent_at is None:
             self.overflowed += 1
             return []
-        if lost or self._is_out(left_at):
+        if is_lost or self._is_outage(sent_at):
             self.lost += 1
             return []
-        if bad:
+        if is_corrupted:
             frame = self._corrupt(frame)
-        due = left_at + model.delay_s + jitter
-        if held:
+        due = sent_at + model.delay_s + jitter
+        if is_reordered:
             self.reordered += 1
             due += model.overtaken_s
         else:
             due = self._latest_due = max(due, self._latest_due)
-        self.duplicated += doubled
-        return [(due, frame)] * (1 + doubled)
+        self.duplicated += is_duplicated
+        return [(due, frame)] * (2 if is_duplicated else 1)
 
     def _transmit(self, size: int, now: float) -> float | None:
         """Return the time at which the last byte is sent; None if the queue is full."""
@@ -140,14 +137,15 @@ class FaultyPath:
         begin = max(now, air.busy_until)
         if math.isinf(model.bandwidth):
             return begin
-        waiting = (begin - now) * model.bandwidth
-        if waiting + size > model.queue_bytes and waiting > 0:
+        queued_bytes = (begin - now) * model.bandwidth
+        # An empty queue accepts even a frame that is larger than the queue.
+        if queued_bytes > 0 and queued_bytes + size > model.queue_bytes:
             return None
         air.busy_until = begin + size / model.bandwidth
         return air.busy_until
 
-    def _is_out(self, when: float) -> bool:
-        elapsed = when - (self._started_at or 0.0)
+    def _is_outage(self, time: float) -> bool:
+        elapsed = time - (self._started_at or 0.0)
         return any(begin <= elapsed < end for begin, end in self.model.outages)
 
     def _corrupt(self, frame: bytes) -> bytes:
@@ -174,11 +172,13 @@ def split_frames(data: bytes) -> Sequence[bytes]:
 
 
 def _end_of_frame(data: bytes, begin: int) -> int | None:
+    """Return the end of the frame that begins here, by its header; None if none does."""
     if len(data) < begin + 3 or data[begin] not in (MAGIC_V1, MAGIC_V2):
         return None
-    if data[begin] == MAGIC_V1:
-        return begin + data[begin + 1] + 8
-    return begin + data[begin + 1] + 12 + (SIGNATURE_LENGTH if data[begin + 2] & SIGNED else 0)
+    magic, payload_length, flags = data[begin : begin + 3]
+    if magic == MAGIC_V1:
+        return begin + payload_length + 8  # header and checksum
+    return begin + payload_length + 12 + (SIGNATURE_LENGTH if flags & SIGNED else 0)
 
 
 def _check_number(name: str, value: float, low: float, high: float) -> None:

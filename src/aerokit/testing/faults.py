@@ -14,7 +14,7 @@ from aerokit.testing.stage import FlightScheduler
 from aerokit.testing.track import true_point
 from aerokit.testing.track_points import TrackPoint
 
-# Function that calls its argument with the scheduler of the flight, now or when the flight is opened.
+# Function that calls its argument, a plan, with the scheduler of the flight.
 ScheduleWith = Callable[[Callable[[FlightScheduler], None]], None]
 
 
@@ -42,10 +42,10 @@ class FaultInjector:
         def is_true() -> bool:
             return condition(true_point(self._vehicle))
 
-        def wait(use: Callable[[FlightScheduler], None]) -> None:
-            self._schedule_with(lambda scheduler: scheduler.do_when(is_true, partial(use, scheduler)))
+        def schedule_when_true(plan: Callable[[FlightScheduler], None]) -> None:
+            self._schedule_with(lambda scheduler: scheduler.do_when(is_true, partial(plan, scheduler)))
 
-        return FaultInjector(self._vehicle, wait)
+        return FaultInjector(self._vehicle, schedule_when_true)
 
     @property
     def all(self) -> Faults:
@@ -83,26 +83,26 @@ class FaultInjector:
     def fail_prearm(self, reason: str, *, after_s: float = 0.0, for_s: float | None = None) -> None:
         """Make an arming check fail for this reason."""
         reasons = self.all.prearm_failures
-        self._plan(partial(reasons.append, reason), after_s)
+        self._schedule(partial(reasons.append, reason), after_s)
         if for_s is not None:
-            self._plan(partial(reasons.remove, reason), after_s + _duration(for_s))
+            self._schedule(partial(reasons.remove, reason), after_s + _duration(for_s))
 
     def reboot(self, *, after_s: float = 0.0) -> None:
         """Reboot the vehicle, also in flight."""
-        self._plan(self._vehicle.restart, after_s)
+        self._schedule(self._vehicle.restart, after_s)
 
     def set_wind(
         self, *, north_m_s: float = 0.0, east_m_s: float = 0.0, gusts_m_s: float = 0.0, after_s: float = 0.0
     ) -> None:
         """Set the velocity of the air, in m/s. ``gusts_m_s`` is the standard deviation of gusts."""
         wind = SimulatedWind(north_m_s, east_m_s, gusts_m_s)
-        self._plan(partial(setattr, self._vehicle.motion, "wind", wind), after_s)
+        self._schedule(partial(setattr, self._vehicle.motion, "wind", wind), after_s)
 
     def set_battery(self, percent: float, *, after_s: float = 0.0) -> None:
         """Set the remaining battery charge in percent; the battery continues to drain."""
         if not 0.0 <= percent <= 100.0:
             raise InvalidArgument(f"percent = {percent!r} is not allowed: 0 to 100")
-        self._plan(partial(setattr, self._vehicle.battery, "percent", percent), after_s)
+        self._schedule(partial(setattr, self._vehicle.battery, "percent", percent), after_s)
 
     def end(self, *, after_s: float = 0.0) -> None:
         """End all faults that a vehicle can recover from: GPS, radios, motor, processor."""
@@ -110,13 +110,13 @@ class FaultInjector:
             self._set(name, False, False, after_s, None)
         self.drop_packets(0.0, after_s=after_s)
 
-    def _set(self, name: str, value: object, well: object, after_s: float, for_s: float | None) -> None:
+    def _set(self, name: str, value: object, healthy_value: object, after_s: float, for_s: float | None) -> None:
         end_s = None if for_s is None else after_s + _duration(for_s)
-        self._plan(partial(setattr, self.all, name, value), after_s)
+        self._schedule(partial(setattr, self.all, name, value), after_s)
         if end_s is not None:
-            self._plan(partial(setattr, self.all, name, well), end_s)
+            self._schedule(partial(setattr, self.all, name, healthy_value), end_s)
 
-    def _plan(self, action: Callable[[], None], after_s: float) -> None:
+    def _schedule(self, action: Callable[[], None], after_s: float) -> None:
         if not (math.isfinite(after_s) and after_s >= 0.0):
             raise InvalidArgument(f"after_s = {after_s!r} must be 0 or more seconds")
         self._schedule_with(lambda scheduler: scheduler.do(action, after_s=after_s))

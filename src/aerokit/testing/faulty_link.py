@@ -34,6 +34,7 @@ from aerokit.transport.link import (
 )
 from aerokit.transport.outbox import Outbox
 
+# Bytes that an outbox keeps for a peer, as many as the TCP links keep.
 LIMIT = 256 * 1024
 
 
@@ -47,11 +48,11 @@ class StalledQueue:
         self,
         system_bytes: int,
         carry: Callable[[bytes, Peer], object],
-        dropped: Callable[[int], object],
-        stalled: Callable[[bool], object],
+        on_drop: Callable[[int], object],
+        on_stall: Callable[[bool], object],
     ) -> None:
-        self._room, self._carry, self._dropped, self._stalled = system_bytes, carry, dropped, stalled
-        self._system: list[tuple[bytes, Peer]] = []
+        self._system_limit, self._carry, self._on_drop, self._on_stall = system_bytes, carry, on_drop, on_stall
+        self._accepted: list[tuple[bytes, Peer]] = []  # Sent by the operating system after the stall.
         self._outboxes: dict[Peer, Outbox] = {}
         self._stalled_peers: set[Peer] = set()
         self._is_stalled = True
@@ -76,8 +77,8 @@ class StalledQueue:
     def drain(self) -> None:
         """Send the bytes that the operating system has accepted, and the queued bytes that have not expired."""
         self._is_stalled = False
-        system, self._system = self._system, []
-        for data, peer in system:
+        accepted, self._accepted = self._accepted, []
+        for data, peer in accepted:
             self._carry(data, peer)
         for outbox in self._outboxes.values():
             outbox.resume()
@@ -90,31 +91,34 @@ class StalledQueue:
 
     def _new_outbox(self, peer: Peer) -> Outbox:
         outbox = Outbox(
-            partial(self._take, peer=peer),
-            partial(self._in_system, peer),
+            partial(self._send_or_accept, peer=peer),
+            partial(self._accepted_bytes_of, peer),
             limit=LIMIT,
-            dropped=self._dropped,
+            dropped=self._on_drop,
             stalled=partial(self._on_peer_stalled, peer),
         )
-        if self._is_stalled and not self._room:
+        if self._is_stalled and not self._system_limit:
             outbox.pause()
         return outbox
 
-    def _take(self, data: bytes, peer: Peer) -> None:
+    def _send_or_accept(self, data: bytes, peer: Peer) -> None:
         if not self._is_stalled:
             self._carry(data, peer)
             return
-        self._system.append((data, peer))
-        if sum(len(piece) for piece, _ in self._system) >= self._room:
+        self._accepted.append((data, peer))
+        if sum(len(piece) for piece, _ in self._accepted) >= self._system_limit:
             for outbox in self._outboxes.values():
                 outbox.pause()
 
-    def _in_system(self, peer: Peer) -> int:
-        return sum(len(data) for data, receiver in self._system if receiver == peer)
+    def _accepted_bytes_of(self, peer: Peer) -> int:
+        return sum(len(data) for data, receiver in self._accepted if receiver == peer)
 
     def _on_peer_stalled(self, peer: Peer, is_stalled: bool) -> None:
-        (self._stalled_peers.add if is_stalled else self._stalled_peers.discard)(peer)
-        self._stalled(bool(self._stalled_peers))
+        if is_stalled:
+            self._stalled_peers.add(peer)
+        else:
+            self._stalled_peers.discard(peer)
+        self._on_stall(bool(self._stalled_peers))
 
 
 class FaultyLink(Link):
@@ -202,7 +206,7 @@ class FaultyLink(Link):
             raise BusyError(f"{self.address} is open; a link can be opened only once")
         loop = asyncio.get_running_loop()
         self._in_flight = _DeliveryQueue(loop)
-        self._incoming_path = _IncomingPath(self.incoming, receiver, self._lost)
+        self._incoming_path = _IncomingPath(self.incoming, receiver, self._discard_in_transit)
         self.outgoing.start(loop.time())
         self.incoming.start(loop.time())
         try:
@@ -223,11 +227,11 @@ class FaultyLink(Link):
             self._carry(data, peer)
 
     def _carry(self, data: bytes, peer: Peer) -> None:
-        on_the_way = self._in_flight
-        if on_the_way is None:
+        in_flight = self._in_flight
+        if in_flight is None:
             return
-        for due, piece in self.outgoing.carry(bytes(data), on_the_way.loop.time()):
-            on_the_way.put(due, lambda piece=piece: self.link.write(piece, peer))  # type: ignore[misc]
+        for due, piece in self.outgoing.carry(bytes(data), in_flight.loop.time()):
+            in_flight.put(due, lambda piece=piece: self.link.write(piece, peer))  # type: ignore[misc]
 
     def keep_peer(self, peer: Peer) -> None:
         """See `Link.keep_peer`."""
@@ -254,12 +258,12 @@ class FaultyLink(Link):
             self._stalled_queue.close()
         if self._incoming_path is not None:
             self._incoming_path.close()
-        on_the_way = self._in_flight
-        if on_the_way is None or on_the_way.loop.is_closed() or not on_the_way:
+        in_flight = self._in_flight
+        if in_flight is None or in_flight.loop.is_closed() or not in_flight:
             self.link.close()
             return
         self._drained.clear()
-        on_the_way.put(min(on_the_way.latest_due, on_the_way.loop.time() + LINGER_S), self._close_link)
+        in_flight.put(min(in_flight.latest_due, in_flight.loop.time() + LINGER_S), self._close_link)
 
     async def wait_closed(self) -> None:
         """See `Link.wait_closed`."""
@@ -270,16 +274,17 @@ class FaultyLink(Link):
         self._expired += writes
 
     def _on_stalled(self, is_stalled: bool) -> None:
-        ears, now, since = self._incoming_path, asyncio.get_running_loop().time(), self._stalled_at
-        if ears is None or is_stalled == (since is not None):
+        now, stalled_at = asyncio.get_running_loop().time(), self._stalled_at
+        was_stalled = stalled_at is not None
+        if self._incoming_path is None or is_stalled == was_stalled:
             return
         self._stalled_at = now if is_stalled else None
-        if since is None:
-            ears.link_stalled(self.unsent_bytes)
+        if stalled_at is None:
+            self._incoming_path.link_stalled(self.unsent_bytes)
         else:
-            ears.link_drained(now - since)
+            self._incoming_path.link_drained(now - stalled_at)
 
-    def _lost(self) -> None:
+    def _discard_in_transit(self) -> None:
         """Discard the outgoing frames in transit."""
         if self._stalled_queue is not None:
             self._stalled_queue.close()
@@ -288,7 +293,7 @@ class FaultyLink(Link):
         self._drained.set()
 
     def _close_link(self) -> None:
-        self._lost()
+        self._discard_in_transit()
         self.link.close()
 
 
@@ -390,7 +395,8 @@ class _DeliveryQueue:
         now = max(self.loop.time(), self._waiting[0][0])  # A timer may fire slightly early.
         try:
             while self._waiting and self._waiting[0][0] <= now:
-                heappop(self._waiting)[2]()
+                _, _, action = heappop(self._waiting)
+                action()
         finally:  # If an action raises, the loop reports the exception, and the other actions still run.
             if self._waiting:
                 self._schedule()

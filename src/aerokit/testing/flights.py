@@ -128,24 +128,26 @@ class SimulatedFleet(Sequence[Flight]):
     @property
     def min_distance_m(self) -> float:
         """Minimum distance of any two vehicles in space; infinity for fewer than two."""
-        return self._nearest()[0]
+        return self._closest_approach()[0]
 
     def assert_stayed_apart(self, distance_m: float) -> None:
         """Assert that no two vehicles came nearer to each other than this distance, in space."""
         __tracebackhide__ = True
-        nearest, time_s, names = self._nearest()
-        assert nearest >= distance_m, f"{names} came nearer than {distance_m:g} m: {nearest:.1f} m at {time_s:.1f} s"
+        closest_m, time_s, names = self._closest_approach()
+        text = f"{names} came nearer than {distance_m:g} m: {closest_m:.1f} m at {time_s:.1f} s"
+        assert closest_m >= distance_m, text
 
     def save(self, path: str | PathLike[str]) -> None:
         """Draw all tracks in one picture; see `aerokit.testing.picture.save_picture`."""
         save_picture([flight.track for flight in self], path)
 
-    def _nearest(self) -> tuple[float, float, str]:
-        pairs = [
-            (*min_distance_m(one.track, other.track), f"{one.track.name} and {other.track.name}")
-            for one, other in combinations(self, 2)
+    def _closest_approach(self) -> tuple[float, float, str]:
+        """Return the minimum distance of any two vehicles in metres, its time, and the names of the two."""
+        approaches = [
+            (*min_distance_m(first.track, second.track), f"{first.track.name} and {second.track.name}")
+            for first, second in combinations(self, 2)
         ]
-        return min(pairs, default=(math.inf, 0.0, ""))
+        return min(approaches, default=(math.inf, 0.0, ""))
 
     @property
     def link(self) -> Link:
@@ -174,16 +176,16 @@ class SimulatedFleet(Sequence[Flight]):
         if self._was_opened:
             raise RuntimeError("this flight was opened before; create a new one")
         self._was_opened = True
-        near, far = memory_link_pair(latency_s=self._latency_s)
+        near_end, far_end = memory_link_pair(latency_s=self._latency_s)
         async with AsyncExitStack() as stack:
-            self._link = near
-            self._server = await stack.enter_async_context(SimulatorServer([self._scheduler, *self._vehicles], far))
+            self._link = near_end
+            self._server = await stack.enter_async_context(SimulatorServer([self._scheduler, *self._vehicles], far_end))
             if self.recording is not None:
                 self.recording.attach(self._server)
             stack.callback(self._close)
             self._scheduler.refresh_with(self._refresh)
             if self._connect:
-                await self._connect_all(near, stack)
+                await self._connect_all(near_end, stack)
             yield self
 
     async def _connect_all(self, link: Link, stack: AsyncExitStack) -> None:
@@ -215,6 +217,7 @@ class SimulatedFleet(Sequence[Flight]):
             )
 
     def _schedule_with(self, plan: Callable[[FlightScheduler], None]) -> None:
+        """Bring the vehicles to the current time, call ``plan`` with the scheduler, and run what is due at once."""
         self._refresh()
         plan(self._scheduler)
         if self._server is not None:
@@ -224,12 +227,13 @@ class SimulatedFleet(Sequence[Flight]):
 def _side_by_side(
     kinds: Sequence[str], spacing_m: float, *, system_id: int = 1, seed: int = 0, **options: Any
 ) -> list[SimulatedVehicle]:
+    """Create a vehicle of each kind: the first at its home, the others in a row to the east of it."""
     vehicles: list[Any] = []
     for number, kind in enumerate(kinds):
         if vehicles:
             frame = vehicles[0].frame
-            place = frame.to_global(0.0, number * spacing_m, 0.0)
-            options["home"] = place.latitude_e7 / 1e7, place.longitude_e7 / 1e7, frame.origin.altitude_m
+            home = frame.to_global(0.0, number * spacing_m, 0.0)
+            options["home"] = home.latitude_e7 / 1e7, home.longitude_e7 / 1e7, frame.origin.altitude_m
         vehicles.append(simulated(kind, system_id=system_id + number, seed=seed + number, **options))
     return vehicles
 

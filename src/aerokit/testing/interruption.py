@@ -27,7 +27,7 @@ class Interruption:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._is_allowed = self._is_sent = self._is_delivered = False
-        self._before: Any = signal.default_int_handler
+        self._previous_handler: Any = signal.default_int_handler
 
     @contextlib.contextmanager
     def allowed(self) -> Iterator[None]:
@@ -35,39 +35,40 @@ class Interruption:
         if threading.current_thread() is not threading.main_thread() or not _is_sigint_available():
             yield
             return
-        self._before = signal.signal(signal.SIGINT, self._on_signal)
+        self._previous_handler = signal.signal(signal.SIGINT, self._on_signal)
         self._is_allowed = True
         try:
             yield
         finally:
-            with self._lock:  # `_interrupts` must not send the signal after this block has ended.
+            with self._lock:  # `_send_signal` must not send after this block has ended.
                 self._is_allowed = False
             if signal.getsignal(signal.SIGINT) == self._on_signal:
                 # signal.signal() runs a pending handler first.
-                signal.signal(signal.SIGINT, self._before)
+                signal.signal(signal.SIGINT, self._previous_handler)
 
     @contextlib.contextmanager
-    def at_an_error(self) -> Iterator[None]:
+    def on_error(self) -> Iterator[None]:
         """Interrupt the main thread when an exception leaves this block, which runs on another thread."""
         try:
             yield
         except Exception:
-            while self._interrupts():
+            while self._send_signal():
                 time.sleep(_RETRY_INTERVAL_S)
             raise
 
-    def _interrupts(self) -> bool:
+    def _send_signal(self) -> bool:
+        """Send the signal unless it was delivered or the block has ended; return True if it was sent."""
         with self._lock:
-            is_wanted = self._is_allowed and not self._is_delivered
-            if is_wanted:
+            is_needed = self._is_allowed and not self._is_delivered
+            if is_needed:
                 self._is_sent = True
                 _interrupt_main()
-        return is_wanted
+        return is_needed
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if not self._is_sent:
-            if callable(self._before):  # signal.SIG_IGN is not callable
-                self._before(number, frame)
+        if not self._is_sent:  # The user pressed Ctrl-C.
+            if callable(self._previous_handler):  # signal.SIG_IGN is not callable
+                self._previous_handler(number, frame)
         elif self._is_allowed and not self._is_delivered and not _is_in_context_code(frame):
             self._is_delivered = True
             raise KeyboardInterrupt

@@ -69,7 +69,7 @@ class Journal:
 
     def commands(self, command: int) -> list[CommandLong | CommandInt]:
         """Return the received COMMAND_LONG and COMMAND_INT messages with this MAV_CMD, including repetitions."""
-        return [order for order in self._orders() if order.command == command]
+        return [message for message in self._received_commands() if message.command == command]
 
     def assert_sent_text(self, part: str) -> None:
         """Assert that the vehicle sent a text that contains ``part``."""
@@ -81,17 +81,18 @@ class Journal:
         """Assert that the vehicle received this MAV_CMD: at least once, or exactly ``times`` times (0: never)."""
         __tracebackhide__ = True
         count = len(self.commands(command))
-        right = count > 0 if times is None else count == times
-        wanted = "" if times is None else f", not {times} times"
-        assert right, f"{_name(command)} was received {count} times{wanted}; received commands:{_lines(self._names())}"
+        is_expected = count > 0 if times is None else count == times
+        expected = "" if times is None else f", not {times} times"
+        received = _lines(self._command_counts())
+        assert is_expected, f"{_name(command)} was received {count} times{expected}; received commands:{received}"
 
-    def _orders(self) -> list[CommandLong | CommandInt]:
+    def _received_commands(self) -> list[CommandLong | CommandInt]:
         messages = (received.message for received in self.messages)
         return [message for message in messages if isinstance(message, CommandLong | CommandInt)]
 
-    def _names(self) -> list[str]:
+    def _command_counts(self) -> list[str]:
         """Command names in the order of their first reception, with counts."""
-        counts = Counter(_name(order.command) for order in self._orders())
+        counts = Counter(_name(message.command) for message in self._received_commands())
         return [name if count == 1 else f"{name}, {count} times" for name, count in counts.items()]
 
 

@@ -164,9 +164,9 @@ class _Axes:
             self.y_range = _widened(self.y_range, scale * self.height)
 
     def place(self, x: float, y: float) -> tuple[float, float]:
-        right = (x - self.x_range[0]) / _span(self.x_range) * self.width
-        up = (y - self.y_range[0]) / _span(self.y_range) * self.height
-        return self.left + right, self.top + self.height - up
+        from_left = (x - self.x_range[0]) / _span(self.x_range) * self.width
+        from_bottom = (y - self.y_range[0]) / _span(self.y_range) * self.height
+        return self.left + from_left, self.top + self.height - from_bottom
 
     def grid(self, x_unit: str, y_unit: str) -> list[_Shape]:
         shapes: list[_Shape] = []
@@ -203,15 +203,16 @@ def _outlines(track: Drawable, origin: Position) -> list[list[tuple[float, float
     failure = track.failure
     if failure is None:
         return []
-    plane, found = metres_from(origin), []
+    offset_of, outlines = metres_from(origin), []
     if failure.circle is not None:
-        (north, east), radius = plane(failure.circle[0]), failure.circle[1]
+        centre, radius = failure.circle
+        north, east = offset_of(centre)
         angles = [2 * math.pi * number / _CORNERS for number in range(_CORNERS + 1)]
-        found.append([(east + radius * math.sin(angle), north + radius * math.cos(angle)) for angle in angles])
+        outlines.append([(east + radius * math.sin(angle), north + radius * math.cos(angle)) for angle in angles])
     if failure.polygon:
-        corners = [plane(corner) for corner in failure.polygon]
-        found.append([(east, north) for north, east in (*corners, corners[0])])
-    return found
+        corners = [offset_of(corner) for corner in failure.polygon]
+        outlines.append([(east, north) for north, east in (*corners, corners[0])])
+    return outlines
 
 
 def _failed_point(track: Drawable, places: Sequence[tuple[float, float]]) -> list[_Shape]:
@@ -242,21 +243,23 @@ class _Labels:
     ) -> list[_Shape]:
         """Return dots and names where modes start."""
         shapes: list[_Shape] = []
-        before = None
+        previous_mode = None
         for point, (x, y) in zip(track, places, strict=True):
-            if point.mode == before:
+            if point.mode == previous_mode:
                 continue
-            before = point.mode
+            previous_mode = point.mode
             shapes.append(_Dot(x, y, colour, 2.5))
-            free = (y - above - step * _LABEL_HEIGHT for step in range(4))
-            height = next((level for level in free if self._is_free(x, level)), None)
-            if height is not None and len(self._places) < _MAX_LABELS:
-                self._places.append((x, height))
-                shapes.append(_Text(x + 4, height, point.mode, "start", colour))
+            label_levels = (y - above - step * _LABEL_HEIGHT for step in range(4))
+            label_y = next((level for level in label_levels if self._is_free(x, level)), None)
+            if label_y is not None and len(self._places) < _MAX_LABELS:
+                self._places.append((x, label_y))
+                shapes.append(_Text(x + 4, label_y, point.mode, "start", colour))
         return shapes
 
     def _is_free(self, x: float, y: float) -> bool:
-        return all(abs(x - a) > _LABEL_WIDTH or abs(y - b) >= _LABEL_HEIGHT for a, b in self._places)
+        return all(
+            abs(x - label_x) > _LABEL_WIDTH or abs(y - label_y) >= _LABEL_HEIGHT for label_x, label_y in self._places
+        )
 
 
 def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
@@ -264,13 +267,8 @@ def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
     limits = [track.failure.altitude_m for track in tracks if track.failure is not None]
     limit = next((altitude for altitude in limits if altitude is not None), None)
     times, heights = zip(*(place for path in paths for place in path), strict=True)
-    axes = _Axes(
-        times,
-        (*heights, *(() if limit is None else (limit,))),
-        _MAP_HEIGHT,
-        _PROFILE_HEIGHT - 40,
-        square=False,
-    )
+    drawn_heights = heights if limit is None else (*heights, limit)
+    axes = _Axes(times, drawn_heights, _MAP_HEIGHT, _PROFILE_HEIGHT - 40, square=False)
     shapes = axes.grid("s", "m up")
     if limit is not None:
         shapes.append(_Line([axes.place(min(times), limit), axes.place(max(times), limit)], _FAILED, True))
@@ -309,11 +307,11 @@ def _span(bounds: tuple[float, float]) -> float:
     return bounds[1] - bounds[0]
 
 
-def _ticks(bounds: tuple[float, float], about: int) -> list[float]:
-    """Return about ``about`` round numbers in a range."""
-    rough = _span(bounds) / about
-    size: float = 10.0 ** math.floor(math.log10(rough))
-    step = next(factor * size for factor in (1.0, 2.0, 5.0, 10.0) if factor * size >= rough)
+def _ticks(bounds: tuple[float, float], max_count: int) -> list[float]:
+    """Return at most ``max_count`` + 1 round numbers in a range, as labels of an axis."""
+    min_step = _span(bounds) / max_count
+    power_of_ten: float = 10.0 ** math.floor(math.log10(min_step))
+    step = next(factor * power_of_ten for factor in (1.0, 2.0, 5.0, 10.0) if factor * power_of_ten >= min_step)
     first = math.ceil(bounds[0] / step)
     return [round(number * step, 6) for number in range(first, math.floor(bounds[1] / step) + 1)]
 

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from aerokit.testing.served import ServedFlight
 
 _MARKER, _PICTURES = "simulated", "--flight-pictures"
-_OPENED = "_aerokit_opened"
+# Attribute of a test function that pytest-asyncio will run: the same test, with its flights opened around it.
+_OPENING_TEST = "_aerokit_opening_test"
+# Names instead of classes, because tests without flights must not import aerokit.
 _REPORTED_CLASSES = ("SimulatedFleet", "Flight", "ServedFlight")
 
 
@@ -71,8 +73,7 @@ def flight(request: pytest.FixtureRequest) -> Flight:
     kinds, options = _requested(request)
     if len(kinds) != 1 or "count" in options:
         raise pytest.UsageError("`flight` is one vehicle: use the fixture `fleet` for several")
-    found: Flight = SimulatedFleet(*kinds, **options)[0]
-    return found
+    return SimulatedFleet(*kinds, **options)[0]
 
 
 @pytest.fixture
@@ -118,10 +119,10 @@ def dronekit() -> Iterator[ModuleType]:
     import aerokit.dronekit as package
     from aerokit.dronekit.runner import install, uninstall
 
-    was_there = sys.modules.get("dronekit") is package
+    was_installed = sys.modules.get("dronekit") is package
     install()
     yield package
-    if not was_there:
+    if not was_installed:
         uninstall()
 
 
@@ -132,7 +133,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
     if not fleets or item.get_closest_marker("asyncio") is None:
         return (yield)
     assert isinstance(item, pytest.Function)
-    with _replaced(item, _only_on_virtual_time(_opened(item.obj, fleets))):
+    with _function_replaced(item, _only_on_virtual_time(_opening_flights(item.obj, fleets))):
         return (yield)
 
 
@@ -142,7 +143,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, object, o
 
     A test with ``served_flight`` fails as soon as the simulated vehicle raises an exception.
     """
-    with _replaced(pyfuncitem, _runnable(pyfuncitem)), _failing_at_once(pyfuncitem):
+    with _function_replaced(pyfuncitem, _runnable_function(pyfuncitem)), _raising_vehicle_errors(pyfuncitem):
         return (yield)
 
 
@@ -150,16 +151,17 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, object, o
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Add a description of the flight to the report of a failed test."""
     report = yield
-    flown = _reported(item) if report.when == "call" and report.failed else []
-    if flown:
+    flights = _reported_flights(item) if report.when == "call" and report.failed else []
+    if flights:
         from aerokit.testing.failure import failure_report
 
         directory = item.config.getoption(_PICTURES)
-        report.sections.append(("simulated flights", failure_report(flown, item.nodeid, directory)))
+        report.sections.append(("simulated flights", failure_report(flights, item.nodeid, directory)))
     return report
 
 
 def _requested(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Return the kinds and options of the test's marker ``simulated``."""
     marker = request.node.get_closest_marker(_MARKER)
     kinds, options = (marker.args, dict(marker.kwargs)) if marker else ((), {})
     options.setdefault("record", request.config.getoption(_PICTURES) is not None)
@@ -168,43 +170,51 @@ def _requested(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[st
 
 def _flight_fixtures(item: pytest.Item) -> list[Any]:
     """Return the flight fixtures of a test, ignoring fixtures of the project with the same names."""
-    funcargs = getattr(item, "funcargs", None) or {}
-    found = [funcargs[name] for name in ("flight", "fleet", "served_flight") if name in funcargs]
-    return [value for value in found if type(value).__module__.startswith("aerokit.testing.")]
+    fixture_values = getattr(item, "funcargs", None) or {}
+    named = [fixture_values[name] for name in ("flight", "fleet", "served_flight") if name in fixture_values]
+    return [value for value in named if _is_of_this_package(value)]
 
 
-def _reported(item: pytest.Item) -> list[Any]:
+def _reported_flights(item: pytest.Item) -> list[Any]:
     """Return the flight fixtures, and flights opened by fixtures of the project."""
-    values = (getattr(item, "funcargs", None) or {}).values()
-    others = [value for value in values if type(value).__module__.startswith("aerokit.testing.")]
-    return list(
-        {
-            id(value): value
-            for value in (*_flight_fixtures(item), *others)
-            if type(value).__name__ in _REPORTED_CLASSES
-        }.values()
-    )
+    fixture_values = getattr(item, "funcargs", None) or {}
+    flights: list[Any] = []
+    for value in (*_flight_fixtures(item), *fixture_values.values()):
+        is_flight = _is_of_this_package(value) and type(value).__name__ in _REPORTED_CLASSES
+        if is_flight and not any(value is flight for flight in flights):
+            flights.append(value)
+    return flights
+
+
+def _is_of_this_package(value: object) -> bool:
+    return type(value).__module__.startswith("aerokit.testing.")
 
 
 def _fleets(item: pytest.Item) -> list[SimulatedFleet]:
+    """Return the fleets of a test that the plugin opens. A served flight has no ``run`` and is open already."""
     return [getattr(value, "_fleet", value) for value in _flight_fixtures(item) if hasattr(value, "run")]
 
 
-def _runnable(item: pytest.Function) -> Callable[..., Any]:
+def _runnable_function(item: pytest.Function) -> Callable[..., Any]:
+    """Return the function that pytest has to call: an ``async def`` test runs with its flights open."""
     fleets = _fleets(item)
     test: Callable[..., Any] = item.obj
-    opened = getattr(test, _OPENED, None)
-    if opened is not None:  # The test is wrapped by pytest-asyncio, which runs it on another event loop.
-        return _on_virtual_time(opened, instead_of=None if inspect.iscoroutinefunction(test) else test)
+    opening_test = getattr(test, _OPENING_TEST, None)
+    if opening_test is not None:  # The test has the asyncio marker.
+        wrapped_by_pytest_asyncio = None if inspect.iscoroutinefunction(test) else test
+        return _on_virtual_time(opening_test, try_first=wrapped_by_pytest_asyncio)
     if not fleets or not inspect.iscoroutinefunction(test):
         return test
-    opened = _opened(test, fleets)
-    return opened if "anyio_backend" in item.fixturenames else _on_virtual_time(opened)
+    opening_test = _opening_flights(test, fleets)
+    # With this fixture, anyio's plugin runs the test.
+    return opening_test if "anyio_backend" in item.fixturenames else _on_virtual_time(opening_test)
 
 
-def _opened(test: Callable[..., Any], fleets: list[SimulatedFleet]) -> Callable[..., Any]:
+def _opening_flights(test: Callable[..., Any], fleets: list[SimulatedFleet]) -> Callable[..., Any]:
+    """Return a test that opens the fleets, awaits ``test`` and closes them."""
+
     @functools.wraps(test)
-    async def opened(**arguments: Any) -> None:
+    async def opening_test(**arguments: Any) -> None:
         from contextlib import AsyncExitStack
 
         async with AsyncExitStack() as stack:
@@ -212,15 +222,17 @@ def _opened(test: Callable[..., Any], fleets: list[SimulatedFleet]) -> Callable[
                 await stack.enter_async_context(fleet.open())
             await test(**arguments)
 
-    return opened
+    return opening_test
 
 
 class _NotVirtualTime(Exception):
     """The running loop is not on virtual time."""
 
 
-def _only_on_virtual_time(opened: Callable[..., Any]) -> Callable[..., Any]:
-    @functools.wraps(opened)
+def _only_on_virtual_time(opening_test: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a test that raises `_NotVirtualTime`, before it begins, on a loop of pytest-asyncio in real time."""
+
+    @functools.wraps(opening_test)
     async def run(**arguments: Any) -> None:
         import asyncio
 
@@ -228,20 +240,26 @@ def _only_on_virtual_time(opened: Callable[..., Any]) -> Callable[..., Any]:
 
         if not isinstance(asyncio.get_running_loop(), VirtualClockLoop):
             raise _NotVirtualTime
-        await opened(**arguments)
+        await opening_test(**arguments)
 
-    setattr(run, _OPENED, opened)  # pytest-asyncio copies the attribute to its wrapper.
+    # pytest-asyncio copies the attribute to its wrapper, where `_runnable_function` reads it.
+    setattr(run, _OPENING_TEST, opening_test)
     return run
 
 
-def _on_virtual_time(test: Callable[..., Any], *, instead_of: Callable[..., Any] | None = None) -> Callable[..., None]:
+def _on_virtual_time(test: Callable[..., Any], *, try_first: Callable[..., Any] | None = None) -> Callable[..., None]:
+    """Return a function that runs an ``async def`` test on virtual time.
+
+    ``try_first`` is the same test as pytest-asyncio runs it. It counts unless its loop is not on virtual time.
+    """
+
     @functools.wraps(test)
     def run(**arguments: Any) -> None:
         from aerokit.testing.clock import run_virtual
 
-        if instead_of is not None:
+        if try_first is not None:
             with contextlib.suppress(_NotVirtualTime):
-                instead_of(**arguments)
+                try_first(**arguments)
                 return
         run_virtual(test(**arguments))
 
@@ -249,14 +267,14 @@ def _on_virtual_time(test: Callable[..., Any], *, instead_of: Callable[..., Any]
 
 
 @contextlib.contextmanager
-def _replaced(item: pytest.Function, test: Callable[..., Any]) -> Iterator[None]:
-    before, item.obj = item.obj, test
+def _function_replaced(item: pytest.Function, test: Callable[..., Any]) -> Iterator[None]:
+    original, item.obj = item.obj, test
     try:
         yield
     finally:
-        item.obj = before
+        item.obj = original
 
 
-def _failing_at_once(item: pytest.Function) -> contextlib.AbstractContextManager[None]:
+def _raising_vehicle_errors(item: pytest.Function) -> contextlib.AbstractContextManager[None]:
     served = [value for value in _flight_fixtures(item) if hasattr(value, "raising_vehicle_errors")]
     return served[0].raising_vehicle_errors() if served else contextlib.nullcontext()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Iterable
 from os import PathLike
@@ -48,14 +49,14 @@ class RecordedParameters(ParameterProtocolServer):
         for time, value in vehicle.recording.parameters:
             self._recorded.setdefault(value.param_id, []).append((time, value))
         values = [value for _, value in vehicle.recording.parameters]
-        counted = {value.param_id: value.param_index for value in values if value.param_index != UNKNOWN_INDEX}
-        uncounted = [name for name in self._recorded if name not in counted]
-        is_whole = bool(counted) and len(counted) == max(value.param_count for value in values)
-        self.names = sorted(counted, key=lambda name: (counted[name], name))
+        indices = {value.param_id: value.param_index for value in values if value.param_index != UNKNOWN_INDEX}
+        without_index = [name for name in self._recorded if name not in indices]
+        is_complete = bool(indices) and len(indices) == max(value.param_count for value in values)
+        self.names = sorted(indices, key=lambda name: (indices[name], name))
         """Names in the order in which the vehicle lists its parameters."""
-        self.names += [name for name in uncounted if name != HASH_NAME]
-        # The hash covers all parameters, so it is unknown if some were not recorded.
-        self._hash = is_whole and HASH_NAME in uncounted
+        self.names += [name for name in without_index if name != HASH_NAME]
+        # PX4's hash covers all parameters, so it is wrong for an incomplete recording.
+        self._has_hash = is_complete and HASH_NAME in without_index
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
         """Return the latest PARAM_VALUE, written or recorded. Before the first recorded value, return that value."""
@@ -65,15 +66,16 @@ class RecordedParameters(ParameterProtocolServer):
         return m.ParamValue(name, written, latest.param_type, len(self.names), index)
 
     def _on_list(self, request: m.ParamRequestList, channel: Channel) -> None:
-        if self._hash:
+        if self._has_hash:
             self.send(HASH_NAME, UNKNOWN_INDEX, channel)
         self.start_list(channel)
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
         name, index = request.param_id, request.param_index
-        if (found := self.requested(name, index)) is not None:
-            self.send(*found, channel)
-        elif index < 0 and name == HASH_NAME and self._hash:
+        name_and_index = self.requested(name, index)
+        if name_and_index is not None:
+            self.send(*name_and_index, channel)
+        elif index < 0 and name == HASH_NAME and self._has_hash:
             self.send(name, UNKNOWN_INDEX, channel)
         else:
             self._refuse(request, index, channel)
@@ -103,18 +105,18 @@ class RecordedMissions(MissionServer):
         self.requests_int: bool = vehicle.recording.uses_int
         self._received: list[AnyItem] = []
         self._written: dict[int, tuple[AnyItem, ...]] = {}
-        self._done: dict[tuple[str, int], int] = {}
+        self._result_counts: dict[tuple[str, int], int] = {}
         self.listen()
 
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
         """Return the current plan, or the first recorded plan before that; None if the recording has no plan."""
         if mission_type in self._written:
             return self._written[mission_type]
-        position, found = self._vehicle.position_s, None
+        position_s, items = self._vehicle.position_s, None
         for plan in self._vehicle.recording.plans:
-            if plan.mission_type == mission_type and (found is None or plan.since <= position):
-                found = plan.items
-        return found
+            if plan.mission_type == mission_type and (items is None or plan.since <= position_s):
+                items = plan.items
+        return items
 
     def count(self, mission_type: int) -> int:
         return len(self.items(mission_type) or ())
@@ -158,23 +160,24 @@ class RecordedMissions(MissionServer):
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
         """Do nothing: the recording decides which item is current."""
 
-    def _recorded_result(self, what: str, results: list[int], mission_type: int) -> int:
+    def _recorded_result(self, request: str, results: list[int], mission_type: int) -> int:
         """Return the next of the recorded results; the last result is repeated."""
-        number = self._done.get((what, mission_type), 0)
-        self._done[what, mission_type] = number + 1
+        number = self._result_counts.get((request, mission_type), 0)
+        self._result_counts[request, mission_type] = number + 1
         return results[min(number, len(results) - 1)]
 
 
-def _item_message(item: AnyItem, seq: int, to: tuple[int, int], as_float: bool) -> AnyItem:
-    scale = 1.0 if item.frame == MavFrame.MISSION else 1e7
+def _item_message(item: AnyItem, seq: int, client: tuple[int, int], as_float: bool) -> AnyItem:
+    """Convert a recorded item to the message that the client requests: MISSION_ITEM or MISSION_ITEM_INT."""
+    scale = 1.0 if item.frame == MavFrame.MISSION else 1e7  # With MAV_FRAME_MISSION, x and y are not degrees.
     is_float = isinstance(item, m.MissionItem)
     if as_float:
         place = (item.x, item.y) if is_float else (item.x / scale, item.y / scale)
-        return item_message_float(item_from(item), place, seq, to, item.mission_type, item.current)
+        return item_message_float(item_from(item), place, seq, client, item.mission_type, item.current)
     x, y = (round(item.x * scale), round(item.y * scale)) if is_float else (int(item.x), int(item.y))
-    numbers = (item.param1, item.param2, item.param3, item.param4)
-    head = (*to, seq, item.frame, item.command, item.current, item.autocontinue)
-    return m.MissionItemInt(*head, *numbers, x, y, item.z, item.mission_type)
+    params = (item.param1, item.param2, item.param3, item.param4)
+    header = (*client, seq, item.frame, item.command, item.current, item.autocontinue)
+    return m.MissionItemInt(*header, *params, x, y, item.z, item.mission_type)
 
 
 _MESSAGE_REQUESTS = (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE)
@@ -246,8 +249,9 @@ class RecordedVehicle(SimulatedVehicle):
     def boot(self) -> None:
         stream = self.recording.stream
         self._began_at = self.now
+        # The tolerance includes messages of exactly the start time.
         self._next = bisect_right([time for time, _ in stream], self._start - 1e-9)
-        self._plan_next()
+        self._schedule_next()
 
     def start_channel(self, channel: Channel) -> None:
         """Do nothing: all ports receive the recording."""
@@ -258,7 +262,7 @@ class RecordedVehicle(SimulatedVehicle):
     def tick(self, dt: float) -> None:
         """Do nothing: motion is recorded, not simulated."""
 
-    def _plan_next(self) -> None:
+    def _schedule_next(self) -> None:
         stream = self.recording.stream
         if self._next < len(stream):
             self.call_at(self._began_at + stream[self._next][0] - self._start, self._play)
@@ -272,7 +276,7 @@ class RecordedVehicle(SimulatedVehicle):
             frame = stream[self._next][1]
             self.send(STANDARD.decode(frame), sender=(frame.system_id, frame.component_id))
             self._next += 1
-        self._plan_next()
+        self._schedule_next()
 
     def _end(self) -> None:
         if self._repeat and self.recording.duration_s > self._start:
@@ -285,25 +289,29 @@ class RecordedVehicle(SimulatedVehicle):
         if answer is None:
             return MavResult.UNSUPPORTED
         for delay, ack in answer.acks:
-            again = m.CommandAck(ack.command, ack.result, ack.progress, ack.result_param2, *command.sender)
-            self.call_later(delay, lambda again=again: self.send(again, command.channel))  # type: ignore[misc]
+            readdressed = m.CommandAck(ack.command, ack.result, ack.progress, ack.result_param2, *command.sender)
+            self.call_later(delay, lambda ack=readdressed: self.send(ack, command.channel))  # type: ignore[misc]
         return None
 
     def _answer_to(self, command: ReceivedCommand) -> RecordedAnswer | None:
+        """Return the recorded answer to a command; equal commands get successive answers, then the last one again."""
         answers = self.recording.answers.get(command.command, [])
         params = (command.param1, command.param2, command.param3, command.param4)
-        alike = [answer for answer in answers if repr(answer.params) == repr(params)]
-        if command.command in _MESSAGE_REQUESTS and not alike:
-            alike = answers = [answer for answer in answers if answer.params[:1] == params[:1]]
-        chosen = alike or answers
-        if not chosen:
+        # Compared as text, because NaN is not equal to NaN.
+        candidates = [answer for answer in answers if repr(answer.params) == repr(params)]
+        if not candidates and command.command in _MESSAGE_REQUESTS:  # Param 1 is the message id.
+            candidates = [answer for answer in answers if answer.params[:1] == params[:1]]
+        elif not candidates:
+            candidates = answers
+        if not candidates:
             return None
-        number = self._answered_counts.get(id(chosen[0]), 0)
-        self._answered_counts[id(chosen[0])] = number + 1
-        return chosen[min(number, len(chosen) - 1)]
+        count = self._answered_counts.get(id(candidates[0]), 0)
+        self._answered_counts[id(candidates[0])] = count + 1
+        return candidates[min(count, len(candidates) - 1)]
 
     def _on_request_message(self, command: ReceivedCommand) -> int | None:
-        message = self._latest_message(int(command.param1) if command.param1 == command.param1 else -1)
+        message_id = -1 if math.isnan(command.param1) else int(command.param1)
+        message = self._latest_message(message_id)
         if message is not None:
             self.send(message, command.channel)
             return MavResult.ACCEPTED

@@ -42,7 +42,7 @@ class RecordedAnswer:
 
     params: tuple[float, ...]
     """Params 1 to 4 of the command; empty if only the acknowledgement was recorded."""
-    asked_at: float
+    requested_at: float
     acks: list[tuple[float, m.CommandAck]] = field(default_factory=list)
     """Seconds after the command, and the acknowledgement."""
 
@@ -87,21 +87,23 @@ class RecordedFlight:
         self.uses_int: bool = True
         """True if the vehicle requests items by MISSION_REQUEST_INT, False by MISSION_REQUEST."""
         self.duration_s: float = 0.0
-        self._sets: dict[str, float] = {}
-        self._incoming: dict[int, dict[int, m.MissionItemInt | m.MissionItem]] = {}
-        self._outgoing: dict[int, tuple[int, dict[int, m.MissionItemInt | m.MissionItem]]] = {}
+        self._unconfirmed_sets: dict[str, float] = {}
+        # Transfers in progress by MAV_MISSION_TYPE: items by index, for downloads after their count.
+        self._uploads: dict[int, dict[int, m.MissionItemInt | m.MissionItem]] = {}
+        self._downloads: dict[int, tuple[int, dict[int, m.MissionItemInt | m.MissionItem]]] = {}
         self._clearing: set[int] = set()
         self._read(frames)
 
     def _read(self, frames: list[tuple[float, Frame]]) -> None:
-        now, last = 0.0, None
+        now, previous_stamp = 0.0, None
         for stamp, frame in frames:
-            is_own = frame.system_id == self.system_id
-            if last is None and not is_own:
-                continue
-            now += 0.0 if last is None else min(max(stamp - last, 0.0), MAX_GAP_S)
-            last = stamp
-            if not is_own:
+            is_of_vehicle = frame.system_id == self.system_id
+            if previous_stamp is not None:
+                now += min(max(stamp - previous_stamp, 0.0), MAX_GAP_S)
+            elif not is_of_vehicle:
+                continue  # The recording begins with the vehicle's first message.
+            previous_stamp = stamp
+            if not is_of_vehicle:
                 if frame.message_id in _REQUESTS:
                     self._read_request(STANDARD.decode(frame), now)
             elif frame.message_id in _ANSWERS:
@@ -109,30 +111,33 @@ class RecordedFlight:
             else:
                 self.stream.append((now, frame))
         self.duration_s = now
-        self.answers = {
-            command: acknowledged
-            for command, answers in self.answers.items()
-            if (acknowledged := [answer for answer in answers if answer.acks])
+        self._discard_unanswered()
+
+    def _discard_unanswered(self) -> None:
+        """Discard requests without an acknowledgement, and commands that were never acknowledged."""
+        acknowledged = {
+            command: [answer for answer in answers if answer.acks] for command, answers in self.answers.items()
         }
+        self.answers = {command: answers for command, answers in acknowledged.items() if answers}
 
     def _read_request(self, message: Message, now: float) -> None:
         if isinstance(message, _COMMANDS):
-            again = isinstance(message, m.CommandLong) and message.confirmation > 0
+            is_repetition = isinstance(message, m.CommandLong) and message.confirmation > 0
             answers = self.answers.setdefault(message.command, [])
-            if not (again and answers):
+            if not answers or not is_repetition:
                 params = (message.param1, message.param2, message.param3, message.param4)
                 answers.append(RecordedAnswer(params, now))
         elif isinstance(message, m.ParamSet):
-            self._sets[message.param_id] = message.param_value
+            self._unconfirmed_sets[message.param_id] = message.param_value
         elif isinstance(message, m.MissionCount):
-            self._incoming[message.mission_type] = {}
+            self._uploads[message.mission_type] = {}
         elif isinstance(message, _ITEMS):
-            self._incoming.setdefault(message.mission_type, {})[message.seq] = message
+            self._uploads.setdefault(message.mission_type, {})[message.seq] = message
         elif isinstance(message, m.MissionClearAll):
             self._clearing.add(message.mission_type)
 
     def _read_answer(self, message: Message, now: float) -> None:
-        note: dict[type[Message], Callable[..., None]] = {
+        readers: dict[type[Message], Callable[..., None]] = {
             m.CommandAck: self._read_ack,
             m.ParamValue: self._read_value,
             m.MissionCount: self._read_count,
@@ -140,8 +145,8 @@ class RecordedFlight:
             m.MissionItemInt: self._read_item,
             m.MissionAck: self._read_mission_ack,
         }
-        if type(message) in note:
-            note[type(message)](message, now)
+        if type(message) in readers:
+            readers[type(message)](message, now)
         elif isinstance(message, m.ParamError):
             self.has_parameter_errors = True
         elif isinstance(message, m.MissionRequest):
@@ -151,28 +156,28 @@ class RecordedFlight:
         answers = self.answers.setdefault(ack.command, [])
         if not answers:
             answers.append(RecordedAnswer((), now))
-        answers[-1].acks.append((now - answers[-1].asked_at, ack))
+        answers[-1].acks.append((now - answers[-1].requested_at, ack))
 
     def _read_value(self, value: m.ParamValue, now: float) -> None:
         self.parameters.append((now, value))
-        if self._sets.pop(value.param_id, None) == value.param_value:
+        if self._unconfirmed_sets.pop(value.param_id, None) == value.param_value:
             self.settable.add(value.param_id)
 
     def _read_count(self, count: m.MissionCount, now: float) -> None:
-        self._outgoing[count.mission_type] = (count.count, {})
+        self._downloads[count.mission_type] = (count.count, {})
         if count.count == 0:
             self.plans.append(RecordedPlan(now, count.mission_type, ()))
 
     def _read_item(self, item: m.MissionItemInt | m.MissionItem, now: float) -> None:
-        count, items = self._outgoing.get(item.mission_type, (0, {}))
+        count, items = self._downloads.get(item.mission_type, (0, {}))
         items[item.seq] = item
         if count and len(items) == count:
-            del self._outgoing[item.mission_type]
+            del self._downloads[item.mission_type]
             self._add_plan(item.mission_type, items, now)
 
     def _read_mission_ack(self, ack: m.MissionAck, now: float) -> None:
-        if ack.mission_type in self._incoming:
-            items = self._incoming.pop(ack.mission_type)
+        if ack.mission_type in self._uploads:
+            items = self._uploads.pop(ack.mission_type)
             self.uploads.setdefault(ack.mission_type, []).append(ack.type)
             if ack.type == MavMissionResult.ACCEPTED:
                 self._add_plan(ack.mission_type, items, now)
@@ -197,5 +202,5 @@ def _autopilot(frames: list[tuple[float, Frame]], system_id: int | None) -> tupl
         assert isinstance(heartbeat, m.Heartbeat)
         if heartbeat.autopilot != MavAutopilot.INVALID and heartbeat.type != MavType.GCS:
             return frame.system_id, frame.component_id
-    which = "no vehicle" if system_id is None else f"no vehicle with system id {system_id}"
-    raise InvalidArgument(f"the recording contains {which}: it has no heartbeat of such an autopilot")
+    wanted = "an autopilot" if system_id is None else f"an autopilot with system id {system_id}"
+    raise InvalidArgument(f"the recording contains no vehicle to play: it has no HEARTBEAT of {wanted}")

@@ -74,10 +74,12 @@ class ServedFlight:
         failure = self._server.failure
         if failure is not None:
             self._is_raised = True
+            # "from" hides the exception that ended the block, such as KeyboardInterrupt, from the traceback.
             raise failure from failure.__cause__
 
     @contextmanager
     def _raising_once(self) -> Iterator[None]:
+        """Suppress the vehicle's exception if `_raise_failure` raised it before."""
         try:
             yield
         except Exception as error:
@@ -130,7 +132,7 @@ def hosted_flight(
 
     @asynccontextmanager
     async def serve() -> AsyncIterator[SimulatorServer]:
-        with interruption.at_an_error():
+        with interruption.on_error():
             async with open_simulator([scheduler, vehicle], address, speedup=speedup) as server:
                 if recording is not None:
                     recording.attach(server)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from aerokit.sim.server import SimulatorServer
     from aerokit.testing.track import Track
 
-# Interval in simulated seconds at which conditions are checked.
+# Simulated seconds between two checks of a condition.
 _POLL_INTERVAL_S = 0.1
 
 
@@ -91,7 +91,7 @@ class FlightRecording:
     def __init__(self) -> None:
         self._file = BytesIO()
         self._writer = TlogWriter(self._file)
-        self._framers = Framer(), Framer()
+        self._framers = Framer(), Framer()  # received and sent bytes
         for framer in self._framers:
             framer.keep_unknown = True
 

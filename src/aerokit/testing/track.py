@@ -85,6 +85,9 @@ class Track(Sequence[TrackPoint]):
         assert points, "nothing was recorded: was the flight opened?"
         return points[-1]
 
+    def _check_not_empty(self) -> None:
+        _ = self.end  # raises AssertionError for an empty track
+
     @property
     def max_altitude_m(self) -> float:
         """Maximum altitude above home."""
@@ -122,12 +125,12 @@ class Track(Sequence[TrackPoint]):
     @property
     def length_m(self) -> float:
         """Length of the path, including climbs."""
-        return sum(math.dist(one, other) for one, other in pairwise(self.local()))
+        return sum(math.dist(start, end) for start, end in pairwise(self.local()))
 
     def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
         """Return metres north and east of ``origin`` (default: home), and metres above home."""
-        plane = metres_from(self.home if origin is None else origin)
-        return [(*plane(point), point.altitude_m) for point in self]
+        offset_of = metres_from(self.home if origin is None else origin)
+        return [(*offset_of(point), point.altitude_m) for point in self]
 
     def snapshot(self) -> Track:
         """Return a copy that does not grow."""
@@ -183,10 +186,10 @@ class Track(Sequence[TrackPoint]):
         """Assert that the vehicle never left a polygon of at least three corners."""
         __tracebackhide__ = True
         assert len(polygon) >= 3, f"a polygon needs at least three positions, not {len(polygon)}"
-        _ = self.end
-        plane = metres_from(self.home)
-        border = PolygonZone([plane(corner) for corner in polygon])
-        outside = [point for point in self if border.outside_m(plane(point)) > 0]
+        self._check_not_empty()
+        offset_of = metres_from(self.home)
+        zone = PolygonZone([offset_of(corner) for corner in polygon])
+        outside = [point for point in self if zone.outside_m(offset_of(point)) > 0]
         self._record_failure(not outside, TrackFailure(outside[0] if outside else self.end, polygon=polygon))
         assert not outside, (
             f"the vehicle left the polygon: {len(outside)} of {len(self)} points are outside, the first {outside[0]}"
@@ -235,37 +238,39 @@ class Track(Sequence[TrackPoint]):
         for name in names:
             assert name in modes, f"{name} is missing in {' → '.join(names)}: the modes were {' → '.join(self.modes)}"
 
-    def _record_failure(self, holds: bool, failure: TrackFailure) -> None:
-        """Keep the details of an assertion that fails."""
-        if not holds:
+    def _record_failure(self, passes: bool, failure: TrackFailure) -> None:
+        """Keep the details of an assertion that does not pass."""
+        if not passes:
             self.failure = failure
 
     def _highest(self) -> TrackPoint:
-        _ = self.end
+        self._check_not_empty()
         return max(self, key=lambda point: point.altitude_m)
 
     def _fastest(self) -> TrackPoint:
-        _ = self.end
+        self._check_not_empty()
         return max(self, key=lambda point: point.speed_m_s)
 
     def _farthest(self, centre: Position) -> tuple[float, TrackPoint]:
-        _ = self.end
-        plane = metres_from(centre)
-        point = max(self, key=lambda point: math.hypot(*plane(point)))
-        return math.hypot(*plane(point)), point
+        """Return the maximum horizontal distance in metres, and its point."""
+        self._check_not_empty()
+        offset_of = metres_from(centre)
+        farthest = max(self, key=lambda point: math.hypot(*offset_of(point)))
+        return math.hypot(*offset_of(farthest)), farthest
 
     def _nearest(self, place: Position) -> tuple[float, TrackPoint]:
-        _ = self.end
-        plane, altitude = metres_from(place), place.altitude_relative_m
-        nearest, point, before = math.inf, self._points[0], None
-        for candidate in self:
-            up = 0.0 if altitude is None else candidate.altitude_m - altitude
-            here = (*plane(candidate), up)
-            distance = _distance_of_origin(here if before is None else before, here)
-            if distance < nearest:
-                nearest, point = distance, candidate
-            before = here
-        return nearest, point
+        """Return the minimum distance in metres, also between two points, and the point at the end of that segment."""
+        self._check_not_empty()
+        offset_of, altitude = metres_from(place), place.altitude_relative_m
+        min_distance, nearest, previous_offset = math.inf, self._points[0], None
+        for point in self:
+            up = 0.0 if altitude is None else point.altitude_m - altitude
+            offset = (*offset_of(point), up)
+            distance = _distance_of_origin(offset if previous_offset is None else previous_offset, offset)
+            if distance < min_distance:
+                min_distance, nearest = distance, point
+            previous_offset = offset
+        return min_distance, nearest
 
 
 def true_point(vehicle: SimulatedVehicle) -> TrackPoint:
@@ -273,16 +278,17 @@ def true_point(vehicle: SimulatedVehicle) -> TrackPoint:
 
     Raises InvalidArgument if the vehicle has no true position.
     """
-    place, flown = true_place(vehicle), cast("Any", vehicle)
+    place = true_place(vehicle)
+    autopilot = cast("Any", vehicle)  # A vehicle with a true position has these attributes, too.
     return TrackPoint(
         vehicle.now,
         place.latitude_e7 * 1e-7,
         place.longitude_e7 * 1e-7,
-        place.altitude_m - flown.frame.origin.altitude_m,
-        flown.is_armed,
+        place.altitude_m - autopilot.frame.origin.altitude_m,
+        autopilot.is_armed,
         _mode_name(vehicle),
-        math.hypot(flown.motion.velocity_north, flown.motion.velocity_east),
-        flown.battery.percent,
+        math.hypot(autopilot.motion.velocity_north, autopilot.motion.velocity_east),
+        autopilot.battery.percent,
     )
 
 
@@ -294,50 +300,56 @@ def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.1) -> Track
     """
     if not interval_s > 0:
         raise InvalidArgument(f"interval_s = {interval_s!r} must be above 0")
-    true_place(vehicle)
+    true_place(vehicle)  # raises InvalidArgument for a vehicle without a true position
     origin = cast("Any", vehicle).frame.origin
     home = Position(origin.latitude_e7 * 1e-7, origin.longitude_e7 * 1e-7, origin.altitude_m)
     track = Track(home, name=f"system {vehicle.system_id}")
 
-    def note() -> None:
+    def append_point() -> None:
         track.append(true_point(vehicle))
 
-    def begin() -> None:
-        note()
-        vehicle.every(interval_s, note)
+    def start_recording() -> None:
+        append_point()
+        vehicle.every(interval_s, append_point)
 
-    vehicle.on_power_on(begin)
+    vehicle.on_power_on(start_recording)
     return track
 
 
-def min_distance_m(one: Track, other: Track) -> tuple[float, float]:
+def min_distance_m(first: Track, second: Track) -> tuple[float, float]:
     """Return the minimum distance between two vehicles in space, and its time.
 
     Returns (infinity, 0) if the vehicles never ran at the same time.
     """
-    ups = one.home.altitude_amsl_m or 0.0, other.home.altitude_amsl_m or 0.0
-    way = [
-        (point.time_s, (north, east, up + ups[1]))
-        for point, (north, east, up) in zip(other, other.local(one.home), strict=True)
+    first_home_m, second_home_m = first.home.altitude_amsl_m or 0.0, second.home.altitude_amsl_m or 0.0
+    second_path = [
+        (point.time_s, (north, east, up + second_home_m))
+        for point, (north, east, up) in zip(second, second.local(first.home), strict=True)
     ]
-    times = [time for time, _ in way]
-    nearest = math.inf, 0.0
-    for point, (north, east, up) in zip(one, one.local(), strict=True):
-        index = bisect_right(times, point.time_s)
-        if index == 0 or (index == len(way) and times[-1] < point.time_s):
+    second_times = [time for time, _ in second_path]
+    closest = math.inf, 0.0
+    for point, (north, east, up) in zip(first, first.local(), strict=True):
+        index = bisect_right(second_times, point.time_s)
+        second_did_not_run = index == 0 or (index == len(second_path) and second_times[-1] < point.time_s)
+        if second_did_not_run:
             continue
-        there = _between(way[index - 1], way[min(index, len(way) - 1)], point.time_s)
-        nearest = min(nearest, (math.dist((north, east, up + ups[0]), there), point.time_s))
-    return nearest
+        first_place = (north, east, up + first_home_m)
+        second_place = _interpolated(
+            second_path[index - 1], second_path[min(index, len(second_path) - 1)], point.time_s
+        )
+        closest = min(closest, (math.dist(first_place, second_place), point.time_s))
+    return closest
 
 
-Moment = tuple[float, tuple[float, float, float]]
+# Time, and metres north, east and up.
+_TimedPlace = tuple[float, tuple[float, float, float]]
 
 
-def _between(before: Moment, after: Moment, time_s: float) -> tuple[float, float, float]:
-    span = after[0] - before[0]
-    share = (time_s - before[0]) / span if span > 0 else 0.0
-    north, east, up = (a + share * (b - a) for a, b in zip(before[1], after[1], strict=True))
+def _interpolated(before: _TimedPlace, after: _TimedPlace, time_s: float) -> tuple[float, float, float]:
+    """Return the place at a time between two recorded ones."""
+    (start_s, start), (end_s, end) = before, after
+    share = (time_s - start_s) / (end_s - start_s) if end_s > start_s else 0.0
+    north, east, up = (from_ + share * (to - from_) for from_, to in zip(start, end, strict=True))
     return north, east, up
 
 
@@ -355,8 +367,10 @@ def _text(place: Position) -> str:
 
 def _distance_of_origin(start: tuple[float, float, float], end: tuple[float, float, float]) -> float:
     """Return the distance from the origin to a line segment."""
-    way = [b - a for a, b in zip(start, end, strict=True)]
-    square = sum(part * part for part in way)
-    share = 0.0 if square == 0.0 else -sum(a * part for a, part in zip(start, way, strict=True)) / square
-    share = max(0.0, min(1.0, share))
-    return math.hypot(*(a + share * part for a, part in zip(start, way, strict=True)))
+    segment = [to - from_ for from_, to in zip(start, end, strict=True)]
+    squared_length = sum(component * component for component in segment)
+    share = 0.0  # Part of the segment before the point that is nearest to the origin.
+    if squared_length != 0.0:
+        dot_product = sum(from_ * component for from_, component in zip(start, segment, strict=True))
+        share = max(0.0, min(1.0, -dot_product / squared_length))
+    return math.hypot(*(from_ + share * component for from_, component in zip(start, segment, strict=True)))

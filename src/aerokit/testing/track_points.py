@@ -55,8 +55,8 @@ def metres_from(origin: Position) -> Callable[[Position | TrackPoint], tuple[flo
     per_latitude = geo.distance_m(latitude - 0.005, longitude, latitude + 0.005, longitude) * 100
     per_longitude = geo.distance_m(latitude, longitude - 0.005, latitude, longitude + 0.005) * 100
 
-    def place(point: Position | TrackPoint) -> tuple[float, float]:
+    def offset_of(point: Position | TrackPoint) -> tuple[float, float]:
         north = (point.latitude_deg - latitude) * per_latitude
         return north, geo.wrap_longitude(point.longitude_deg - longitude) * per_longitude
 
-    return place
+    return offset_of

@@ -47,8 +47,8 @@ class LinkAddress(Snapshot):
     """
 
     def __str__(self) -> str:
-        as_written = _quote_option if self.kind in _ZENOH_KINDS else str
-        query = "&".join(f"{key}={as_written(value)}" for key, value in self.options)
+        encode_value = _quote_option if self.kind in _ZENOH_KINDS else str
+        query = "&".join(f"{key}={encode_value(value)}" for key, value in self.options)
         return self._without_options() + (f"?{query}" if query else "")
 
     def option(self, name: str) -> str | None:
@@ -60,7 +60,9 @@ class LinkAddress(Snapshot):
             baud = "" if self.baud is None else f":{self.baud}"
             return f"serial://{_quote_device(self.device)}{baud}"
         if self.kind == "replay":
-            return f"replay:{'//' if self.path.startswith('//') else ''}{_quote(self.path)}"
+            # In replay://…, the slashes belong to the scheme. A path that begins with two slashes gets two more.
+            slashes = "//" if self.path.startswith("//") else ""
+            return f"replay:{slashes}{_quote(self.path)}"
         if self.kind == "pty":
             return f"pty:{self.path}" if self.path else "pty"
         if self.kind in _ZENOH_KINDS:
@@ -165,9 +167,9 @@ class _Parser:
             self.fail("it contains a NUL character")
         if text.lower() == "pty" or text.lower().startswith("pty:"):
             return LinkAddress("pty", path=text[len("pty:") :])
-        scheme, rest = self.split_scheme(text)
+        scheme, after_scheme = self.split_scheme(text)
         if scheme in _SCHEMES:
-            return self.with_scheme(scheme, rest)
+            return self.with_scheme(scheme, after_scheme)
         if scheme:
             self.fail_scheme(scheme)
         return self.bare(text)
@@ -181,20 +183,22 @@ class _Parser:
             return match[1].lower(), match[2]
         return "", text
 
-    def with_scheme(self, scheme: str, rest: str) -> LinkAddress:
+    def with_scheme(self, scheme: str, after_scheme: str) -> LinkAddress:
         kind = _SCHEMES[scheme]
-        rest, _, query = rest.partition("?")
+        target, _, query = after_scheme.partition("?")
         options = self.options(kind, query)
         if kind == "serial":
-            return self.serial(rest, options, decode=True)
+            return self.serial(target, options, decode=True)
         if kind == "replay":
-            drive = scheme == "file" and re.match(r"/[a-z]:[/\\]", rest, re.IGNORECASE)
-            return self.replay(_unquote(rest[1:] if drive else rest), options)
+            if scheme == "file" and re.match(r"/[a-z]:[/\\]", target, re.IGNORECASE):
+                target = target[1:]  # In file:///C:/…, the slash before a Windows drive is not part of the path.
+            return self.replay(_unquote(target), options)
         if kind in _ZENOH_KINDS:
-            return self.named(kind, rest.removesuffix("/"), options)
-        return self.network(kind, rest.removesuffix("/"), options)
+            return self.zenoh(kind, target.removesuffix("/"), options)
+        return self.network(kind, target.removesuffix("/"), options)
 
     def bare(self, text: str) -> LinkAddress:
+        """Parse an address without a scheme: a recording, a serial port, or host:port to listen on."""
         if _RECORDING.fullmatch(text):
             end = text.lower().rindex(".tlog") + len(".tlog")
             return self.replay(text[:end], self.options("replay", text[end + 1 :]))
@@ -207,22 +211,23 @@ class _Parser:
         if ":" not in text:
             self.fail("it is neither host:port nor the path of a serial port or of a .tlog file")
         if not text.startswith("[") and text.count(":") > 1 and not _is_ipv6(text.rpartition(":")[0]):
-            self.fail_scheme(text.partition(":")[0])
+            self.fail_scheme(text.partition(":")[0])  # e.g. "upd:127.0.0.1:14550"
         return self.network("udpin", text, {})
 
     def network(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+        """Parse ``host:port``."""
         if text.startswith("["):
             host, bracket, tail = text[1:].partition("]")
             if not bracket or not _is_ipv6(host):
                 self.fail(f"{text!r} does not start with an IPv6 address in brackets")
         else:
-            host, colon, tail = text.rpartition(":")
-            if not colon:
-                host, tail = tail, ""
-            tail = colon + tail
+            host, colon, port = text.rpartition(":")
+            if not colon:  # rpartition() then has the whole text in its last part
+                host, port = text, ""
+            tail = colon + port
             if _is_ipv6(host):
                 self.fail("an IPv6 address needs brackets, as in [::1]:14550")
-            if host.isdigit() and not tail:
+            if host.isdigit() and not tail:  # only a port, e.g. "udpin:14550"
                 self.fail(f"the host is missing, as in {kind}:127.0.0.1:{host}")
         if not host and kind in _LISTENING:
             host = "0.0.0.0"
@@ -234,7 +239,8 @@ class _Parser:
             self.fail(f"{host!r} is not a host")
         return LinkAddress(kind, host=host, port=self.port(kind, tail), options=tuple(sorted(options.items())))
 
-    def named(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+    def zenoh(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+        """Parse ``fleet/name``."""
         from aerokit.transport.zenoh.keys import check_name  # imported here because few addresses need it
 
         for key in ("connect", "listen"):
@@ -247,32 +253,38 @@ class _Parser:
         try:
             check_name("the fleet", fleet)
             check_name("the name", name)
-            check_name("client", options.get("client", "c"))
+            if "client" in options:
+                check_name("client", options["client"])
         except InvalidArgument as error:
             self.fail(str(error))
         return LinkAddress(kind, path=f"{fleet}/{name}", options=tuple(sorted(options.items())))
 
     def port(self, kind: LinkKind, tail: str) -> int:
+        """Parse the text after a host, which must be ``:port``."""
         if not tail.startswith(":") or tail == ":":
             self.fail("the port is missing" if tail in ("", ":") else f"{tail!r} follows the host, not :port")
-        port, lowest = self.whole_number("the port", tail[1:]), 0 if kind in _LISTENING else 1
-        if not lowest <= port <= 65535:
-            self.fail(f"the port {port} is out of range ({lowest} to 65535)")
+        port = self.whole_number("the port", tail[1:])
+        min_port = 0 if kind in _LISTENING else 1
+        if not min_port <= port <= 65535:
+            self.fail(f"the port {port} is out of range ({min_port} to 65535)")
         return port
 
     def serial(self, text: str, options: dict[str, str], *, decode: bool) -> LinkAddress:
-        rate: str | None
+        """Parse a serial port and its baud rate. ``decode`` is True for an address with a scheme."""
+        # Without a scheme, a colon before the baud rate is accepted only after a COM port.
+        colon_baud = _COLON_BAUD if decode else _COM_COLON_BAUD
+        baud_text: str | None
         if "," in text:
-            device, _, rate = text.partition(",")
-        elif match := (_COLON_BAUD if decode else _COM_COLON_BAUD).fullmatch(text):
-            device, rate = match[1], match[2]
+            device, _, baud_text = text.partition(",")
+        elif match := colon_baud.fullmatch(text):
+            device, baud_text = match[1], match[2]
         else:
-            device, rate = text, None
-        given = options.pop("baud", rate)
+            device, baud_text = text, None
+        baud_text = options.pop("baud", baud_text)
         device = _unquote(device) if decode else device
         if not device.strip("/"):
             self.fail("the serial port is missing")
-        baud = None if given is None else self.whole_number("the baud rate", given)
+        baud = None if baud_text is None else self.whole_number("the baud rate", baud_text)
         if baud == 0:
             self.fail("the baud rate is 0")
         return LinkAddress("serial", device=device, baud=baud, options=tuple(sorted(options.items())))
@@ -283,26 +295,29 @@ class _Parser:
         return LinkAddress("replay", path=path, options=tuple(sorted(options.items())))
 
     def options(self, kind: LinkKind, query: str) -> dict[str, str]:
-        found: dict[str, str] = {}
-        for item in filter(None, query.split("&")):
-            key, _, value = item.partition("=")
+        options: dict[str, str] = {}
+        allowed = _OPTIONS.get(kind, ())
+        if kind not in _NEVER_COSTLY:
+            allowed = (*allowed, "costly")
+        for assignment in filter(None, query.split("&")):
+            key, _, value = assignment.partition("=")
             key = key.strip().lower()
-            allowed = (*_OPTIONS.get(kind, ()), *(() if kind in _NEVER_COSTLY else ("costly",)))
             if key not in allowed:
-                known = ", ".join(allowed) or "none"
-                meant = did_you_mean(key, allowed)
-                self.fail(f"{key!r} is not an option of {kind} links (they have: {known}){meant}")
+                names = ", ".join(allowed) or "none"
+                suggestion = did_you_mean(key, allowed)
+                self.fail(f"{key!r} is not an option of {kind} links (they have: {names}){suggestion}")
             if key in _CASE_SENSITIVE:
-                found[key] = _unquote(value.strip()) or self.fail(f"{key}= is empty")
+                options[key] = _unquote(value.strip())
+                if not options[key]:
+                    self.fail(f"{key}= is empty")
             else:
-                found[key] = self.option_value(key, value.strip().lower())
-        return {
-            key: value
-            for key, value in found.items()
-            if (key, value) not in (("rtscts", "0"), ("costly", "0"), ("speed", "1"))
-        }
+                options[key] = self.option_value(key, value.strip().lower())
+        # An option with its default value is left out, so that addresses of the same link are equal.
+        defaults = (("rtscts", "0"), ("costly", "0"), ("speed", "1"))
+        return {key: value for key, value in options.items() if (key, value) not in defaults}
 
     def option_value(self, key: str, value: str) -> str:
+        """Check a value, and return its canonical form."""
         if key == "baud":
             return value
         if key in _CHOICES:
@@ -332,8 +347,8 @@ class _Parser:
         self.fail(f"a colon is missing: write {scheme}://{text[len(begin) :]}")
 
     def fail_scheme(self, scheme: str) -> NoReturn:
-        known = "supported by pymavlink, not by aerokit" if scheme in _PYMAVLINK_ONLY else "unknown kind of link"
-        self.fail(f"{scheme}: {known}{did_you_mean(scheme, _SCHEMES)}")
+        reason = "supported by pymavlink, not by aerokit" if scheme in _PYMAVLINK_ONLY else "unknown kind of link"
+        self.fail(f"{scheme}: {reason}{did_you_mean(scheme, _SCHEMES)}")
 
     def fail(self, reason: str) -> NoReturn:
         shown = re.sub(r"(//[^/@:]*):.*@", r"\1:…@", self.text)  # hide the password of a broker's URL
@@ -370,4 +385,5 @@ def _unquote(text: str) -> str:
 
 
 def _quote_device(device: str) -> str:
+    """Percent-encode also commas, and a colon before digits at the end, because a baud rate follows them."""
     return re.sub(r":(?=[0-9]+$)", "%3A", _quote(device).replace(",", "%2C"))

@@ -24,51 +24,59 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: PeerFil
     Raises:
         InvalidArgument: the address or ``peers`` are wrong.
     """
-    where = address if isinstance(address, LinkAddress) else parse_address(address)
-    if peers is not None and where.kind not in ("udpin", "udpbcast", "tcpin"):
+    parsed = address if isinstance(address, LinkAddress) else parse_address(address)
+    if peers is not None and parsed.kind not in ("udpin", "udpbcast", "tcpin"):
         raise InvalidArgument(
-            f"peers = … is not allowed with {where}: only udpin, udpbcast and tcpin links filter senders"
+            f"peers = … is not allowed with {parsed}: only udpin, udpbcast and tcpin links filter senders"
         )
-    if where.kind == "serial":
+    if parsed.kind == "serial":
         from aerokit.transport.serial import SerialLink  # imported here because a program uses few kinds of links
 
-        return SerialLink(where.device, where.baud or baud, rtscts=where.option("rtscts") == "1")
-    if where.kind == "replay":
+        return SerialLink(parsed.device, parsed.baud or baud, rtscts=parsed.option("rtscts") == "1")
+    if parsed.kind == "replay":
         from aerokit.transport.replay import Replay
 
-        return Replay(where.path, float(where.option("speed") or 1.0))
-    if where.kind == "pty":
+        return Replay(parsed.path, float(parsed.option("speed") or 1.0))
+    if parsed.kind == "pty":
         from aerokit.transport.serial import PtyLink
 
-        return PtyLink(where.path)
-    if where.kind in ("zenoh", "zenohin"):
-        return _zenoh(where)
-    if where.kind in ("tcp", "tcpin"):
-        return _tcp(where, peers)
-    return _udp(where, peers)
+        return PtyLink(parsed.path)
+    if parsed.kind in ("zenoh", "zenohin"):
+        return _zenoh(parsed)
+    if parsed.kind in ("tcp", "tcpin"):
+        return _tcp(parsed, peers)
+    return _udp(parsed, peers)
 
 
-def _tcp(where: LinkAddress, peers: PeerFilter | None) -> Link:
+def _tcp(parsed: LinkAddress, peers: PeerFilter | None) -> Link:
     from aerokit.transport.tcp import CONNECT_TIMEOUT_S, TcpConnect, TcpListen
 
-    if where.kind == "tcpin":
-        return TcpListen(where.host, where.port, peers=peers)
-    timeout = float(where.option("timeout") or CONNECT_TIMEOUT_S)
-    return TcpConnect(where.host, where.port, connect_timeout_s=timeout)
+    if parsed.kind == "tcpin":
+        return TcpListen(parsed.host, parsed.port, peers=peers)
+    timeout = float(parsed.option("timeout") or CONNECT_TIMEOUT_S)
+    return TcpConnect(parsed.host, parsed.port, connect_timeout_s=timeout)
 
 
-def network_options(where: LinkAddress) -> NetworkOptions:
+def network_options(parsed: LinkAddress) -> NetworkOptions:
     """Return the zenoh options of an address."""
     from aerokit.transport.zenoh.session import NetworkOptions
 
-    connect, listen = (tuple(filter(None, (where.option(key) or "").split(","))) for key in ("connect", "listen"))
-    return NetworkOptions(connect, listen, where.option("mode") or "", where.option("config") or "")
+    return NetworkOptions(
+        connect=_endpoints(parsed.option("connect")),
+        listen=_endpoints(parsed.option("listen")),
+        mode=parsed.option("mode") or "",
+        config=parsed.option("config") or "",
+    )
 
 
-def _zenoh(where: LinkAddress) -> Link:
-    fleet, _, name = where.path.partition("/")
-    options = network_options(where)
-    if where.kind == "zenohin":
+def _endpoints(comma_separated: str | None) -> tuple[str, ...]:
+    return tuple(endpoint for endpoint in (comma_separated or "").split(",") if endpoint)
+
+
+def _zenoh(parsed: LinkAddress) -> Link:
+    fleet, _, name = parsed.path.partition("/")
+    options = network_options(parsed)
+    if parsed.kind == "zenohin":
         from aerokit.transport.zenoh.listen import ZenohListen
 
         return ZenohListen(fleet, name, options=options)
@@ -78,17 +86,17 @@ def _zenoh(where: LinkAddress) -> Link:
         fleet,
         name,
         options=options,
-        client=where.option("client") or "",
-        control=where.option("control") or "free",
-        open_timeout_s=float(where.option("timeout") or OPEN_TIMEOUT_S),
+        client=parsed.option("client") or "",
+        control=parsed.option("control") or "free",
+        open_timeout_s=float(parsed.option("timeout") or OPEN_TIMEOUT_S),
     )
 
 
-def _udp(where: LinkAddress, peers: PeerFilter | None) -> Link:
+def _udp(parsed: LinkAddress, peers: PeerFilter | None) -> Link:
     from aerokit.transport.udp import UdpBroadcast, UdpConnect, UdpListen
 
-    if where.kind == "udpin":
-        return UdpListen(where.host, where.port, peers=peers)
-    if where.kind == "udpbcast":
-        return UdpBroadcast(where.host, where.port, peers=peers)
-    return UdpConnect(where.host, where.port)
+    if parsed.kind == "udpin":
+        return UdpListen(parsed.host, parsed.port, peers=peers)
+    if parsed.kind == "udpbcast":
+        return UdpBroadcast(parsed.host, parsed.port, peers=peers)
+    return UdpConnect(parsed.host, parsed.port)

@@ -216,7 +216,7 @@ class BaseLink(Link):
         if self._is_closed:
             self._release()
             raise ConnectionClosed(f"{self.address} was closed while it was being opened")
-        if self._state is _State.OPENING:
+        if self._state is _State.OPENING:  # otherwise the link was lost already
             self._state = _State.OPEN
 
     def close(self) -> None:
@@ -248,17 +248,18 @@ class BaseLink(Link):
 
     def _report_stalled(self, is_stalled: bool) -> None:
         """Notify the receiver when the first transport of this link stalls, and when all have recovered."""
-        if is_stalled == (self._stalled_at is not None):
+        now, stalled_at = asyncio.get_running_loop().time(), self._stalled_at
+        was_stalled = stalled_at is not None
+        if is_stalled == was_stalled:
             return
-        now, since = asyncio.get_running_loop().time(), self._stalled_at
         self._stalled_at = now if is_stalled else None
         receiver = self._receiver
         if not isinstance(receiver, DrainListener):
             return
-        if since is None:
+        if stalled_at is None:
             receiver.link_stalled(self.unsent_bytes)
         else:
-            receiver.link_drained(now - since)
+            receiver.link_drained(now - stalled_at)
 
     def _lose(self, reason: str, cause: BaseException | None = None, kind: type[LinkLost] = LinkLost) -> None:
         """Release the link and report its loss to the receiver, once."""
@@ -361,13 +362,15 @@ class MemoryLink(BaseLink):
             self._wake_up.cancel()
         self._wake_up = None
         self._inbox.clear()
-        opened, self._loop = self._loop is not None, None
-        if opened and self._far is not None:
+        was_open, self._loop = self._loop is not None, None
+        if was_open and self._far is not None:
             self._far._post(None, self)
 
     def _post(self, data: bytes | None, sender: MemoryLink) -> None:
+        """Schedule the arrival of ``sender``'s data; None: ``sender`` was closed."""
         if self._loop is None or self._receiver is None:
-            sender.dropped_writes += data is not None
+            if data is not None:
+                sender.dropped_writes += 1
             return
         self._inbox.append((self._loop.time() + self._latency_s, data))
         if self._wake_up is None:
@@ -383,8 +386,9 @@ class MemoryLink(BaseLink):
         if self._loop is None or not self._inbox:
             return
         now = max(self._loop.time(), self._inbox[0][0])  # a timer may fire early by the clock's resolution
-        due = 1 if len(self._inbox) == 1 else sum(when <= now for when, _ in self._inbox)
-        for _ in range(due):
+        # Counted before the delivery, so that data written by the receiver arrives in a later loop iteration.
+        due_count = 1 if len(self._inbox) == 1 else sum(due <= now for due, _ in self._inbox)
+        for _ in range(due_count):
             if not self._inbox:  # closed by the receiver
                 return
             _, data = self._inbox.popleft()

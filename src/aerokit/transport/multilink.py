@@ -48,7 +48,8 @@ class MultiLink(Link):
     Args:
         factories: functions that create the links, called for the first and every later attempt to open them.
         costly: indices of links that are used only when the others fail.
-        survives_loss: True to report an interruption instead of a loss while all links are lost.
+        survives_loss: if all links are lost, True keeps this link open, reports an interruption and reopens the links
+            as soon as possible; False reports this link as lost for good.
     """
 
     is_multilink = True
@@ -62,9 +63,9 @@ class MultiLink(Link):
     ) -> None:
         if not factories:
             raise InvalidArgument("factories = [] is not allowed: at least one link")
-        wrong = [index for index in costly if not 0 <= index < len(factories)]
-        if wrong:
-            raise InvalidArgument(f"costly = {wrong} is not allowed: there are links 0 to {len(factories) - 1}")
+        unknown_links = [index for index in costly if not 0 <= index < len(factories)]
+        if unknown_links:
+            raise InvalidArgument(f"costly = {unknown_links} is not allowed: there are links 0 to {len(factories) - 1}")
         self.costly: frozenset[int] = frozenset(costly)
         """Indices of links that are used only when the others fail."""
         self._factories = tuple(factories)
@@ -73,7 +74,7 @@ class MultiLink(Link):
         self._receiver: Receiver | None = None
         self._was_opened = self._is_closed = False
         self._is_available = [False] * len(self._links)
-        self._kept: list[set[Peer]] = [set() for _ in self._links]
+        self._kept: list[set[Peer]] = [set() for _ in self._links]  # peers to keep again at a reopened link
         self._openings: set[asyncio.Task[None]] = set()
         self._foreign: set[int] = set()  # links that another owner opened and closes
         self._is_opening = False
@@ -123,15 +124,15 @@ class MultiLink(Link):
         self._is_opening, self._last_loss = True, None
         openings = [asyncio.ensure_future(self._open_one(index)) for index in range(len(self._links))]
         try:
-            results = await asyncio.gather(*openings)
-            if all(results):
-                raise LinkOpenError("no link can be opened: " + "; ".join(map(str, results)))
+            failures = await asyncio.gather(*openings)
+            if None not in failures:
+                raise LinkOpenError("no link can be opened: " + "; ".join(map(str, failures)))
         except BaseException:
             await self._abort_opening(openings)
             raise
         finally:
             self._is_opening = False
-        for index, failure in enumerate(results):
+        for index, failure in enumerate(failures):
             if failure is not None and not self._is_closed:
                 logger.warning("one of several links cannot be opened and is retried: %s", failure)
                 self._start_opening(index)
@@ -169,28 +170,29 @@ class MultiLink(Link):
             for task in self._openings:
                 with contextlib.suppress(RuntimeError):  # the loop is closed
                     task.cancel()
-            for link in self._own:
+            for link in self._own_links:
                 link.close()
 
     async def wait_closed(self) -> None:
         if self._openings:
             await asyncio.wait(tuple(self._openings))
-        for link in self._own:
+        for link in self._own_links:
             await link.wait_closed()
 
     @property
-    def _own(self) -> list[Link]:
+    def _own_links(self) -> list[Link]:
         return [link for index, link in enumerate(self._links) if index not in self._foreign]
 
     # ------------------------------------------------------------------------------- opening
 
     async def _open_one(self, index: int) -> LinkOpenError | None:
+        """Open one link. Return the error if it cannot be opened; another attempt may succeed."""
         receiver = _MemberReceiver(self, index)
         try:
             await self._links[index].open(receiver)
         except LinkOpenError as error:
             return error
-        except BusyError:
+        except BusyError:  # a link object that another connection uses
             self._foreign.add(index)
             raise
         if not receiver.is_lost:
@@ -202,8 +204,9 @@ class MultiLink(Link):
         for opening in openings:
             opening.cancel()
         await asyncio.wait(openings)
-        for link in self._own:
+        for link in self._own_links:
             link.close()
+        # Make new links for another call of open(), because a closed link cannot be opened again.
         for index, make_link in enumerate(self._factories):
             if index not in self._foreign:
                 self._links[index] = make_link()
@@ -236,11 +239,12 @@ class MultiLink(Link):
 
     def _on_lost(self, index: int, error: LinkLost) -> None:
         self._is_available[index] = False
-        self._notify(index)
+        self._notify_availability(index)
         self._last_loss = error
         self._check_all_lost()
 
     def _check_all_lost(self) -> None:
+        """Report a loss or an interruption if no link is available. Does nothing during the first opening."""
         receiver, error = self._receiver, self._last_loss
         if error is None or receiver is None or self._is_opening:
             return
@@ -260,7 +264,7 @@ class MultiLink(Link):
         self._is_available[index] = True
         for peer in self._kept[index]:
             self._links[index].keep_peer(peer)
-        self._notify(index)
+        self._notify_availability(index)
         if self._lost_at is not None:
             away_s, self._lost_at = asyncio.get_running_loop().time() - self._lost_at, None
             if isinstance(self._receiver, InterruptionListener):
@@ -270,7 +274,7 @@ class MultiLink(Link):
         if isinstance(self._receiver, MemberLinkListener):
             self._receiver.member_link_stalled(index, is_stalled)
 
-    def _notify(self, index: int) -> None:
+    def _notify_availability(self, index: int) -> None:
         if isinstance(self._receiver, MemberLinkListener):
             self._receiver.member_link_changed(index, self._is_available[index])
 

@@ -46,8 +46,8 @@ class Outbox:
         self._dropped, self._on_stalled = dropped, stalled
         self._waiting: deque[tuple[float, bytes]] = deque()  # (deadline, frame)
         self._waiting_bytes = 0
-        self._forwarded = 0  # bytes written to the transport
-        self._left = 0  # bytes that had left this machine at the last poll
+        self._forwarded_bytes = 0  # bytes written to the transport
+        self._sent_bytes = 0  # bytes that had left this machine at the last poll
         self._progress_at = 0.0  # time of the last progress, or of the start of waiting
         self._is_full = False  # True between pause() and resume()
         self._is_stalled = self._is_closed = False
@@ -75,9 +75,11 @@ class Outbox:
             self._schedule_poll()
 
     def pause(self) -> None:
+        """Keep data from now on, because the transport accepts no more."""
         self._is_full = True
 
     def resume(self) -> None:
+        """Forward the kept data, because the transport accepts data again."""
         self._is_full = False
         if self._is_closed:
             return
@@ -93,7 +95,7 @@ class Outbox:
 
     def reclaimed(self, count: int) -> None:
         """Record that bytes were removed from the transport or kernel without being sent."""
-        self._forwarded -= count
+        self._forwarded_bytes -= count
 
     def close(self) -> None:
         """Forward waiting data, or drop it if the transport is stalled. Only ``dropped`` is called afterwards."""
@@ -103,7 +105,7 @@ class Outbox:
         self._stop_polling()
         if self._is_stalled:
             self.discard()
-        self._expire()
+        self._drop_outdated()
         while self._waiting:
             self._forward(self._joined())
 
@@ -115,30 +117,30 @@ class Outbox:
         self._waiting_bytes += len(data)
 
     def _forward(self, data: bytes) -> None:
-        self._forwarded += len(data)
+        self._forwarded_bytes += len(data)
         self._send(data)
 
     def _flush(self) -> None:
-        self._expire()
+        self._drop_outdated()
         while self._waiting and not self._is_full and not self._is_stalled and not self._is_closed:
             self._forward(self._joined())
 
     def _joined(self) -> bytes:
         """Return the next write, joined with following writes up to `_MAX_JOINED_BYTES`."""
-        data = self._next()
+        data = self._pop_oldest()
         while self._waiting and len(data) + len(self._waiting[0][1]) <= _MAX_JOINED_BYTES:
-            data += self._next()
+            data += self._pop_oldest()
         return data
 
-    def _next(self) -> bytes:
+    def _pop_oldest(self) -> bytes:
         data = self._waiting.popleft()[1]
         self._waiting_bytes -= len(data)
         return data
 
-    def _expire(self) -> None:
+    def _drop_outdated(self) -> None:
         now, count = self._loop.time(), 0
         while self._waiting and self._waiting[0][0] <= now:
-            self._next()
+            self._pop_oldest()
             count += 1
         if count:
             self._dropped(count)
@@ -154,13 +156,14 @@ class Outbox:
             self._timer = None
 
     def _poll(self) -> None:
+        """Check whether data has left since the last poll. Polling ends when there is no unsent data."""
         self._timer = None
-        self._expire()
+        self._drop_outdated()
         pending, now = self._pending(), self._loop.time()
-        left = self._forwarded - pending
+        sent_bytes = self._forwarded_bytes - pending
         is_idle = not (pending or self._waiting or self._is_full)
-        if left != self._left or is_idle:
-            self._left, self._progress_at = left, now
+        if sent_bytes != self._sent_bytes or is_idle:
+            self._sent_bytes, self._progress_at = sent_bytes, now
             self._set_stalled(False)
         elif now - self._progress_at >= STALLED_AFTER_S:
             self._set_stalled(True)

@@ -132,7 +132,7 @@ class ReconnectingLink(Link):
         try:
             await self._link.open(current)
         except BaseException:
-            self._cancel_reopening()
+            self._cancel_reopening()  # the link may have been lost while it was being opened
             self._receiver = self._current = self._lost_at = None
             self._was_opened = False
             raise
@@ -180,12 +180,13 @@ class ReconnectingLink(Link):
         if current is self._current and self._lost_at is not None:
             self._is_up = True
             self._on_restored()
-        if current is self._current and self._receiver is not None:
+        if current is self._current and self._receiver is not None:  # the callback above has not closed the link
             self._receiver.bytes_received(data, peer)
 
-    def _listener_of(self, current: _CurrentReceiver) -> DrainListener | None:
-        is_present = current is self._current and isinstance(self._receiver, DrainListener)
-        return self._receiver if is_present else None  # type: ignore[return-value]
+    def _drain_listener(self, current: _CurrentReceiver) -> DrainListener | None:
+        if current is self._current and isinstance(self._receiver, DrainListener):
+            return self._receiver
+        return None
 
     def _on_lost(self, current: _CurrentReceiver, error: LinkLost) -> None:
         if current is not self._current:
@@ -207,16 +208,17 @@ class ReconnectingLink(Link):
 
     async def _reopen(self) -> None:
         try:
-            while not await self._try_again():
+            while not await self._try_to_open():
                 pass
-        except Exception as error:  # make_link failed, so that further attempts are useless
+        except Exception as error:  # make_link failed, so further attempts are useless
             lost = LinkLost(f"{self.address} cannot be reopened: {error}")
             lost.__cause__ = error
             self._end(lost)
         finally:
             self._reopening = None
 
-    async def _try_again(self) -> bool:
+    async def _try_to_open(self) -> bool:
+        """Wait, and try once to open a new link. Return True if no further attempt is needed."""
         await self._link.wait_closed()
         await asyncio.sleep(self._backoff.next_delay())
         link = self._make_link()
@@ -228,7 +230,7 @@ class ReconnectingLink(Link):
         except OSError as error:
             logger.debug("the link still cannot be opened: %s", error)
             return False
-        if current.is_lost:
+        if current.is_lost:  # during the opening; further attempts follow, unless that was the end of a recording
             return self._receiver is None
         self._is_up = True
         if self._lost_at is not None:
@@ -276,11 +278,11 @@ class _CurrentReceiver:
         self._owner._on_bytes(self, data, peer)
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        if listener := self._owner._listener_of(self):
+        if listener := self._owner._drain_listener(self):
             listener.link_stalled(unsent_bytes)
 
     def link_drained(self, stalled_s: float) -> None:
-        if listener := self._owner._listener_of(self):
+        if listener := self._owner._drain_listener(self):
             listener.link_drained(stalled_s)
 
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:

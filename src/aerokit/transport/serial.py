@@ -77,13 +77,14 @@ class SerialLink(BaseLink):
         if self._outbox is None or not self._loop or self._loop.is_closed():
             return
         self._outbox.discard()
-        before = self._waiting_to_be_sent(self._transport)
+        bytes_before = self._waiting_to_be_sent(self._transport)
         self._transport.flush()
         with contextlib.suppress(Exception):
             self._port.reset_output_buffer()
-        taken = before - self._waiting_to_be_sent(self._transport)
-        self._outbox.reclaimed(taken)
-        self._drop(taken > 0)
+        discarded_bytes = bytes_before - self._waiting_to_be_sent(self._transport)
+        self._outbox.reclaimed(discarded_bytes)
+        if discarded_bytes > 0:
+            self._drop(1)
 
     async def _connect(self) -> None:
         """Open the port. This method contains no await, so that it cannot be cancelled halfway."""
@@ -136,15 +137,15 @@ class SerialLink(BaseLink):
                 outbox.close()
         transport.pause_reading()
         if self._loop.is_running():
-            until = self._loop.time() + (LINGER_S if self._is_closed else 0.0)
-            self._loop.call_soon(self._finish, transport, until)
+            linger_s = LINGER_S if self._is_closed else 0.0  # nothing can be sent to a lost device
+            self._loop.call_soon(self._close_when_sent, transport, self._loop.time() + linger_s)
         else:
             self._close_port(transport)
 
-    def _finish(self, transport: Any, until: float) -> None:
+    def _close_when_sent(self, transport: Any, deadline: float) -> None:
         assert self._loop is not None
-        if self._waiting_to_be_sent(transport) and self._loop.time() < until:
-            self._loop.call_later(_LINGER_STEP_S, self._finish, transport, until)
+        if self._waiting_to_be_sent(transport) and self._loop.time() < deadline:
+            self._loop.call_later(_LINGER_STEP_S, self._close_when_sent, transport, deadline)
         else:
             self._close_port(transport)
 
@@ -177,7 +178,7 @@ class _SerialProtocol(asyncio.Protocol):
             self._link._outbox.pause()
 
     def resume_writing(self) -> None:
-        # Report the failure in a later loop iteration, because the transport is in the middle of a write.
+        # Resume in a later loop iteration, because the transport is in the middle of a write.
         if self._link._outbox is not None and self._link._loop is not None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._link._loop.call_soon(self._link._outbox.resume)
@@ -216,16 +217,16 @@ def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -
         raise  # the transport retries later
     except OSError as error:
         on_failure(error)
-        return len(data)
+        return len(data)  # the transport must not retry, because the link is closed soon
 
 
 def _open_error(address: str, error: Exception) -> OSError:
     number = error.errno if isinstance(error, OSError) else None
-    if number is None and str(errno.ENOTTY) in str(error):
+    if number is None and str(errno.ENOTTY) in str(error):  # an error of termios has its number only in the text
         number = errno.ENOTTY
     cause = OSError(number, os.strerror(number)) if number else OSError(str(error))
-    missing = number in (errno.ENOENT, errno.ENXIO, errno.ENODEV)
-    return link_open_error(address, cause, _available_ports() if missing else _HINTS.get(number or 0, ""))
+    is_missing = number in (errno.ENOENT, errno.ENXIO, errno.ENODEV)
+    return link_open_error(address, cause, _available_ports() if is_missing else _HINTS.get(number or 0, ""))
 
 
 def _available_ports() -> str:
@@ -257,7 +258,7 @@ class PtyLink(BaseLink):
         self._path = path
         self._ends: tuple[int, ...] = ()
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._linked = False
+        self._has_symlink = False
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`. Data that does not fit into the kernel's buffer is dropped."""
@@ -267,7 +268,8 @@ class PtyLink(BaseLink):
             written = os.write(self._ends[0], data)
         except OSError:
             written = 0
-        self._drop(written < len(data))
+        if written < len(data):
+            self._drop(1)
 
     async def _connect(self) -> None:
         if sys.platform == "win32":
@@ -281,16 +283,16 @@ class PtyLink(BaseLink):
         os.set_blocking(ours, False)
         name = os.ttyname(theirs)
         if self._path:
-            self._link_to(name)
+            self._make_symlink(name)
         self.address: str = f"pty:{self._path or name}"
         self._released.clear()
         self._loop.add_reader(ours, self._read)
 
-    def _link_to(self, name: str) -> None:
-        if os.path.islink(self._path) and not os.path.exists(self._path):
+    def _make_symlink(self, target: str) -> None:
+        if os.path.islink(self._path) and not os.path.exists(self._path):  # dangling, e.g. of a killed program
             os.unlink(self._path)
-        os.symlink(name, self._path)
-        self._linked = True
+        os.symlink(target, self._path)
+        self._has_symlink = True
 
     def _read(self) -> None:
         try:
@@ -308,8 +310,8 @@ class PtyLink(BaseLink):
             self._loop.remove_reader(ends[0])
         for end in ends:
             os.close(end)
-        if self._linked:
-            self._linked = False
+        if self._has_symlink:
+            self._has_symlink = False
             with contextlib.suppress(OSError):
                 os.unlink(self._path)
         self._released.set()

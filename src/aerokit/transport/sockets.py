@@ -32,10 +32,10 @@ async def resolve(host: str, port: int, kind: socket.SocketKind) -> list[SocketA
     A name is resolved on a thread of the loop's executor.
     """
     try:
-        found = socket.getaddrinfo(host, port, type=kind, flags=socket.AI_NUMERICHOST)
-    except socket.gaierror:
-        found = await asyncio.get_running_loop().getaddrinfo(host, port, type=kind)
-    addresses = [SocketAddress(family, address) for family, _, _, _, address in found]
+        results = socket.getaddrinfo(host, port, type=kind, flags=socket.AI_NUMERICHOST)
+    except socket.gaierror:  # the host is a name, not an IP address
+        results = await asyncio.get_running_loop().getaddrinfo(host, port, type=kind)
+    addresses = [SocketAddress(family, address) for family, _, _, _, address in results]
     return sorted(addresses, key=lambda address: address.family != socket.AF_INET)
 
 
@@ -47,7 +47,7 @@ async def bound_socket(host: str, port: int, kind: socket.SocketKind) -> socket.
     """
     addresses = await resolve(host, port, kind)
     for address in addresses[:-1]:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # try the next address
             return bind_to(address, kind)
     return bind_to(addresses[-1], kind)
 
@@ -66,7 +66,9 @@ def bind_to(address: SocketAddress, kind: socket.SocketKind) -> socket.socket:
         sock.setblocking(False)
         if address.family == socket.AF_INET6:
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
-        if kind is socket.SOCK_STREAM and hasattr(socket, "AF_UNIX"):  # on Windows this option would share the port
+        # With SO_REUSEADDR, a TCP port that was just closed can be bound again. On Windows the option would share the
+        # port with another program.
+        if kind is socket.SOCK_STREAM and hasattr(socket, "AF_UNIX"):
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind(address.address)
     except BaseException:
@@ -95,7 +97,7 @@ Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 PeerFilter = str | ipaddress.IPv4Address | ipaddress.IPv6Address | Network | Iterable[object]
 """Value of ``peers``: IP addresses or networks ("10.0.0.7", "10.0.0.0/24", objects of `ipaddress`), one or several."""
 
-_KINDS = (
+_PEER_TYPES = (
     str,
     ipaddress.IPv4Address,
     ipaddress.IPv6Address,
@@ -108,20 +110,20 @@ class AllowedPeers:
     """Filter by IP address; None accepts all. Raises InvalidArgument for invalid or empty ``peers``."""
 
     def __init__(self, peers: PeerFilter | None) -> None:
-        self._networks = None if peers is None else tuple(map(_network, _several(peers)))
+        self._networks = None if peers is None else tuple(map(_parse_network, _as_iterable(peers)))
         if self._networks == ():
             raise InvalidArgument("peers = [] is not allowed: at least one IP address or network, or None")
 
     def allows(self, host: str) -> bool:
         if self._networks is None:
             return True
-        address = ipaddress.ip_address(host.partition("%")[0])
+        address = ipaddress.ip_address(host.partition("%")[0])  # without the scope of an IPv6 address (fe80::1%eth0)
         if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
             address = address.ipv4_mapped
         return any(address in network for network in self._networks)
 
 
-def _several(peers: PeerFilter) -> Iterable[object]:
+def _as_iterable(peers: PeerFilter) -> Iterable[object]:
     if isinstance(peers, Iterable) and not isinstance(
         peers, (str, bytes, ipaddress.IPv4Network, ipaddress.IPv6Network)
     ):
@@ -129,15 +131,15 @@ def _several(peers: PeerFilter) -> Iterable[object]:
     return (peers,)
 
 
-def _network(item: object) -> Network:
-    error: object = "wrong type"
-    if isinstance(item, _KINDS):
+def _parse_network(peer: object) -> Network:
+    reason = "wrong type"
+    if isinstance(peer, _PEER_TYPES):
         try:
-            return ipaddress.ip_network(item)
-        except ValueError as refused:
-            error = refused
+            return ipaddress.ip_network(peer)
+        except ValueError as error:
+            reason = str(error)
     raise InvalidArgument(
-        f"peers: {short_repr(item)} is not an IP address or network such as '10.0.0.7' or '10.0.0.0/24' ({error})"
+        f"peers: {short_repr(peer)} is not an IP address or network such as '10.0.0.7' or '10.0.0.0/24' ({reason})"
     )
 
 

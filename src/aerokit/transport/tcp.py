@@ -35,7 +35,8 @@ SEND_BUFFER = 16 * 1024
 NOT_SENT_LOW_WATER = 1024
 """Limit of unsent data in the kernel (TCP_NOTSENT_LOWAT, where available)."""
 
-# Loop iterations from accepting a client to `connection_made`. A link that is closed in between misses the client.
+# Loop iterations from accepting a client to `connection_made`. A closed link waits for them, because the connection of
+# a client that was just accepted can only be closed then.
 ACCEPT_ITERATIONS = 5
 
 MAX_CLIENTS = 64
@@ -69,7 +70,7 @@ class _TcpLink(BaseLink):
     def _add_stream(self, stream: _Stream) -> None:
         self._streams.add(stream)
         self._released.clear()
-        if self._receiver is None:
+        if self._receiver is None:  # the link was closed while this connection was being made
             stream.close()
         else:
             self._on_connected(stream)
@@ -82,7 +83,10 @@ class _TcpLink(BaseLink):
         self._on_stalled(stream, False)
 
     def _on_stalled(self, stream: _Stream, is_stalled: bool) -> None:
-        (self._stalled.add if is_stalled else self._stalled.discard)(stream)
+        if is_stalled:
+            self._stalled.add(stream)
+        else:
+            self._stalled.discard(stream)
         self._report_stalled(bool(self._stalled))
 
     def _release(self) -> None:
@@ -111,6 +115,7 @@ class TcpConnect(_TcpLink):
     async def _connect(self) -> None:
         with anyio.move_on_after(self._connect_timeout_s):
             return await self._connect_to_any(await resolve(self._host, self._port, socket.SOCK_STREAM))
+        # Reached only after the time-out.
         raise OSError(errno.ETIMEDOUT, f"no answer within {self._connect_timeout_s:g} s")
 
     async def _connect_to_any(self, addresses: list[SocketAddress]) -> None:
@@ -211,7 +216,7 @@ class TcpListen(_TcpLink):
             stream.close()
 
     async def wait_closed(self) -> None:
-        for _ in range(ACCEPT_ITERATIONS):
+        for _ in range(ACCEPT_ITERATIONS):  # a client that was just accepted is closed by `_add_stream`
             await asyncio.sleep(0)
         await super().wait_closed()
         if self._server is not None and self._receiver is None:
@@ -224,19 +229,20 @@ class TcpListen(_TcpLink):
         self.address: str = f"tcpin:{host_and_port(self._host, self._local_address[1])}"
         loop = asyncio.get_running_loop()
         self._server = await loop.create_server(lambda: _Stream(self), sock=sock, backlog=16, start_serving=False)
-        self._socket = None
+        self._socket = None  # from now on, closing the server closes the socket
         await self._server.start_serving()
 
     def _on_connected(self, stream: _Stream) -> None:
         host = stream.peer[0] if isinstance(stream.peer, tuple) else ""
-        if (host and not self._allowed.allows(host)) or not self._has_room():
+        if (host and not self._allowed.allows(host)) or not self._make_room():
             stream.close()
         else:
             self._clients[stream.peer] = stream
             if isinstance(self._receiver, PeerListener):
                 self._receiver.peer_joined(stream.peer)
 
-    def _has_room(self) -> bool:
+    def _make_room(self) -> bool:
+        """Disconnect a client if there are too many. Return False if all of them are kept."""
         if len(self._clients) < MAX_CLIENTS:
             return True
         unkept = next((peer for peer in self._clients if peer not in self._kept), None)
@@ -274,13 +280,13 @@ class _Stream(asyncio.Protocol):
         self._outbox: Outbox | None = None
         self._fd = -1
         self._loop = asyncio.get_running_loop()
-        self._linger: asyncio.TimerHandle | None = None
+        self._linger_timer: asyncio.TimerHandle | None = None
         self.peer: Peer = None
 
     @property
     def own_address(self) -> tuple[str, int]:
-        name: Any = self._transport and self._transport.get_extra_info("sockname")
-        return name[:2] if name else ("", 0)
+        address: Any = None if self._transport is None else self._transport.get_extra_info("sockname")
+        return address[:2] if address else ("", 0)
 
     @property
     def unsent_bytes(self) -> int:
@@ -307,7 +313,7 @@ class _Stream(asyncio.Protocol):
             self._outbox.close()
             self._transport.close()
             if self._transport.get_write_buffer_size():
-                self._linger = self._loop.call_later(LINGER_S, self._abort)
+                self._linger_timer = self._loop.call_later(LINGER_S, self._abort)
 
     def _abort(self) -> None:
         """Close the connection and discard unsent data."""
@@ -318,7 +324,8 @@ class _Stream(asyncio.Protocol):
 
     def connection_made(self, transport: Any) -> None:  # not every loop's transport inherits from Transport
         self._transport = transport
-        self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"  # None after a disconnection
+        # The name is None if the client has disconnected already.
+        self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"
         transport.set_write_buffer_limits(high=0)  # data that cannot be sent at once waits in the outbox
         sock = transport.get_extra_info("socket")
         with contextlib.suppress(OSError):
@@ -359,12 +366,14 @@ class _Stream(asyncio.Protocol):
         if self._outbox is not None:
             self._outbox.discard()
             self._outbox.close()
-        if self._linger is not None:
-            self._linger.cancel()
+        if self._linger_timer is not None:
+            self._linger_timer.cancel()
         self._link._remove_stream(self, exc)
 
 
 def _why_lost(error: Exception | None) -> str:
     if error is None:
         return "the other end closed the connection"
-    return (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return str(error) or type(error).__name__

@@ -57,6 +57,7 @@ class _UdpLink(BaseLink):
         self._socket: socket.socket | None = None
         self._transport: asyncio.DatagramTransport | None = None  # only on loops without add_reader
         self._transport_owns_socket = False
+        # Tells whether another datagram waits. bool() returns False, because no socket is open yet.
         self._has_more: Callable[[], object] = bool
         self._burst_listener: BurstListener | None = None
 
@@ -79,7 +80,7 @@ class _UdpLink(BaseLink):
         self._has_more = has_more(sock)
         _enlarge_buffer(sock)
         try:
-            self._loop.add_reader(sock, self._drain)
+            self._loop.add_reader(sock, self._on_readable)
         except NotImplementedError:
             await self._connect_without_reader(sock)
 
@@ -118,7 +119,7 @@ class _UdpLink(BaseLink):
     def reports_bursts(self) -> bool:
         return self._socket is not None and not self._transport_owns_socket
 
-    def _drain(self) -> None:
+    def _on_readable(self) -> None:
         self._read_burst()
         if self._burst_listener is not None and self._receiver is not None:
             self._burst_listener.burst_ended()
@@ -195,7 +196,7 @@ class UdpListen(_UdpLink):
         return sock
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
-        if source != self._last_source:
+        if source != self._last_source:  # A sender is checked only when it changes, because most links have one peer.
             if source not in self._peers and not self._allowed.allows(source[0]):
                 return
             self._last_source = source
@@ -250,8 +251,9 @@ class UdpBroadcast(_UdpLink):
         self._remote: Any = None  # the peer that answered
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        default = self._broadcast_address if self._is_remote_silent() else self._remote
-        self._send(data, default if peer is None else peer)
+        if peer is None:
+            peer = self._broadcast_address if self._is_remote_silent() else self._remote
+        self._send(data, peer)
 
     def keep_peer(self, peer: Peer) -> None:
         self._remote, self._received_at = peer, self._now()
@@ -276,9 +278,11 @@ class UdpBroadcast(_UdpLink):
             return
         elif not self._keeps_peers:
             self.keep_peer(source)
+        # Without peers to keep, this is a link with a single remote end, whose peer is None.
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:
+        # A receiver that keeps peers checks the frames of another port before it accepts the port (`keep_peer`).
         is_same_host = self._keeps_peers and self._remote is not None and source[0] == self._remote[0]
         return (is_same_host or self._is_remote_silent()) and self._allowed.allows(source[0])
 

@@ -714,7 +714,7 @@ async def test_set_heading_absolute_and_relative(flying: Flight) -> None:
 
 async def test_set_heading_not_reached_times_out(flying: Flight) -> None:
     flying.copter.faults.lose_ack(MavCmd.CONDITION_YAW)
-    flying.copter.yaw.fixed = lambda *_, **__: None  # type: ignore[method-assign]
+    flying.copter.yaw.turn_to = lambda *_, **__: None  # type: ignore[method-assign]
     with pytest.raises(OperationTimeout, match=r"set_heading\(90°\): not done within 3 s; the heading is \d+° off"):
         await flying.vehicle.set_heading(90.0, timeout=3.0)
 

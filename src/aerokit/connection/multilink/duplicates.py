@@ -53,26 +53,28 @@ class Copies:
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
         count = self._counts.get(sender, 0)
-        before, bit = self._seen.get(key), 1 << link
+        earlier, link_bit = self._seen.get(key), 1 << link
         self.is_late = False
-        if before is not None:
-            age_s, is_other_link = frame.received_at - before.at, not before.links & bit
-            is_recent = age_s <= COPY_WINDOW_S and count - before.count < COPY_WINDOW_FRAMES
+        if earlier is not None:
+            age_s = frame.received_at - earlier.at
+            is_other_link = not earlier.links & link_bit
+            is_recent = age_s <= COPY_WINDOW_S and count - earlier.count < COPY_WINDOW_FRAMES
             if is_recent and is_other_link:
-                before.links |= bit
-                self._current = before
+                earlier.links |= link_bit
+                self._current = earlier
                 return True
-            self.is_late = is_other_link and before.is_accepted and age_s <= LATE_COPY_WINDOW_S
+            self.is_late = is_other_link and earlier.is_accepted and age_s <= LATE_COPY_WINDOW_S
             del self._seen[key]
         self._counts[sender] = count + 1
-        self._current = self._seen[key] = _Seen(frame.received_at, bit, count + 1)
+        self._current = self._seen[key] = _Seen(frame.received_at, link_bit, count + 1)
         if len(self._seen) > MAX_REMEMBERED:
-            for old in list(self._seen)[: MAX_REMEMBERED // 4]:
-                del self._seen[old]
+            for oldest_key in list(self._seen)[: MAX_REMEMBERED // 4]:
+                del self._seen[oldest_key]
         return False
 
     @property
     def was_accepted(self) -> bool:
+        """True if the first copy of the last checked frame was accepted."""
         return self._current is not None and self._current.is_accepted
 
     @property
@@ -86,6 +88,7 @@ class Copies:
             self._current.is_admitted = True
 
     def accept(self) -> None:
+        """Record that the last checked frame is delivered. Its copies are then dropped."""
         if self._current is not None:
             self._current.is_accepted = True
 
@@ -127,7 +130,7 @@ class _Stream:
         """Count an acknowledgement. Return True if another link has delivered it at least as often as this one."""
         counts = self.acknowledgements.setdefault(payload, [0] * len(self.received_at))
         counts[link] += 1
-        return counts[link] <= max(count for other, count in enumerate(counts) if other != link)
+        return counts[link] <= max(count for index, count in enumerate(counts) if index != link)
 
 
 class MergedStreams:
@@ -146,13 +149,15 @@ class MergedStreams:
         self._streams = {key: stream for key, stream in self._streams.items() if key & 0xFF != system_id}
 
     def was_accepted(self, frame: Frame, link: int) -> bool:
+        """Return True if this frame is a copy of a frame that was accepted over another link."""
         if not self.copies.is_copy(frame, link):
             return False
         choice = self._choices.get(frame.system_id)
         # Only frames with a time stamp prove that both links lead to one vehicle: two vehicles may send equal
         # heartbeats.
         if choice is not None and boot_time_ms(frame):
-            for index in {link, -1 if choice.used is None else choice.used.link}:
+            links = {link} if choice.used is None else {link, choice.used.link}
+            for index in links:
                 if (candidate := choice.candidates.get(index)) is not None:
                     candidate.record_copy(frame.received_at)
         if not self.copies.was_accepted:
@@ -172,14 +177,14 @@ class MergedStreams:
         if candidate is not None and not choice.may_be_used(candidate):
             return False
         if frame.received_at <= choice.fresh_after and frame.message_id not in ANSWERS:
-            return False
-        if self.copies.is_late and not _may_be_equal(frame, link, choice):
+            return False  # older than the telemetry that the former link has delivered
+        if self.copies.is_late and not _may_be_different_frame(frame, link, choice):
             return False
         if link != choice.used.link and not _is_accepted_from_unused(frame, candidate, choice, stream):
             return False
-        is_soon = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
-        if is_soon and frame.message_id in ACKNOWLEDGEMENTS:
-            is_repeated = stream.is_repeated(frame.payload, link)
+        is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
+        if is_after_change and frame.message_id in ACKNOWLEDGEMENTS:
+            is_repeated = stream.is_repeated(frame.payload, link)  # also called for the link in use, to count
             if is_repeated and link != choice.used.link:
                 return False
         stream.newest = frame.sequence
@@ -187,6 +192,7 @@ class MergedStreams:
         return True
 
     def _stream(self, frame: Frame) -> _Stream:
+        """Return the stream of the frame's sender; a new stream replaces the oldest if there are too many."""
         key = frame.component_id << 8 | frame.system_id
         stream = self._streams.get(key)
         if stream is None:
@@ -202,16 +208,18 @@ def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: 
         return False
     is_answer = frame.message_id in ANSWERS
     if choice.is_shared(candidate, frame.received_at):
+        # The link in use has lost this frame, or its copy arrives later.
         is_late = stream.newest >= 0 and (frame.sequence - stream.newest) & 0xFF >= 128
         return is_answer or not is_late
+    # Separate streams. The component may be reached over this link only, or answer what was sent before a change.
     is_on_used_link = frame.received_at - stream.received_at[choice.used.link] <= COMPONENT_TTL_S
-    is_soon = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
-    return not is_on_used_link or (is_answer and candidate is choice.former and is_soon)
+    is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
+    return not is_on_used_link or (is_answer and candidate is choice.former and is_after_change)
 
 
-def _may_be_equal(frame: Frame, link: int, choice: LinkChoice) -> bool:
+def _may_be_different_frame(frame: Frame, link: int, choice: LinkChoice) -> bool:
     """Return True if frames with equal bytes may be different frames, such as heartbeats of separate streams."""
-    candidate = choice.used
-    if candidate is None or candidate.link != link or frame.message_id != m.Heartbeat.ID:
+    used = choice.used
+    if used is None or used.link != link or frame.message_id != m.Heartbeat.ID:
         return False
-    return not choice.is_shared(candidate, frame.received_at)
+    return not choice.is_shared(used, frame.received_at)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 # Silence after which a link is not alive. Probes are answered twice a second.
 PROBED_TIMEOUT_S = 1.0
 
-# Silence after which a link without answers, or a costly link, is not alive: two missing heartbeats.
+# Silence (two missing heartbeats) after which a link without answers to probes, or a costly link, counts as dead.
 UNPROBED_TIMEOUT_S = 2.5
 
 # Consecutive matching clock samples that prove that a second link leads to the same vehicle.
@@ -35,10 +35,15 @@ class Candidate:
         self.link = link
         self.is_costly = is_costly
         self.received_at: float = now
+        """Time of the last frame of the system over the link."""
         self.answered_at: float = -math.inf
+        """Time of the last answer to a probe."""
         self.shared_at: float = -math.inf
+        """Time of the last frame that was received both over this link and over the link in use."""
         self.is_available: bool = True
+        """True while the link is open."""
         self.is_stalled: bool = False
+        """True while written data does not leave this machine."""
         self.loss: float | None = None
         """Share of frames lost over the last seconds, 0 to 1; None: unknown."""
         self.round_trip_s: float | None = None
@@ -53,19 +58,22 @@ class Candidate:
         """Hardware id received over the link; None if none was received."""
         self.is_other_hardware: bool = False
         """True if :attr:`hardware` belongs to another vehicle: neither clock nor copies can then prove the link."""
-        self._hardware_requests = self._times_since_request = 0
+        self._hardware_requests = self._answers_since_request = 0
         self._clock_matches = self._clock_mismatches = self._copies = 0
-        self._counted = (0, 0)
+        self._last_counts = (0, 0)  # frames received and lost
 
     def record_counts(self, received: int, lost: int, now: float) -> None:
-        before, self._counted = self._counted, (received, lost)
-        if received > before[0]:
+        """Update :attr:`loss` from the total numbers of frames that were received and lost over this link."""
+        received_before, lost_before = self._last_counts
+        self._last_counts = received, lost
+        if received > received_before:
             self.received_at = now
-        arrived, missing = received - before[0], max(0, lost - before[1])
-        if arrived > 0 or missing:
-            share = missing / (max(arrived, 0) + missing)
-            weight = 1 - 0.85 ** (max(arrived, 0) + missing)  # about the last dozen frames dominate
-            self.loss = share if self.loss is None else self.loss + weight * (share - self.loss)
+        # Totals shrink when counters are replaced, e.g. those of an evicted peer.
+        new_received, new_lost = max(0, received - received_before), max(0, lost - lost_before)
+        if new_received or new_lost:
+            new_loss = new_lost / (new_received + new_lost)
+            weight = 1 - 0.85 ** (new_received + new_lost)  # about the last dozen frames dominate
+            self.loss = new_loss if self.loss is None else self.loss + weight * (new_loss - self.loss)
 
     def record_round_trip(self, seconds: float, now: float) -> None:
         self.answered_at = self.received_at = now
@@ -73,6 +81,10 @@ class Candidate:
         self.round_trip_s = seconds if before is None else 0.7 * before + 0.3 * seconds
 
     def record_clock(self, matches: bool, *, may_prove: bool) -> None:
+        """Record whether the time in a probe's answer matches the vehicle's clock.
+
+        ``may_prove`` is False while the hardware id, which is stronger evidence, may still be received.
+        """
         if matches:
             self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0
         else:
@@ -93,7 +105,7 @@ class Candidate:
         self.was_proven = self.was_proven or self.is_proven
         self.is_proven = self.is_other_hardware = False
         self.hardware = None
-        self._hardware_requests = self._times_since_request = 0
+        self._hardware_requests = self._answers_since_request = 0
         self._clock_matches = self._clock_mismatches = self._copies = 0
 
     def request_hardware(self) -> bool:
@@ -109,7 +121,8 @@ class Candidate:
 
     @property
     def is_hardware_pending(self) -> bool:
-        return self._hardware_requests > 0 and self._times_since_request < MAX_TIMES_WITHOUT_HARDWARE
+        """True while an answer to a request for the hardware id can still be expected."""
+        return self._hardware_requests > 0 and self._answers_since_request < MAX_TIMES_WITHOUT_HARDWARE
 
     def record_hardware(self, *, is_other: bool) -> None:
         """Record whether the hardware id received over the link contradicts that of the vehicle."""
@@ -123,7 +136,7 @@ class Candidate:
     def record_time(self) -> None:
         """Count a TIMESYNC answer after a request for the hardware id."""
         if self._hardware_requests:
-            self._times_since_request += 1
+            self._answers_since_request += 1
 
     def reset_mismatches(self) -> None:
         self._clock_mismatches = 0
@@ -142,13 +155,18 @@ class Candidate:
         """Return the reason why the link is no longer used, for events."""
         if self.is_other_hardware:
             return "another vehicle"
-        return "lost" if not self.is_available else "stalled" if self.is_stalled else "silent"
+        if not self.is_available:
+            return "lost"
+        return "stalled" if self.is_stalled else "silent"
 
     @property
     def cost_s(self) -> float:
         """Expected time for a command and its answer, retries after losses included."""
         loss = min(0.9, self.loss or 0.0)
-        return ((0.1 if self.round_trip_s is None else self.round_trip_s) + 0.05) / (1 - loss) ** 2
+        round_trip_s = 0.1 if self.round_trip_s is None else self.round_trip_s
+        # The constant keeps links with round trips of a few milliseconds about equal. The loss counts twice, because
+        # the command and its answer must both arrive.
+        return (round_trip_s + 0.05) / (1 - loss) ** 2
 
 
 # Two links that carried the same frame within this time carry one stream.
@@ -179,16 +197,17 @@ class LinkChoice:
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
         """The vehicle's hardware id, as received over the link that was in use then."""
-        self._hardware_link = -1
+        self._hardware_link = -1  # the link over which `hardware` was received; its next id replaces `hardware`
         self.used: Candidate | None = None
+        """The link in use; None before the first choice."""
         self.former: Candidate | None = None
         """The link used before; it may still deliver answers."""
         self.changed_at: float = -math.inf
         self.fresh_after: float = -math.inf
         """Telemetry received before this time is older than the last telemetry of the former link."""
-        self._better: Candidate | None = None
+        self._better: Candidate | None = None  # a link that has been better than the link in use since `_better_since`
         self._better_since = 0.0
-        self._command_at = -math.inf
+        self._command_at = -math.inf  # time of the last command to the system
 
     def record_heartbeat(self, link: int, now: float, *, is_costly: bool) -> Candidate:
         candidate = self.candidates.get(link)
@@ -207,6 +226,7 @@ class LinkChoice:
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
         """Record the vehicle's time ``vehicle_s``, received over a link; ``at`` is our time at that moment."""
         candidate = self.candidates[link]
+        # Compared before this answer is recorded: the link in use has missed an earlier answer, too.
         is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
         candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:
@@ -214,16 +234,17 @@ class LinkChoice:
                 # The vehicle may have rebooted or been replaced by another one, so the next hardware id over this link
                 # is accepted.
                 self._hardware_link = link
-                for other in self.candidates.values():
-                    other.reset_proof()
+                for affected in self.candidates.values():
+                    affected.reset_proof()
             elif not self.clock.is_steady:
-                for other in self.candidates.values():
-                    other.reset_mismatches()
+                for affected in self.candidates.values():
+                    affected.reset_mismatches()
         else:
             candidate.record_time()
             matches = self.clock.matches(at, vehicle_s, round_trip_s)
             if not matches and is_used_silent:
-                # The link in use may be dead, and the vehicle may have paused or rebooted since.
+                # The link in use may be dead, and the vehicle may have paused or rebooted since. Its clock then proves
+                # nothing against this link, so without a matching hardware id the answer is not judged (None).
                 matches = True if self._is_same_by_hardware(candidate, now) else None
             if matches is not None:
                 candidate.record_clock(matches, may_prove=not self._awaits_hardware(candidate))
@@ -239,12 +260,12 @@ class LinkChoice:
             candidate.hardware = hardware
         if candidate is self.used:
             self._adopt_hardware(candidate)
-        for other in self.candidates.values():
-            if self.hardware is not None and other.hardware is not None:
-                other.record_hardware(is_other=self.hardware.contradicts(other.hardware))
+        for compared in self.candidates.values():
+            if self.hardware is not None and compared.hardware is not None:
+                compared.record_hardware(is_other=self.hardware.contradicts(compared.hardware))
 
     def may_be_used(self, candidate: Candidate) -> bool:
-        """Return True if the link leads to the same system."""
+        """Return True if frames and commands may use the link: it is in use, is proven, or needs no proof."""
         if candidate.is_other_hardware:
             return False
         return self.used in (None, candidate) or candidate.is_proven or not self.needs_proof
@@ -292,14 +313,15 @@ class LinkChoice:
         is_same = (
             self.hardware is not None and candidate.hardware is not None and self.hardware.confirms(candidate.hardware)
         )
-        alive = [known for known in self.candidates.values() if known.is_alive(now)]
+        alive = [link for link in self.candidates.values() if link.is_alive(now)]
         return candidate.was_proven and is_same and alive == [candidate]
 
     def _awaits_hardware(self, candidate: Candidate) -> bool:
-        has_both = self.hardware is not None and candidate.hardware is not None
-        return candidate.is_hardware_pending and not has_both
+        can_compare_ids = self.hardware is not None and candidate.hardware is not None
+        return candidate.is_hardware_pending and not can_compare_ids
 
     def _adopt_hardware(self, used: Candidate) -> None:
+        """Make the id received over the link in use the vehicle's id, unless another link's id contradicts it."""
         hardware = used.hardware
         if hardware is None or not hardware.has_value:
             return
@@ -313,13 +335,14 @@ class LinkChoice:
         waited_s = now - self._better_since - MIN_BETTER_S
         return now - self._command_at <= transit_s and waited_s <= MAX_SWITCH_DELAY_S
 
-    def _change(self, to: Candidate, reason: str, now: float) -> str:
+    def _change(self, chosen: Candidate, reason: str, now: float) -> str:
+        """Use this link from now on. Return the reason."""
         former = self.used
         if former is not None:
-            longer_s = ((to.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
-            self.fresh_after = former.received_at + longer_s + JITTER_S
-            # Both links lead to the same vehicle; otherwise the new link would not be used.
+            extra_transit_s = ((chosen.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
+            self.fresh_after = former.received_at + extra_transit_s + JITTER_S
+            # The former and the new link lead to the same vehicle; otherwise the new link would not be used.
             former.is_proven = not former.is_other_hardware
-        self.former, self.used, self.changed_at, self._better = former, to, now, None
-        self._adopt_hardware(to)
+        self.former, self.used, self.changed_at, self._better = former, chosen, now, None
+        self._adopt_hardware(chosen)
         return reason

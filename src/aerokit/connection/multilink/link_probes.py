@@ -53,6 +53,7 @@ class LinkProbes:
         self._names, self._choices, self._bus, self._send = names, choices, bus, send
         self._pending: dict[int, tuple[int, int, float]] = {}  # ts1 → system, link, sent at
         self._probed_at: dict[tuple[int, int], float] = {}
+        # Number of probes that may be sent now to systems without a vehicle object, and the time of its last refill.
         self._budget, self._budget_at = UNATTACHED_RATE_HZ, 0.0
         self._reported: set[tuple[int, int]] = set()
         bus.require_frames(m.Timesync, m.AutopilotVersion)
@@ -74,17 +75,17 @@ class LinkProbes:
         key = system_id, candidate.link
         if now - self._probed_at.get(key, -math.inf) < interval_s - TIMER_TOLERANCE_S:
             return
-        if not is_attached and not self._take_budget(now):
+        if not is_attached and not self._consume_budget(now):
             return
         self._probed_at[key] = now
-        # The number is our time in nanoseconds, with last digits that are unique per system and link.
-        number = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
-        if number <= 0 or number in self._pending:
+        # ts1 is our time in nanoseconds, with last digits that tell systems and links apart.
+        ts1 = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
+        if ts1 <= 0 or ts1 in self._pending:
             return
         if len(self._pending) >= MAX_PENDING:
             del self._pending[next(iter(self._pending))]
-        self._pending[number] = system_id, candidate.link, now
-        self._send(m.Timesync(0, number, target_system=system_id, target_component=_AUTOPILOT), peer)
+        self._pending[ts1] = system_id, candidate.link, now
+        self._send(m.Timesync(0, ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
         if choice.should_request_hardware(candidate, is_attached=is_attached):
             message_id = float(m.AutopilotVersion.ID)
             request = m.CommandLong(system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, 0, message_id, 0, 0, 0, 0, 0, 0)
@@ -104,6 +105,7 @@ class LinkProbes:
         return True
 
     def record_hardware(self, frame: Frame, link: int) -> None:
+        """Record the hardware id if the frame is an AUTOPILOT_VERSION of an autopilot."""
         if frame.message_id != m.AutopilotVersion.ID or frame.component_id != _AUTOPILOT:
             return
         choice, message = self._choices.get(frame.system_id), self._bus.dialect.decode(frame)
@@ -112,7 +114,8 @@ class LinkProbes:
             for candidate in choice.candidates.values():
                 self._report_doubt(frame, candidate)
 
-    def _take_budget(self, now: float) -> bool:
+    def _consume_budget(self, now: float) -> bool:
+        """Count a probe to a system without a vehicle object. Return False if there were too many (token bucket)."""
         self._budget = min(UNATTACHED_RATE_HZ, self._budget + UNATTACHED_RATE_HZ * (now - self._budget_at))
         self._budget_at = now
         if self._budget < 1:
@@ -122,11 +125,14 @@ class LinkProbes:
 
     def _round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
         """Return the seconds since the probe; None if the probe went to another system or link."""
-        if self._pending.get(answer.ts1, (0, 0, 0.0))[:2] != (system_id, link):
+        probed_system, probed_link, sent_at = self._pending.get(answer.ts1, (0, 0, 0.0))
+        if (probed_system, probed_link) != (system_id, link):
             return None
-        return max(0.0, now - self._pending.pop(answer.ts1)[2])
+        del self._pending[answer.ts1]
+        return max(0.0, now - sent_at)
 
     def _report_doubt(self, frame: Frame, candidate: Candidate) -> None:
+        """Report once that another vehicle has the same system id, until the link leads to the known vehicle again."""
         key = frame.system_id, candidate.link
         if not candidate.is_doubted:
             self._reported.discard(key)

@@ -51,6 +51,7 @@ class LinkStates:
         self.cell: StateCell[tuple[LinkStatus, ...]] = StateCell("links", clock, "frame")
 
     def update(self, now: float) -> None:
+        """Set CONNECTED or SILENT for each open link over which a system is known. Refresh the cell once a second."""
         for link in range(len(self._states)):
             candidates = [choice.candidates[link] for choice in self._choices.values() if link in choice.candidates]
             if candidates and self._link.is_available(link):
@@ -198,7 +199,7 @@ class MultiLinkRoutes:
                 return ()  # the link in use leads to another vehicle, and no live link leads to this one
             if message is None or message.ID in COMMANDS:
                 choice.record_command(now)
-            return self._peers_on(self._link_to(choice, (system_id, component_id)), system_id, component_id)
+            return self._peers_on(self._link_reaching(choice, (system_id, component_id)), system_id, component_id)
         if message is not None and message.ID in BROADCASTS:
             return EVERY_PEER
         return self._one_per_system(self._now())
@@ -210,11 +211,12 @@ class MultiLinkRoutes:
 
         PX4 forwards our heartbeats from one of its ports to its other ports.
         """
-        if frame.system_id == self._own_source[0] and frame.component_id == self._own_source[1]:
+        if (frame.system_id, frame.component_id) == self._own_source:
             return True
         link = _link(peer)
         if not self._merged.was_accepted(frame, link):
             return False
+        # A copy is not delivered, but shows what this link leads to, and that it works.
         self._probes.record_hardware(frame, link)
         if frame.message_id == m.Heartbeat.ID and not self.arrived_on_other_peer(frame, peer):
             counters = self._counters.get((frame.system_id, link), {}).get(frame.component_id)
@@ -239,7 +241,7 @@ class MultiLinkRoutes:
             if (candidate := choice.candidates.get(link)) is not None:
                 candidate.is_available = is_available
                 if not is_available:
-                    candidate.is_stalled = False
+                    candidate.is_stalled = False  # a lost link has no unsent data
                 self._choose(system_id, choice, now)
         self._states.set_state(link, LinkState.CONNECTED if is_available else LinkState.LOST, now)
 
@@ -275,7 +277,7 @@ class MultiLinkRoutes:
 
     # ---------------------------------------------------------------------------- internal
 
-    def _link_to(self, choice: LinkChoice, source: tuple[int, int]) -> int:
+    def _link_reaching(self, choice: LinkChoice, source: tuple[int, int]) -> int:
         """Return the link in use, or another link to the same system if only that link reaches the component."""
         assert choice.used is not None
         if not self._routes[choice.used.link].has_route(source):
@@ -293,7 +295,7 @@ class MultiLinkRoutes:
         """Return peers that together reach every system. A system behind an already chosen peer adds no second peer."""
         peers: set[Peer] = set()
         links_with_systems: set[int] = set()
-        options: list[list[Collection[Peer]]] = []
+        options_by_system: list[list[Collection[Peer]]] = []  # for each system, the peers on each usable link
         for system_id, choice in self._choices.items():
             links_with_systems.update(choice.candidates)
             if choice.used is not None:
@@ -302,10 +304,13 @@ class MultiLinkRoutes:
                     for candidate in choice.candidates.values()
                     if candidate is not choice.used and choice.may_be_used(candidate) and candidate.is_alive(now)
                 ]
-                options.append([self._peers_on(candidate.link, system_id, 0) for candidate in (choice.used, *usable)])
-        for of_system in sorted(options, key=len):
-            if not any(peers.issuperset(option) for option in of_system):
-                peers.update(of_system[0])
+                options_by_system.append(
+                    [self._peers_on(candidate.link, system_id, 0) for candidate in (choice.used, *usable)]
+                )
+        # Systems with one link come first, because their peers may also reach systems that have several links.
+        for options in sorted(options_by_system, key=len):
+            if not any(peers.issuperset(option) for option in options):
+                peers.update(options[0])
         peers.update(LinkPeer(link, None) for link in range(len(self._routes)) if link not in links_with_systems)
         return peers
 
@@ -325,7 +330,7 @@ class MultiLinkRoutes:
                 system_id,
                 name,
                 former,
-                _OF_FORMER.get(reason, reason),
+                _DISADVANTAGE_OF_FORMER.get(reason, reason),
             )
         self._bus.publish(
             LinkSelected(
@@ -345,7 +350,8 @@ class MultiLinkRoutes:
                 self._probes.probe(system_id, choice, candidate, peer, now, is_attached=is_attached)
 
 
-_OF_FORMER = {"better": "worse", "cheaper": "costly"}
+# Reason for a change, which describes the new link → word for the former link, for the log.
+_DISADVANTAGE_OF_FORMER = {"better": "worse", "cheaper": "costly"}
 
 
 def _link(peer: Peer) -> int:

@@ -47,32 +47,37 @@ class VehicleClock:
         return continues
 
     def matches(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
-        """Return True if a sample from another link is this clock's time; ``at`` is the middle of the round trip.
+        """Return True if a sample from another link agrees with this clock; ``at`` is the middle of the round trip.
 
         Return None while the speed is unknown, because a simulation may run at any speed. The speed from before a pause
         or reboot can confirm a sample, but not contradict it.
         """
         fits = self._fits(at, vehicle_s, round_trip_s)
-        return None if not fits and self._measured_speed is None else fits
+        if self._measured_speed is None and not fits:
+            return None
+        return fits
 
     def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
+        """Return True if a sample is where the clock's speed leads to; None if the speed is unknown."""
         speed = self._speed
         if speed is None:
             return None
-        last_at, last = self._samples[-1]
+        last_at, last_vehicle_s = self._samples[-1]
         tolerance = self._tolerance_s(at, round_trip_s, speed)
-        return abs(last + speed * (at - last_at) - vehicle_s) <= tolerance
+        return abs(last_vehicle_s + speed * (at - last_at) - vehicle_s) <= tolerance
 
     def _continues(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
-        last_at, last = self._samples[-1]
+        """Return True if a sample may follow the last one: the clock is not too fast, and was paused only briefly."""
+        last_at, last_vehicle_s = self._samples[-1]
+        advance_s = vehicle_s - last_vehicle_s
         speed = self._measured_speed
         if speed is None:
-            longest = MAX_SPEED * (at - last_at + TOLERANCE_S + round_trip_s)
-            return -TOLERANCE_S - round_trip_s <= vehicle_s - last <= longest
-        tolerance = self._tolerance_s(at, round_trip_s, speed)
-        expected = speed * (at - last_at)
-        shortest = max(0.0, expected - MAX_PAUSE_S * max(1.0, speed))
-        return shortest - tolerance <= vehicle_s - last <= expected + tolerance
+            max_advance_s = MAX_SPEED * (at - last_at + TOLERANCE_S + round_trip_s)
+            return -TOLERANCE_S - round_trip_s <= advance_s <= max_advance_s
+        tolerance_s = self._tolerance_s(at, round_trip_s, speed)
+        expected_s = speed * (at - last_at)
+        min_advance_s = max(0.0, expected_s - MAX_PAUSE_S * max(1.0, speed))
+        return min_advance_s - tolerance_s <= advance_s <= expected_s + tolerance_s
 
     def _tolerance_s(self, at: float, round_trip_s: float, speed: float) -> float:
         drift_s = min(MAX_SPEED_ERROR * abs(at - self._samples[-1][0]), MAX_DRIFT_S)
@@ -80,19 +85,23 @@ class VehicleClock:
 
     @property
     def _speed(self) -> float | None:
-        if (measured := self._measured_speed) is not None or self._former_speed is None:
-            return measured
+        """The measured speed, or for a few seconds after a pause or reboot the speed measured before it."""
+        if self._measured_speed is not None:
+            return self._measured_speed
+        if self._former_speed is None:
+            return None
         speed, measured_at = self._former_speed
         return speed if self._samples[-1][0] - measured_at <= SPEED_MAX_AGE_S else None
 
     @property
     def _measured_speed(self) -> float | None:
+        """Seconds of the vehicle's clock per second of ours, from the stored samples; None if they span too little."""
         if not self._samples:
             return None
-        (first_at, first), (last_at, last) = self._samples[0], self._samples[-1]
+        (first_at, first_vehicle_s), (last_at, last_vehicle_s) = self._samples[0], self._samples[-1]
         if last_at - first_at < MIN_SPAN_S:
             return None
-        speed = (last - first) / (last_at - first_at)
+        speed = (last_vehicle_s - first_vehicle_s) / (last_at - first_at)
         return 1.0 if abs(speed - 1) <= REAL_TIME_TOLERANCE else speed
 
 
@@ -100,7 +109,8 @@ class HardwareId(NamedTuple):
     """Hardware id from AUTOPILOT_VERSION; all zeros mean none.
 
     ArduPilot sends the processor's serial number as ``uid2`` (on Linux and in simulation the machine id), and no
-    ``uid``. PX4 sends both; in simulation they are a constant and the system id. Equal or missing ids prove nothing.
+    ``uid``. PX4 sends both; in simulation ``uid2`` is a constant and ``uid`` the system id. So only different ids
+    prove something: that there are two vehicles.
     https://mavlink.io/en/messages/common.html#AUTOPILOT_VERSION
     """
 

@@ -73,18 +73,16 @@ def _information(camera: CameraDevice) -> m.CameraInformation:
 
 
 def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[Message]:
-    """Return the images with indexes from param 2 (-1: all images) to param 3 (0: only the first of them, -1: to the
-    last).
+    """Return the images that a request selects, or the last image for a stream.
+
+    Param 2 is the first index (-1: all images), param 3 the last index (0: only the first image, -1: to the end).
     """
-    images = camera.captures.images
     if command is None:
-        return images[-1:]
+        return camera.captures.images[-1:]
     first, last = whole(command.param2), whole(command.param3)
     if first < 0:
-        return list(images)
-    if last == _TO_THE_END:
-        return images[first:]
-    return images[first : max(first, last) + 1]
+        return list(camera.captures.images)
+    return camera.captures.between(first, None if last == _TO_THE_END else max(first, last))
 
 
 def _streams(camera: CameraDevice, number: int) -> list[m.VideoStreamInformation]:

@@ -45,7 +45,7 @@ def camera_commands(camera: CameraDevice) -> dict[int, AsyncHandler]:
 
 def legacy_requests(streams: MessageStreams) -> dict[int, CommandHandler]:
     """Return handlers of the older requests that REQUEST_MESSAGE supersedes."""
-    wanted: dict[int, int] = {
+    message_ids: dict[int, int] = {
         MavCmd.REQUEST_CAMERA_INFORMATION: m.CameraInformation.ID,
         MavCmd.REQUEST_CAMERA_SETTINGS: m.CameraSettings.ID,
         MavCmd.REQUEST_CAMERA_CAPTURE_STATUS: m.CameraCaptureStatus.ID,
@@ -56,9 +56,10 @@ def legacy_requests(streams: MessageStreams) -> dict[int, CommandHandler]:
     }
 
     def handler(message_id: int) -> CommandHandler:
+        # REQUEST_MESSAGE has the number of a storage or stream in param 2, the older requests have it in param 1.
         return lambda command: streams.answer_with(message_id, replace(command, param2=command.param1))
 
-    return {command: handler(message_id) for command, message_id in wanted.items()}
+    return {command: handler(message_id) for command, message_id in message_ids.items()}
 
 
 class _Pictures:
@@ -69,25 +70,27 @@ class _Pictures:
         self._last_number = 0
 
     async def start(self, command: ReceivedCommand) -> int:
-        """Take images if param 1 is 0 or 1 (this camera). A command with a repeated sequence number (param 4) takes
-        none.
+        """Take images, if param 1 selects this camera.
+
+        A command for a single image with the same sequence number (param 4) as the last one takes none.
         """
         camera, captures = self._camera, self._camera.captures
-        interval = command.param2 if math.isfinite(command.param2) else 0.0
+        interval_s = command.param2 if math.isfinite(command.param2) else 0.0
         count, number = whole(command.param3), whole(command.param4)
         in_wrong_mode = _has_wrong_mode(camera, CameraMode.VIDEO, _CAN_ALWAYS_CAPTURE)
         if not camera.can(CameraCapFlags.CAPTURE_IMAGE):
             return MavResult.UNSUPPORTED
-        if not _is_own(command.param1) or interval < 0 or count < 0 or in_wrong_mode:
+        if not _is_own(command.param1) or interval_s < 0 or count < 0 or in_wrong_mode:
             return MavResult.DENIED
-        if count == 1 and number > 0 and number == self._last_number:
+        is_repeated = count == 1 and number > 0 and number == self._last_number
+        if is_repeated:
             return MavResult.ACCEPTED
         if captures.is_busy:
             return MavResult.TEMPORARILY_REJECTED
         if not camera.has_space():
             return MavResult.FAILED
         self._last_number = number if count == 1 else 0
-        captures.take_series(interval, count)
+        captures.take_series(interval_s, count)
         return MavResult.ACCEPTED
 
     async def stop(self, command: ReceivedCommand) -> int:
@@ -148,14 +151,16 @@ class _Videos:
         """Start or stop the stream with the number in param 1; 0 selects all streams."""
         camera, number = self._camera, whole(command.param1)
         available = range(1, len(camera.streams) + 1)
-        if not available or number not in (0, *available):
-            return MavResult.DENIED if available else MavResult.UNSUPPORTED
-        chosen = set(available) if number == 0 else {number}
-        await camera.switch_stream(chosen, on=runs)
+        if not available:
+            return MavResult.UNSUPPORTED
+        if number not in (0, *available):
+            return MavResult.DENIED
+        selected = set(available) if number == 0 else {number}
+        await camera.switch_stream(selected, on=runs)
         if runs:
-            camera.running_streams |= chosen
+            camera.running_streams |= selected
         else:
-            camera.running_streams -= chosen
+            camera.running_streams -= selected
         return MavResult.ACCEPTED
 
 
@@ -169,12 +174,12 @@ class _Settings:
         camera, mode = self._camera, whole(command.param2)
         if not camera.can(CameraCapFlags.HAS_MODES):
             return MavResult.UNSUPPORTED
-        modes = {
+        needed_capabilities = {
             CameraMode.IMAGE: CameraCapFlags.CAPTURE_IMAGE,
             CameraMode.VIDEO: CameraCapFlags.CAPTURE_VIDEO,
             CameraMode.IMAGE_SURVEY: CameraCapFlags.HAS_IMAGE_SURVEY_MODE,
         }
-        if mode not in modes or not camera.can(modes[CameraMode(mode)]):
+        if mode not in needed_capabilities or not camera.can(needed_capabilities[CameraMode(mode)]):
             return MavResult.DENIED
         if camera.captures.is_busy or camera.captures.is_recording:
             return MavResult.TEMPORARILY_REJECTED
@@ -220,5 +225,6 @@ def _is_own(device: float) -> bool:
     return math.isnan(device) or device in (0.0, 1.0)
 
 
-def _has_wrong_mode(camera: CameraDevice, wrong: int, unless: int) -> bool:
-    return camera.can(CameraCapFlags.HAS_MODES) and camera.mode == wrong and not camera.can(unless)
+def _has_wrong_mode(camera: CameraDevice, wrong_mode: int, works_in_any_mode: int) -> bool:
+    """Return True if the camera is in this mode, and has no capability ``works_in_any_mode`` (CAMERA_CAP_FLAGS)."""
+    return camera.can(CameraCapFlags.HAS_MODES) and camera.mode == wrong_mode and not camera.can(works_in_any_mode)

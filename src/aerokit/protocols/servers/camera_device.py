@@ -154,31 +154,34 @@ class CameraDevice:
 
 
 class Captures:
-    """Series of images, videos, and the image log. The next image begins when the device has finished the previous
-    image.
+    """Series of images, videos, and the image log.
+
+    The next image begins when the device has finished the previous image.
     """
 
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
         self.images: list[CameraImageCaptured] = []
-        """Images since the image log was last cleared, by image index."""
+        """The last images since the image log was cleared, at most ``max_images``."""
+        self.dropped_count: int = 0
+        """Number of older images that the log no longer has; the image index of the first one in it."""
         self.interval_s: float = 0.0
         """Interval of the series."""
-        self._remaining = 0
-        self._is_open = False
-        self._is_late = False
-        self._series = 0
-        self._recording_since = math.nan
+        self._remaining = 0  # images that the series has not begun yet; -1: no limit
+        self._is_exposing = False  # True while an image is being taken
+        self._is_late = False  # True if the next image is due, but the previous one is not finished
+        self._series = 0  # number of the series; callbacks of earlier series are ignored
+        self._recording_since = math.nan  # start of the video; NaN: no video
 
     def switch_off(self) -> None:
         """Abort everything, as by a power failure. The images are kept."""
-        self._remaining, self._is_open, self._is_late, self._recording_since = 0, False, False, math.nan
+        self._remaining, self._is_exposing, self._is_late, self._recording_since = 0, False, False, math.nan
         self._series += 1
 
     @property
     def is_busy(self) -> bool:
         """True while an image is being taken or a series runs."""
-        return self._is_open or self._remaining != 0
+        return self._is_exposing or self._remaining != 0
 
     @property
     def is_recording(self) -> bool:
@@ -192,7 +195,7 @@ class Captures:
         self.interval_s = interval_s if count != 1 else 0.0
         self._remaining = count or _UNLIMITED
         self._series += 1
-        self._open(self._series)
+        self._begin_image(self._series)
 
     def stop(self) -> None:
         """End a series; the current image is completed."""
@@ -201,42 +204,57 @@ class Captures:
     def clear(self) -> None:
         """Clear the image log; the next index is 0."""
         self.images.clear()
+        self.dropped_count = 0
 
-    def _open(self, series: int) -> None:
+    @property
+    def image_count(self) -> int:
+        """Number of images since the image log was cleared; the next image index."""
+        return self.dropped_count + len(self.images)
+
+    def between(self, first: int, last: int | None) -> list[CameraImageCaptured]:
+        """Return the images with these indices, up to the newest if ``last`` is None."""
+        end = None if last is None else max(0, last + 1 - self.dropped_count)
+        return self.images[max(0, first - self.dropped_count) : end]
+
+    def _begin_image(self, series: int) -> None:
+        """Take the next image of a series, and schedule the one after it."""
         camera = self._camera
         if series != self._series or self._remaining == 0:
             return
-        if self._is_open:
+        if self._is_exposing:
             self._is_late = True
             return
-        self._remaining = max(_UNLIMITED, self._remaining - 1) if self._remaining > 0 else _UNLIMITED
-        self._is_open = True
+        if self._remaining != _UNLIMITED:
+            self._remaining -= 1
+        self._is_exposing = True
         camera.expose(lambda shot: self._finish(series, shot))
         if self._remaining:
-            wait = max(self.interval_s, camera.shutter_s)
-            camera.host.call_later(wait, lambda: self._open(series))
+            wait_s = max(self.interval_s, camera.shutter_s)
+            camera.host.call_later(wait_s, lambda: self._begin_image(series))
 
     def _finish(self, series: int, shot: Shot | None) -> None:
         """Log and announce an image. ``shot`` is None if the device failed to take it."""
         if series != self._series:
             return
-        self._is_open = False
-        camera, index = self._camera, len(self.images)
+        self._is_exposing = False
+        camera, index = self._camera, self.image_count
         url = None if shot is None else camera.store_image(shot(image_index=index, capture_result=1))
-        make = camera.failed_shot() if shot is None else shot
+        make_image = camera.failed_shot() if shot is None else shot
         if url is None:
             self.stop()
-            image = make(image_index=index, capture_result=0)
+            image = make_image(image_index=index, capture_result=0)
         else:
-            image = make(image_index=index, capture_result=1, file_url=url)
+            image = make_image(image_index=index, capture_result=1, file_url=url)
             self.images.append(image)
-            del self.images[: len(self.images) - camera.max_images]
+            if len(self.images) > camera.max_images:
+                del self.images[0]
+                self.dropped_count += 1
         camera.host.send(image)
         if not self._remaining:
             camera.host.send(self.status())
         elif self._is_late:
             self._is_late = False
-            self._open(series)
+            self._begin_image(series)
 
     def record(self, status_interval_s: float) -> None:
         """Register the start of a video, and send CAMERA_CAPTURE_STATUS at this interval (0: never)."""
@@ -255,7 +273,7 @@ class Captures:
 
     def _send_status_every(self, recording: float, interval_s: float) -> None:
         def send_status() -> None:
-            if self._recording_since == recording:
+            if self._recording_since == recording:  # otherwise this video has ended
                 self._camera.host.send(self.status())
                 self._send_status_every(recording, interval_s)
 
@@ -264,16 +282,19 @@ class Captures:
     def status(self) -> CameraCaptureStatus:
         camera = self._camera
         is_series = self._remaining != 0 and self.interval_s > 0.0
-        busy = (_WAITING_AND_CAPTURING if self._is_open else _WAITING) if is_series else int(self._is_open)
+        if is_series:
+            image_status = _WAITING_AND_CAPTURING if self._is_exposing else _WAITING
+        else:
+            image_status = _CAPTURING if self._is_exposing else _IDLE
         recording_s = camera.host.now - self._recording_since if self.is_recording else 0.0
         return CameraCaptureStatus(
             time_boot_ms=camera.host.time_boot_ms,
-            image_status=busy,
+            image_status=image_status,
             video_status=int(self.is_recording),
             image_interval=self.interval_s if is_series else 0.0,
             recording_time_ms=round(recording_s * 1000),
             available_capacity=camera.free_mib,
-            image_count=len(self.images),
+            image_count=self.image_count,
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -90,20 +91,21 @@ class CommandDispatcher:
         host.on(CommandInt, self._on_int)
 
     def _on_long(self, message: CommandLong, channel: Channel) -> None:
-        numbers = (message.param1, message.param2, message.param3, message.param4)
-        place = (message.param5, message.param6, message.param7)
+        params = (message.param1, message.param2, message.param3, message.param4)
+        position = (message.param5, message.param6, message.param7)
         sender, confirmation = sender_of(message), message.confirmation
-        self.execute(ReceivedCommand(message.command, *numbers, *place, None, channel, sender, confirmation))
+        self.execute(ReceivedCommand(message.command, *params, *position, None, channel, sender, confirmation))
 
     def _on_int(self, message: CommandInt, channel: Channel) -> None:
-        numbers = (message.param1, message.param2, message.param3, message.param4)
-        place = (message.x, message.y, message.z)
-        self.execute(ReceivedCommand(message.command, *numbers, *place, message.frame, channel, sender_of(message)))
+        params = (message.param1, message.param2, message.param3, message.param4)
+        position = (message.x, message.y, message.z)
+        self.execute(ReceivedCommand(message.command, *params, *position, message.frame, channel, sender_of(message)))
 
     def execute(self, command: ReceivedCommand) -> None:
         """Refuse a command, or dispatch it."""
-        if (refused := self._refusal(command)) is not None:
-            self.answer(command, refused)
+        refusal = self._refusal(command)
+        if refusal is not None:
+            self.answer(command, refusal)
             return
         self.dispatch(command)
 
@@ -173,8 +175,9 @@ class RunningCommand:
 
 
 class RunningCommands:
-    """Commands that take time. Sends IN_PROGRESS while they run, handles COMMAND_CANCEL, and runs one command of each
-    MAV_CMD.
+    """Commands that take time: at most one of each MAV_CMD at a time.
+
+    Sends IN_PROGRESS while they run, and handles COMMAND_CANCEL.
 
     A repeated transmission (COMMAND_LONG with a confirmation) never executes a command twice: it is answered by
     IN_PROGRESS, or by the result if the command ended at most five seconds ago. Another command with the same MAV_CMD
@@ -185,7 +188,7 @@ class RunningCommands:
         self._host = host
         self._server = server
         self._running: dict[int, RunningCommand] = {}
-        self._ended: dict[int, tuple[ReceivedCommand, Outcome, float]] = {}
+        self._ended: dict[int, tuple[ReceivedCommand, Outcome, float]] = {}  # MAV_CMD → command, result, end time
         host.on(CommandCancel, self._on_cancel)
 
     def __len__(self) -> int:
@@ -197,10 +200,11 @@ class RunningCommands:
         if running is not None and _is_repeated(command, running.command):
             self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
             return None
-        ended = self._ended.get(command.command)
-        if ended is not None and _is_repeated(command, ended[0]) and self._host.now - ended[2] <= RESULT_MAX_AGE_S:
-            self._server.answer(command, *ended[1])
-            return None
+        if command.command in self._ended:
+            ended_command, outcome, ended_at = self._ended[command.command]
+            if _is_repeated(command, ended_command) and self._host.now - ended_at <= RESULT_MAX_AGE_S:
+                self._server.answer(command, *outcome)
+                return None
         if running is not None or len(self._running) >= MAX_RUNNING_COMMANDS:
             self._server.answer(command, MavResult.TEMPORARILY_REJECTED)
             return None
@@ -239,9 +243,10 @@ class RunningCommands:
 
 
 def _is_repeated(command: ReceivedCommand, first: ReceivedCommand) -> bool:
+    """Return True if ``command`` is another transmission of ``first``."""
     return command.confirmation > 0 and (command.sender, command.params) == (first.sender, first.params)
 
 
 def whole(value: float) -> int:
     """Return a parameter as an integer; 0 for NaN (unset) and for values beyond 32 bits."""
-    return int(value) if value == value and abs(value) < 2**31 else 0
+    return int(value) if not math.isnan(value) and abs(value) < 2**31 else 0

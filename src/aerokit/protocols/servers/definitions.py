@@ -29,10 +29,11 @@ class DefinedParameterServer(ExtendedParameterServer):
         self.values: dict[str, SettingValue] = {}
         """Current values; assign them at any time."""
         self.slow: dict[str, float] = {}
-        """Maps the name of a slow setting to the seconds that a change takes. During this time, the answer is
-        IN_PROGRESS.
+        """Maps the name of a slow setting to the seconds that a change takes.
+
+        During this time, the answer is IN_PROGRESS.
         """
-        self._pending: set[str] = set()
+        self._pending: set[str] = set()  # names of slow settings that are being changed
         super().__init__(host, self)
         self.reset()
 
@@ -65,10 +66,11 @@ class DefinedParameterServer(ExtendedParameterServer):
         return self.values[name], self.definition.settings[name].wire_type
 
     def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
-        own = self.definition.settings.get(name)
-        if own is None:
+        """Set a value, at once or after the time in `slow`. Return PARAM_ACK, and the value and type to report."""
+        setting = self.definition.settings.get(name)
+        if setting is None:
             return ParamAck.VALUE_UNSUPPORTED, data, kind
-        result, value = self._verdict(name, setting_value(data, kind), kind)
+        result, value = self._check(name, setting_value(data, kind), kind)
         if result == ParamAck.ACCEPTED and name in self.slow and name not in self._pending:
             self._pending.add(name)
             self._host.call_later(self.slow[name], lambda: self._finish_slow(name, value))
@@ -76,14 +78,15 @@ class DefinedParameterServer(ExtendedParameterServer):
             result = ParamAck.IN_PROGRESS
         elif result == ParamAck.ACCEPTED:
             self._store(name, value)
-        return result, setting_bytes(self.values[name], own.wire_type), own.wire_type
+        return result, setting_bytes(self.values[name], setting.wire_type), setting.wire_type
 
-    def _verdict(self, name: str, value: SettingValue, kind: int) -> tuple[ParamAck, SettingValue]:
+    def _check(self, name: str, value: SettingValue, kind: int) -> tuple[ParamAck, SettingValue]:
+        """Return the answer to a received value, and the value to store."""
         self.refresh()
-        own, definition = self.definition.settings[name], self.definition
-        if own.read_only or not self.can_set(name) or definition.excluded_by(name, self.values):
+        setting, definition = self.definition.settings[name], self.definition
+        if setting.read_only or not self.can_set(name) or definition.excluded_by(name, self.values):
             return ParamAck.FAILED, value
-        if kind != own.wire_type:
+        if kind != setting.wire_type:
             return ParamAck.VALUE_UNSUPPORTED, value
         value = self.limited(name, value)
         try:
@@ -92,9 +95,9 @@ class DefinedParameterServer(ExtendedParameterServer):
             return ParamAck.VALUE_UNSUPPORTED, value
 
     def _store(self, name: str, value: SettingValue) -> None:
-        is_new = not settings_equal(self.values[name], value)
+        has_changed = not settings_equal(self.values[name], value)
         self.values[name] = value
-        if is_new:
+        if has_changed:
             self.on_set(name, value)
 
     def _finish_slow(self, name: str, value: SettingValue) -> None:

@@ -8,8 +8,8 @@ from typing import Protocol
 
 from typing_extensions import Self
 
-ENOENT, EEXIST, ENOTDIR, EISDIR = 2, 17, 20, 21
 # Linux's error numbers, which the firmwares send on every platform.
+ENOENT, EEXIST, ENOTDIR, EISDIR = 2, 17, 20, 21
 EINVAL, ENFILE, EFBIG, ENOSPC, EROFS, ENOTEMPTY = 22, 23, 27, 28, 30, 39
 
 # Name and size in bytes; None for a folder.
@@ -76,7 +76,9 @@ class UploadedFile(FileHandle):
         raise FileFault(EINVAL)
 
     def write(self, offset: int, data: bytes) -> None:
-        end = max(offset + len(data), self.announced_size(data) if offset == 0 else 0)
+        end = offset + len(data)
+        if offset == 0:
+            end = max(end, self.announced_size(data))
         self.content.extend(bytes(max(0, end - len(self.content))))
         self.content[offset : offset + len(data)] = data
 
@@ -150,7 +152,9 @@ class _File:
     @property
     def size(self) -> int:
         """Size in bytes. The content is not created for this if the size was given."""
-        return self._size if self._make is not None and self._size is not None else len(self.content)
+        if self._make is not None and self._size is not None:
+            return self._size
+        return len(self.content)
 
 
 _Folder = dict[str, "_File | _Folder"]
@@ -168,7 +172,7 @@ class _Opened(FileHandle):
         if self._tree is None:
             raise FileFault(EROFS)
         content = self._file.content
-        self._tree.claim(max(0, offset + len(data) - len(content)))
+        self._tree.reserve(max(0, offset + len(data) - len(content)))
         if offset > len(content):
             content.extend(bytes(offset - len(content)))
         content[offset : offset + len(data)] = data
@@ -189,12 +193,12 @@ class FileTree:
     def put(self, path: str, content: bytes | Callable[[], bytes], *, size: int | None = None) -> Self:
         """Create or replace a file and its folders. A function as content is called when the file is first read."""
         folder = self._root
-        *above, name = _parts(path)
-        for part in above:
-            inner = folder.setdefault(part, {})
-            if not isinstance(inner, dict):
+        *parents, name = _parts(path)
+        for parent in parents:
+            subfolder = folder.setdefault(parent, {})
+            if not isinstance(subfolder, dict):
                 raise FileFault(ENOTDIR)
-            folder = inner
+            folder = subfolder
         folder[name] = _File(content, size)
         return self
 
@@ -215,49 +219,54 @@ class FileTree:
 
     def mounted(self, path: str) -> tuple[Mount, str] | None:
         """Return the mount of a path, and the rest of the path; None if the path is in no mount."""
-        bare = path[1:] if path.startswith("/") else path
+        relative_path = path.removeprefix("/")
         for prefix, mount in self.mounts.items():
-            if bare.startswith(prefix):
-                return mount, bare[len(prefix) :].removeprefix("/")
+            if relative_path.startswith(prefix):
+                return mount, relative_path[len(prefix) :].removeprefix("/")
         return None
 
     def size(self, path: str) -> int:
         """Return the size of a file in bytes; 4096 for a folder."""
-        if (inside := self.mounted(path)) is not None:
-            return inside[0].size(inside[1])
+        mounted = self.mounted(path)
+        if mounted is not None:
+            mount, path_in_mount = mounted
+            return mount.size(path_in_mount)
         node = self._find(path)
         return 4096 if isinstance(node, dict) else node.size
 
     def open(self, path: str, *, writing: bool = False, create: bool = False) -> FileHandle:
         """Open a file; ``create`` creates a missing file and empties an existing one."""
-        if (inside := self.mounted(path)) is not None:
-            return inside[0].open(inside[1], writing=writing)
+        mounted = self.mounted(path)
+        if mounted is not None:
+            mount, path_in_mount = mounted
+            return mount.open(path_in_mount, writing=writing)
         if create:
             self._create(path)
         return _Opened(self, self._file(path))
 
     def _create(self, path: str) -> None:
+        """Create an empty file, or empty an existing one."""
         folder, name = self._parent(path)
         node = folder.get(name)
         if isinstance(node, dict):
             raise FileFault(EISDIR)
         if node is None:
-            self.claim(0)
+            self.reserve(0)
             folder[name] = _File()
         else:
-            self.claim(-node.size)
+            self.reserve(-node.size)
             node.content.clear()
 
     def truncate(self, path: str, size: int) -> None:
         """Cut a file to this size, or pad it with zeros."""
         content = self._file(path).content
-        self.claim(size - len(content))
+        self.reserve(size - len(content))
         del content[size:]
         content.extend(bytes(size - len(content)))
 
     def remove_file(self, path: str) -> None:
         folder, name = self._parent(path)
-        self.claim(-self._file(path).size)
+        self.reserve(-self._file(path).size)
         del folder[name]
 
     def rename(self, path: str, to: str) -> None:
@@ -269,14 +278,17 @@ class FileTree:
             raise FileFault(ENOTEMPTY if isinstance(node, dict) else EISDIR)
         if isinstance(existing, _File) and isinstance(node, dict):
             raise FileFault(ENOTDIR)
-        if isinstance(node, dict) and _contains(node, folder):
+        if isinstance(node, dict) and _contains(node, folder):  # a folder cannot be moved into itself
             raise FileFault(EINVAL)
         old_folder, old_name = self._parent(path)
         del old_folder[old_name]
         folder[name] = node
 
-    def claim(self, size: int) -> None:
-        """Reserve free bytes; a negative size releases them. Raises FileFault if there are not enough."""
+    def reserve(self, size: int) -> None:
+        """Reserve free bytes; a negative size releases them.
+
+        Raises FileFault if there are not enough, and even for size 0 (a new name) if no byte is free.
+        """
         if self.free_bytes is None:
             return
         if size >= 0 and (size > self.free_bytes or self.free_bytes == 0):
@@ -285,10 +297,12 @@ class FileTree:
 
     def entries(self, path: str) -> list[Entry]:
         """Return the entries of a folder, oldest first."""
-        if (inside := self.mounted(path)) is not None:
-            if inside[1]:
+        mounted = self.mounted(path)
+        if mounted is not None:
+            mount, path_in_mount = mounted
+            if path_in_mount:
                 raise FileFault(ENOENT)
-            return inside[0].entries()
+            return mount.entries()
         folder = self._find(path)
         if not isinstance(folder, dict):
             raise FileFault(ENOTDIR)
@@ -299,7 +313,7 @@ class FileTree:
         folder, name = self._parent(path)
         if name in folder:
             raise FileFault(EEXIST)
-        self.claim(0)
+        self.reserve(0)
         folder[name] = {}
 
     def remove_folder(self, path: str) -> None:
@@ -328,6 +342,7 @@ class FileTree:
         return node
 
     def _parent(self, path: str) -> tuple[_Folder, str]:
+        """Return the folder that contains a path, and the last part of the path, which need not exist."""
         parts = _parts(path)
         if not parts:
             raise FileFault(EEXIST)
@@ -338,6 +353,7 @@ class FileTree:
 
 
 def _parts(path: str) -> list[str]:
+    """Split a path. ``..`` removes the folder before it, and never leads above the root."""
     parts: list[str] = []
     for part in path.split("/"):
         if part == "..":

@@ -17,10 +17,10 @@ from aerokit.protocols.servers.host import Channel, ServerHost
 FilesT = TypeVar("FilesT", bound=FileSystem)
 
 
-_BURST_BYTES = 35_000
-_BURST_BLOCKS = 24
+_BURST_BYTES = 35_000  # size after which a burst ends
+_BURST_BLOCKS = 24  # blocks that a burst sends at once
 _CRC_PAUSE_S = 0.002
-_MAX_SIZE = 0xFFFFFFFF
+_MAX_SIZE = 0xFFFFFFFF  # maximum file size, because sizes and offsets have 32 bits
 
 Op = MavFtpOpcode
 
@@ -128,12 +128,13 @@ class SessionFtpServer(Generic[FilesT]):
         Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0. The last reply
         may be the end of a burst, which does not replace the blocks of the burst.
         """
-        same = peer.request is not None and request.repeats(peer.request)
-        return same and request.opcode == last.request_opcode and request.sequence + 1 & 0xFFFF == last.sequence
+        is_same = peer.request is not None and request.repeats(peer.request)
+        return is_same and request.opcode == last.request_opcode and request.sequence + 1 & 0xFFFF == last.sequence
 
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
-        """Return the number for a new session: the number that the client requests (as MAVProxy does), or a free
-        number.
+        """Return the number for a new session.
+
+        It is the number that the client requests, as MAVProxy does, or a free number.
         """
         if request.session and request.session not in peer.sessions:
             return request.session
@@ -147,10 +148,10 @@ class SessionFtpServer(Generic[FilesT]):
         """Return the state of a client; None if there are too many clients with open files."""
         key = self._key(request, channel)
         if key not in self._peers and len(self._peers) >= self.max_clients:
-            idle = [other for other, peer in self._peers.items() if not peer.sessions and peer.checksum is None]
-            if not idle:
+            idle_keys = [idle for idle, peer in self._peers.items() if not peer.sessions and peer.checksum is None]
+            if not idle_keys:
                 return None
-            del self._peers[idle[0]]
+            del self._peers[idle_keys[0]]
         peer = self._peers.setdefault(key, FtpPeer(channel))
         peer.channel = channel
         return peer
@@ -170,6 +171,7 @@ class SessionFtpServer(Generic[FilesT]):
             self._answer(peer, request)
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
+        """Execute a request. A handler that returns None answers later."""
         handler = _HANDLERS.get(request.opcode)
         peer.request, peer.reply = request, None
         try:
@@ -182,10 +184,11 @@ class SessionFtpServer(Generic[FilesT]):
             self._reply(peer, self._adapted(peer, request, answer))
 
     def _adapted(self, peer: FtpPeer, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
-        """Return the answer as it is sent."""
+        """Return the answer with the fields that this firmware sends. Subclasses change them."""
         return answer.replace(offset=request.offset)
 
     def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
+        # A client that got NOSESSIONSAVAILABLE repeats its request until a session is free, so it needs a new answer.
         if answer.size <= self.reply_kept and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
             peer.reply = answer
         self._host.send(answer.message(), peer.channel)
@@ -194,6 +197,7 @@ class SessionFtpServer(Generic[FilesT]):
         return checked_path(request.data[: request.size])
 
     def _opened(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
+        """Return the session that a request names; raises Refused if it is not open."""
         session = peer.sessions.get(request.session)
         if session is None:
             raise Refused(MavFtpErr.INVALIDSESSION)
@@ -217,6 +221,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge()
 
     def _close_all(self, peer: FtpPeer) -> None:
+        """Close all files of a client, then raise the last error, if any."""
         sessions = list(peer.sessions.values())
         peer.sessions.clear()
         fault = None
@@ -233,18 +238,20 @@ class SessionFtpServer(Generic[FilesT]):
         if len(peer.sessions) >= self.max_sessions:
             return request.refuse(MavFtpErr.NOSESSIONSAVAILABLE)
         path = self._path(request)
-        reading = request.opcode == Op.OPENFILERO
-        size = self._size(path, reading=reading)
+        is_reading = request.opcode == Op.OPENFILERO
+        size = self._size(path, reading=is_reading)
         if size > _MAX_SIZE:
             raise FileFault(EFBIG)
-        create = request.opcode == Op.CREATEFILE or (not reading and self.creates_missing and path not in self.files)
-        file = self.files.open(path, writing=not reading, create=create)
+        is_new_file = not is_reading and self.creates_missing and path not in self.files
+        create = request.opcode == Op.CREATEFILE or is_new_file
+        file = self.files.open(path, writing=not is_reading, create=create)
         number = self._new_number(peer, request)
-        session = peer.sessions[number] = FtpSession(number, file, size, not reading)
+        session = peer.sessions[number] = FtpSession(number, file, size, not is_reading)
         self._watch(peer, session)
         return request.acknowledge(size.to_bytes(4, "little"), session=number)
 
     def _size(self, path: str, *, reading: bool) -> int:
+        """Return the size of a file; 0 for a missing file that is opened for writing."""
         try:
             return self.files.size(path)
         except FileFault:
@@ -258,8 +265,9 @@ class SessionFtpServer(Generic[FilesT]):
         def close_if_due() -> None:
             if peer.sessions.get(session.number) is not session:
                 return
-            if self._host.now < (end := peer.used_at + self.session_timeout_s):
-                self._host.call_at(end, close_if_due)
+            due_at = peer.used_at + self.session_timeout_s
+            if self._host.now < due_at:  # the client has sent a request meanwhile
+                self._host.call_at(due_at, close_if_due)
                 return
             peer.reply = None
             del peer.sessions[session.number]
@@ -281,6 +289,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge(request.size.to_bytes(4, "little"))
 
     def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
+        """Start a burst, or continue a running one from another offset. The blocks are the answer, so return None."""
         session = self._opened(peer, request)
         is_running = session.burst is not None
         session.burst, session.burst_sent = request.replace(sequence=request.sequence + 1 & 0xFFFF), 0
@@ -289,6 +298,7 @@ class SessionFtpServer(Generic[FilesT]):
         return None
 
     def _send_blocks(self, peer: FtpPeer, session: FtpSession) -> None:
+        """Send the next blocks of a burst, none while the link is congested, until the burst has ended."""
         for number in range(0 if self._is_congested() else self.burst):
             if session.burst is None:
                 return
@@ -298,9 +308,10 @@ class SessionFtpServer(Generic[FilesT]):
         self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
 
     def _send_block(self, peer: FtpPeer, session: FtpSession, burst: FtpPacket, *, may_end: bool) -> None:
-        own = session.number
-        answer = burst.acknowledge(offset=burst.offset, session=own).replace(sequence=burst.sequence)
-        refusal = burst.refuse(MavFtpErr.EOF).replace(sequence=burst.sequence, offset=burst.offset, session=own)
+        # In `burst`, the sequence number is that of the reply, not of the request.
+        number = session.number
+        answer = burst.acknowledge(offset=burst.offset, session=number).replace(sequence=burst.sequence)
+        refusal = burst.refuse(MavFtpErr.EOF).replace(sequence=burst.sequence, offset=burst.offset, session=number)
         try:
             data = b"" if burst.offset >= session.size else session.file.read(burst.offset, DATA_SIZE)
         except FileFault as fault:
@@ -311,12 +322,13 @@ class SessionFtpServer(Generic[FilesT]):
             self._reply(peer, refusal)
             return
         session.burst_sent += len(data)
-        complete = may_end and session.burst_sent > _BURST_BYTES
-        self._reply(peer, answer.replace(data=data, size=len(data), burst_complete=complete))
-        following = burst.replace(sequence=burst.sequence + 1 & 0xFFFF, offset=burst.offset + len(data))
-        session.burst = None if complete else following
+        is_complete = may_end and session.burst_sent > _BURST_BYTES
+        self._reply(peer, answer.replace(data=data, size=len(data), burst_complete=is_complete))
+        next_block = burst.replace(sequence=burst.sequence + 1 & 0xFFFF, offset=burst.offset + len(data))
+        session.burst = None if is_complete else next_block
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        """Return as many entries of a folder as fit, from entry number ``offset`` on."""
         entries = self._entries(self._path(request))
         listing = b""
         for text in [*self.list_prefix, *map(_line, entries)][request.offset :]:
@@ -342,10 +354,10 @@ class SessionFtpServer(Generic[FilesT]):
         return self._change(request, lambda path: self.files.truncate(path, request.offset))
 
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        first, _, rest = request.data[: request.size].partition(b"\0")
-        if len(first) + 2 >= request.size:
+        old_path, _, new_path = request.data[: request.size].partition(b"\0")
+        if len(old_path) + 2 >= request.size:  # the new path is missing
             return self._fault(peer, request, FileFault(EINVAL))
-        self.files.rename(checked_path(first), checked_path(rest))
+        self.files.rename(checked_path(old_path), checked_path(new_path))
         return request.acknowledge()
 
     def _crc32(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
@@ -358,16 +370,18 @@ class SessionFtpServer(Generic[FilesT]):
         return None
 
     def _continue_crc32(self, peer: FtpPeer, request: FtpPacket, file: FileHandle, offset: int, checksum: int) -> None:
-        data = b"?"
+        has_more = True
         try:
             for _ in range(self.crc_blocks_at_once):
-                if not (data := file.read(offset, self.crc_block)):
+                data = file.read(offset, self.crc_block)
+                if not data:
+                    has_more = False
                     break
                 checksum, offset = crc32(data, checksum), offset + len(data)
             answer = request.acknowledge(checksum.to_bytes(4, "little"))
         except FileFault as fault:
-            data, answer = b"", self._fault(peer, request, fault)
-        if peer.checksum is request and data:
+            has_more, answer = False, self._fault(peer, request, fault)
+        if peer.checksum is request and has_more:
             self._host.call_later(_CRC_PAUSE_S, lambda: self._continue_crc32(peer, request, file, offset, checksum))
             return
         with suppress(FileFault):

@@ -48,8 +48,8 @@ class FtpPacket(FtpMessage):
 
     def refuse_errno(self, errno: int) -> FtpPacket:
         """Return the NAK for an errno; MAVFTP has separate error codes for EEXIST and ENOENT."""
-        own = {EEXIST: MavFtpErr.FILEEXISTS, ENOENT: MavFtpErr.FILENOTFOUND}.get(errno)
-        return self.refuse(MavFtpErr.FAILERRNO, errno) if own is None else self.refuse(own)
+        separate_code = {EEXIST: MavFtpErr.FILEEXISTS, ENOENT: MavFtpErr.FILENOTFOUND}.get(errno)
+        return self.refuse(MavFtpErr.FAILERRNO, errno) if separate_code is None else self.refuse(separate_code)
 
 
 def path_in(data: bytes) -> str:

@@ -177,13 +177,13 @@ def _manager_information(gimbal: GimbalMount) -> m.GimbalManagerInformation:
     capabilities = int(gimbal.capabilities)
     if gimbal.can_point_at_positions:
         capabilities |= GimbalManagerCapFlags.CAN_POINT_LOCATION_GLOBAL
-    limits = (end for axis in gimbal.limits for end in axis)
+    limits = (limit for min_and_max in gimbal.limits for limit in min_and_max)
     return m.GimbalManagerInformation(gimbal.host.time_boot_ms, capabilities, gimbal.device_id, *limits)
 
 
 _UNCHANGED, _SENDER, _RELEASE = -1, -2, -3
 _RETRACTED_ANGLES = (0.0, 0.0, 0.0)
-_ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
+_ABSOLUTE_FRAMES = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 
 
 class GimbalRequests:
@@ -192,14 +192,15 @@ class GimbalRequests:
     def __init__(self, gimbal: GimbalMount) -> None:
         self._gimbal = gimbal
 
-    def _is_mine(self, device_id: float) -> bool:
+    def _selects_gimbal(self, device_id: float) -> bool:
+        """Return True if a device id in a command or message selects this gimbal; 0 selects all."""
         return whole(device_id) in (0, self._gimbal.device_id)
 
     def configure(self, command: ReceivedCommand) -> int:
         """Set primary (params 1, 2) and secondary control (3, 4). -1 means unchanged, -2 the sender, -3 release."""
         gimbal, sender = self._gimbal, command.sender
         numbers = [command.param1, command.param2, command.param3, command.param4]
-        if not self._is_mine(command.z) or not all(_RELEASE <= number <= 255 for number in numbers):
+        if not self._selects_gimbal(command.z) or not all(_RELEASE <= number <= 255 for number in numbers):
             return MavResult.DENIED
         primary = _owner(gimbal.primary, (int(numbers[0]), int(numbers[1])), sender)
         secondary = _owner(gimbal.secondary, (int(numbers[2]), int(numbers[3])), sender)
@@ -208,19 +209,19 @@ class GimbalRequests:
 
     def pitch_and_yaw(self, command: ReceivedCommand) -> int:
         """Apply angles in degrees or rates in degrees per second; NaN means not given."""
-        if not self._is_mine(command.z) or not self._gimbal.is_in_control(command.sender):
+        if not self._selects_gimbal(command.z) or not self._gimbal.is_in_control(command.sender):
             return MavResult.DENIED
         pitch, yaw, pitch_rate, yaw_rate = map(
             math.radians, (command.param1, command.param2, command.param3, command.param4)
         )
-        done = self.apply(whole(command.x), (0.0, pitch, yaw), (0.0, pitch_rate, yaw_rate))
-        return MavResult.ACCEPTED if done else MavResult.DENIED
+        is_applied = self.apply(whole(command.x), (0.0, pitch, yaw), (0.0, pitch_rate, yaw_rate))
+        return MavResult.ACCEPTED if is_applied else MavResult.DENIED
 
     def _refusal(self, device_id: float, command: ReceivedCommand) -> int | None:
         """Return the MAV_RESULT for a command that the gimbal cannot or must not execute, or None."""
         if not self._gimbal.can_point_at_positions:
             return MavResult.UNSUPPORTED
-        is_allowed = self._is_mine(device_id) and self._gimbal.is_in_control(command.sender)
+        is_allowed = self._selects_gimbal(device_id) and self._gimbal.is_in_control(command.sender)
         return None if is_allowed else MavResult.DENIED
 
     def look_at(self, command: ReceivedCommand) -> int:
@@ -230,7 +231,7 @@ class GimbalRequests:
             return refusal
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
         altitude = command.z
-        if frame not in _ABSOLUTE:
+        if frame not in _ABSOLUTE_FRAMES:
             altitude += gimbal.home_altitude_m()
         gimbal.look_at((*command.place(), altitude))
         return MavResult.ACCEPTED
@@ -267,7 +268,7 @@ class GimbalRequests:
         return True
 
     def on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
-        if self._is_mine(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):
+        if self._selects_gimbal(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):
             self._apply_attitude(message)
 
     def on_device_attitude(self, message: m.GimbalDeviceSetAttitude, _: Channel) -> None:
@@ -282,26 +283,26 @@ class GimbalRequests:
         self.apply(message.flags, (angles[0], angles[1], angles[2]), rates)
 
     def on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
-        if self._is_mine(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):
+        if self._selects_gimbal(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):
             self.apply(message.flags, (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate))
 
     def on_manual_control(self, message: m.GimbalManagerSetManualControl, _: Channel) -> None:
         """Apply angles, or rates from -1 to 1, which are fractions of the slew rate."""
         gimbal = self._gimbal
-        if self._is_mine(message.gimbal_device_id) and gimbal.is_in_control(sender_of(message)):
+        if self._selects_gimbal(message.gimbal_device_id) and gimbal.is_in_control(sender_of(message)):
             rates = (0.0, message.pitch_rate * gimbal.slew_rad_s, message.yaw_rate * gimbal.slew_rad_s)
             self.apply(message.flags, (0.0, message.pitch, message.yaw), rates)
 
 
-def _owner(before: Owner, wanted: tuple[int, int], sender: Owner) -> Owner:
+def _owner(current: Owner, requested: tuple[int, int], sender: Owner) -> Owner:
     """Return the component in control after a pair of params of the command is applied; (0, 0) if none."""
-    if _SENDER in wanted:
+    if _SENDER in requested:
         return sender
-    if _RELEASE in wanted:
-        return (0, 0) if before == sender else before
-    if _UNCHANGED in wanted:
-        return before
-    return wanted
+    if _RELEASE in requested:  # only the component in control can release it
+        return (0, 0) if current == sender else current
+    if _UNCHANGED in requested:
+        return current
+    return requested
 
 
 def gimbal_commands(gimbal: GimbalMount) -> dict[int, CommandHandler]:

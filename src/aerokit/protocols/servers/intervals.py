@@ -52,10 +52,10 @@ class MessageStreams:
             self._streams.pop(key, None)
             return True
         interval_s = max(interval_s, self._min_interval_s)
-        before = self._streams.get(key)
-        if before is None and self._max_streams is not None and len(self._streams) >= self._max_streams:
+        running = self._streams.get(key)
+        if running is None and self._max_streams is not None and len(self._streams) >= self._max_streams:
             return False
-        if before is None or before.interval_s != interval_s:
+        if running is None or running.interval_s != interval_s:
             self._streams[key] = _Stream(interval_s)
             self._send_stream(key, self._streams[key])
         return True
@@ -88,17 +88,18 @@ class MessageStreams:
         message_id = whole(command.param1)
         if message_id not in self.builders:
             return MavResult.DENIED
-        self._streams.pop((None, message_id), None)
-        is_possible = self.stream(message_id, whole(command.param2) / 1e6, command.channel)
-        return MavResult.ACCEPTED if is_possible else MavResult.TEMPORARILY_REJECTED
+        self._streams.pop((None, message_id), None)  # a stream to all channels would be sent here, too
+        is_accepted = self.stream(message_id, whole(command.param2) / 1e6, command.channel)
+        return MavResult.ACCEPTED if is_accepted else MavResult.TEMPORARILY_REJECTED
 
     def _get_interval(self, command: ReceivedCommand) -> int:
         message_id = whole(command.param1)
         if message_id not in self.builders:
             return MavResult.DENIED
-        of_all = self._streams.get((None, message_id), _Stream(0.0))
-        interval = self._streams.get((command.channel, message_id), of_all).interval_s
-        self._host.send(MessageInterval(message_id, round(interval * 1e6) or -1), command.channel)
+        stream_to_all = self._streams.get((None, message_id), _Stream(0.0))
+        interval_s = self._streams.get((command.channel, message_id), stream_to_all).interval_s
+        interval_us = round(interval_s * 1e6) or -1  # -1: the message is not streamed
+        self._host.send(MessageInterval(message_id, interval_us), command.channel)
         return MavResult.ACCEPTED
 
 

@@ -47,9 +47,9 @@ MAX_ITEMS = 2000
 _TYPES = (MavMissionType.MISSION, MavMissionType.FENCE, MavMissionType.RALLY)
 _R = MavMissionResult
 
-# Accepts or refuses an uploaded list: called with MAV_MISSION_TYPE, items, and a function that takes the
+# Accepts or refuses an uploaded list, now or later. Called with MAV_MISSION_TYPE, items, and a function that takes the
 # MAV_MISSION_RESULT.
-Judge = Callable[[int, tuple[MissionItem, ...], Callable[[int], None]], None]
+Validator = Callable[[int, tuple[MissionItem, ...], Callable[[int], None]], None]
 
 
 @dataclass(eq=False)
@@ -67,16 +67,16 @@ class ListUpload:
     requested_at: float
     uses_int: bool = True
     items: list[MissionItem] = field(default_factory=list)
-    is_judged: bool = False
-    """True from the call of ``judge`` until its answer."""
+    is_being_validated: bool = False
+    """True from the call of ``validate`` until its answer."""
 
 
 class MissionServer:
     """Stores missions, fences and rally points. Downloads have no state; one upload runs at a time.
 
-    When ``judge`` has accepted an upload, the upload replaces the whole list. A missing item is requested again every
+    An upload that ``validate`` has accepted replaces the whole list. A missing item is requested again every
     ``retry_interval_s`` seconds. An upload without progress for ``timeout_s`` seconds ends with OPERATION_CANCELLED.
-    During an upload, other clients are DENIED. While ``judge`` decides on a MISSION_CLEAR_ALL, uploads and other
+    During an upload, other clients are DENIED. While ``validate`` decides on a MISSION_CLEAR_ALL, uploads and other
     requests to clear are DENIED, but a repeated request is ignored. Subclasses for firmware that behaves
     differently override methods.
     """
@@ -89,7 +89,7 @@ class MissionServer:
     def __init__(
         self,
         host: ServerHost,
-        judge: Judge = lambda _, __, answer: answer(_R.ACCEPTED),
+        validate: Validator = lambda _, __, answer: answer(_R.ACCEPTED),
         *,
         on_set_current: Callable[[int], bool] = lambda _: False,
         capacity: int = MAX_ITEMS,
@@ -100,12 +100,12 @@ class MissionServer:
         self.current: int = 0
         """Index of the current item of the mission."""
         self._host = host
-        self._judge = judge
+        self._validate = validate
         self._may_set_current = on_set_current
         self._capacity = capacity
         self._uploads: dict[int, ListUpload] = {}
         self._clearing: m.MissionClearAll | None = None
-        """Request to clear that ``judge`` decides on."""
+        """Request to clear that ``validate`` decides on."""
 
     def listen(self) -> None:
         on = self._host.on
@@ -134,7 +134,8 @@ class MissionServer:
         items = self.lists.get(mission_type, ())
         if items and mission_type not in self._opaque_ids:
             messages = (_item_message(item, seq, (0, 0), mission_type, current=False) for seq, item in enumerate(items))
-            self._opaque_ids[mission_type] = zlib.crc32(b"".join(message.encode() for message in messages)) or 1
+            checksum = zlib.crc32(b"".join(message.encode() for message in messages))
+            self._opaque_ids[mission_type] = checksum or 1  # 0 means no id
         return self._opaque_ids[mission_type] if items else 0
 
     def current_message(self) -> m.MissionCurrent:
@@ -176,6 +177,7 @@ class MissionServer:
         return items[seq] if 0 <= seq < len(items) else _R.INVALID_SEQUENCE
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
+        """Return the item as MISSION_ITEM_INT or MISSION_ITEM, like the request."""
         seq, (system, component), kind = request.seq, sender_of(request), request.mission_type
         current = seq == self.current and kind == MavMissionType.MISSION
         if isinstance(request, m.MissionRequestInt):
@@ -206,28 +208,28 @@ class MissionServer:
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         refusal = self._refusal(request, channel)
-        item = self._item(request.mission_type, request.seq) if refusal is None else refusal
-        if isinstance(item, int):
-            self._refuse_item(request, item, channel)
+        item_or_result = self._item(request.mission_type, request.seq) if refusal is None else refusal
+        if isinstance(item_or_result, int):
+            self._refuse_item(request, item_or_result, channel)
         else:
-            self._host.send(self._message(item, request), channel)
+            self._host.send(self._message(item_or_result, request), channel)
 
     def _refuse_item(self, request: AnyRequest, result: int, channel: Channel) -> None:
         self._acknowledge(sender_of(request), request.mission_type, result, channel)
 
     def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
         client, kind = sender_of(count), count.mission_type
-        before = self._uploads.get(self._key(kind))
+        running = self._uploads.get(self._key(kind))
         refusal = self._refusal(count, channel)
-        if refusal is None and before is not None and (before.client != client or before.is_judged):
+        if refusal is None and running is not None and (running.client != client or running.is_being_validated):
             refusal = _R.DENIED
         if refusal is None and self._clearing is not None:
             refusal = _R.DENIED
         if refusal is not None:
             self._acknowledge(client, kind, refusal, channel)
             return
-        if before is not None:
-            self._drop(before)
+        if running is not None:  # the client starts its own upload again
+            self._drop(running)
         if count.count > self.capacity(kind):
             self._refuse_size(count, channel)
             return
@@ -270,6 +272,7 @@ class MissionServer:
         self._host.call_at(due, lambda: self._check(upload))
 
     def _check(self, upload: ListUpload) -> None:
+        """End an upload that has timed out, or request the missing item again."""
         if not self._is_watched(upload):
             return
         if self._host.now >= upload.received_at + self.timeout_s:
@@ -283,7 +286,7 @@ class MissionServer:
         return self._uploads.get(self._key(upload.mission_type)) is upload
 
     def _is_watched(self, upload: ListUpload) -> bool:
-        return self._is_running(upload) and not upload.is_judged
+        return self._is_running(upload) and not upload.is_being_validated
 
     def _repeat(self, upload: ListUpload) -> None:
         self._request_item(upload)
@@ -299,14 +302,15 @@ class MissionServer:
             self._answer_item(message, _R.INVALID_SEQUENCE, upload.channel)
         elif sender_of(message) != upload.client:
             self._answer_item(message, _R.DENIED, upload.channel)
-        elif not upload.is_judged:
+        elif not upload.is_being_validated:
             self._receive_item(upload, message)
 
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
         """Answer an item that no upload expects. Here it is ignored, because the expected item is requested again."""
 
     def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
-        if (result := self._put(upload, message)) != _R.ACCEPTED:
+        result = self._put(upload, message)
+        if result != _R.ACCEPTED:
             self._end(upload, result)
             return
         upload.received_at, upload.next = self._host.now, upload.next + 1
@@ -317,7 +321,7 @@ class MissionServer:
 
     def _finish(self, upload: ListUpload) -> None:
         """Handle the arrival of the last item."""
-        upload.is_judged = True
+        upload.is_being_validated = True
 
         def answer(result: int) -> None:
             if self._is_running(upload):
@@ -326,34 +330,41 @@ class MissionServer:
                 self._end(upload, result)
 
         try:
-            self._judge(upload.mission_type, tuple(upload.items), answer)
+            self._validate(upload.mission_type, tuple(upload.items), answer)
         except InvalidArgument:
             answer(_R.INVALID)
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
         """End the client's own upload. At the end of a download there is nothing to do."""
         upload = self._uploads.get(self._key(ack.mission_type))
-        if upload is not None and sender_of(ack) == upload.client and not upload.is_judged and ack.type != _R.ACCEPTED:
+        if (
+            upload is not None
+            and sender_of(ack) == upload.client
+            and not upload.is_being_validated
+            and ack.type != _R.ACCEPTED
+        ):
             self._drop(upload)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
         client, kind = sender_of(request), request.mission_type
         if kind not in (*self.lists, MavMissionType.ALL):
             self._acknowledge(client, kind, _R.UNSUPPORTED, channel)
-        elif (running := self._clearing) is not None and (sender_of(running), running.mission_type) == (client, kind):
-            return  # A repetition; the answer follows.
-        elif self.transfer_is_open or running is not None:
+        elif self._clearing is not None:
+            is_repeated = (sender_of(self._clearing), self._clearing.mission_type) == (client, kind)
+            if not is_repeated:  # otherwise the answer to the first transmission follows
+                self._acknowledge(client, kind, _R.DENIED, channel)
+        elif self.transfer_is_open:
             self._acknowledge(client, kind, _R.DENIED, channel)
         else:
             self._clearing = request
-            stored: list[int] = [each for each in _TYPES if self.lists[each]]
-            self._clear(stored if kind == MavMissionType.ALL else [kind], request, channel)
+            non_empty: list[int] = [mission_type for mission_type in _TYPES if self.lists[mission_type]]
+            self._clear(non_empty if kind == MavMissionType.ALL else [kind], request, channel)
 
     def _clear(self, kinds: list[int], request: m.MissionClearAll, channel: Channel) -> None:
-        """Clear these lists one after the other, each only if ``judge`` accepts that."""
+        """Clear these lists one after the other, each only if ``validate`` accepts that."""
 
         def answer(result: int) -> None:
-            if self._clearing is not request:  # after a reset
+            if self._clearing is not request:  # the server was reset meanwhile
                 return
             if result == _R.ACCEPTED and kinds:
                 self.store(kinds[0], ())
@@ -366,7 +377,7 @@ class MissionServer:
             answer(_R.ACCEPTED)
             return
         try:
-            self._judge(kinds[0], (), answer)
+            self._validate(kinds[0], (), answer)
         except InvalidArgument:
             answer(_R.INVALID)
 
@@ -378,5 +389,5 @@ class MissionServer:
 def _item_message(
     item: MissionItem, seq: int, to: tuple[int, int], mission_type: int, *, current: bool
 ) -> m.MissionItemInt:
-    whole = item.replace(x=round(item.x), y=round(item.y))
-    return item_message_int(whole, seq, to, mission_type, current=current)
+    rounded = item.replace(x=round(item.x), y=round(item.y))
+    return item_message_int(rounded, seq, to, mission_type, current=current)

@@ -37,8 +37,8 @@ class ParameterLists:
         self.list_rate_hz = list_rate_hz
         self._host = host
         self._listed = parameters
-        self._lists: dict[Channel, int] = {}
-        self._list_number = 0
+        self._lists: dict[Channel, int] = {}  # channel → number of the list that is being sent there
+        self._list_number = 0  # numbers differ, so that a restart ends the earlier list on the same channel
 
     @property
     def running_lists(self) -> int:
@@ -62,7 +62,8 @@ class ParameterLists:
         self._lists.pop(channel, None)
 
     def _send_from(self, index: int, channel: Channel, number: int) -> None:
-        if self._lists.get(channel) != number:
+        """Send the group of parameters from ``index`` on, and schedule the next group of list ``number``."""
+        if self._lists.get(channel) != number:  # the list was stopped or restarted
             return
         names, end = self._listed.names, index + self.burst
         for position, name in enumerate(names[index:end], start=index):
@@ -159,8 +160,8 @@ class TypedParameterServer(ParameterProtocolServer):
     def value_message(self, name: str, index: int) -> m.ParamValue:
         value, type_ = self._store[name], ParameterType(self._store.type(name))
         assert isinstance(value, (int, float))
-        place = None if index == UNKNOWN_INDEX else index
-        return value_message(Parameter(name, value, type_, index=place), len(self.names), bytewise=self.bytewise)
+        parameter = Parameter(name, value, type_, index=None if index == UNKNOWN_INDEX else index)
+        return value_message(parameter, len(self.names), bytewise=self.bytewise)
 
     def publish(self, name: str) -> None:
         """Send a changed value to all other programs."""
@@ -173,11 +174,12 @@ class TypedParameterServer(ParameterProtocolServer):
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
         name, index = request.param_id, request.param_index
-        if (found := self.requested(name, index)) is not None:
-            self.send(*found, channel)
+        name_and_index = self.requested(name, index)
+        if name_and_index is not None:
+            self.send(*name_and_index, channel)
         else:
-            unknown = name if index < 0 else ""
-            self.send_error(sender_of(request), unknown, index, MavParamError.DOES_NOT_EXIST, channel)
+            unknown_name = name if index < 0 else ""
+            self.send_error(sender_of(request), unknown_name, index, MavParamError.DOES_NOT_EXIST, channel)
 
     def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
         name, names, store = request.param_id, self.names, self._store
@@ -188,13 +190,14 @@ class TypedParameterServer(ParameterProtocolServer):
         # The type is ignored if values are cast to float, because ArduPilot's clients send all values as REAL32.
         problem = store.problem(name, value, request.param_type if self.bytewise else store.type(name))
         if problem is not None:
-            self.send_error(sender_of(request), name, names.index(name), problem[0], channel)
+            param_error, _ = problem
+            self.send_error(sender_of(request), name, names.index(name), param_error, channel)
             self.send(name, names.index(name), channel)
             return
-        before = store[name]
+        old_value = store[name]
         store.store(name, value)
-        is_new = not settings_equal(before, store[name])
-        self.send(name, names.index(name), channel if not is_new else None)
+        is_unchanged = settings_equal(old_value, store[name])
+        self.send(name, names.index(name), channel if is_unchanged else None)  # all programs get a changed value
 
 
 def fits_param_value(type_: MavParamExtType) -> bool:
@@ -230,8 +233,9 @@ class ExtendedParameterServer(ParameterLists):
         self.start_list(channel)
 
     def _on_read(self, request: m.ParamExtRequestRead, channel: Channel) -> None:
-        if (found := self.requested(request.param_id, request.param_index)) is not None:
-            self.send(*found, channel)
+        name_and_index = self.requested(request.param_id, request.param_index)
+        if name_and_index is not None:
+            self.send(*name_and_index, channel)
 
     def send(self, name: str, index: int, channel: Channel) -> None:
         value, kind = self.value(name)
@@ -244,8 +248,8 @@ class ExtendedParameterServer(ParameterLists):
 
     def acknowledge(self, name: str, data: bytes, kind: int, result: int) -> None:
         """Send PARAM_EXT_ACK to all, because other clients read changes from it."""
-        known = kind if kind in MavParamExtType.__members__.values() else int(MavParamExtType.CUSTOM)
-        self._host.send(m.ParamExtAck(name, data, known, result))
+        known_type = kind if kind in MavParamExtType.__members__.values() else int(MavParamExtType.CUSTOM)
+        self._host.send(m.ParamExtAck(name, data, known_type, result))
 
 
 class TypedExtendedServer(ExtendedParameterServer):
@@ -263,10 +267,12 @@ class TypedExtendedServer(ExtendedParameterServer):
         if name not in store:
             return ParamAck.VALUE_UNSUPPORTED, data, kind
         value = setting_value(data, kind)
-        if isinstance(store[name], str) and value == b"":
+        if isinstance(store[name], str) and value == b"":  # an empty text looks like empty bytes on the wire
             value = ""
         problem = store.problem(name, value, kind)
         if problem is None:
             store.store(name, value)
-        result = ParamAck.ACCEPTED if problem is None else problem[1]
+            result: int = ParamAck.ACCEPTED
+        else:
+            _, result = problem
         return result, setting_bytes(store[name], store.type(name)), store.type(name)

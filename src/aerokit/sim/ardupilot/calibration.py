@@ -30,7 +30,7 @@ class AccelerometerCalibration:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.is_held_wrong = False  # If True, the calibration fails after the second position.
-        self._run = 0
+        self._run_number = 0
         self._requested: int | None = None
 
     @property
@@ -38,24 +38,25 @@ class AccelerometerCalibration:
         return self._requested is not None and AccelcalVehiclePos.LEVEL <= self._requested <= _LAST
 
     def reset(self) -> None:
-        self._run += 1
+        self._run_number += 1
         self._requested = None
 
     def start(self) -> None:
-        self._run += 1
+        self._run_number += 1
         self._vehicle.send_text(MavSeverity.CRITICAL, "Place vehicle level and press any key.")
-        self._request(self._run, AccelcalVehiclePos.LEVEL)
+        self._request(self._run_number, AccelcalVehiclePos.LEVEL)
 
     def confirm(self, command: ReceivedCommand) -> int:
         """Execute MAV_CMD_ACCELCAL_VEHICLE_POS, which confirms that the vehicle is in the requested position."""
         if not self.is_waiting or command.param1 != self._requested:
             return MavResult.FAILED
-        self._requested, run, position = None, self._run, whole(command.param1)
+        self._requested = None
+        run, position = self._run_number, whole(command.param1)
         self._vehicle.call_later(_SAMPLE_S, lambda: self._on_sample(run, position))
         return MavResult.ACCEPTED
 
     def _on_sample(self, run: int, position: int) -> None:
-        if run != self._run:
+        if run != self._run_number:  # The calibration was started again or cancelled.
             return
         if self.is_held_wrong and position > AccelcalVehiclePos.LEVEL:
             self._end("Calibration FAILED", AccelcalVehiclePos.FAILED)
@@ -66,13 +67,13 @@ class AccelerometerCalibration:
 
     def _end(self, text: str, result: int) -> None:
         self._vehicle.send_text(MavSeverity.CRITICAL, text)
-        self._request(self._run, result)
+        self._request(self._run_number, result)
 
     def _request(self, run: int, position: int) -> None:
         self._requested = position
 
         def request() -> None:
-            if run == self._run and self._requested == position:
+            if run == self._run_number and self._requested == position:
                 params = (float(position), 0, 0, 0, 0, 0, 0)
                 self._vehicle.send(m.CommandLong(0, 0, MavCmd.ACCELCAL_VEHICLE_POS, 0, *params))
                 self._vehicle.call_later(_REPEAT_INTERVAL_S, request)
@@ -97,9 +98,9 @@ class CompassCalibration:
         self.turns_s: float = 30.0
         self._mask = 0
         self._started_at = math.inf
-        self._saves = False
-        self._next = 0
-        self._reported = 0
+        self._saves_at_once = False
+        self._progress_compass = 0
+        self._reported_compass = 0
 
     def reset(self) -> None:
         self._mask, self._started_at = 0, math.inf
@@ -133,7 +134,7 @@ class CompassCalibration:
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
         self._mask = whole(command.param1) & _ALL or _ALL
-        self._started_at, self._saves = self._vehicle.now, command.param3 != 0.0
+        self._started_at, self._saves_at_once = self._vehicle.now, command.param3 != 0.0
         return MavResult.ACCEPTED
 
     def _accept(self, command: ReceivedCommand) -> int:
@@ -152,22 +153,25 @@ class CompassCalibration:
         """Return the progress of one compass, each compass in turn; None if no calibration runs."""
         if not self.is_running:
             return None
-        self._next = self._next_compass(self._next)
+        self._progress_compass = self._next_compass(self._progress_compass)
         percent = self.percent
         status = MagCalStatus.RUNNING_STEP_ONE if percent < 50 else MagCalStatus.RUNNING_STEP_TWO
-        seen = percent * 80 // 100
-        mask = ((1 << seen) - 1).to_bytes(10, "little")
-        return m.MagCalProgress(self._next, self._mask, status, 1, percent, mask, 0.0, 0.0, 0.0)
+        # One bit for each of 80 directions in which the vehicle has pointed.
+        direction_count = percent * 80 // 100
+        directions = ((1 << direction_count) - 1).to_bytes(10, "little")
+        return m.MagCalProgress(self._progress_compass, self._mask, status, 1, percent, directions, 0.0, 0.0, 0.0)
 
     def report(self) -> m.MagCalReport | None:
         """Return the result of the next compass until it is accepted or cancelled, else None."""
         if not self._mask or self.is_running:
             return None
-        self._reported = self._next_compass(self._reported)
+        self._reported_compass = self._next_compass(self._reported_compass)
         offsets, diagonal, off_diagonal = (5.0, 13.0, -18.0), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
-        saved = int(self._saves)
+        saved = int(self._saves_at_once)
         status = MagCalStatus.SUCCESS
-        return m.MagCalReport(self._reported, self._mask, status, saved, _FITNESS, *offsets, *diagonal, *off_diagonal)
+        return m.MagCalReport(
+            self._reported_compass, self._mask, status, saved, _FITNESS, *offsets, *diagonal, *off_diagonal
+        )
 
     def _next_compass(self, compass: int) -> int:
         candidates = ((compass + step) % _COMPASSES for step in range(1, _COMPASSES + 1))
@@ -176,7 +180,7 @@ class CompassCalibration:
 
 _GYROS_S, _TRIM_S, _ACCELEROMETERS_S = 0.5, 1.0, 1.0
 _MIN_ACCELEROMETERS_INTERVAL_S = 5.0
-_FORCED = 76
+_FORCED = 76  # Keeps the present calibration (GCS_Common.cpp, _handle_command_preflight_calibration).
 _Accelerometers = PreflightCalibrationAccelerometer
 
 
@@ -232,7 +236,6 @@ class Calibrations:
             vehicle.info("Initialising ArduPilot")
             text = "Trim OK: roll=0.00 pitch=0.00 yaw=0.00"
             return CommandProgress((), _TRIM_S, finish=lambda: vehicle.info(text))
-
         if command.x == _Accelerometers.SIMPLE:
             if vehicle.now - self._accelerometers_at < _MIN_ACCELEROMETERS_INTERVAL_S:
                 return MavResult.TEMPORARILY_REJECTED

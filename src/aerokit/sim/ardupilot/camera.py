@@ -32,8 +32,8 @@ class ArduPilotCamera:
         self.remaining = 0  # Remaining images of the series; -1 is unlimited.
         self.trigger_distance_m: float = 0.0  # Distance in metres between images; 0 is off.
         self._taken_at = -math.inf
-        self._taken_where: tuple[float, float] | None = None
-        self._ticks = False
+        self._taken_place: tuple[float, float] | None = None
+        self._is_update_scheduled = False
         self.feedback: m.CameraFeedback = m.CameraFeedback(0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0)
         """CAMERA_FEEDBACK of the latest image; zeros before the first image."""
 
@@ -51,7 +51,7 @@ class ArduPilotCamera:
             return False
         motion = self._vehicle.motion
         self.image_count += 1
-        self._taken_at, self._taken_where = self._vehicle.now, (motion.north, motion.east)
+        self._taken_at, self._taken_place = self._vehicle.now, (motion.north, motion.east)
         self.feedback = self._take_feedback()
         self._vehicle.send(self.feedback)
         return True
@@ -61,7 +61,7 @@ class ArduPilotCamera:
         if not self.is_fitted:
             return False
         self.interval_s, self.remaining = interval_s, count
-        self._watch()
+        self._schedule_update()
         return True
 
     def stop(self) -> None:
@@ -71,30 +71,32 @@ class ArduPilotCamera:
     def trigger_by_distance(self, metres: float) -> None:
         """Take an image each time the vehicle has moved this far in metres; 0 stops."""
         self.trigger_distance_m = metres
-        self._taken_where = None
-        self._watch()
+        self._taken_place = None
+        self._schedule_update()
 
-    def _watch(self) -> None:
-        """Check at 50 Hz while a trigger is active."""
-        if not self._ticks and (self.remaining or self.trigger_distance_m > 0):
-            self._ticks = True
+    def _schedule_update(self) -> None:
+        """Call `_update` in 20 ms, if a trigger is active."""
+        if not self._is_update_scheduled and (self.remaining or self.trigger_distance_m > 0):
+            self._is_update_scheduled = True
             self._vehicle.call_later(_PERIOD_S, self._update)
 
     def _update(self) -> None:
-        self._ticks = False
+        self._is_update_scheduled = False
         if self.remaining:
-            if self._vehicle.now - self._taken_at > self.interval_s and self.take() and self.remaining > 0:
+            is_due = self._vehicle.now - self._taken_at > self.interval_s
+            is_taken = is_due and self.take()
+            if is_taken and self.remaining > 0:
                 self.remaining -= 1
         elif self.trigger_distance_m > 0.0:
             self._check_distance()
-        self._watch()
+        self._schedule_update()
 
     def _check_distance(self) -> None:
         motion = self._vehicle.motion
         place = (motion.north, motion.east)
-        if self._taken_where is None:
-            self._taken_where = place
-        elif math.dist(place, self._taken_where) >= self.trigger_distance_m:
+        if self._taken_place is None:
+            self._taken_place = place
+        elif math.dist(place, self._taken_place) >= self.trigger_distance_m:
             self.take()
 
     def run(self, item: MissionItem) -> None:

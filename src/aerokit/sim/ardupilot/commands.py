@@ -8,7 +8,9 @@ from __future__ import annotations
 import math
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavMountMode, MavResult, MavSeverity
+from aerokit.mavlink.enums import MavCmd as Cmd
+from aerokit.mavlink.enums import MavDoRepositionFlags, MavFrame, MavMountMode, MavSeverity
+from aerokit.mavlink.enums import MavResult as Result
 from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
 from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
@@ -16,19 +18,18 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
 from aerokit.sim.motion import Ned, euler_from_quaternion
 
-_C, _R = MavCmd, MavResult
 _FORCE_ARM_OR_DISARM, _FORCE_ARM = 21196.0, 2989.0
 _FORCE_REBOOT = 20190226
 _SOURCE_SETS = (1.0, 2.0, 3.0)
 _NOTICE, _WARNING = MavSeverity.NOTICE, MavSeverity.WARNING
 
 _FIXED_TEXTS: dict[tuple[int, Kind], tuple[tuple[int, str], ...]] = {
-    (_C.DO_LAND_START, "plane"): ((_WARNING, "Unable to start landing sequence"),),
-    (_C.DO_LAND_START, "copter"): (
+    (Cmd.DO_LAND_START, "plane"): ((_WARNING, "Unable to start landing sequence"),),
+    (Cmd.DO_LAND_START, "copter"): (
         (_WARNING, "Unable to start landing sequence"),
         (_WARNING, "Mode change to AUTO RTL failed: No landing sequence found"),
     ),
-    (_C.DO_VTOL_TRANSITION, "plane"): ((_NOTICE, "VTOL not available"),),
+    (Cmd.DO_VTOL_TRANSITION, "plane"): ((_NOTICE, "VTOL not available"),),
 }
 
 
@@ -37,55 +38,55 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     common, requests = _CommonCommands(vehicle), vehicle.requests
     # Commands of absent devices.
     handlers: dict[int, CommandHandler] = {
-        _C[command]: common.fixed(_R[result], _FIXED_TEXTS.get((_C[command], vehicle.KIND), ()))
+        Cmd[command]: common.fixed(Result[result], _FIXED_TEXTS.get((Cmd[command], vehicle.KIND), ()))
         for command, result in rows_of(vehicle.KIND, "fixed_results.csv")
     }
     if vehicle.KIND != "sub":
-        handlers[_C.DO_FOLLOW] = lambda c: _R.ACCEPTED if 0 < c.param1 <= 255 else _R.DENIED
+        handlers[Cmd.DO_FOLLOW] = lambda command: Result.ACCEPTED if 0 < command.param1 <= 255 else Result.DENIED
     # A reboot replaces the devices, so they are looked up at each command.
     if vehicle.KIND in ("copter", "plane"):
-        handlers[_C.AIRFRAME_CONFIGURATION] = lambda c: vehicle.devices.move_gear(c)
-        handlers[_C.DO_PARACHUTE] = lambda c: vehicle.devices.handle_chute(c)
+        handlers[Cmd.AIRFRAME_CONFIGURATION] = lambda command: vehicle.devices.move_gear(command)
+        handlers[Cmd.DO_PARACHUTE] = lambda command: vehicle.devices.handle_chute(command)
     if vehicle.KIND == "copter":
-        handlers[_C.DO_WINCH] = lambda c: vehicle.devices.wind(c)
+        handlers[Cmd.DO_WINCH] = lambda command: vehicle.devices.move_winch(command)
     return {
         **handlers,
-        _C.DO_GRIPPER: lambda c: vehicle.devices.grip(c),
-        _C.DO_SET_SERVO: lambda c: vehicle.accessories.set_servo(c),
-        _C.DO_REPEAT_SERVO: lambda c: vehicle.accessories.set_servo(c),
-        _C.DO_SET_RELAY: lambda c: vehicle.accessories.set_relay(c),
-        _C.DO_REPEAT_RELAY: lambda c: vehicle.accessories.repeat_relay(c),
-        _C.DO_AUX_FUNCTION: lambda c: vehicle.accessories.switch(c),
-        _C.DO_FENCE_ENABLE: lambda c: vehicle.fence.command(c),
-        _C.IMAGE_START_CAPTURE: lambda c: vehicle.camera.start_capture(c),
-        _C.IMAGE_STOP_CAPTURE: lambda c: vehicle.camera.stop_capture(c),
-        _C.DO_DIGICAM_CONTROL: lambda c: vehicle.camera.control(c),
-        _C.DO_SET_CAM_TRIGG_DIST: lambda c: vehicle.camera.set_trigger_distance(c),
-        _C.SET_CAMERA_ZOOM: lambda c: vehicle.camera.zoom(c),
-        _C.SET_CAMERA_FOCUS: lambda c: vehicle.camera.focus(c),
-        _C.DO_DIGICAM_CONFIGURE: lambda _: _R.ACCEPTED,
-        _C.SET_CAMERA_SOURCE: lambda _: _R.DENIED,
-        _C.VIDEO_START_CAPTURE: lambda _: _R.FAILED,
-        _C.VIDEO_STOP_CAPTURE: lambda _: _R.FAILED,
-        _C.EXTERNAL_WIND_ESTIMATE: lambda c: vehicle.external.set_wind(c),
-        _C.SET_EKF_SOURCE_SET: lambda c: _R.ACCEPTED if c.param1 in _SOURCE_SETS else _R.DENIED,
-        _C.BATTERY_RESET: common.reset_battery,
-        _C.CONTROL_HIGH_LATENCY: common.control_high_latency,
-        _C.COMPONENT_ARM_DISARM: common.arm_or_disarm,
-        _C.DO_SET_MODE: lambda c: vehicle.set_mode_from(whole(c.param1), whole(c.param2)),
-        _C.DO_SET_MISSION_CURRENT: common.set_mission_current,
-        _C.DO_FLIGHTTERMINATION: common.terminate,
-        _C.MISSION_START: common.start_mission,
-        _C.DO_REPOSITION: common.reposition,
-        _C.REQUEST_AUTOPILOT_CAPABILITIES: common.request_capabilities,
-        _C.REQUEST_MESSAGE: requests.request_message,
-        _C.SET_MESSAGE_INTERVAL: requests.set_interval,
-        _C.GET_MESSAGE_INTERVAL: requests.get_interval,
-        _C.RUN_PREARM_CHECKS: common.run_prearm_checks,
-        _C.PREFLIGHT_REBOOT_SHUTDOWN: common.reboot,
-        _C.DO_SEND_BANNER: common.send_banner,
-        **dict.fromkeys((_C.DO_SET_ROI, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_NONE), common.look_at),
-        _C.DO_SET_ROI_SYSID: common.look_at_vehicle,
+        Cmd.DO_GRIPPER: lambda command: vehicle.devices.grip(command),
+        Cmd.DO_SET_SERVO: lambda command: vehicle.accessories.set_servo(command),
+        Cmd.DO_REPEAT_SERVO: lambda command: vehicle.accessories.set_servo(command),
+        Cmd.DO_SET_RELAY: lambda command: vehicle.accessories.set_relay(command),
+        Cmd.DO_REPEAT_RELAY: lambda command: vehicle.accessories.repeat_relay(command),
+        Cmd.DO_AUX_FUNCTION: lambda command: vehicle.accessories.switch(command),
+        Cmd.DO_FENCE_ENABLE: lambda command: vehicle.fence.command(command),
+        Cmd.IMAGE_START_CAPTURE: lambda command: vehicle.camera.start_capture(command),
+        Cmd.IMAGE_STOP_CAPTURE: lambda command: vehicle.camera.stop_capture(command),
+        Cmd.DO_DIGICAM_CONTROL: lambda command: vehicle.camera.control(command),
+        Cmd.DO_SET_CAM_TRIGG_DIST: lambda command: vehicle.camera.set_trigger_distance(command),
+        Cmd.SET_CAMERA_ZOOM: lambda command: vehicle.camera.zoom(command),
+        Cmd.SET_CAMERA_FOCUS: lambda command: vehicle.camera.focus(command),
+        Cmd.DO_DIGICAM_CONFIGURE: lambda _: Result.ACCEPTED,
+        Cmd.SET_CAMERA_SOURCE: lambda _: Result.DENIED,
+        Cmd.VIDEO_START_CAPTURE: lambda _: Result.FAILED,
+        Cmd.VIDEO_STOP_CAPTURE: lambda _: Result.FAILED,
+        Cmd.EXTERNAL_WIND_ESTIMATE: lambda command: vehicle.external.set_wind(command),
+        Cmd.SET_EKF_SOURCE_SET: lambda command: Result.ACCEPTED if command.param1 in _SOURCE_SETS else Result.DENIED,
+        Cmd.BATTERY_RESET: common.reset_battery,
+        Cmd.CONTROL_HIGH_LATENCY: common.control_high_latency,
+        Cmd.COMPONENT_ARM_DISARM: common.arm_or_disarm,
+        Cmd.DO_SET_MODE: lambda command: vehicle.set_mode_from(whole(command.param1), whole(command.param2)),
+        Cmd.DO_SET_MISSION_CURRENT: common.set_mission_current,
+        Cmd.DO_FLIGHTTERMINATION: common.terminate,
+        Cmd.MISSION_START: common.start_mission,
+        Cmd.DO_REPOSITION: common.reposition,
+        Cmd.REQUEST_AUTOPILOT_CAPABILITIES: common.request_capabilities,
+        Cmd.REQUEST_MESSAGE: requests.request_message,
+        Cmd.SET_MESSAGE_INTERVAL: requests.set_interval,
+        Cmd.GET_MESSAGE_INTERVAL: requests.get_interval,
+        Cmd.RUN_PREARM_CHECKS: common.run_prearm_checks,
+        Cmd.PREFLIGHT_REBOOT_SHUTDOWN: common.reboot,
+        Cmd.DO_SEND_BANNER: common.send_banner,
+        **dict.fromkeys((Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE), common.look_at),
+        Cmd.DO_SET_ROI_SYSID: common.look_at_vehicle,
         **vehicle.calibrations.commands,
         **GimbalCommands(vehicle).commands,
         **HomeAndOrigin(vehicle).commands,
@@ -94,11 +95,13 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
 
 def relative_heading(command: ReceivedCommand, yaw: float) -> float | None:
     """Return the heading of CONDITION_YAW in radians; None if its parameters are invalid."""
-    angle, relative = command.param1, command.param4
-    if not 0.0 <= angle <= 360.0 or relative not in (0.0, 1.0):
+    angle_deg, is_relative = command.param1, command.param4
+    if not 0.0 <= angle_deg <= 360.0 or is_relative not in (0.0, 1.0):
         return None
-    heading = math.radians(angle)
-    return yaw + math.copysign(heading, command.param3 or 1.0) if relative else heading
+    angle = math.radians(angle_deg)
+    if not is_relative:
+        return angle
+    return yaw + math.copysign(angle, command.param3 or 1.0)
 
 
 class _CommonCommands:
@@ -106,6 +109,8 @@ class _CommonCommands:
         self._vehicle = vehicle
 
     def fixed(self, result: int, texts: tuple[tuple[int, str], ...]) -> CommandHandler:
+        """Return a handler that sends these texts and answers ``result``, whatever the params are."""
+
         def handle(_: ReceivedCommand) -> int:
             for severity, text in texts:
                 self._vehicle.send_text(severity, text)
@@ -117,33 +122,33 @@ class _CommonCommands:
         vehicle = self._vehicle
         if command.param1 == 1.0:
             force = command.param2 in (_FORCE_ARM, _FORCE_ARM_OR_DISARM)
-            done = vehicle.motors.is_armed or vehicle.arming.arm(force=force)
+            is_done = vehicle.motors.is_armed or vehicle.arming.arm(force=force)
         elif command.param1 == 0.0:
-            done = vehicle.arming.disarm(force=command.param2 == _FORCE_ARM_OR_DISARM)
+            is_done = vehicle.arming.disarm(force=command.param2 == _FORCE_ARM_OR_DISARM)
         else:
-            return _R.UNSUPPORTED
-        return _R.ACCEPTED if done else _R.FAILED
+            return Result.UNSUPPORTED
+        return Result.ACCEPTED if is_done else Result.FAILED
 
     def set_mission_current(self, command: ReceivedCommand) -> int:
         vehicle, resets = self._vehicle, command.param2 == 1.0
         if not 0 <= command.param1 < vehicle.missions.commands.count:
-            return _R.DENIED
+            return Result.DENIED
         if resets:
             vehicle.mission.reset()
         if not vehicle.mission.set_current(whole(command.param1)):
-            return _R.FAILED
+            return Result.FAILED
         if resets:
             vehicle.mission.start_or_resume()
         vehicle.requests.send_soon(m.MissionCurrent.ID, command.channel)
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def start_mission(self, command: ReceivedCommand) -> int:
         """Start or resume the mission; if the vehicle is armed on the ground, this permits the take-off."""
         vehicle = self._vehicle
         if command.param1 or command.param2:
-            return _R.DENIED
+            return Result.DENIED
         result = vehicle.change_to(vehicle.auto.number)
-        if result == _R.ACCEPTED:
+        if result == Result.ACCEPTED:
             vehicle.auto.may_lift_off = vehicle.is_armed
             if not vehicle.mission.is_running:
                 vehicle.mission.start_or_resume()
@@ -152,75 +157,75 @@ class _CommonCommands:
     def reposition(self, command: ReceivedCommand) -> int:
         vehicle, guided = self._vehicle, self._vehicle.guided
         if command.is_long:  # COMMAND_LONG does not specify the altitude frame that ArduPilot requires here.
-            return _R.UNSUPPORTED
+            return Result.UNSUPPORTED
         if vehicle.mode is not guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
-            return _R.DENIED
-        point = vehicle.point(*command.place(), command.z, command.altitude_frame)
+            return Result.DENIED
+        point = vehicle.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:
-            return _R.DENIED
+            return Result.DENIED
         if not vehicle.set_mode(guided.number) or not vehicle.may_go_to(point):
-            return _R.FAILED
+            return Result.FAILED
         guided.go_to(point)
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def terminate(self, command: ReceivedCommand) -> int:
         if command.param1 <= 0.5:
-            return _R.FAILED
+            return Result.FAILED
         self._vehicle.arming.disarm()
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def request_capabilities(self, command: ReceivedCommand) -> int:
         if command.param1 != 1.0:
-            return _R.FAILED
+            return Result.FAILED
         self._vehicle.requests.send_soon(m.AutopilotVersion.ID, command.channel)
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def run_prearm_checks(self, _: ReceivedCommand) -> int:
         if self._vehicle.motors.is_armed:
-            return _R.TEMPORARILY_REJECTED
+            return Result.TEMPORARILY_REJECTED
         self._vehicle.arming.report()
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def reboot(self, command: ReceivedCommand) -> int:
-        if self._vehicle.is_armed and command.y != _FORCE_REBOOT:
-            return _R.FAILED
+        if self._vehicle.is_armed and command.y != _FORCE_REBOOT:  # y is param 6.
+            return Result.FAILED
         if command.param1 not in (1.0, 3.0):
-            return _R.UNSUPPORTED
+            return Result.UNSUPPORTED
         self._vehicle.call_later(0.1, self._vehicle.restart)  # The acknowledgement is sent first.
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def send_banner(self, _: ReceivedCommand) -> int:
         self._vehicle.send_banner()
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def reset_battery(self, command: ReceivedCommand) -> int:
         """Set the charge of the first battery to param 2 (percent), if the mask in param 1 selects that battery."""
         if whole(command.param1) & 1:
             self._vehicle.battery.percent = max(0.0, min(100.0, command.param2))
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def control_high_latency(self, command: ReceivedCommand) -> int:
         """Refuse to start high-latency mode, which no port supports. Accept requests to stop it."""
         if command.param1:
-            return _R.FAILED
+            return Result.FAILED
         self._vehicle.send_text(_NOTICE, "High Latency disabled")
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def look_at(self, command: ReceivedCommand) -> int:
         """Set the region of interest, with or without a gimbal; zeros or DO_SET_ROI_NONE clear it."""
         point = None
-        if command.command != _C.DO_SET_ROI_NONE:
-            point = self._vehicle.point(*command.place(), command.z, command.altitude_frame)
+        if command.command != Cmd.DO_SET_ROI_NONE:
+            point = self._vehicle.world_point(*command.place(), command.z, command.altitude_frame)
             if point is None:
-                return _R.DENIED
+                return Result.DENIED
             if command.place() == (0, 0) and command.z == 0:
                 point = None
         self._vehicle.look_at(point)
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def look_at_vehicle(self, command: ReceivedCommand) -> int:
         self._vehicle.gimbal.follow(whole(command.param1))
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
 
 _FRAMES = frozenset(
@@ -241,24 +246,24 @@ class HomeAndOrigin:
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
         self.commands: dict[int, CommandHandler] = {
-            _C.DO_SET_HOME: self._set_home,
-            _C.GET_HOME_POSITION: self._get_home,
+            Cmd.DO_SET_HOME: self._set_home,
+            Cmd.GET_HOME_POSITION: self._get_home,
         }
         vehicle.on(m.SetGpsGlobalOrigin, self._on_origin)
 
     def _set_home(self, command: ReceivedCommand) -> int:
         vehicle, nav = self._vehicle, self._vehicle.navigation
         if command.param1 == 1.0 or command.place() == (0, 0):
-            return self._make_home(vehicle.motion.place) if nav.has_position else _R.FAILED
+            return self._make_home(vehicle.motion.place) if nav.has_position else Result.FAILED
         if command.param1 != 0.0:
-            return _R.FAILED
-        frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
+            return Result.FAILED
+        frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame  # COMMAND_LONG has no frame.
         if frame not in _FRAMES:
             vehicle.info(f"Unknown mavlink coordinate frame {frame}")
-            return _R.DENIED
-        point = vehicle.point(*command.place(), command.z, frame)
+            return Result.DENIED
+        point = vehicle.world_point(*command.place(), command.z, frame)
         if point is None or (nav.origin is None and vehicle.HOME_NEEDS_ORIGIN):
-            return _R.FAILED
+            return Result.FAILED
         return self._make_home(point)
 
     def _make_home(self, point: Ned) -> int:
@@ -268,19 +273,19 @@ class HomeAndOrigin:
             place = vehicle.frame.to_global(*point)
             latitude, longitude = place.latitude_e7 / 1e7, place.longitude_e7 / 1e7
             vehicle.info(f"Set HOME to {latitude:.6f} {longitude:.6f} at {place.altitude_m:.2f}m")
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def _get_home(self, command: ReceivedCommand) -> int:
         if self._vehicle.navigation.home is None:
-            return _R.FAILED
+            return Result.FAILED
         self._vehicle.send_home(command.channel)
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def _on_origin(self, message: m.SetGpsGlobalOrigin, channel: Channel) -> None:
         """Set the origin and send it to the requester. Invalid values and second requests are ignored."""
         vehicle = self._vehicle
         place = (message.latitude, message.longitude)
-        point = vehicle.point(*place, message.altitude / 1000.0, MavFrame.GLOBAL)
+        point = vehicle.world_point(*place, message.altitude / 1000.0, MavFrame.GLOBAL)
         if point is None or place == (0, 0) or not vehicle.navigation.set_origin(point):
             return
         origin = vehicle.build(m.GpsGlobalOrigin.ID)
@@ -299,10 +304,10 @@ class GimbalCommands:
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
         self.commands: dict[int, CommandHandler] = {
-            _C.DO_MOUNT_CONFIGURE: self._configure_mount,
-            _C.DO_MOUNT_CONTROL: self._control_mount,
-            _C.DO_GIMBAL_MANAGER_PITCHYAW: self._manage,
-            _C.DO_GIMBAL_MANAGER_CONFIGURE: self._configure_manager,
+            Cmd.DO_MOUNT_CONFIGURE: self._configure_mount,
+            Cmd.DO_MOUNT_CONTROL: self._control_mount,
+            Cmd.DO_GIMBAL_MANAGER_PITCHYAW: self._manage,
+            Cmd.DO_GIMBAL_MANAGER_CONFIGURE: self._configure_manager,
         }
         vehicle.on(m.GimbalManagerSetAttitude, self._on_attitude)
         vehicle.on(m.GimbalManagerSetPitchyaw, self._on_pitch_and_yaw)
@@ -315,58 +320,62 @@ class GimbalCommands:
     def _configure_mount(self, command: ReceivedCommand) -> int:
         gimbal = self._gimbal()
         if gimbal is None:
-            return _R.FAILED
+            return Result.FAILED
         gimbal.set_mode(whole(command.param1))
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def _control_mount(self, command: ReceivedCommand) -> int:
         gimbal, mode = self._gimbal(), whole(command.z)
         if gimbal is None:
-            return _R.FAILED
+            return Result.FAILED
         if mode in _PLAIN_MOUNT_MODES:
             gimbal.set_mode(mode)
-            return _R.ACCEPTED
+            return Result.ACCEPTED
         if mode == MavMountMode.MAVLINK_TARGETING:
             pitch, roll, yaw = command.param1, command.param2, command.param3
             if abs(pitch) > 90.0 or abs(roll) > 180.0 or abs(yaw) > 360.0:
                 gimbal.warn()
-                return _R.FAILED
+                return Result.FAILED
             gimbal.point(roll, pitch, yaw, from_north=False)
-            return _R.ACCEPTED
-        if mode == MavMountMode.GPS_POINT and (command.x or command.y or not command.param1):
+            return Result.ACCEPTED
+        # The firmware refuses a position in params 1 and 2, which AP 4.2 accepted (AP_Mount_Backend.cpp).
+        has_place_in_params = command.param1 and not command.x and not command.y
+        if mode == MavMountMode.GPS_POINT and not has_place_in_params:
             place = (whole(command.x), whole(command.y), float(whole(command.param4)))
-            gimbal.look_at(self._vehicle.point(*place, MavFrame.GLOBAL_RELATIVE_ALT))
-            return _R.ACCEPTED
-        return _R.FAILED
+            gimbal.look_at(self._vehicle.world_point(*place, MavFrame.GLOBAL_RELATIVE_ALT))
+            return Result.ACCEPTED
+        return Result.FAILED
 
     def _manage(self, command: ReceivedCommand) -> int:
         gimbal = self._gimbal(command.z)
         if gimbal is None:
-            return _R.FAILED
+            return Result.FAILED
         angles = (0.0, command.param1, command.param2)
         return gimbal.manage(whole(command.x), angles, (0.0, command.param3, command.param4))
 
     def _configure_manager(self, command: ReceivedCommand) -> int:
         gimbal = self._gimbal(command.z)
         ids = (whole(command.param1), whole(command.param2))
-        done = gimbal is not None and gimbal.set_control(command.sender, *ids)
-        return _R.ACCEPTED if done else _R.FAILED
+        is_done = gimbal is not None and gimbal.set_control(command.sender, *ids)
+        return Result.ACCEPTED if is_done else Result.FAILED
 
-    def _on_attitude(self, order: m.GimbalManagerSetAttitude, _: Channel) -> None:
-        gimbal = self._gimbal(order.gimbal_device_id)
-        rates = (order.angular_velocity_x, order.angular_velocity_y, order.angular_velocity_z)
-        has_angles = not any(map(math.isnan, order.q))
-        if gimbal is None or (has_angles and not any(map(math.isnan, rates))):
+    def _on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
+        gimbal = self._gimbal(message.gimbal_device_id)
+        rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
+        has_angles = not any(map(math.isnan, message.q))
+        has_rates = not any(map(math.isnan, rates))
+        if gimbal is None or (has_angles and has_rates):
             return
-        angles = euler_from_quaternion(*order.q) if has_angles else (math.nan,) * 3
-        gimbal.manage(order.flags, _degrees(*angles), _degrees(*rates))
+        angles = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
+        gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
 
-    def _on_pitch_and_yaw(self, order: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
-        gimbal = self._gimbal(order.gimbal_device_id)
-        values = (order.pitch, order.yaw, order.pitch_rate, order.yaw_rate)
-        if gimbal is not None and any(map(math.isnan, values)):
-            angles, rates = (0.0, order.pitch, order.yaw), (0.0, order.pitch_rate, order.yaw_rate)
-            gimbal.manage(order.flags, _degrees(*angles), _degrees(*rates))
+    def _on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
+        gimbal = self._gimbal(message.gimbal_device_id)
+        values = (message.pitch, message.yaw, message.pitch_rate, message.yaw_rate)
+        has_angles_and_rates = not any(map(math.isnan, values))
+        if gimbal is not None and not has_angles_and_rates:
+            angles, rates = (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate)
+            gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
 
 
 def _degrees(roll: float, pitch: float, yaw: float) -> tuple[float, float, float]:

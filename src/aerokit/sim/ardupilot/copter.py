@@ -44,7 +44,7 @@ class MotorTest:
     def __init__(self, copter: SimulatedCopter) -> None:
         self._copter = copter
         self.is_running: bool = False
-        self._number = 0
+        self._test_number = 0
 
     def command(self, command: ReceivedCommand) -> int:
         """Start a test, or replace the motors of the running test. A text reports the end."""
@@ -57,23 +57,28 @@ class MotorTest:
                 return MavResult.FAILED
             self._copter.info("starting motor test")
         self.is_running = True
-        self._number += 1
-        self._copter.call_later(self._duration_s(command), partial(self._stop, self._number))
+        self._test_number += 1
+        self._copter.call_later(self._duration_s(command), partial(self._stop, self._test_number))
         return MavResult.ACCEPTED
 
     def _duration_s(self, command: ReceivedCommand) -> float:
         """Return the duration; 0 for an invalid throttle."""
-        kind, throttle = command.param2, command.param3
-        is_valid = kind == MotorTestThrottleType.THROTTLE_PILOT or (
-            throttle <= 100.0
-            if kind in (MotorTestThrottleType.THROTTLE_PERCENT, MotorTestThrottleType.COMPASS_CAL)
-            else kind == MotorTestThrottleType.THROTTLE_PWM and _MIN_PWM <= throttle <= _MAX_PWM
-        )
-        time, motors = max(0.0, min(command.param4, _MAX_S)), max(1, whole(command.x))
-        return time * (motors + (motors - 1) * _PAUSE_SHARE) if is_valid else 0.0
+        throttle_type, throttle = command.param2, command.param3
+        if throttle_type == MotorTestThrottleType.THROTTLE_PILOT:
+            is_valid = True
+        elif throttle_type == MotorTestThrottleType.THROTTLE_PWM:
+            is_valid = _MIN_PWM <= throttle <= _MAX_PWM
+        else:
+            in_percent = (MotorTestThrottleType.THROTTLE_PERCENT, MotorTestThrottleType.COMPASS_CAL)
+            is_valid = throttle_type in in_percent and throttle <= 100.0
+        if not is_valid:
+            return 0.0
+        seconds_per_motor = max(0.0, min(command.param4, _MAX_S))
+        motor_count = max(1, whole(command.x))
+        return seconds_per_motor * (motor_count + (motor_count - 1) * _PAUSE_SHARE)
 
     def _stop(self, number: int) -> None:
-        if number == self._number:
+        if number == self._test_number:
             self.is_running = False
             self._copter.info("finished motor test")
             self._copter.motors.set_armed(False, self._copter.now)
@@ -199,7 +204,7 @@ class SimulatedCopter(CopterHost):
 
     def reset_controllers(self) -> None:
         super().reset_controllers()
-        self._still = ConditionTimer()
+        self._on_ground_timer = ConditionTimer()
         self.motor_test: MotorTest = MotorTest(self)
 
     @property
@@ -213,13 +218,15 @@ class SimulatedCopter(CopterHost):
 
     @property
     def base_mode(self) -> int:
-        # GUIDED_ENABLED is set in modes that use a position, in RTL only while armed.
-        base, name = _BASE, self.mode.name
         if not self.has_left_boot:
-            return base | _GUIDED
-        if name in _GUIDED_MODES and (self.motors.is_armed or name != "RTL"):
-            base |= _GUIDED
-        return base | _ARMED if self.is_armed else base
+            return _BASE | _GUIDED
+        flags, mode_name = _BASE, self.mode.name
+        # GUIDED_ENABLED is set in modes that use a position, in RTL only while armed.
+        if mode_name in _GUIDED_MODES and (self.motors.is_armed or mode_name != "RTL"):
+            flags |= _GUIDED
+        if self.is_armed:
+            flags |= _ARMED
+        return flags
 
     def move(self, dt: float) -> None:
         motion = self.motion
@@ -229,25 +236,27 @@ class SimulatedCopter(CopterHost):
         if is_on_ground and not was_on_ground:
             self.info(f"SIM Hit ground at {motion.impact_speed_m_s:f} m/s")
         keeps_flying = self.motors.is_armed and (self.mode.is_taking_off or not self.mode.notices_landing)
-        still_for = self._still.seconds(is_on_ground and not keeps_flying, self.now)
-        if still_for >= _LAND_DETECTOR_S or (still_for > 0.0 and not self.motors.is_armed):
+        on_ground_for = self._on_ground_timer.seconds(is_on_ground and not keeps_flying, self.now)
+        # With stopped motors, the copter has landed as soon as it is on the ground.
+        if on_ground_for >= _LAND_DETECTOR_S or (on_ground_for > 0.0 and not self.motors.is_armed):
             self.is_landed: bool = True
-            self._still.reset()
+            self._on_ground_timer.reset()
             motion.settle()
 
     def _take_off(self, command: ReceivedCommand) -> int:
         if command.altitude_frame != MavFrame.GLOBAL_RELATIVE_ALT:
             return MavResult.DENIED
-        upwards = command.z > self.navigation.altitude_above_home
-        if not (self.motors.is_armed and self.is_landed and upwards):
+        is_upwards = command.z > self.navigation.altitude_above_home
+        if not (self.motors.is_armed and self.is_landed and is_upwards):
             return MavResult.FAILED
-        done = self.mode.take_off(command.z, must_navigate=command.param3 == 0.0)
-        return MavResult.ACCEPTED if done else MavResult.FAILED
+        must_navigate = command.param3 == 0.0  # Param 3 is 1 if the pilot may control the horizontal position.
+        is_accepted = self.mode.take_off(command.z, must_navigate=must_navigate)
+        return MavResult.ACCEPTED if is_accepted else MavResult.FAILED
 
     def may_go_to(self, place: Ned) -> bool:
         if not self.fence.contains(place):
             return False
-        self.yaw.default()
+        self.yaw.apply_default()  # A new target ends a commanded heading.
         return True
 
     def _change_speed(self, command: ReceivedCommand) -> int:
@@ -272,15 +281,16 @@ class SimulatedCopter(CopterHost):
         heading = relative_heading(command, self.motion.yaw)
         if heading is None:
             return MavResult.FAILED
+        # The sign of a relative angle (param 4) is its direction already.
         direction = 0 if command.param4 else int(command.param3)
-        self.yaw.fixed(heading, math.radians(command.param2), direction)
+        self.yaw.turn_to(heading, math.radians(command.param2), direction)
         return MavResult.ACCEPTED
 
     def _pause_or_continue(self, command: ReceivedCommand) -> int:
         if command.param1 not in (0.0, 1.0):
             return MavResult.DENIED
-        pause = command.param1 == 0.0
-        if self.mode.pause() if pause else self.mode.resume():
-            return MavResult.ACCEPTED
-        self.info("Failed to pause" if pause else "Failed to resume")
-        return MavResult.FAILED
+        is_pause = command.param1 == 0.0
+        is_done = self.mode.pause() if is_pause else self.mode.resume()
+        if not is_done:
+            self.info("Failed to pause" if is_pause else "Failed to resume")
+        return MavResult.ACCEPTED if is_done else MavResult.FAILED

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import islice
 from typing import Protocol
 
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavFrame, MavSeverity, SpeedType
+from aerokit.mavlink.enums import CopterMode, MavFrame, MavSeverity, SpeedType
+from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.messages import MissionItemReached
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterRtl, CopterTakeOff
 from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance, set_home_from
 from aerokit.sim.motion import Ned, wrap_pi
 
-_STOPPED_M = 0.3
-_TO_EDGE_M = 3.0
-_TAKE_OFF_WITHOUT_THROTTLE = 2
-_RAISED_THROTTLE = 1100
+_STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
+_TAKE_OFF_WITHOUT_THROTTLE, _RAISED_THROTTLE = 2, 1100  # bit of AUTO_OPTIONS, and µs
 
 
 class _Leg(Protocol):
@@ -43,7 +43,7 @@ class _FlyLeg:
 
     def update(self, dt: float) -> None:
         copter, limits, motion = self._copter, self._auto, self._copter.motion
-        copter.motors.wanted = not copter.is_landed
+        copter.motors.spool_up_requested = not copter.is_landed
         if copter.is_landed:
             return
         motion.seek_position(*self.destination, speed=limits.speed, climb=limits.climb, descent=limits.descent)
@@ -57,14 +57,14 @@ class _CircleLeg:
         self._copter, self._turns, self._centre = auto.vehicle, turns, centre
         parameters, motion = self._copter.parameters, self._copter.motion
         self._radius = abs(radius) or parameters["CIRCLE_RADIUS"] / 100.0
-        self._rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
+        self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
         north, east = motion.north - centre[0], motion.east - centre[1]
         self._angle = math.atan2(east, north)
         self._turned = 0.0
-        self._reported = -1
+        self._reported_turns = -1
         self._approach: _FlyLeg | None = None
-        to_edge = abs(math.hypot(north, east) - self._radius)
-        if to_edge > _TO_EDGE_M or abs(motion.down - centre[2]) > _TO_EDGE_M:
+        distance_to_circle = abs(math.hypot(north, east) - self._radius)
+        if distance_to_circle > _ON_CIRCLE_M or abs(motion.down - centre[2]) > _ON_CIRCLE_M:
             self._approach = _FlyLeg(auto, self._point(), stops=True)
 
     @property
@@ -78,13 +78,15 @@ class _CircleLeg:
                 self._approach = None
             return
         motion = self._copter.motion
+        # The centripetal acceleration uses 70 % of the limit; the rest keeps the copter on the circle.
         max_rate = math.sqrt(0.7 * motion.limits.acceleration_m_s2 / max(0.5, self._radius))
-        rate = math.copysign(min(abs(self._rate), max_rate), self._rate)
-        self._report()
+        rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)
+        self._report_new_turn()
         self._angle += rate * dt
         self._turned += abs(rate) * dt
-        self._report()
+        self._report_new_turn()
         point, speed = self._point(), rate * self._radius
+        # The velocity of the moving point, plus a correction of 1 m/s per metre between the copter and the point.
         motion.seek_velocity(
             point[0] - motion.north - speed * math.sin(self._angle),
             point[1] - motion.east + speed * math.cos(self._angle),
@@ -95,10 +97,10 @@ class _CircleLeg:
         north = self._centre[0] + self._radius * math.cos(self._angle)
         return (north, self._centre[1] + self._radius * math.sin(self._angle), self._centre[2])
 
-    def _report(self) -> None:
+    def _report_new_turn(self) -> None:
         number = int(self._turned / math.tau)
-        if number > self._reported:
-            self._reported = number
+        if number > self._reported_turns:
+            self._reported_turns = number
             self._copter.info(f"Mission: starting circle {number + 1}/{int(self._turns)}")
 
 
@@ -140,21 +142,19 @@ class _DescendLeg:
         self._copter.descend()
 
 
-_C = MavCmd
-_ALLOW_ARMING = 1
-_CONTINUE_AFTER_LAND = 4
-_HEADING_REACHED_RAD = math.radians(2.0)
-_MIN_TAKE_OFF_M = 1.0
-_STOPS_NOT_BEFORE = frozenset(
-    {_C.NAV_WAYPOINT, _C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME, _C.NAV_SPLINE_WAYPOINT, _C.NAV_PAYLOAD_PLACE}
+_ALLOW_ARMING, _CONTINUE_AFTER_LAND = 1, 4  # bits of AUTO_OPTIONS and of MIS_OPTIONS
+_HEADING_REACHED_RAD, _MIN_TAKE_OFF_M = math.radians(2.0), 1.0
+# A waypoint without delay is passed without a stop if one of these commands follows.
+_PASSED_BEFORE = frozenset(
+    {Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_PAYLOAD_PLACE}
 )
-_WAYPOINTS = frozenset({_C.NAV_WAYPOINT, _C.NAV_SPLINE_WAYPOINT, _C.NAV_LOITER_TIME})
-_TAKE_OFFS = frozenset({_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF})
-_LANDINGS = frozenset({_C.NAV_LAND, _C.NAV_VTOL_LAND})
-_UNTIL_LEG_ENDS = _TAKE_OFFS | {_C.NAV_LOITER_TURNS, _C.NAV_LOITER_TO_ALT, _C.NAV_RETURN_TO_LAUNCH}
+_WAYPOINTS = frozenset({Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_LOITER_TIME})
+_TAKE_OFFS = frozenset({Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF})
+_LANDINGS = frozenset({Cmd.NAV_LAND, Cmd.NAV_VTOL_LAND})
+_UNTIL_LEG_ENDS = _TAKE_OFFS | {Cmd.NAV_LOITER_TURNS, Cmd.NAV_LOITER_TO_ALT, Cmd.NAV_RETURN_TO_LAUNCH}
 _WITHOUT_EFFECT = (
-    _C.DO_FENCE_ENABLE, _C.DO_WINCH, _C.DO_RETURN_PATH_START, _C.DO_LAND_START, _C.DO_MOUNT_CONTROL,
-    _C.DO_GUIDED_LIMITS, _C.NAV_GUIDED_ENABLE, _C.CONDITION_DISTANCE,
+    Cmd.DO_FENCE_ENABLE, Cmd.DO_WINCH, Cmd.DO_RETURN_PATH_START, Cmd.DO_LAND_START, Cmd.DO_MOUNT_CONTROL,
+    Cmd.DO_GUIDED_LIMITS, Cmd.NAV_GUIDED_ENABLE, Cmd.CONDITION_DISTANCE,
 )  # fmt: skip
 
 
@@ -168,26 +168,25 @@ class CopterAuto(MissionMode):
 
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
-        self.climb: float = 0.0
-        self.descent: float = 0.0  # Limits in m/s.
-        # Without a leg, AUTO holds the position.
-        self._leg: _Leg | None = None
+        self.climb: float = 0.0  # Limit in m/s.
+        self.descent: float = 0.0  # Limit in m/s.
+        self._leg: _Leg | None = None  # AUTO holds the position without a leg.
         self._last_reached = 0
         self._reached_at = self._condition_from = self._delay_until = 0.0
-        self._version = -1
+        self._list_version = -1
         self._upcoming: tuple[tuple[int, MissionItem], ...] = ()
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             **dict.fromkeys(_TAKE_OFFS, self._take_off),
-            **dict.fromkeys((*_WAYPOINTS, _C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TO_ALT), self._fly),
+            **dict.fromkeys((*_WAYPOINTS, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TO_ALT), self._fly),
             **dict.fromkeys(_LANDINGS, self._land),
-            _C.NAV_LOITER_TURNS: self._circle,
-            _C.NAV_RETURN_TO_LAUNCH: self._return,
-            _C.NAV_DELAY: self._delay,
-            _C.CONDITION_DELAY: self._wait,
-            _C.CONDITION_YAW: self._turn,
-            _C.DO_CHANGE_SPEED: self._change_speed,
-            _C.DO_SET_HOME: lambda item: set_home_from(copter, item),
-            **dict.fromkeys((_C.DO_SET_ROI, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_NONE), self._look_at),
+            Cmd.NAV_LOITER_TURNS: self._circle,
+            Cmd.NAV_RETURN_TO_LAUNCH: self._return,
+            Cmd.NAV_DELAY: self._delay,
+            Cmd.CONDITION_DELAY: self._wait,
+            Cmd.CONDITION_YAW: self._turn,
+            Cmd.DO_CHANGE_SPEED: self._change_speed,
+            Cmd.DO_SET_HOME: lambda item: set_home_from(copter, item),
+            **dict.fromkeys((Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE), self._look_at),
             **dict.fromkeys(_WITHOUT_EFFECT, lambda _: None),
         }
 
@@ -239,16 +238,16 @@ class CopterAuto(MissionMode):
         self.wait_for_origin()
         return True
 
-    def mission_started(self) -> None:
-        self._has_changed()
+    def on_mission_started(self) -> None:
+        self._upcoming_changed()  # remembers the commands
 
     def update(self, dt: float) -> None:
         self.start_if_waiting()
         if not self.is_waiting:
-            if self._has_changed() and isinstance(self._leg, _FlyLeg):
+            if self._upcoming_changed() and isinstance(self._leg, _FlyLeg):
                 self._restart_command()
             self.vehicle.mission.update()
-            self._has_changed()
+            self._upcoming_changed()  # remembers the commands
         if self.vehicle.mode is not self:
             return
         is_stopped = self.is_paused and isinstance(self._leg, _FlyLeg)
@@ -259,25 +258,24 @@ class CopterAuto(MissionMode):
         if not is_stopped:
             self.vehicle.yaw.update()
 
-    def _has_changed(self) -> bool:
-        """Return True if an upload changed the next commands while the current index stayed the same."""
+    def _upcoming_changed(self) -> bool:
+        """Return True if an upload changed the next three commands since the last call, at the same current index."""
         run, commands = self.vehicle.mission, self.vehicle.missions.commands
-        had_same_place = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
-        if commands.version == self._version and had_same_place:
+        has_same_index = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
+        if commands.version == self._list_version and has_same_index:
             return False
-        following = zip(run.navigation_from(max(1, run.nav_index)), range(3), strict=False)
-        upcoming = tuple(found for found, _ in following)
-        changed = upcoming != self._upcoming
-        self._version, self._upcoming = commands.version, upcoming
-        return changed and had_same_place
+        upcoming = tuple(islice(run.navigation_from(max(1, run.nav_index)), 3))
+        has_changed = upcoming != self._upcoming
+        self._list_version, self._upcoming = commands.version, upcoming
+        return has_changed and has_same_index
 
     def _restart_command(self) -> None:
         run = self.vehicle.mission
         if not run.is_running:
             return
-        done = run.set_current(run.nav_index)
-        text = "restarted command" if done else "but failed to restart command"
-        self.vehicle.send_text(MavSeverity.CRITICAL, f"Auto mission changed{',' if done else ''} {text}")
+        is_restarted = run.set_current(run.nav_index)
+        result = ", restarted command" if is_restarted else " but failed to restart command"
+        self.vehicle.send_text(MavSeverity.CRITICAL, f"Auto mission changed{result}")
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
         if self.vehicle.mode is not self or not self._is_done(index, item):
@@ -308,25 +306,27 @@ class CopterAuto(MissionMode):
             return self._is_leg_complete
         if command in _LANDINGS:
             return self._has_landed(index)
-        if command in (_C.NAV_LOITER_UNLIM, _C.NAV_GUIDED_ENABLE):
-            return command == _C.NAV_GUIDED_ENABLE and item.param1 == 0
-        if command == _C.NAV_DELAY:
+        if command == Cmd.NAV_LOITER_UNLIM:
+            return False
+        if command == Cmd.NAV_GUIDED_ENABLE:
+            return item.param1 == 0
+        if command == Cmd.NAV_DELAY:
             return now > self._delay_until
-        if command == _C.CONDITION_DELAY:
+        if command == Cmd.CONDITION_DELAY:
             return now - self._condition_from > max(0.0, item.param1)
-        if command == _C.CONDITION_DISTANCE:
+        if command == Cmd.CONDITION_DISTANCE:
             return horizontal_distance(self.vehicle, self.destination) < max(0.0, item.param1)
-        if command == _C.CONDITION_YAW:
-            return self.vehicle.yaw.keep_fixed(_HEADING_REACHED_RAD)
+        if command == Cmd.CONDITION_YAW:
+            return self.vehicle.yaw.turn_to_last_heading(_HEADING_REACHED_RAD)
         self.warn_if_unknown(item)
         return True
 
     def _has_stayed(self, index: int, seconds: float) -> bool:
         if not self._is_leg_complete:
             return False
-        now = self.vehicle.now
-        self._reached_at = self._reached_at or now
-        if math.floor(now - self._reached_at) < seconds:
+        self._reached_at = self._reached_at or self.vehicle.now
+        # The firmware counts whole seconds (mode_auto.cpp, verify_nav_wp).
+        if math.floor(self.vehicle.now - self._reached_at) < seconds:
             return False
         self.vehicle.info(f"Reached command #{index}")
         return True
@@ -350,37 +350,38 @@ class CopterAuto(MissionMode):
     def _place(self, item: MissionItem) -> Ned:
         """Return the place of an item; zero coordinates mean the vehicle's current coordinates."""
         leg = self._leg
-        here: Ned = self.vehicle.motion.place
+        current: Ned = self.vehicle.motion.place
         if isinstance(leg, _FlyLeg) and leg.is_complete:
-            here = leg.destination
-        point = self.vehicle.point(int(item.x), int(item.y), item.z, item.frame)
+            current = leg.destination  # The copter is there, except for a small error.
+        point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
         if point is None:
-            return here
-        north, east = here[:2] if (item.x, item.y) == (0, 0) else point[:2]
-        return (north, east, here[2] if item.z == 0 else point[2])
+            return current
+        north, east = current[:2] if (item.x, item.y) == (0, 0) else point[:2]
+        return (north, east, current[2] if item.z == 0 else point[2])
 
     def _go(self, place: Ned, *, stops: bool = True) -> None:
         self._reached_at = 0.0
         self.is_paused: bool = False
         if not self.vehicle.yaw.has_region_of_interest:
-            self.vehicle.yaw.default()
+            self.vehicle.yaw.apply_default()
         self._leg = _FlyLeg(self, place, stops=stops)
 
     def _fly(self, item: MissionItem) -> None:
         run = self.vehicle.mission
-        stops = item.command not in (_C.NAV_WAYPOINT, _C.NAV_SPLINE_WAYPOINT) or item.param1 > 0
+        stops = item.command not in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT) or item.param1 > 0
         if not stops:
             following = next(run.navigation_from(run.nav_index + 1), None)
-            stops = following is None or following[1].command not in _STOPS_NOT_BEFORE
+            stops = following is None or following[1].command not in _PASSED_BEFORE
         self._go(self._place(item), stops=stops)
 
     def _take_off(self, item: MissionItem) -> None:
         copter, down = self.vehicle, self.vehicle.motion.down
-        point = copter.point(0, 0, item.z, item.frame)
-        lowest = down - (_MIN_TAKE_OFF_M if copter.is_landed else 0.0)
+        point = copter.world_point(0, 0, item.z, item.frame)
         copter.yaw.hold()
-        target = min(lowest, down if point is None else point[2])
-        self._leg = _ClimbLeg(self, copter.ground_or_home_down - target)
+        # Never descend; from the ground, climb at least this much.
+        min_climb = _MIN_TAKE_OFF_M if copter.is_landed else 0.0
+        target_down = min(down - min_climb, down if point is None else point[2])
+        self._leg = _ClimbLeg(self, copter.ground_or_home_down - target_down)
 
     def _circle(self, item: MissionItem) -> None:
         self._leg = _CircleLeg(self, self._place(item), turns=item.param1, radius=item.param3)
@@ -398,8 +399,7 @@ class CopterAuto(MissionMode):
         leg.enter(force=True)
 
     def _delay(self, item: MissionItem) -> None:
-        # A delay until a time of day is not simulated, so it counts as no delay.
-        seconds = max(0.0, item.param1)
+        seconds = max(0.0, item.param1)  # A negative number means until a time of day, which is not simulated.
         self._delay_until = self.vehicle.now + seconds
         self.vehicle.info(f"Delaying {int(seconds)} sec")
 
@@ -408,10 +408,10 @@ class CopterAuto(MissionMode):
 
     def _turn(self, item: MissionItem) -> None:
         heading, direction = math.radians(item.param1), int(item.param3)
-        if item.param4 > 0:
+        if item.param4 > 0:  # The angle is relative, so that its sign is the direction.
             heading = self.vehicle.motion.yaw + math.copysign(heading, direction or 1.0)
             direction = 0
-        self.vehicle.yaw.fixed(wrap_pi(heading), math.radians(item.param2), direction)
+        self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)
 
     def _change_speed(self, item: MissionItem) -> None:
         if item.param2 <= 0:
@@ -425,5 +425,5 @@ class CopterAuto(MissionMode):
 
     def _look_at(self, item: MissionItem) -> None:
         is_none = (item.x, item.y, item.z) == (0, 0, 0)
-        point = None if is_none else self.vehicle.point(int(item.x), int(item.y), item.z, MavFrame.GLOBAL)
+        point = None if is_none else self.vehicle.world_point(int(item.x), int(item.y), item.z, MavFrame.GLOBAL)
         self.vehicle.yaw.region_of_interest(point)

@@ -31,9 +31,12 @@ class CopterArming(ArduPilotArming[CopterHost]):
         return super().ahrs_reasons() or self.mandatory_reasons()
 
     def own_reasons(self) -> list[str]:
-        failsafes = self.vehicle.failsafes
-        reasons = ["GCS failsafe on"] if failsafes.ground_station else []
-        return [*reasons, "Battery failsafe"] if failsafes.battery_is_low else reasons
+        reasons = []
+        if self.vehicle.failsafes.ground_station:
+            reasons.append("GCS failsafe on")
+        if self.vehicle.failsafes.battery_is_low:
+            reasons.append("Battery failsafe")
+        return reasons
 
     def mandatory_reasons(self) -> list[str]:
         copter, nav = self.vehicle, self.vehicle.navigation
@@ -44,15 +47,15 @@ class CopterArming(ArduPilotArming[CopterHost]):
             reasons.append("Need Alt Estimate")
         return reasons
 
-    def armed(self) -> None:
+    def on_armed(self) -> None:
         self.vehicle.path.reset()
 
     def final_reasons(self) -> list[str]:
         mode = self.vehicle.mode
         if not mode.can_arm:
             return [f"{mode.name} mode not armable"]
-        high = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
-        if not mode.arms_with_raised_throttle and self.vehicle.rc[2] > high:
+        max_throttle = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
+        if not mode.arms_with_raised_throttle and self.vehicle.rc[2] > max_throttle:
             return ["Throttle too high"]
         return []
 
@@ -74,7 +77,7 @@ _FALLBACK_TEXTS = {
     _SMART_RTL_OR_LAND: "SmartRTL Unavailable, Using Land Mode",
     _BRAKE: "Trying Land Mode",
 }
-# Bits of FS_OPTIONS that continue the flight in spite of a failsafe: (modes, bit, text).
+# Bits of FS_OPTIONS that continue the flight in spite of a failsafe; in the tables: (modes, bit, text).
 _IF_LANDING = 8
 _RADIO_OPTIONS = (
     (frozenset({"AUTO"}), 1, "Continuing Auto"),
@@ -116,33 +119,33 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
     def _check_radio(self) -> None:
         """Detect missing pulses for RC_FS_TIMEOUT, or a throttle below FS_THR_VALUE."""
         copter, parameters = self.vehicle, self.vehicle.parameters
-        receives = copter.rc.is_receiving
-        if receives:
+        is_receiving = copter.rc.is_receiving
+        if is_receiving:
             self.radio_received_at: float = copter.now
         if not parameters["FS_THR_ENABLE"]:
-            self._set_radio(False)
+            self._set_radio(is_lost=False)
             return
-        low = copter.rc[2] < parameters["FS_THR_VALUE"]
-        if receives and not low:
+        is_throttle_low = copter.rc[2] < parameters["FS_THR_VALUE"]
+        if is_receiving and not is_throttle_low:
             if math.isnan(self._radio_good_at):
                 self._radio_good_at = copter.now
             if copter.now - self._radio_good_at >= _MIN_PULSES_S:
-                self._set_radio(False)
+                self._set_radio(is_lost=False)
             return
-        if math.isnan(self.radio_received_at):
+        if math.isnan(self.radio_received_at):  # No transmitter was ever received, so none can be lost.
             return
-        silent = copter.now - self.radio_received_at >= parameters["RC_FS_TIMEOUT"]
+        is_silent = copter.now - self.radio_received_at >= parameters["RC_FS_TIMEOUT"]
         self._radio_good_at = math.nan
-        if (receives and low) or silent:
-            self._set_radio(True)
+        if is_receiving or is_silent:  # While pulses are received, the throttle is low.
+            self._set_radio(is_lost=True)
 
-    def _set_radio(self, lost: bool) -> None:
-        if lost == self.radio:
+    def _set_radio(self, *, is_lost: bool) -> None:
+        if is_lost == self.radio:
             return
-        self.radio = lost
-        if lost:
-            action = self._link_parameter("FS_THR_ENABLE", _LAND)
-            self._execute(self._link_action("Radio", action, _RADIO_OPTIONS))
+        self.radio = is_lost
+        if is_lost:
+            action = self._configured_action("FS_THR_ENABLE", _LAND)
+            self._execute(self._action_after_loss("Radio", action, _RADIO_OPTIONS))
         else:
             self.warn("Radio Failsafe Cleared")
 
@@ -150,45 +153,47 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         copter, parameters = self.vehicle, self.vehicle.parameters
         if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
             return
-        lost = self.ground_station_silence > parameters["FS_GCS_TIMEOUT"]
-        if lost == self.ground_station:
+        is_lost = self.ground_station_silence > parameters["FS_GCS_TIMEOUT"]
+        if is_lost == self.ground_station:
             return
-        self.ground_station = lost
-        if not lost:
+        self.ground_station = is_lost
+        if not is_lost:
             self.warn("GCS Failsafe Cleared")
             return
         copter.rc.release_overrides()
         if copter.is_armed:
-            self._execute(self._link_action("GCS", self._link_parameter("FS_GCS_ENABLE", _RTL), _GCS_OPTIONS))
+            action = self._configured_action("FS_GCS_ENABLE", _RTL)
+            self._execute(self._action_after_loss("GCS", action, _GCS_OPTIONS))
         else:
             self.warn("GCS Failsafe")
 
-    def _link_parameter(self, name: str, default: int) -> int:
-        value = int(self.vehicle.parameters[name])
+    def _configured_action(self, parameter: str, default: int) -> int:
+        value = int(self.vehicle.parameters[parameter])
         return _LINK_ACTIONS[value] if 0 <= value < len(_LINK_ACTIONS) else default
 
-    def _link_action(self, name: str, action: int, options: Sequence[tuple[frozenset[str], int, str]]) -> int:
-        """Report the loss of a link and return the action that follows."""
+    def _action_after_loss(self, name: str, action: int, options: Sequence[tuple[frozenset[str], int, str]]) -> int:
+        """Report the loss of the link ``name``. Return ``action``, or what replaces it in the present situation."""
         mode = self.vehicle.mode
-        if self._disarms(name):
+        if self._disarm_if_landed(name):
             return _NONE
         if mode.is_landing:
-            if self.battery_is_low and self.battery.priority <= self.BATTERY_PRIORITIES.index(_LAND):
-                return self._continue(f"{name} + Battery", "Continuing Landing", _LAND)
+            is_landing_for_battery = self.battery.priority <= self.BATTERY_PRIORITIES.index(_LAND)
+            if self.battery_is_low and is_landing_for_battery:
+                return self._report_continuation(f"{name} + Battery", "Continuing Landing", _LAND)
             if self._has_option(_IF_LANDING):
-                return self._continue(name, "Continuing Landing", _LAND)
+                return self._report_continuation(name, "Continuing Landing", _LAND)
         for modes, bit, text in options:
             if mode.name in modes and self._has_option(bit):
-                return self._continue(name, text)
+                return self._report_continuation(name, text)
         self.warn(f"{name} Failsafe")
         return action
 
     def act_on_battery(self, action: int) -> None:
         """Execute the action; on the ground disarm instead. With FS_OPTIONS bit 3 a landing continues."""
-        if self._disarms("Battery"):
+        if self._disarm_if_landed("Battery"):
             return
         if self.vehicle.mode.is_landing and self._has_option(_IF_LANDING) and action != _NONE:
-            action = self._continue("Battery", "Continuing Landing", _LAND)
+            action = self._report_continuation("Battery", "Continuing Landing", _LAND)
         else:
             self.warn("Battery Failsafe")
         self._execute(action)
@@ -223,18 +228,19 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
     def _check_idling(self) -> None:
         """Disarm if the motors have idled on the ground for DISARM_DELAY."""
         copter, delay = self.vehicle, self.vehicle.parameters["DISARM_DELAY"]
-        idles = copter.is_armed and copter.is_landed and copter.motors.is_idle
-        if 0 < delay <= self._idling.seconds(idles and delay > 0, copter.now):
+        is_idling = copter.is_armed and copter.is_landed and copter.motors.is_idle
+        idling_for = self._idling.seconds(is_idling and delay > 0, copter.now)
+        if 0 < delay <= idling_for:
             copter.arming.disarm()
 
     def _has_option(self, bit: int) -> bool:
         return bool(int(self.vehicle.parameters["FS_OPTIONS"]) & bit)
 
-    def _continue(self, name: str, text: str, action: int = _NONE) -> int:
+    def _report_continuation(self, name: str, text: str, action: int = _NONE) -> int:
         self.warn(f"{name} Failsafe - {text}")
         return action
 
-    def _disarms(self, name: str) -> bool:
+    def _disarm_if_landed(self, name: str) -> bool:
         """Disarm a landed vehicle and return True; return False in the air or if a mission is about to take off."""
         copter = self.vehicle
         if not copter.is_landed or (copter.mode.needs_mission and not copter.motors.is_idle):
@@ -249,7 +255,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
     def _execute(self, action: int) -> None:
         if action == _TERMINATE:
             self.vehicle.arming.disarm()
-        if action == _AUTO:
+        if action == _AUTO:  # The firmware looks for a landing sequence first, which is not simulated.
             self.warn("Unable to start landing sequence")
             self.warn("Mode change to AUTO RTL failed: No return path or landing sequence found")
             self.warn("Trying RTL Mode")
@@ -280,7 +286,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
     CHECKS_DISARMED: ClassVar[bool] = True
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
-    def act(self, new: int) -> None:
+    def act(self, new_breaches: int) -> None:
         """Disarm on the ground; execute FENCE_ACTION in the air."""
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
@@ -288,15 +294,15 @@ class CopterFence(ArduPilotFence[CopterHost]):
             if action != REPORT_ONLY:
                 vehicle.arming.disarm()
             return
-        self.report("breached", new)
+        self.report("breached", new_breaches)
         if action == REPORT_ONLY:
             return
         modes = _FENCE_ACTIONS.get(action, _FENCE_ACTIONS[1])
-        if self.beyond_m(new) > _LAND_BEYOND_M:
+        if self.beyond_m(new_breaches) > _LAND_BEYOND_M:
             modes = (CopterMode.LAND,)
-        self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
+        self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)  # until one is not refused
 
-    def cleared(self) -> None:
+    def on_cleared(self) -> None:
         if not self.vehicle.is_landed:
             self.vehicle.send_text(MavSeverity.NOTICE, "Fence breach cleared")
 
@@ -305,8 +311,8 @@ class CopterFence(ArduPilotFence[CopterHost]):
             return None
         return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"
 
-    def mode_changed(self) -> None:
+    def on_mode_changed(self) -> None:
         """Suspend the fence's actions for ten seconds, unless FENCE_ACTION only reports."""
-        super().mode_changed()
+        super().on_mode_changed()
         if self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY:
             self.recover_by_hand()

@@ -42,12 +42,14 @@ class CopterGuided(CopterModeBase):
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
         self.submode: GuidedSubmode = GuidedSubmode.VELOCITY
+        # Limits in m/s.
         self.speed: float = 0.0
         self.climb: float = 0.0
-        self.descent: float = 0.0  # Limits in m/s.
+        self.descent: float = 0.0
+        # Targets in the world frame: north, east, down.
         self.position: Ned = _ZERO
         self.velocity: Ned = _ZERO
-        self.acceleration: Ned = _ZERO  # Targets in the world frame: north, east, down.
+        self.acceleration: Ned = _ZERO
         self._attitude = (0.0, 0.0)
         self._body_rates: tuple[float, float] | None = None
         self._attitude_climb = 0.0
@@ -132,7 +134,7 @@ class CopterGuided(CopterModeBase):
         self._take_off, self.is_taking_off = None, False
         self.speed = copter.speed_limit("WPNAV_SPEED")
         self.climb, self.descent = copter.speed_limit("WPNAV_SPEED_UP"), copter.speed_limit("WPNAV_SPEED_DN")
-        copter.yaw.default()
+        copter.yaw.apply_default()
 
     def update(self, dt: float) -> None:
         copter = self.vehicle
@@ -148,7 +150,7 @@ class CopterGuided(CopterModeBase):
         elif copter.is_landed:
             copter.hold_position()  # Only a take-off command or a climb rate leaves the ground.
         else:
-            copter.motors.wanted = True
+            copter.motors.spool_up_requested = True
             self._run_target()
             copter.yaw.update()
 
@@ -164,7 +166,7 @@ class CopterGuided(CopterModeBase):
         (roll, pitch), climb = self._attitude, self._attitude_climb
         if self._is_stale:
             roll = pitch = climb = 0.0
-        copter.motors.wanted = not copter.is_landed or climb > 0
+        copter.motors.spool_up_requested = not copter.is_landed or climb > 0
         if copter.is_landed:
             copter.is_landed = not (climb > 0 and copter.motors.can_lift)
             return
@@ -185,14 +187,15 @@ class CopterGuided(CopterModeBase):
             else:
                 motion.seek_acceleration(*self.acceleration)
         else:
-            errors = (target - now for target, now in zip(self.position, motion.place, strict=True))
+            # The distance to the moving position corrects the velocity, with a gain of 1 per second.
+            errors = (target - current for target, current in zip(self.position, motion.place, strict=True))
             north, east, down = (speed + error for speed, error in zip(self.velocity, errors, strict=True))
             self._seek_velocity(north, east, down)
 
     def _seek_velocity(self, north: float, east: float, down: float) -> None:
-        size = math.hypot(north, east)
-        if size > self.speed:
-            north, east = north * self.speed / size, east * self.speed / size
+        horizontal_speed = math.hypot(north, east)
+        if horizontal_speed > self.speed:
+            north, east = north * self.speed / horizontal_speed, east * self.speed / horizontal_speed
         self.vehicle.motion.seek_velocity(north, east, max(-self.climb, min(self.descent, down)))
 
 
@@ -226,18 +229,20 @@ class CopterSetpoints:
             return
         frame = target.coordinate_frame
         point = self._copter.local_point(target, _BODY)
-        if frame not in _LOCAL or not self._apply(target, point, rotate=frame in _BODY):
+        if frame not in _LOCAL or not self._follow(target, point, rotate=frame in _BODY):
             self._guided.enter(force=False)
 
     def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
         if not self._is_guided:
             return
-        point = self._copter.point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
+        point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
         is_invalid = point is None and Setpoint.of(target).has_position
-        if is_invalid or not self._apply(target, point or _ZERO, rotate=False):
+        # Without a position in the set-point, any point does.
+        if is_invalid or not self._follow(target, point or _ZERO, rotate=False):
             self._guided.enter(force=False)
 
-    def _apply(self, target: PositionTarget, point: Ned, *, rotate: bool) -> bool:
+    def _follow(self, target: PositionTarget, point: Ned, *, rotate: bool) -> bool:
+        """Follow a set-point; return False if it is invalid. With ``rotate``, its vectors are in the body frame."""
         setpoint, motion, yaw = Setpoint.of(target), self._copter.motion, self._copter.yaw
         velocity = setpoint.velocity if setpoint.has_velocity else None
         acceleration = setpoint.acceleration if setpoint.has_acceleration else None
@@ -251,11 +256,11 @@ class CopterSetpoints:
         if not self._guided.set_target(position, velocity, acceleration):
             return False
         if setpoint.yaw is not None:
-            yaw.fixed(setpoint.yaw + (motion.yaw if rotate else 0.0))
+            yaw.turn_to(setpoint.yaw + (motion.yaw if rotate else 0.0))
         elif setpoint.yaw_rate is not None:
             yaw.turn(setpoint.yaw_rate)
         else:
-            yaw.default()
+            yaw.apply_default()
         return True
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
@@ -263,23 +268,24 @@ class CopterSetpoints:
         guided = copter.mode
         if not isinstance(guided, CopterGuided):
             return
-        rates_ignored = mask & _ALL_RATES
-        size = math.sqrt(sum(part * part for part in target.q))
-        is_invalid = mask & AttitudeMask.THROTTLE_IGNORE or rates_ignored not in (0, _ALL_RATES)
-        if is_invalid or (not mask & AttitudeMask.ATTITUDE_IGNORE and not abs(size - 1.0) < 1e-3):
+        has_attitude, ignored_rates = not mask & AttitudeMask.ATTITUDE_IGNORE, mask & _ALL_RATES
+        quaternion_norm = math.sqrt(sum(component * component for component in target.q))
+        has_some_rates = ignored_rates not in (0, _ALL_RATES)
+        is_invalid = mask & AttitudeMask.THROTTLE_IGNORE or has_some_rates
+        if is_invalid or (has_attitude and not abs(quaternion_norm - 1.0) < 1e-3):
             guided.enter(force=False)
             return
         roll = pitch = 0.0
-        if not mask & AttitudeMask.ATTITUDE_IGNORE:
+        if has_attitude:
             roll, pitch, yaw = euler_from_quaternion(*target.q)
             copter.motion.face(yaw)
-        elif not rates_ignored:
+        elif not ignored_rates:
             copter.motion.turn(target.body_yaw_rate)
         # Thrust is a climb rate; 0.5 holds the altitude. Thrust as throttle (GUID_OPTIONS bit 3) is not simulated.
-        share = (max(0.0, min(1.0, target.thrust)) - 0.5) * 2.0
-        name = "WPNAV_SPEED_UP" if share > 0 else "WPNAV_SPEED_DN"
-        climb = share * copter.parameters[name] / 100.0
-        if mask & AttitudeMask.ATTITUDE_IGNORE and not rates_ignored:
+        climb_share = (max(0.0, min(1.0, target.thrust)) - 0.5) * 2.0
+        max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
+        climb = climb_share * copter.parameters[max_climb_parameter] / 100.0
+        if not has_attitude and not ignored_rates:
             guided.rotate(target.body_roll_rate, target.body_pitch_rate, climb)
         else:
             guided.lean(roll, pitch, climb)

@@ -12,6 +12,7 @@ from aerokit.sim.commands import rotated
 from aerokit.sim.motion import Ned, wrap_pi
 
 _MIN_LOOK_AHEAD_M_S = 0.5
+_HEADING_TOLERANCE_RAD = 0.02
 
 
 class AutoYaw:
@@ -19,65 +20,68 @@ class AutoYaw:
 
     def __init__(self, copter: ArduPilotVehicle) -> None:
         self._copter = copter
-        self._apply: Callable[[], None] = self._hold
+        self._control: Callable[[], None] = self._hold
+        """The method that `update` calls at every tick."""
         self._roi: tuple[float, float] | None = None
         self._heading = 0.0
         self._rate = 0.0
+        """Turn rate of `turn`, or of `turn_to` while the commanded direction is the longer way, else 0."""
 
     def hold(self) -> None:
-        self._apply = self._hold
+        self._control = self._hold
         self._copter.motion.turn(0.0)
 
-    def default(self, *, returning: bool = False) -> None:
+    def apply_default(self, *, returning: bool = False) -> None:
         """Apply WP_YAW_BEHAVIOR: hold (0), look ahead (1), look ahead except when returning home (2).
 
         Every new guided target calls this, which ends a commanded heading or region of interest.
         """
         behaviour = int(self._copter.parameters["WP_YAW_BEHAVIOR"])
         if behaviour == 1 or (behaviour == 2 and not returning):
-            self._apply = self._look_ahead
+            self._control = self._look_ahead
         else:
             self.hold()
 
-    def fixed(self, heading: float, rate: float = 0.0, direction: int = 0) -> None:
+    def turn_to(self, heading: float, rate: float = 0.0, direction: int = 0) -> None:
         """Turn to a heading (radians). ``rate`` 0 is the default rate, ``direction`` 1 clockwise, -1 anticlockwise."""
         motion = self._copter.motion
-        self._heading, self._apply = wrap_pi(heading), self._go_to_heading
+        self._heading, self._control = wrap_pi(heading), self._go_to_heading
         self._rate = 0.0
         offset = wrap_pi(self._heading - motion.yaw)
-        if direction and math.copysign(1, offset) != direction and abs(offset) > 0.02:
+        is_longer_way = direction and math.copysign(1, offset) != direction
+        if is_longer_way and abs(offset) > _HEADING_TOLERANCE_RAD:  # `Motion.face` turns the shorter way.
             self._rate = direction * (rate or motion.limits.turn_rate_rad_s)
 
-    def keep_fixed(self, tolerance: float) -> bool:
-        """Turn to the last `fixed` heading again; return True within ``tolerance`` radians of it."""
-        self._apply = self._go_to_heading
+    def turn_to_last_heading(self, tolerance: float) -> bool:
+        """Turn to the last `turn_to` heading again; return True within ``tolerance`` radians of it."""
+        self._control = self._go_to_heading
         return abs(wrap_pi(self._heading - self._copter.motion.yaw)) <= tolerance
 
     @property
     def has_region_of_interest(self) -> bool:
-        return self._apply == self._look_at_roi
+        return self._control == self._look_at_roi
 
     def turn(self, rate: float) -> None:
         """Turn continuously, in radians per second."""
-        self._rate, self._apply = rate, self._turn
+        self._rate, self._control = rate, self._turn
 
     def region_of_interest(self, point: Ned | None) -> None:
         """Turn towards a place until the next target; None stops. A gimbal, if fitted, turns instead of the copter."""
         gimbal = self._copter.gimbal
         gimbal.look_at(point)
         if point is None:
-            self.default()
+            self.apply_default()
         elif not gimbal.is_fitted:
             self._roi = point[:2]
-            self._apply = self._look_at_roi
+            self._control = self._look_at_roi
 
     def stop_turning(self) -> None:
         """Stop turning because the set-points with a turn rate have stopped."""
-        if self._apply == self._turn:
+        if self._control == self._turn:
             self.hold()
 
     def update(self) -> None:
-        self._apply()
+        self._control()
 
     def _hold(self) -> None:
         pass
@@ -131,7 +135,7 @@ class CopterHost(ArduPilotVehicle):
 
     def fly_to(self, target: Ned, speed: float) -> float:
         """Fly towards a target with the default climb and sink rates; return the distance in metres."""
-        self.motors.wanted = True
+        self.motors.spool_up_requested = True
         climb, descent = self.speed_limit("WPNAV_SPEED_UP"), self.speed_limit("WPNAV_SPEED_DN")
         self.motion.seek_position(*target, speed=speed, climb=climb, descent=descent)
         self.yaw.update()
@@ -139,12 +143,12 @@ class CopterHost(ArduPilotVehicle):
 
     def hold_position(self) -> None:
         """Hold the position; on the ground let the motors idle."""
-        self.motors.wanted = not self.is_landed
+        self.motors.spool_up_requested = not self.is_landed
         self.motion.seek_velocity(0.0, 0.0, 0.0)
 
     def descend(self) -> None:
         """Descend with the speeds of LAND; on the ground let the motors idle."""
-        self.motors.wanted = not self.is_landed
+        self.motors.spool_up_requested = not self.is_landed
         if self.is_landed:
             return
         speed = self.speed_limit("LAND_SPEED")
@@ -174,7 +178,7 @@ class CopterTakeOff:
 
     def update(self, climb_m_s: float) -> None:
         copter, motion = self._copter, self._copter.motion
-        copter.motors.wanted = True
+        copter.motors.spool_up_requested = True
         if copter.is_landed:
             copter.is_landed = not copter.motors.can_lift
             return
@@ -223,7 +227,7 @@ class CopterPilotedMode(CopterModeBase):
                 self._take_off, self.is_taking_off = None, False
             return
         climb = self.climb_from_stick()
-        copter.motors.wanted = not copter.is_landed or climb > 0
+        copter.motors.spool_up_requested = not copter.is_landed or climb > 0
         if copter.is_landed and climb > 0 and copter.motors.can_lift:
             copter.is_landed = False
         if copter.is_landed:
@@ -297,7 +301,7 @@ class CopterRtl(CopterModeBase):
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
         self._phase = "climb"
-        self._altitude_down = 0.0
+        self._return_down = 0.0
         self._waiting_since = 0.0
         self._place: Ned = (0.0, 0.0, 0.0)
         self.speed: float = 0.0
@@ -310,34 +314,34 @@ class CopterRtl(CopterModeBase):
         self._place = best_return_place(copter, home, is_allowed=copter.fence.contains)
         north, east, down = self._place
         distance = math.hypot(north - copter.motion.north, east - copter.motion.east)
-        self._altitude_down = min(down, home[2] - self._return_altitude(distance))
-        copter.yaw.default(returning=True)
+        self._return_down = min(down, home[2] - self._return_altitude(distance))
+        copter.yaw.apply_default(returning=True)
         return True
 
     def _return_altitude(self, distance: float) -> float:
         """Return the altitude of the way back in metres above home."""
         parameters = self.vehicle.parameters
-        now = self.vehicle.navigation.altitude_above_home
-        lowest = now + parameters["RTL_CLIMB_MIN"] / 100.0
-        target = max(lowest, parameters["RTL_ALT"] / 100.0, _RTL_MIN_ALTITUDE_M)
+        current = self.vehicle.navigation.altitude_above_home
+        after_min_climb = current + parameters["RTL_CLIMB_MIN"] / 100.0
+        target = max(after_min_climb, parameters["RTL_ALT"] / 100.0, _RTL_MIN_ALTITUDE_M)
         if parameters["RTL_CONE_SLOPE"] > 0:
-            target = min(target, max(distance * parameters["RTL_CONE_SLOPE"], _RTL_MIN_ALTITUDE_M, now))
-        return max(target, now)
+            target = min(target, max(distance * parameters["RTL_CONE_SLOPE"], _RTL_MIN_ALTITUDE_M, current))
+        return max(target, current)
 
     @property
     def destination(self) -> Ned | None:
         """Target of the current phase."""
         north, east, down = self._place
         if self._phase == "climb":
-            return (self.vehicle.motion.north, self.vehicle.motion.east, self._altitude_down)
-        return (north, east, down if self._phase == "land" else self._altitude_down)
+            return (self.vehicle.motion.north, self.vehicle.motion.east, self._return_down)
+        return (north, east, down if self._phase == "land" else self._return_down)
 
     def update(self, dt: float) -> None:
         copter, target = self.vehicle, self.destination
         if self._phase == "land":
             copter.land()
         elif copter.is_landed:  # The copter disarms after DISARM_DELAY.
-            copter.motors.wanted = False
+            copter.motors.spool_up_requested = False
         elif target is not None:
             self._next_phase(copter.fly_to(target, self.speed))
 
@@ -361,37 +365,37 @@ class CopterSmartRtl(CopterModeBase):
 
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
-        self._way: list[Ned] = []
+        self._way_back: list[Ned] = []
 
     def enter(self, *, force: bool) -> bool:
         if not self.vehicle.path.is_active:
             return False
-        self._way, self.is_landing = self.vehicle.path.take_way_back(), False
-        self._raise_last(_SMART_RTL_EXTRA_ALTITUDE_M)
-        self.vehicle.yaw.default(returning=True)
+        self._way_back, self.is_landing = self.vehicle.path.take_way_back(), False
+        self._raise_last(_SMART_RTL_EXTRA_ALTITUDE_M)  # The copter lands from there.
+        self.vehicle.yaw.apply_default(returning=True)
         return True
 
     def _raise_last(self, metres: float) -> None:
-        if self._way:
-            north, east, down = self._way[-1]
-            self._way[-1] = (north, east, down - metres)
+        if self._way_back:
+            north, east, down = self._way_back[-1]
+            self._way_back[-1] = (north, east, down - metres)
 
     def leave(self) -> None:
         """Restore the points that were not reached, so that a later SMART_RTL can use them."""
-        if self._way:
+        if self._way_back:
             self._raise_last(-_SMART_RTL_EXTRA_ALTITUDE_M)
-            self.vehicle.path.restore(self._way)
+            self.vehicle.path.restore(self._way_back)
 
     @property
     def destination(self) -> Ned | None:
-        return self._way[0] if self._way else None
+        return self._way_back[0] if self._way_back else None
 
     def update(self, dt: float) -> None:
         copter = self.vehicle
-        if copter.is_landed or not self._way:
+        if copter.is_landed or not self._way_back:
             self.is_landing: bool = True
             copter.land()
             return
-        radius = _ARRIVED_M if len(self._way) == 1 else copter.parameters["WPNAV_RADIUS"] / 100
-        if copter.fly_to(self._way[0], copter.speed_limit("WPNAV_SPEED")) < radius:
-            del self._way[0]
+        radius = _ARRIVED_M if len(self._way_back) == 1 else copter.parameters["WPNAV_RADIUS"] / 100
+        if copter.fly_to(self._way_back[0], copter.speed_limit("WPNAV_SPEED")) < radius:
+            del self._way_back[0]

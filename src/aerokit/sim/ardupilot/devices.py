@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import GripperActions, MavResult, MavSeverity, ParachuteAction, WinchActions
+from aerokit.mavlink.enums import GripperActions, MavSeverity, ParachuteAction, WinchActions
+from aerokit.mavlink.enums import MavResult as Result
 from aerokit.sim.commands import ReceivedCommand, whole
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.host import ArduPilotHost
 
-_R = MavResult
 _GRIP_S = 0.7
 _WINCH_RATE_M_S, _WINCH_STEP_S = 1.0, 0.1
 _MIN_CHUTE_ALTITUDE_M = 10.0
@@ -36,25 +36,26 @@ class ArduPilotDevices:
         """Move the servo gripper. The answer comes at once, a status text at the end (AP_Gripper_Servo.cpp)."""
         is_known = command.param2 in (GripperActions.GRAB, GripperActions.RELEASE)
         if not self._is_set("GRIP_ENABLE") or not is_known:
-            return _R.FAILED
-        grabs, done = command.param2 == GripperActions.GRAB, "grabbed" if command.param2 else "released"
-        if grabs is not self.is_gripped:
-            self._vehicle.info(f"Gripper load {'grabbing' if grabs else 'releasing'}")
+            return Result.FAILED
+        is_grab = command.param2 == GripperActions.GRAB
+        moves = is_grab is not self.is_gripped
+        if moves:
+            self._vehicle.info(f"Gripper load {'grabbing' if is_grab else 'releasing'}")
 
         def finish() -> None:
-            self._vehicle.info(f"Gripper load {done}")
+            self._vehicle.info(f"Gripper load {'grabbed' if is_grab else 'released'}")
 
-        self._vehicle.call_later(0.0 if grabs is self.is_gripped else _GRIP_S, finish)
-        self.is_gripped = grabs
-        return _R.ACCEPTED
+        self._vehicle.call_later(_GRIP_S if moves else 0.0, finish)
+        self.is_gripped = is_grab
+        return Result.ACCEPTED
 
     def move_gear(self, command: ReceivedCommand) -> int:
         """Accept every command, like the firmware without a landing gear."""
-        up = command.param2 == 1
-        if self._is_set("LGR_ENABLE") and up is not self.gear_is_up:
-            self.gear_is_up = up
-            self._vehicle.info(f"LandingGear: {'RETRACT' if up else 'DEPLOY'}")
-        return _R.ACCEPTED
+        is_retraction = command.param2 == 1
+        if self._is_set("LGR_ENABLE") and is_retraction is not self.gear_is_up:
+            self.gear_is_up = is_retraction
+            self._vehicle.info(f"LandingGear: {'RETRACT' if is_retraction else 'DEPLOY'}")
+        return Result.ACCEPTED
 
     def handle_chute(self, command: ReceivedCommand) -> int:
         vehicle = self._vehicle
@@ -62,7 +63,7 @@ class ArduPilotDevices:
             if "CHUTE_ENABLED" in vehicle.parameters:
                 vehicle.parameters["CHUTE_ENABLED"] = command.param1
         elif command.param1 != ParachuteAction.RELEASE:
-            return _R.FAILED
+            return Result.FAILED
         elif self._is_set("CHUTE_ENABLED"):
             if vehicle.is_landed:
                 vehicle.info("Parachute: Landed")
@@ -72,12 +73,13 @@ class ArduPilotDevices:
                 self.chute_is_released = True
                 vehicle.info("Parachute: Released")
                 vehicle.arming.disarm(force=True)
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
-    def wind(self, command: ReceivedCommand) -> int:
+    def move_winch(self, command: ReceivedCommand) -> int:
+        """Start or stop the winch (MAV_CMD_DO_WINCH)."""
         action = whole(command.param2)
         if not self._is_set("WINCH_TYPE") or action > WinchActions.RATE_CONTROL:
-            return _R.FAILED
+            return Result.FAILED
         was_moving = self.line_rate_m_s != 0.0
         self._goal_m, self.line_rate_m_s = None, 0.0
         if action == WinchActions.RATE_CONTROL:
@@ -87,10 +89,11 @@ class ArduPilotDevices:
             self.line_rate_m_s = _WINCH_RATE_M_S if command.param3 > 0 else -_WINCH_RATE_M_S
         if not was_moving and self.line_rate_m_s:
             self._vehicle.call_later(_WINCH_STEP_S, self._run)
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def _run(self) -> None:
         self.line_m += self.line_rate_m_s * _WINCH_STEP_S
+        # The remaining length and the rate have opposite signs once the line has passed the goal.
         if self._goal_m is not None and (self._goal_m - self.line_m) * self.line_rate_m_s <= 0:
             self.line_rate_m_s = 0.0
         if self.line_rate_m_s:
@@ -100,6 +103,6 @@ class ArduPilotDevices:
         """Return WINCH_STATUS; None without a winch."""
         if not self._is_set("WINCH_TYPE"):
             return None
-        unknown = float("nan")
-        rest = (self.line_m, self.line_rate_m_s, unknown, unknown, unknown, 0x7FFF, 1)
-        return m.WinchStatus(self._vehicle.time_boot_us, *rest)
+        unknown, unknown_temperature, healthy = float("nan"), 0x7FFF, 1
+        electrical = (unknown, unknown, unknown, unknown_temperature)  # tension, voltage, current
+        return m.WinchStatus(self._vehicle.time_boot_us, self.line_m, self.line_rate_m_s, *electrical, healthy)

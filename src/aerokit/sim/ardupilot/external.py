@@ -17,7 +17,7 @@ _SENSORS = (
     *(m.VisionSpeedEstimate, m.GpsInput, m.ObstacleDistance, m.ObstacleDistance3d),
     *(m.DistanceSensor, m.OpticalFlow),
 )
-_MAVLINK = 1
+_PLND_TYPE_MAVLINK = 1
 _TARGET_TIMEOUT_S = 2.0
 
 
@@ -37,10 +37,10 @@ class ArduPilotExternal:
 
     def listen(self) -> None:
         vehicle = self._vehicle
-        for kind in _EXTERNAL_NAVIGATION:
-            vehicle.on(kind, self._on_navigation)
-        for sensor in _SENSORS:
-            vehicle.on(sensor, self._on_sensor)
+        for navigation_message in _EXTERNAL_NAVIGATION:
+            vehicle.on(navigation_message, self._on_navigation)
+        for sensor_message in _SENSORS:
+            vehicle.on(sensor_message, self._on_sensor)
         vehicle.on(m.LandingTarget, self._on_target)
 
     @property
@@ -69,7 +69,7 @@ class ArduPilotExternal:
 
     def _on_target(self, target: m.LandingTarget, _: Channel) -> None:
         parameters, motion = self._vehicle.parameters, self._vehicle.motion
-        is_enabled = parameters.get("PLND_ENABLED", 0.0) and parameters.get("PLND_TYPE", 0.0) == _MAVLINK
+        is_enabled = parameters.get("PLND_ENABLED", 0.0) and parameters.get("PLND_TYPE", 0.0) == _PLND_TYPE_MAVLINK
         if not is_enabled or target.frame not in (MavFrame.BODY_FRD, MavFrame.LOCAL_FRD):
             return
         self.latest[type(target)] = target

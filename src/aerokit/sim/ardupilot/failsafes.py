@@ -36,7 +36,7 @@ class BatteryFailsafe:
         """Check now. A low charge counts at once, a low voltage only after BATT_LOW_TIMER."""
         if not self._vehicle.motors.is_armed:
             return
-        level = max(self._below(_LOW), self._below(_CRITICAL))
+        level = max(self._level_if_below(_LOW), self._level_if_below(_CRITICAL))
         if level <= self.level:
             return
         self.level = level
@@ -57,27 +57,30 @@ class BatteryFailsafe:
         if self._remaining_mah() < parameters["BATT_ARM_MAH"]:
             return "Battery 1 below minimum arming capacity"
         for level, word in _WORDS.items():
-            for is_below, quantity in zip(self._is_below(level), ("voltage", "capacity"), strict=True):
-                if is_below:
-                    return f"Battery 1 {word} {quantity} failsafe"
+            is_voltage_low, is_charge_low = self._is_voltage_and_charge_low(level)
+            if is_voltage_low:
+                return f"Battery 1 {word} voltage failsafe"
+            if is_charge_low:
+                return f"Battery 1 {word} capacity failsafe"
         for name, quantity in (("MAH", "capacity"), ("VOLT", "voltage")):
             if 0.0 < parameters[f"BATT_LOW_{name}"] <= parameters[f"BATT_CRT_{name}"]:
                 return f"Battery 1 {quantity} failsafe critical >= low"
         return None
 
-    def _below(self, level: int) -> int:
+    def _level_if_below(self, level: int) -> int:
         """Return the level if the battery has been below the limits of this level for long enough, else 0."""
-        volts, charge = self._is_below(level)
-        low_for = self._voltage_low[level].seconds(volts, self._vehicle.now)
-        timer = self._vehicle.parameters["BATT_LOW_TIMER"]
-        return level if charge or 0 < timer < low_for else _OK
+        is_voltage_low, is_charge_low = self._is_voltage_and_charge_low(level)
+        voltage_low_for = self._voltage_low[level].seconds(is_voltage_low, self._vehicle.now)
+        timeout = self._vehicle.parameters["BATT_LOW_TIMER"]
+        return level if is_charge_low or 0 < timeout < voltage_low_for else _OK
 
-    def _is_below(self, level: int) -> tuple[bool, bool]:
+    def _is_voltage_and_charge_low(self, level: int) -> tuple[bool, bool]:
         """Return two values: True if the voltage, and True if the charge, is below the limit of the level."""
         parameters, name = self._vehicle.parameters, _NAMES[level]
-        volts, charge = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
-        is_charge_low = charge > 0 and self._remaining_mah() < charge
-        return volts > 0 and self._vehicle.battery.voltage_v < volts, is_charge_low
+        min_volts, min_mah = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]  # 0: no limit
+        is_voltage_low = min_volts > 0 and self._vehicle.battery.voltage_v < min_volts
+        is_charge_low = min_mah > 0 and self._remaining_mah() < min_mah
+        return is_voltage_low, is_charge_low
 
     def _remaining_mah(self) -> float:
         return self._vehicle.parameters["BATT_CAPACITY"] - self._vehicle.battery.consumed_mah
@@ -178,8 +181,8 @@ class ArduPilotArming(Generic[HostT]):
         self.vehicle = vehicle
         self.passes: bool = False  # True if SYS_STATUS reports healthy pre-arm checks.
         self._reported_at = -math.inf
-        self._passed_common = self._is_news = False
-        self._needs_no_arming = False
+        self._passed_common = self._has_new_failure = False
+        self._was_always_armed = False
 
     def start(self) -> None:
         self._reported_at = self.vehicle.now
@@ -203,29 +206,29 @@ class ArduPilotArming(Generic[HostT]):
     def common_reasons(self) -> list[str]:
         """Run the checks that all firmwares have, in the order of the firmwares."""
         vehicle, check = self.vehicle, ArmingCheck
-        found = list(vehicle.faults.prearm_failures)
+        reasons = list(vehicle.faults.prearm_failures)
         if vehicle.calibrations.is_compass_running:
-            found.append("Compass calibration running")
+            reasons.append("Compass calibration running")
         if self.is_checked(check.INS):
-            found += self.ahrs_reasons()
-        found += self.position_reasons()
+            reasons += self.ahrs_reasons()
+        reasons += self.position_reasons()
         if self.is_checked(check.BATTERY):
-            found += _listed(vehicle.failsafes.battery.reason_not_to_arm())
+            reasons += _listed(vehicle.failsafes.battery.reason_not_to_arm())
         if self.is_checked(check.RC) and vehicle.failsafes.radio:
-            found.append("Radio failsafe on")
+            reasons.append("Radio failsafe on")
         if self.is_checked(check.MISSION) and vehicle.mode.needs_mission and not vehicle.mission.is_present:
-            found.append("Mode requires mission")
-        return found + _listed(vehicle.fence.reason_not_to_arm())
+            reasons.append("Mode requires mission")
+        return reasons + _listed(vehicle.fence.reason_not_to_arm())
 
     def own_reasons(self) -> list[str]:
         return []
 
     def mandatory_reasons(self) -> list[str]:
-        """Run the checks that a forced arming does not skip."""
+        """Return the failures of the checks that a forced arming does not skip."""
         return []
 
     def final_reasons(self) -> list[str]:
-        """Run the checks of arming requests only. The base class checks that the sticks are centred."""
+        """Return the failures of the checks that only a request to arm runs: here, whether the sticks are centred."""
         options = int(self.vehicle.parameters["RC_OPTIONS"])
         if not self.is_checked(ArmingCheck.RC) or not self.vehicle.rc.is_receiving:
             return []
@@ -267,11 +270,11 @@ class ArduPilotArming(Generic[HostT]):
             return
         reasons = self.reasons()
         passes_common = not self.common_reasons()
-        self._is_news |= self._passed_common and not passes_common
+        self._has_new_failure |= self._passed_common and not passes_common
         self._passed_common, self.passes = passes_common, not reasons
         waited = vehicle.now - self._reported_at
-        if waited >= _REPORT_INTERVAL_S or (self._is_news and waited > _MIN_REPORT_INTERVAL_S):
-            self._reported_at, self._is_news = vehicle.now, False
+        if waited >= _REPORT_INTERVAL_S or (self._has_new_failure and waited > _MIN_REPORT_INTERVAL_S):
+            self._reported_at, self._has_new_failure = vehicle.now, False
             self._send_reasons("PreArm", reasons)
 
     def report(self) -> None:
@@ -290,12 +293,14 @@ class ArduPilotArming(Generic[HostT]):
         return self.vehicle.parameters.get("ARMING_REQUIRE", 1) != _NOT_REQUIRED
 
     def _follow_requirement(self) -> None:
-        vehicle, needs_none = self.vehicle, not self.needs_arming
-        if needs_none != self._needs_no_arming:
-            self._needs_no_arming = needs_none
-            if needs_none != vehicle.motors.is_armed:
-                vehicle.motors.set_armed(needs_none, vehicle.now)
-                vehicle.set_ticking(True)
+        """Arm or disarm when ARMING_REQUIRE has changed."""
+        vehicle, is_always_armed = self.vehicle, not self.needs_arming
+        if is_always_armed == self._was_always_armed:
+            return
+        self._was_always_armed = is_always_armed
+        if is_always_armed != vehicle.motors.is_armed:
+            vehicle.motors.set_armed(is_always_armed, vehicle.now)
+            vehicle.set_ticking(True)
 
     def arm(self, *, force: bool = False) -> bool:
         """Arm and return True, or report the failing checks."""
@@ -310,17 +315,18 @@ class ArduPilotArming(Generic[HostT]):
             return False
         if self.checks_nothing and not force:
             vehicle.send_text(MavSeverity.WARNING, "Warning: Arming Checks Disabled")
-        vehicle.fence.armed()
+        vehicle.fence.on_armed()
+        # Home moves to the place of arming, unless a command has set it.
         if vehicle.navigation.home is not None and not vehicle.navigation.home_is_locked:
             vehicle.navigation.set_home(vehicle.motion.place, lock=False)
         vehicle.info(self.ARMED_TEXT)
         vehicle.motors.set_armed(True, vehicle.now)
-        vehicle.mode.enter(force=False)
+        vehicle.mode.enter(force=False)  # The mode begins anew, because it was entered while disarmed.
         vehicle.set_ticking(True)
-        self.armed()
+        self.on_armed()
         return True
 
-    def armed(self) -> None:
+    def on_armed(self) -> None:
         """Called after arming."""
 
     def disarm(self, *, force: bool = True) -> bool:
@@ -330,10 +336,10 @@ class ArduPilotArming(Generic[HostT]):
             return True
         if not self.needs_arming or (not force and not vehicle.is_landed):
             return False
-        vehicle.fence.disarmed()
+        vehicle.fence.on_disarmed()
         vehicle.info(self.DISARMED_TEXT)
         vehicle.motors.set_armed(False, vehicle.now)
-        vehicle.mission.disarmed()
+        vehicle.mission.on_disarmed()
         return True
 
 

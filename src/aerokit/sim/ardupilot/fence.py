@@ -30,36 +30,38 @@ class FenceZones:
     """Inclusion and exclusion zones of an uploaded fence, in metres north and east of the world frame."""
 
     def __init__(self, items: Sequence[MissionItem], frame: LocalFrame) -> None:
-        self._inside: list[PolygonZone | CircleZone] = []
-        self._outside: list[PolygonZone | CircleZone] = []
+        self._inclusions: list[PolygonZone | CircleZone] = []
+        self._exclusions: list[PolygonZone | CircleZone] = []
         corners: list[Point] = []
         for item in items:
             place = frame.to_local(int(item.x), int(item.y))
             if item.command in (_CIRCLE_IN, _CIRCLE_OUT):
-                zones = self._inside if item.command == _CIRCLE_IN else self._outside
+                zones = self._inclusions if item.command == _CIRCLE_IN else self._exclusions
                 zones.append(CircleZone(place, item.param1))
             elif item.command in (_IN, _OUT):
                 corners.append(place)
-                if len(corners) == int(item.param1):
-                    (self._inside if item.command == _IN else self._outside).append(PolygonZone(corners))
+                is_polygon_complete = len(corners) == int(item.param1)
+                if is_polygon_complete:
+                    zones = self._inclusions if item.command == _IN else self._exclusions
+                    zones.append(PolygonZone(corners))
                     corners = []
 
     def __bool__(self) -> bool:
         """Return True if there is a zone; a return point does not count."""
-        return bool(self._inside or self._outside)
+        return bool(self._inclusions or self._exclusions)
 
     @property
     def smallest_inclusion_m(self) -> float:
         """Radius of the smallest inclusion circle; infinity if there is none."""
-        return min((zone.radius for zone in self._inside if isinstance(zone, CircleZone)), default=math.inf)
+        return min((zone.radius for zone in self._inclusions if isinstance(zone, CircleZone)), default=math.inf)
 
     def breach_m(self, place: Point, *, union: bool = False) -> float:
         """Return metres beyond the border; negative within. With ``union``, being in one inclusion zone suffices."""
-        inside = [zone.outside_m(place) for zone in self._inside]
-        outside = [-zone.outside_m(place) for zone in self._outside]
-        if union and inside:
-            inside = [min(inside)]
-        return max(inside + outside, default=-math.inf)
+        out_of_inclusions = [zone.outside_m(place) for zone in self._inclusions]
+        into_exclusions = [-zone.outside_m(place) for zone in self._exclusions]
+        if union and out_of_inclusions:
+            out_of_inclusions = [min(out_of_inclusions)]
+        return max(out_of_inclusions + into_exclusions, default=-math.inf)
 
 
 class CircleZone:
@@ -82,18 +84,19 @@ class PolygonZone:
 
     def outside_m(self, place: Point) -> float:
         """Return the distance from the border in metres; negative inside."""
-        distance = min(_distance(place, start, end) for start, end in self._sides)
+        distance = min(_distance_to_side(place, start, end) for start, end in self._sides)
         crossings = sum(_crosses(place, start, end) for start, end in self._sides)
-        return -distance if crossings % 2 else distance
+        is_inside = crossings % 2 == 1  # A ray from inside crosses the border an odd number of times.
+        return -distance if is_inside else distance
 
 
-def _distance(place: Point, start: Point, end: Point) -> float:
+def _distance_to_side(place: Point, start: Point, end: Point) -> float:
     north, east = end[0] - start[0], end[1] - start[1]
-    length2 = north * north + east * east
-    along = 0.0
-    if length2 > 0.0:
-        along = ((place[0] - start[0]) * north + (place[1] - start[1]) * east) / length2
-    share = min(1.0, max(0.0, along))
+    squared_length = north * north + east * east
+    share = 0.0  # Part of the side before the point that is nearest to the place.
+    if squared_length > 0.0:
+        projection = ((place[0] - start[0]) * north + (place[1] - start[1]) * east) / squared_length
+        share = min(1.0, max(0.0, projection))
     return math.dist(place, (start[0] + share * north, start[1] + share * east))
 
 
@@ -145,9 +148,9 @@ class ArduPilotFence(Generic[HostT]):
         self.breach_count: int = 0
         self.breach_time_ms: int = 0  # Start of the latest breach, in milliseconds since boot.
         self.caused_mode: bool = False  # True while the present mode is the result of FENCE_ACTION.
-        self._switch = (0, 0)
-        self._backup: dict[int, float] = {}
-        self._floor_by_hand: bool | None = None
+        self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE, as followed last.
+        self._new_breach_m: dict[int, float] = {}  # Metres beyond a breached limit that count as a new breach.
+        self._floor_enabled_by_command: bool | None = None  # The lower limit as a command enabled or disabled it.
         self._recovering_since = -math.inf
         self._reported_at = self._checked_at = -math.inf
         self._zones = FenceZones((), vehicle.frame)
@@ -182,18 +185,24 @@ class ArduPilotFence(Generic[HostT]):
         enforced = present and self.enabled != 0 and self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY
         return present, enforced, not (present and self.breached)
 
-    def enable(self, on: bool, kinds: int = _ALL, *, by_hand: bool = True) -> int:
-        """Enable or disable kinds of fences that are configured; return the kinds that changed."""
+    def enable(self, on: bool, kinds: int = _ALL, *, by_command: bool = True) -> int:
+        """Enable (``on``) or disable kinds of fences that are configured; return the kinds that changed.
+
+        ``by_command`` is False if the firmware does it, which a later command can override.
+        """
         kinds &= self.configured
-        if by_hand and kinds & _MIN_ALT:
-            self._floor_by_hand = on
-        before = self.enabled
-        self.enabled = before | kinds if on else before & ~kinds
-        if not on:
+        if by_command and kinds & _MIN_ALT:
+            self._floor_enabled_by_command = on
+        previous = self.enabled
+        if on:
+            self.enabled |= kinds
+        else:
+            self.enabled &= ~kinds
             self._clear(kinds)
-        return before ^ self.enabled
+        return previous ^ self.enabled
 
     def command(self, command: ReceivedCommand) -> int:
+        """Execute DO_FENCE_ENABLE: param 1 is 0 to disable, 1 to enable, 2 to disable the lower limit only."""
         kinds = whole(command.param2) or _ALL
         if command.param1 == 1.0:
             if not self.present & kinds:
@@ -205,22 +214,23 @@ class ArduPilotFence(Generic[HostT]):
             return MavResult.FAILED
         return MavResult.ACCEPTED
 
-    def armed(self) -> None:
+    def on_armed(self) -> None:
         """Enable the fence if FENCE_AUTOENABLE is 3."""
         if self._value("FENCE_AUTOENABLE") == _WHEN_ARMED:
-            self._floor_by_hand = None
-            self.report("auto-enabled", self.enable(True, _ALL & ~_MIN_ALT, by_hand=False))
+            self._floor_enabled_by_command = None
+            self.report("auto-enabled", self.enable(True, _ALL & ~_MIN_ALT, by_command=False))
 
-    def disarmed(self) -> None:
+    def on_disarmed(self) -> None:
         """Disable the fence if FENCE_AUTOENABLE is 3."""
         if self._value("FENCE_AUTOENABLE") == _WHEN_ARMED:
-            self.report("auto-disabled", self.enable(False, by_hand=False))
+            self.report("auto-disabled", self.enable(False, by_command=False))
 
     def _follow_parameters(self) -> None:
-        switch = (int(self.vehicle.parameters["FENCE_ENABLE"]), int(self._value("FENCE_AUTOENABLE")))
-        if switch != self._switch:
-            self._switch = switch
-            self.enabled = self.configured & ~_MIN_ALT if switch[0] else 0
+        parameters = (int(self.vehicle.parameters["FENCE_ENABLE"]), int(self._value("FENCE_AUTOENABLE")))
+        if parameters != self._enabling_parameters:
+            self._enabling_parameters = parameters
+            is_enabled = parameters[0] != 0
+            self.enabled = self.configured & ~_MIN_ALT if is_enabled else 0
         self._clear(_ALL & ~self.configured)
 
     def update(self) -> None:
@@ -229,38 +239,41 @@ class ArduPilotFence(Generic[HostT]):
         self._follow_parameters()
         if not self.enabled and not self.configured & _MIN_ALT:
             return
-        due = vehicle.now - self._checked_at > self.PERIOD_S - 1e-6
-        if not due or not (self.CHECKS_DISARMED or vehicle.is_armed):
+        is_due = vehicle.now - self._checked_at > self.PERIOD_S - 1e-6  # tolerates rounding errors
+        if not is_due or not (self.CHECKS_DISARMED or vehicle.is_armed):
             return
-        self._checked_at, before = vehicle.now, self.breached
-        new = self._check() if vehicle.navigation.home is not None else 0
-        if before and not self.breached:
-            self.cleared()
-        if new and vehicle.is_armed and vehicle.now - self._recovering_since >= _RECOVERY_S:
-            self.act(new)
+        self._checked_at, breached_before = vehicle.now, self.breached
+        new_breaches = self._check() if vehicle.navigation.home is not None else 0
+        if breached_before and not self.breached:
+            self.on_cleared()
+        is_recovering = vehicle.now - self._recovering_since < _RECOVERY_S
+        if new_breaches and vehicle.is_armed and not is_recovering:
+            self.act(new_breaches)
 
     def _check(self) -> int:
+        """Compare the position with all active limits; return the kinds with a new breach."""
         vehicle = self.vehicle
-        down = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed
-        if down and self._floor_by_hand is not True and self.enabled & _MIN_ALT:
-            self.report("auto-disabled", self.enable(False, _MIN_ALT, by_hand=False))
-        new = 0
-        for kind, beyond in self._beyond(vehicle.motion.place).items():
-            new |= self._judge(kind, beyond) if self.active & kind else 0
-        if not down:
+        may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed
+        if may_be_low and self._floor_enabled_by_command is not True and self.enabled & _MIN_ALT:
+            self.report("auto-disabled", self.enable(False, _MIN_ALT, by_command=False))
+        new_breaches = 0
+        for kind, beyond_m in self._beyond(vehicle.motion.place).items():
+            if self.active & kind and self._update_breach(kind, beyond_m):
+                new_breaches |= kind
+        if not may_be_low:
             self._raise_floor()
-        return new
+        return new_breaches
 
-    def _judge(self, kind: int, beyond: float) -> int:
-        """Return the kind if its breach is new, else 0. A breach that grows by the backup distance counts as new."""
-        if beyond < 0.0 or (kind == _POLYGON and beyond == 0.0):
+    def _update_breach(self, kind: int, beyond_m: float) -> bool:
+        """Record the state of a limit; return True for a new breach. One that grows by the backup distance is new."""
+        if beyond_m < 0.0 or (kind == _POLYGON and beyond_m == 0.0):
             self._clear(kind)
-            return 0
-        if self.breached & kind and (kind == _POLYGON or beyond < self._backup.get(kind, math.inf)):
-            return 0
+            return False
+        if self.breached & kind and (kind == _POLYGON or beyond_m < self._new_breach_m.get(kind, math.inf)):
+            return False
         self._record(kind)
-        self._backup[kind] = beyond + (self.CIRCLE_BACKUP_M if kind == _CIRCLE else _BACKUP_M)
-        return kind
+        self._new_breach_m[kind] = beyond_m + (self.CIRCLE_BACKUP_M if kind == _CIRCLE else _BACKUP_M)
+        return True
 
     def _beyond(self, place: Ned) -> dict[int, float]:
         """Return metres beyond each limit by kind; negative within."""
@@ -277,12 +290,13 @@ class ArduPilotFence(Generic[HostT]):
 
     def _raise_floor(self) -> None:
         """Enable the lower limit once the vehicle is above it by FENCE_MARGIN."""
-        wanted = self.configured & _MIN_ALT and self._floor_by_hand is not False
-        if not wanted or self.active & _MIN_ALT or not (self._switch[0] or self._switch[1] > 1):
+        enable, auto_enable = self._enabling_parameters
+        is_enabled_in_flight = self.configured & _MIN_ALT and (enable or auto_enable > 1)
+        if not is_enabled_in_flight or self._floor_enabled_by_command is False or self.active & _MIN_ALT:
             return
         floor = self._value("FENCE_ALT_MIN") + self.vehicle.parameters["FENCE_MARGIN"]
         if self.vehicle.altitude_m >= floor:
-            self.enable(True, _MIN_ALT, by_hand=False)
+            self.enable(True, _MIN_ALT, by_command=False)
             self.vehicle.send_text(MavSeverity.NOTICE, "Min Alt fence enabled (auto enable)")
 
     def contains(self, place: Ned) -> bool:
@@ -291,31 +305,34 @@ class ArduPilotFence(Generic[HostT]):
     def _record(self, kind: int) -> None:
         vehicle = self.vehicle
         self.breach_count += 1
-        first, self.breached = not self.breached, self.breached | kind
-        if first:
-            self.breach_time_ms = vehicle.time_boot_ms
-            if vehicle.now - self._reported_at > _STATUS_INTERVAL_S:
-                self._reported_at = vehicle.now
-                if (status := self.status()) is not None:
-                    vehicle.send(status)
+        is_first = not self.breached
+        self.breached |= kind
+        if not is_first:
+            return
+        self.breach_time_ms = vehicle.time_boot_ms
+        if vehicle.now - self._reported_at > _STATUS_INTERVAL_S:
+            self._reported_at = vehicle.now
+            status = self.status()
+            if status is not None:
+                vehicle.send(status)
 
     def _clear(self, kinds: int) -> None:
         self.breached &= ~kinds
         for kind in _NAMES:
             if kinds & kind:
-                self._backup.pop(kind, None)
+                self._new_breach_m.pop(kind, None)
 
-    def act(self, new: int) -> None:
+    def act(self, new_breaches: int) -> None:
         """React to a new breach of these kinds while armed."""
 
-    def cleared(self) -> None:
+    def on_cleared(self) -> None:
         """Called when the last breach has ended."""
 
     def refusal(self, mode: ArduPilotMode) -> tuple[int, str] | None:
         """Return severity and text of the refusal if the fence forbids the mode, else None."""
         return None
 
-    def mode_changed(self) -> None:
+    def on_mode_changed(self) -> None:
         """Called after every mode change."""
         self.caused_mode = False
 
@@ -355,6 +372,7 @@ class ArduPilotFence(Generic[HostT]):
         return next((text for failed, text in self._arming_checks() if failed), None)
 
     def _arming_checks(self) -> tuple[tuple[bool, str], ...]:
+        """Return for each check, in the order of the firmware, whether it fails, and its text."""
         parameters = self.vehicle.parameters
         radius, margin = parameters["FENCE_RADIUS"], parameters["FENCE_MARGIN"]
         high, low = self._value("FENCE_ALT_MAX"), self._value("FENCE_ALT_MIN")
@@ -390,5 +408,6 @@ class ArduPilotFence(Generic[HostT]):
 def _joined_names(kinds: int) -> str:
     """Join names of fences like the firmware: Max Alt, Circle and Polygon fences."""
     words = [name for kind, name in _NAMES.items() if kinds & kind]
-    text = words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
-    return f"{text} fence" + "s" * (len(words) > 1)
+    if len(words) == 1:
+        return f"{words[0]} fence"
+    return f"{', '.join(words[:-1])} and {words[-1]} fences"

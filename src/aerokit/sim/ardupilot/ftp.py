@@ -53,8 +53,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     def restart(self) -> None:
         super().restart()
         self._queue: deque[tuple[FtpPacket, Channel]] = deque()
-        self._is_awake = self._is_bursting = self._banner_wanted = False
-        self._sent_at = float("-inf")
+        self._is_worker_scheduled = self._is_bursting = self._is_banner_due = False
+        self._sent_at = float("-inf")  # Time of the last reply; infinitely long ago after a session was closed.
 
     @property
     def open_sessions(self) -> int:
@@ -67,8 +67,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     def receive(self, request: FtpPacket, channel: Channel) -> None:
         if len(self._queue) < _QUEUE_DEPTH:
             self._queue.append((request, channel))
-        if not self._is_awake:
-            self._is_awake = True
+        if not self._is_worker_scheduled:
+            self._is_worker_scheduled = True
             self._host.call_later(_WORKER_PERIOD_S, self._work)
 
     def _work(self) -> None:
@@ -81,14 +81,14 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
                 self._reply(peer, peer.reply)
             elif request.opcode not in (Op.ACK, Op.NAK):
                 super().receive(request, channel)
-        self._is_awake = self._is_bursting
+        self._is_worker_scheduled = self._is_bursting
 
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
         return None  # All clients share one state.
 
     def _is_repeated(self, peer: FtpPeer, request: FtpPacket, last: FtpPacket) -> bool:
-        same = request.client == last.client and request.session == last.session
-        return same and request.sequence + 1 == last.sequence
+        is_same_session = request.client == last.client and request.session == last.session
+        return is_same_session and request.sequence + 1 == last.sequence
 
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
         return request.session
@@ -97,8 +97,9 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         """Close nothing: an idle session ends when another request needs it."""
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
-        is_end = request.opcode in (Op.TERMINATESESSION, Op.RESETSESSION)
-        if peer.sessions and request.session not in peer.sessions and not is_end:
+        """Refuse requests of another session while one has an open file, unless that session is idle."""
+        is_close = request.opcode in (Op.TERMINATESESSION, Op.RESETSESSION)
+        if peer.sessions and request.session not in peer.sessions and not is_close:
             if not self._is_idle():
                 self._reply(peer, request.refuse(MavFtpErr.INVALIDSESSION))
                 return
@@ -106,23 +107,27 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         super()._answer(peer, request)
 
     def _adapted(self, peer: FtpPeer, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
-        is_file = request.opcode in (Op.READFILE, Op.WRITEFILE) and answer.opcode == Op.ACK
-        offset = request.offset if is_file or request.opcode == Op.LISTDIRECTORY else 0
-        if answer.opcode == Op.ACK and request.opcode in _WITHOUT_DATA:
+        """Return the answer with the offset and the data that the firmware sends for this opcode."""
+        is_acknowledged = answer.opcode == Op.ACK
+        is_transfer = request.opcode in (Op.READFILE, Op.WRITEFILE) and is_acknowledged
+        offset = request.offset if is_transfer or request.opcode == Op.LISTDIRECTORY else 0
+        if is_acknowledged and request.opcode in _WITHOUT_DATA:
             answer = request.acknowledge()
         return answer.replace(offset=offset)
 
     def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
         super()._reply(peer, answer)
-        ended = answer.request_opcode == Op.TERMINATESESSION
-        self._sent_at = float("-inf") if ended else self._host.now
-        if self._banner_wanted:
-            self._banner_wanted = False
+        is_session_closed = answer.request_opcode == Op.TERMINATESESSION
+        self._sent_at = float("-inf") if is_session_closed else self._host.now
+        if self._is_banner_due:
+            self._is_banner_due = False
             self._send_banner()
 
     def _fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
-        is_open = request.opcode in (Op.OPENFILERO, Op.OPENFILEWO, Op.CREATEFILE)
-        return request.refuse_errno(ENOENT if is_open and fault.errno == EISDIR else fault.errno)
+        is_opening = request.opcode in (Op.OPENFILERO, Op.OPENFILEWO, Op.CREATEFILE)
+        # The firmware reports a folder as a missing file.
+        errno = ENOENT if is_opening and fault.errno == EISDIR else fault.errno
+        return request.refuse_errno(errno)
 
     def _unknown(self, request: FtpPacket) -> FtpPacket:
         self._host.send_text(MavSeverity.DEBUG, f"Unsupported FTP: {request.opcode}")
@@ -156,13 +161,13 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return self._terminate(peer, request)
 
     def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        reading = request.opcode == Op.OPENFILERO
-        if reading and self._host.now - self._sent_at > _SESSION_TIMEOUT_S:
+        is_reading = request.opcode == Op.OPENFILERO
+        if is_reading and self._host.now - self._sent_at > _SESSION_TIMEOUT_S:
             self._close_all(peer)
         if peer.sessions:
             raise Refused(MavFtpErr.FAIL)
         answer = super()._open(peer, request)
-        self._banner_wanted = reading and self._path(request).startswith("@PARAM/param.pck")
+        self._is_banner_due = is_reading and self._path(request).startswith("@PARAM/param.pck")
         return answer
 
     def _read(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
@@ -175,29 +180,30 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._send_next(peer, session, request, 0)
 
     def _send_next(self, peer: FtpPeer, session: FtpSession, request: FtpPacket, number: int) -> None:
-        """Send one block and schedule the next. No other request is processed until the burst ends."""
-        step = request.size or DATA_SIZE
-        offset, sequence = request.offset + number * step, request.sequence + 1 + number & 0xFFFF
+        """Send the block with this number and schedule the next. No other request is processed until the burst ends."""
+        block_size = request.size or DATA_SIZE
+        offset, sequence = request.offset + number * block_size, (request.sequence + 1 + number) & 0xFFFF
         refusal = request.refuse(MavFtpErr.EOF)
         try:
-            data = session.file.read(offset, step)
+            data = session.file.read(offset, block_size)
         except FileFault as fault:
             data, refusal = b"", request.refuse_errno(fault.errno)
         if not data:
-            last = peer.reply if number and peer.reply is not None else refusal
-            end = refusal.replace(sequence=sequence, offset=last.offset, burst_complete=last.burst_complete)
+            # The refusal has the offset and the flag of the block before it.
+            previous = peer.reply if number and peer.reply is not None else refusal
+            end = refusal.replace(sequence=sequence, offset=previous.offset, burst_complete=previous.burst_complete)
             self._reply(peer, end)
             self._end_burst()
             return
-        is_short, is_last = len(data) < step, number == _BURST_BLOCKS - 1
+        is_short, is_last = len(data) < block_size, number == _BURST_BLOCKS - 1
         block = request.acknowledge(data, offset=offset)
         block = block.replace(sequence=sequence, burst_complete=is_short or is_last)
         self._reply(peer, block)
         # The firmware has already advanced its last reply when it repeats this reply or refuses to read on.
-        after = offset + len(data) if is_short else offset
-        peer.reply = block.replace(sequence=sequence + 1 & 0xFFFF, offset=after)
-        following = self._end_burst if is_last else partial(self._send_next, peer, session, request, number + 1)
-        self._host.call_later(self.burst_interval_s, following)
+        next_offset = offset + len(data) if is_short else offset
+        peer.reply = block.replace(sequence=(sequence + 1) & 0xFFFF, offset=next_offset)
+        next_step = self._end_burst if is_last else partial(self._send_next, peer, session, request, number + 1)
+        self._host.call_later(self.burst_interval_s, next_step)
 
     def _end_burst(self) -> None:
         self._is_bursting = False
@@ -230,13 +236,13 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return self._unknown(request)
 
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        first, _, rest = request.data.partition(b"\0")
-        second = rest.partition(b"\0")[0]
-        length = len(first) + len(second)
-        if request.size == 0 or request.size not in (length + 1, length + 2):
+        old_name, _, remainder = request.data.partition(b"\0")
+        new_name = remainder.partition(b"\0")[0]
+        length = len(old_name) + len(new_name)
+        if request.size == 0 or request.size not in (length + 1, length + 2):  # with or without the final NUL
             raise Refused(MavFtpErr.INVALIDDATASIZE)
-        paths = path_in(first), path_in(second)
-        if any(self.files.mounted(path) is not None for path in paths):
+        old_path, new_path = path_in(old_name), path_in(new_name)
+        if self.files.mounted(old_path) is not None or self.files.mounted(new_path) is not None:
             raise FileFault(ENOENT)
-        self.files.rename(*paths)
+        self.files.rename(old_path, new_path)
         return request.acknowledge()

@@ -26,6 +26,8 @@ from aerokit.sim.motion import Ned, quaternion_from_euler
 from aerokit.sim.vehicle import sender_of
 
 _DEVICE_ID = 1
+# Special system ids of DO_GIMBAL_MANAGER_CONFIGURE.
+_KEEP_CONTROL, _TAKE_CONTROL, _RELEASE_CONTROL = -1, -2, -3
 _Can = GimbalManagerCapFlags
 _CAPABILITIES = (
     _Can.HAS_RETRACT | _Can.HAS_NEUTRAL | _Can.HAS_RC_INPUTS
@@ -45,7 +47,7 @@ DEFAULTS = {
     "MNT1_PITCH_MAX": 20.0,
     "MNT1_YAW_MIN": -180.0,
     "MNT1_YAW_MAX": 180.0,
-    **dict.fromkeys((f"MNT1_{place}_{axis}" for place in ("RETRACT", "NEUTRAL") for axis in "XYZ"), 0.0),
+    **dict.fromkeys((f"MNT1_{mode_name}_{axis}" for mode_name in ("RETRACT", "NEUTRAL") for axis in "XYZ"), 0.0),
 }
 """Defaults for parameters that a vehicle with a reduced ``parameter_count`` may lack."""
 _FIXED_ANGLE_MODES = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
@@ -73,8 +75,8 @@ class ArduPilotGimbal:
         self.in_control: tuple[int, int] = (0, 0)  # System and component id in control.
         self._target = MountTarget()
         self._region: Ned | None = None
-        self._followed = 0
-        self._follows: Ned | None = None
+        self._followed_id = 0
+        self._followed_place: Ned | None = None
         vehicle.observe(GlobalPositionInt, self._on_global_position)
 
     @property
@@ -93,10 +95,11 @@ class ArduPilotGimbal:
             return (self.target.roll, self.target.pitch, self.target.yaw)
         target, motion = self.target, self._vehicle.motion
         yaw = self._limited("YAW", self._from_nose(target))
-        lean = (math.degrees(motion.roll), math.degrees(motion.pitch))
+        # The servos compensate the lean of the vehicle, rotated by the yaw of the gimbal.
+        lean_roll, lean_pitch = math.degrees(motion.roll), math.degrees(motion.pitch)
         cos, sin = math.cos(math.radians(-yaw)), math.sin(math.radians(-yaw))
-        roll = target.roll - (lean[0] * cos - lean[1] * sin)
-        pitch = target.pitch - (lean[0] * sin + lean[1] * cos)
+        roll = target.roll - (lean_roll * cos - lean_pitch * sin)
+        pitch = target.pitch - (lean_roll * sin + lean_pitch * cos)
         return self._limited("ROLL", roll), self._limited("PITCH", pitch), yaw
 
     @property
@@ -104,13 +107,13 @@ class ArduPilotGimbal:
         if self.mode == MavMountMode.RC_TARGETING:  # The sticks of the gimbal are not simulated; they rest centred.
             return MountTarget(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
         if self.mode in _FIXED_ANGLE_MODES:
-            place = MavMountMode(self.mode).name
-            roll, pitch, yaw = (self.setting(f"MNT1_{place}_{axis}") for axis in "XYZ")
+            mode_name = MavMountMode(self.mode).name
+            roll, pitch, yaw = (self.setting(f"MNT1_{mode_name}_{axis}") for axis in "XYZ")
             return MountTarget(roll, pitch, yaw)
         if self.mode == MavMountMode.GPS_POINT:
             return self._angles_to(self._region)
         if self.mode == MavMountMode.SYSID_TARGET:
-            return self._angles_to(self._follows)
+            return self._angles_to(self._followed_place)
         if self.mode == MavMountMode.HOME_LOCATION:
             return self._angles_to(self._vehicle.navigation.home)
         return self._stabilized(self._target)
@@ -126,7 +129,7 @@ class ArduPilotGimbal:
         return replace(target, roll=roll, pitch=pitch, yaw=yaw)
 
     def _angles_to(self, place: Ned | None) -> MountTarget:
-        """Return the angles to a position; the current target if ``place`` or the vehicle's position is unknown."""
+        """Return the angles to a position; the last ones if ``place`` or the vehicle's position is unknown."""
         motion = self._vehicle.motion
         if place is not None and self._vehicle.navigation.has_position:
             north, east, down = place[0] - motion.north, place[1] - motion.east, place[2] - motion.down
@@ -160,11 +163,14 @@ class ArduPilotGimbal:
 
     def turn(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
         """Turn at these rates in degrees per second from the current direction."""
-        now = self.target
-        start = self._from_nose(now)
-        if from_north:
-            start = now.yaw if now.is_from_north else start + math.degrees(self._vehicle.motion.yaw)
-        self._target = MountTarget(now.roll, now.pitch, start, from_north, (roll, pitch, yaw), self._vehicle.now)
+        current = self.target
+        current_yaw = self._from_nose(current)
+        if from_north and current.is_from_north:
+            current_yaw = current.yaw
+        elif from_north:
+            current_yaw += math.degrees(self._vehicle.motion.yaw)
+        rates = (roll, pitch, yaw)
+        self._target = MountTarget(current.roll, current.pitch, current_yaw, from_north, rates, self._vehicle.now)
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def look_at(self, place: Ned | None) -> None:
@@ -177,26 +183,26 @@ class ArduPilotGimbal:
 
     def follow(self, system_id: int) -> None:
         """Point at another vehicle once its position is received."""
-        self._followed, self._follows = system_id, None
+        self._followed_id, self._followed_place = system_id, None
         self.set_mode(MavMountMode.SYSID_TARGET)
 
     def _on_global_position(self, message: GlobalPositionInt, _: Channel) -> None:
-        if sender_of(message)[0] == self._followed:
-            place = self._vehicle.point(message.lat, message.lon, message.alt * 1e-3, MavFrame.GLOBAL)
-            self._follows = self._follows if place is None else place
+        if sender_of(message)[0] == self._followed_id:
+            place = self._vehicle.world_point(message.lat, message.lon, message.alt * 1e-3, MavFrame.GLOBAL)
+            self._followed_place = self._followed_place if place is None else place
 
     def set_control(self, sender: tuple[int, int], system: int, component: int) -> bool:
         """Handle MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE; return False for invalid ids."""
         if not (-3 <= system <= 255 and -3 <= component <= 255):
             return False
-        before = self.in_control
-        if system == -2:
+        previous = self.in_control
+        if system == _TAKE_CONTROL:
             self.in_control = sender
-        elif system == -3:
-            self.in_control = (0, 0) if before == sender else before
-        elif system != -1:
+        elif system == _RELEASE_CONTROL:
+            self.in_control = (0, 0) if previous == sender else previous
+        elif system != _KEEP_CONTROL:
             self.in_control = (system, component)
-        if self.in_control != before:
+        if self.in_control != previous:
             self._vehicle.call_later(0.0, self._send_status)
         return True
 
@@ -216,7 +222,7 @@ class ArduPilotGimbal:
             self.point(*angles, from_north=from_north)
         elif not any(map(math.isnan, rates)):
             self.turn(*rates, from_north=from_north)
-        elif all(map(math.isnan, (*angles[1:], *rates[1:]))):
+        elif all(map(math.isnan, (*angles[1:], *rates[1:]))):  # no pitch and yaw: a client changes only the lock
             self.is_yaw_locked = from_north
         else:
             return MavResult.FAILED
@@ -231,16 +237,16 @@ class ArduPilotGimbal:
             return None
         roll, pitch, yaw = map(math.radians, self.angles)
         return m.GimbalDeviceAttitudeStatus(
-            0,
+            0,  # target system and component: broadcast
             0,
             self._vehicle.time_boot_ms,
             _device_flags(self),
             quaternion_from_euler(roll, pitch, yaw),
+            math.nan,  # angular velocities
             math.nan,
             math.nan,
-            math.nan,
-            0,
-            math.nan,
+            0,  # failure flags
+            math.nan,  # yaw and yaw rate of the vehicle
             math.nan,
             _DEVICE_ID,
         )

@@ -85,19 +85,19 @@ class ArduPilotMode:
 
 
 def variant(
-    make: Callable[[HostT], ArduPilotMode], number: int, name: str, **traits: Any
+    make_mode: Callable[[HostT], ArduPilotMode], number: int, name: str, **traits: Any
 ) -> Callable[[HostT], ArduPilotMode]:
-    """Return a factory of a mode with the behaviour of ``make``, but another number, name and ``traits``."""
+    """Return a factory of a mode like that of ``make_mode``, with another number and name, and these attributes."""
 
-    def build(host: HostT) -> ArduPilotMode:
-        mode = make(host)
+    def make_variant(host: HostT) -> ArduPilotMode:
+        mode = make_mode(host)
         mode.number, mode.name = number, name
         for trait, value in traits.items():
             assert hasattr(mode, trait), trait
             setattr(mode, trait, value)
         return mode
 
-    return build
+    return make_variant
 
 
 class ConditionTimer:
@@ -129,7 +129,7 @@ _STOPPED_PWM, _IDLE_PWM, _FULL_PWM = 1000, 1100, 2000
 class ArduPilotMotors:
     """Arming delay, spool-up and power consumption of the motors of a quadrotor.
 
-    ``spool`` is 0 for idle or stopped motors and 1 for motors that can lift. Set ``wanted`` to request spool-up.
+    ``spool`` is 0 for idle or stopped motors and 1 for motors that can lift. It rises while ``spool_up_requested``.
     """
 
     def __init__(self, vehicle: Any) -> None:
@@ -138,7 +138,7 @@ class ArduPilotMotors:
         self.armed_at: float = -math.inf
         self.disarmed_at: float = -math.inf
         self.may_turn: bool = False  # True once the arming delay is over.
-        self.wanted: bool = False
+        self.spool_up_requested: bool = False
         self.spool: float = 0.0
         self.throttle: float = 0.0  # 0 to 1; VFR_HUD reports it in percent.
 
@@ -167,13 +167,13 @@ class ArduPilotMotors:
         if self.is_armed and not armed:
             self.disarmed_at = now
         self.is_armed, self.armed_at = armed, now
-        self.may_turn = self.wanted = False
+        self.may_turn = self.spool_up_requested = False
         self.spool = self.throttle = 0.0
 
     def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
         """Advance spool and throttle by ``dt`` seconds; ``motion`` is the vehicle's motion model."""
         self.may_turn = self.is_armed and now - self.armed_at >= _ARMING_DELAY_S
-        if self.may_turn and self.wanted:
+        if self.may_turn and self.spool_up_requested:
             if self.spool < 1.0:
                 self.spool = min(1.0, self.spool + dt / _SPOOL_UP_S)
         else:
@@ -181,10 +181,9 @@ class ArduPilotMotors:
         if landed or not self.is_armed:
             self.throttle = 0.05 * self.spool
             return
-        lean = math.cos(motion.roll) * math.cos(motion.pitch)
+        vertical_share_of_thrust = max(0.5, math.cos(motion.roll) * math.cos(motion.pitch))
         lift = 1.0 - motion.acceleration_down / GRAVITY_M_S2
-        throttle = _HOVER_THROTTLE * lift / (lean if lean > 0.5 else 0.5)
-        self.throttle = 0.0 if throttle < 0.0 else throttle if throttle < 1.0 else 1.0
+        self.throttle = max(0.0, min(1.0, _HOVER_THROTTLE * lift / vertical_share_of_thrust))
 
 
 # Interfaces of the parts, for other parts.
@@ -244,7 +243,7 @@ class ArduPilotMissionHost(Protocol):
     def update(self) -> None: ...
     def stop(self) -> None: ...
     def reset(self) -> None: ...
-    def disarmed(self) -> None: ...
+    def on_disarmed(self) -> None: ...
     def clear(self) -> None: ...
     def message(self, seq: int | None = None) -> m.MissionCurrent: ...
 
@@ -274,8 +273,8 @@ class ArduPilotFailsafesHost(Protocol):
 
 class ArduPilotFenceHost(Protocol):
     def update(self) -> None: ...
-    def armed(self) -> None: ...
-    def disarmed(self) -> None: ...
+    def on_armed(self) -> None: ...
+    def on_disarmed(self) -> None: ...
     def reason_not_to_arm(self) -> str | None: ...
 
 
@@ -376,15 +375,16 @@ class ArduPilotHost(SimulatedAutopilot):
         if self.FRAME is not None:
             self.info(self.FRAME)
 
-    def point(self, latitude_e7: int, longitude_e7: int, altitude: float, frame: int) -> Ned | None:
+    def world_point(self, latitude_e7: int, longitude_e7: int, altitude: float, frame: int) -> Ned | None:
         """Convert a global position to the world frame; return None for invalid values or an unknown frame."""
-        valid = abs(latitude_e7) <= 900_000_000 and abs(longitude_e7) <= 1_800_000_000
-        if not valid or not math.isfinite(altitude):
+        is_place = abs(latitude_e7) <= 900_000_000 and abs(longitude_e7) <= 1_800_000_000
+        if not is_place or not math.isfinite(altitude):
             return None
         north, east = self.frame.to_local(latitude_e7, longitude_e7)
         if frame in _RELATIVE:
             home = self.navigation.home
-            return (north, east, (self.motion.ground_down if home is None else home[2]) - altitude)
+            home_down = self.motion.ground_down if home is None else home[2]
+            return (north, east, home_down - altitude)
         if frame in _TERRAIN:
             return (north, east, self.motion.ground_down - altitude)
         if frame in _ABSOLUTE:

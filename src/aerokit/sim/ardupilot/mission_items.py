@@ -12,7 +12,8 @@ import struct
 from collections.abc import Callable
 from typing import NamedTuple
 
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult
+from aerokit.mavlink.enums import MavCmd as Cmd
+from aerokit.mavlink.enums import MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.missions import float32
@@ -27,8 +28,6 @@ _DOWNLOADED_FRAMES: dict[int, int] = {
     MavFrame.GLOBAL_TERRAIN_ALT: MavFrame.GLOBAL_TERRAIN_ALT,
     MavFrame.GLOBAL_TERRAIN_ALT_INT: MavFrame.GLOBAL_TERRAIN_ALT,
 }
-
-_C = MavCmd
 
 
 class StoredCommand(NamedTuple):
@@ -46,7 +45,7 @@ def _read_commands() -> dict[int, StoredCommand]:
     data = pkgutil.get_data(__name__, "mission_commands.csv")
     assert data is not None
     return {
-        MavCmd[row["command"]]: StoredCommand(row["name"], row["parameters"], row["has_place"] == "1")
+        Cmd[row["command"]]: StoredCommand(row["name"], row["parameters"], row["has_place"] == "1")
         for row in csv.DictReader(data.decode().splitlines())
     }
 
@@ -55,15 +54,16 @@ STORED_COMMANDS: dict[int, StoredCommand] = _read_commands()
 _UNKNOWN = StoredCommand("?", "", has_place=False)
 
 # ArduPlane stores acceptance radius and passing distance of waypoints, and has no splines.
-_PLANE_PARAMETERS: dict[int, str] = {_C.NAV_WAYPOINT: "-BB-", _C.NAV_SPLINE_WAYPOINT: ""}
+_PLANE_PARAMETERS: dict[int, str] = {Cmd.NAV_WAYPOINT: "-BB-", Cmd.NAV_SPLINE_WAYPOINT: ""}
 
+# Indices of params that may be NaN; 0 is param 1.
 _NAN_ALLOWED: dict[int, tuple[int, ...]] = {
-    _C.NAV_WAYPOINT: (3,),
-    _C.NAV_LOITER_UNLIM: (3,),
-    _C.NAV_LAND: (3,),
-    _C.NAV_TAKEOFF: (3,),
-    _C.NAV_VTOL_TAKEOFF: (3,),
-    _C.NAV_VTOL_LAND: (2, 3),
+    Cmd.NAV_WAYPOINT: (3,),
+    Cmd.NAV_LOITER_UNLIM: (3,),
+    Cmd.NAV_LAND: (3,),
+    Cmd.NAV_TAKEOFF: (3,),
+    Cmd.NAV_VTOL_TAKEOFF: (3,),
+    Cmd.NAV_VTOL_LAND: (2, 3),
 }
 
 
@@ -76,7 +76,7 @@ def has_location(command: int) -> bool:
     return STORED_COMMANDS.get(command, _UNKNOWN).has_place
 
 
-def is_place(latitude_e7: float, longitude_e7: float) -> int:
+def check_place(latitude_e7: float, longitude_e7: float) -> int:
     """Return ACCEPTED, or the MAV_MISSION_RESULT of the invalid coordinate.
 
     Like the firmware, the function compares in single precision.
@@ -97,37 +97,38 @@ def stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
     result = _check_numbers(item)
     if result == MavMissionResult.ACCEPTED and item.command in (0, 1):
         result = MavMissionResult.INVALID
-    layout = _PLANE_PARAMETERS.get(item.command) if kind == "plane" else None
-    layout = STORED_COMMANDS.get(item.command, _UNKNOWN).parameters if layout is None else layout
+    layout = STORED_COMMANDS.get(item.command, _UNKNOWN).parameters
+    if kind == "plane":
+        layout = _PLANE_PARAMETERS.get(item.command, layout)
     if result == MavMissionResult.ACCEPTED and not layout:
         result = MavMissionResult.UNSUPPORTED
     if result != MavMissionResult.ACCEPTED:
         return result
-    assert layout is not None
-    numbers = (item.param1, item.param2, item.param3, item.param4, float(item.x), float(item.y), item.z)
-    kept = [_CONVERSIONS[kind](number) for kind, number in zip(layout.ljust(7, "-"), numbers, strict=True)]
-    if item.command == _C.NAV_LOITER_TURNS:
-        kept[:4] = _kept_turns(item)
-    p1, p2, p3, p4, x, y, z = kept
+    values = (item.param1, item.param2, item.param3, item.param4, float(item.x), float(item.y), item.z)
+    stored_values = [_CONVERSIONS[type_](value) for type_, value in zip(layout.ljust(7, "-"), values, strict=True)]
+    if item.command == Cmd.NAV_LOITER_TURNS:
+        stored_values[:4] = _stored_turns(item)
+    p1, p2, p3, p4, x, y, z = stored_values
     frame: int = MavFrame.GLOBAL
     if has_location(item.command):
-        place = _kept_place(item)
-        if isinstance(place, int):
-            return place
-        x, y, z, frame = place
+        place_or_result = _stored_place(item)
+        if isinstance(place_or_result, int):
+            return place_or_result
+        x, y, z, frame = place_or_result
     return MissionItem(item.command, frame, p1, p2, p3, p4, int(x), int(y), z)
 
 
 def _check_numbers(item: MissionItem) -> int:
-    allowed = _NAN_ALLOWED.get(item.command, ())
-    for index, number in enumerate((item.param1, item.param2, item.param3, item.param4)):
-        if math.isinf(number) or (math.isnan(number) and index not in allowed):
+    may_be_nan = _NAN_ALLOWED.get(item.command, ())
+    for index, value in enumerate((item.param1, item.param2, item.param3, item.param4)):
+        if math.isinf(value) or (math.isnan(value) and index not in may_be_nan):
             return MavMissionResult.INVALID_PARAM1 + index
     return MavMissionResult.ACCEPTED
 
 
-def _kept_place(item: MissionItem) -> tuple[float, float, float, int] | int:
-    result = is_place(item.x, item.y)
+def _stored_place(item: MissionItem) -> tuple[float, float, float, int] | int:
+    """Return x, y, z and frame of a position, or the MAV_MISSION_RESULT that refuses it."""
+    result = check_place(item.x, item.y)
     if result != MavMissionResult.ACCEPTED:
         return result
     if not abs(item.z) < _MAX_ALTITUDE_M:
@@ -139,17 +140,19 @@ def _kept_place(item: MissionItem) -> tuple[float, float, float, int] | int:
     return item.x, item.y, float32(centimetres * float32(0.01)), frame
 
 
-def _kept_turns(item: MissionItem) -> tuple[float, float, float, float]:
+def _stored_turns(item: MissionItem) -> tuple[float, float, float, float]:
     """Return params 1 to 4 of NAV_LOITER_TURNS. Turns and radius have one byte each.
 
     Less than one turn is stored in 256ths, a radius above 255 m in tens of metres.
     """
     turns, radius = item.param1, abs(item.param3)
-    is_part = 0 < turns < 1
-    count = int(min(255.0, turns * 256 if is_part else turns)) & 0xFF
-    size = float(int(radius)) if radius <= 255 else int(min(255.0, radius * 0.1)) * 10.0
+    turn_unit = 1 / 256 if 0 < turns < 1 else 1
+    turn_byte = int(min(255.0, turns / turn_unit)) & 0xFF
+    radius_unit = 1 if radius <= 255 else 10
+    radius_byte = int(min(255.0, radius / radius_unit))
     sign = -1.0 if item.param3 < 0 else 1.0
-    return (count / 256 if is_part else float(count), 0.0, sign * size, float(item.param4 > 0))
+    exits_at_tangent = float(item.param4 > 0)
+    return (turn_byte * float(turn_unit), 0.0, sign * radius_byte * radius_unit, exits_at_tangent)
 
 
 def whole(value: float) -> int:

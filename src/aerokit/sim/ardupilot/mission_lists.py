@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult
+from aerokit.mavlink.enums import MavCmd as Cmd
+from aerokit.mavlink.enums import MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.kinds import Kind
-from aerokit.sim.ardupilot.mission_items import altitude_frame, is_place, stored, whole
+from aerokit.sim.ardupilot.mission_items import altitude_frame, check_place, stored, whole
 from aerokit.sim.missions import float32
 
 _MIN_RALLY_M, _MAX_RALLY_M = -32768, 32767
@@ -33,7 +34,8 @@ class ItemList:
 
     def items(self) -> list[MissionItem]:
         """Return all items that a download sends."""
-        return [item for seq in range(self.count) if not isinstance(item := self.item(seq), int)]
+        items_or_results = [self.item(seq) for seq in range(self.count)]
+        return [item for item in items_or_results if not isinstance(item, int)]
 
     def item(self, seq: int) -> MissionItem | int:
         """Return an item, or the result that reports a missing item."""
@@ -103,25 +105,26 @@ class CommandList(ItemList):
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
         """Replace or append an item. Item 0 is validated, then ignored. Home is added to an empty list first."""
-        kept = stored(item, self._kind)
-        if isinstance(kept, int):
-            return kept
-        if kept.command == MavCmd.DO_JUMP and not self._is_target(kept.param1, last):
+        stored_item = stored(item, self._kind)
+        if isinstance(stored_item, int):
+            return stored_item
+        if stored_item.command == Cmd.DO_JUMP and not self._is_jump_target(stored_item.param1, last):
             return MavMissionResult.ERROR
-        return self._write(seq, kept)
+        return self._write(seq, stored_item)
 
-    def _is_target(self, target: float, last: int) -> bool:
+    def _is_jump_target(self, target: float, last: int) -> bool:
         return target != 0 and (target < self.count or target <= last)
 
-    def _write(self, seq: int, kept: MissionItem) -> int:
+    def _write(self, seq: int, stored_item: MissionItem) -> int:
         count = len(self._commands)
+        # A list with space for home alone accepts nothing, not even item 0, which is ignored.
         if seq > count or max(seq, 1) >= self.capacity:
             return MavMissionResult.ERROR
         if seq == count:
             self.add_home()
-            self._commands.append(kept)
+            self._commands.append(stored_item)
         elif seq > 0:
-            self._commands[seq] = kept
+            self._commands[seq] = stored_item
         self.version += 1
         return MavMissionResult.ACCEPTED
 
@@ -134,12 +137,12 @@ class CommandList(ItemList):
     def write_file(self, items: list[MissionItem], start: int) -> int:
         """Store the items of an uploaded file, until one is refused."""
         for seq, item in enumerate(items):
-            kept = stored(item, self._kind)
-            if isinstance(kept, int):
-                return kept
-            if kept.command == MavCmd.DO_JUMP and not 0 < kept.param1 < len(items):
+            stored_item = stored(item, self._kind)
+            if isinstance(stored_item, int):
+                return stored_item
+            if stored_item.command == Cmd.DO_JUMP and not 0 < stored_item.param1 < len(items):
                 return MavMissionResult.ERROR
-            result = self._write(seq + start, kept)
+            result = self._write(seq + start, stored_item)
             if result != MavMissionResult.ACCEPTED:
                 return result
         return MavMissionResult.ACCEPTED
@@ -169,12 +172,12 @@ class RallyList(ItemList):
         del self._points[count:]
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        kept = _stored_rally_point(item)
-        if isinstance(kept, int):
-            return kept
+        stored_item = _stored_rally_point(item)
+        if isinstance(stored_item, int):
+            return stored_item
         if seq > len(self._points) or seq >= self.capacity:
             return MavMissionResult.ERROR
-        self._points[seq : seq + 1] = [kept]
+        self._points[seq : seq + 1] = [stored_item]  # replaces the point, or appends it at the end
         return MavMissionResult.ACCEPTED
 
     def clear(self) -> bool:
@@ -183,9 +186,9 @@ class RallyList(ItemList):
 
 
 def _stored_rally_point(item: MissionItem) -> MissionItem | int:
-    if item.command != MavCmd.NAV_RALLY_POINT:
+    if item.command != Cmd.NAV_RALLY_POINT:
         return MavMissionResult.UNSUPPORTED
-    result = is_place(item.x, item.y)
+    result = check_place(item.x, item.y)
     if result != MavMissionResult.ACCEPTED:
         return result
     if not _MIN_RALLY_M <= item.z <= _MAX_RALLY_M:
@@ -197,15 +200,14 @@ def _stored_rally_point(item: MissionItem) -> MissionItem | int:
     return MissionItem(item.command, frame, 0.0, 0.0, 0.0, 0.0, *place, height, autocontinue=False)
 
 
-_C = MavCmd
-_POLYGONS = (_C.NAV_FENCE_POLYGON_VERTEX_INCLUSION, _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
-_CIRCLES = (_C.NAV_FENCE_CIRCLE_INCLUSION, _C.NAV_FENCE_CIRCLE_EXCLUSION)
+_POLYGONS = (Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
+_CIRCLES = (Cmd.NAV_FENCE_CIRCLE_INCLUSION, Cmd.NAV_FENCE_CIRCLE_EXCLUSION)
 _TYPE_NUMBERS: dict[int, int] = {
-    _C.NAV_FENCE_POLYGON_VERTEX_INCLUSION: 98,
-    _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: 97,
-    _C.NAV_FENCE_RETURN_POINT: 95,
-    _C.NAV_FENCE_CIRCLE_EXCLUSION: 93,
-    _C.NAV_FENCE_CIRCLE_INCLUSION: 92,
+    Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: 98,
+    Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: 97,
+    Cmd.NAV_FENCE_RETURN_POINT: 95,
+    Cmd.NAV_FENCE_CIRCLE_EXCLUSION: 93,
+    Cmd.NAV_FENCE_CIRCLE_INCLUSION: 92,
 }
 _STORAGE_BYTES = 560
 _BYTES_PER_POINT = 8
@@ -244,10 +246,10 @@ class FenceList(ItemList):
         assert self._uploaded is not None
         if seq >= len(self._uploaded):
             return MavMissionResult.INVALID_SEQUENCE
-        kept = _stored_fence_item(item)
-        if isinstance(kept, int):
-            return kept
-        self._uploaded[seq] = kept
+        stored_item = _stored_fence_item(item)
+        if isinstance(stored_item, int):
+            return stored_item
+        self._uploaded[seq] = stored_item
         return MavMissionResult.ACCEPTED
 
     def finish(self, warn: Warn) -> int:
@@ -275,13 +277,13 @@ class FenceList(ItemList):
         return MavMissionResult.ACCEPTED
 
     def replace(self, items: Sequence[MissionItem], warn: Warn) -> int:
-        kept: list[MissionItem] = []
+        stored_items: list[MissionItem] = []
         for item in items:
-            converted = _stored_fence_item(item)
-            if isinstance(converted, int):
-                return converted
-            kept.append(converted)
-        return self.store(kept, warn)
+            stored_item = _stored_fence_item(item)
+            if isinstance(stored_item, int):
+                return stored_item
+            stored_items.append(stored_item)
+        return self.store(stored_items, warn)
 
 
 def _stored_fence_item(item: MissionItem) -> MissionItem | int:
@@ -294,34 +296,36 @@ def _stored_fence_item(item: MissionItem) -> MissionItem | int:
         size = float(whole(item.param1) & 0xFF)
     elif item.command in _CIRCLES:
         size = float32(item.param1)
-    elif item.command != _C.NAV_FENCE_RETURN_POINT:
+    elif item.command != Cmd.NAV_FENCE_RETURN_POINT:
         return MavMissionResult.UNSUPPORTED
     return MissionItem(item.command, MavFrame.GLOBAL, size, x=int(item.x), y=int(item.y), z=0.0, autocontinue=False)
 
 
 def _problem(items: Sequence[MissionItem]) -> str | None:
     """Return the firmware's text about an invalid fence; None if it is valid."""
-    wanted, vertices, missing, has_return_point = 0, 0.0, 0, False
+    # Type and number of vertices of the current polygon, and how many of them are still to come.
+    polygon_type, vertices, missing = 0, 0.0, 0
+    has_return_point = False
     for item in items:
         if item.command in _POLYGONS:
             if item.param1 < 3:
                 return f"Invalid vertex count ({item.param1:.0f})"
             if missing == 0:
-                wanted, vertices, missing = item.command, item.param1, int(item.param1)
-            elif item.command != wanted:
-                return f"Received incorrect vertex type (want={_number(wanted)} got={_number(item.command)})"
+                polygon_type, vertices, missing = item.command, item.param1, int(item.param1)
+            elif item.command != polygon_type:
+                return f"Received incorrect vertex type (want={_number(polygon_type)} got={_number(item.command)})"
             elif item.param1 != vertices:
                 return f"Unexpected vertex count want={vertices:.0f} got={item.param1:.0f}"
             missing -= 1
         elif missing:
-            return f"Received incorrect type (want={_number(wanted)} got={_number(item.command)})"
+            return f"Received incorrect type (want={_number(polygon_type)} got={_number(item.command)})"
         elif item.command in _CIRCLES and not item.param1 > 0:
             return "Non-positive circle radius"
-        elif item.command == _C.NAV_FENCE_RETURN_POINT:
+        elif item.command == Cmd.NAV_FENCE_RETURN_POINT:
             if has_return_point:
                 return "Multiple return points"
             has_return_point = True
-        if is_place(item.x, item.y) != MavMissionResult.ACCEPTED:
+        if check_place(item.x, item.y) != MavMissionResult.ACCEPTED:
             return "Bad lat or lon"
     return "Incorrect item count" if missing else None
 
@@ -331,15 +335,17 @@ def _number(command: int) -> int:
 
 
 def _storage_needed(items: Sequence[MissionItem]) -> int:
-    size, left = 4, 0
+    """Return the bytes that ArduPilot needs to store a fence."""
+    size, vertices_left = 4, 0  # header
     for item in items:
         size += _BYTES_PER_POINT
-        if left:
-            left -= 1
+        if vertices_left:
+            vertices_left -= 1
             continue
-        size += 1
+        size += 1  # type
         if item.command in _POLYGONS:
-            size, left = size + 1, int(item.param1) - 1
+            size += 1  # number of vertices
+            vertices_left = int(item.param1) - 1
         elif item.command in _CIRCLES:
-            size += 4
+            size += 4  # radius
     return size

@@ -9,30 +9,30 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 
-from aerokit.mavlink.enums import MavCmd, MavSeverity, MissionState
+from aerokit.mavlink.enums import MavCmd as Cmd
+from aerokit.mavlink.enums import MavSeverity, MissionState
 from aerokit.mavlink.messages import MissionCurrent
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import ArduPilotHost, ArduPilotMode
 from aerokit.sim.ardupilot.mission_items import command_name
 from aerokit.sim.motion import Ned
 
-_C = MavCmd
 _FIRST = 1
 _MAX_JUMPS, _MAX_STEPS = 64, 255
 _UNLIMITED = -1
-_WITH_TARGET = frozenset({_C.DO_JUMP, _C.JUMP_TAG, _C.DO_JUMP_TAG})
-_TAKE_OFFS = frozenset({_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF})
-_BEFORE_TAKE_OFF = frozenset({_C.DO_AUX_FUNCTION, _C.NAV_DELAY})
-_NAVIGATION_BEYOND = frozenset({_C.NAV_SET_YAW_SPEED, _C.NAV_SCRIPT_TIME, _C.NAV_ATTITUDE_TIME})
+_WITH_TARGET = frozenset({Cmd.DO_JUMP, Cmd.JUMP_TAG, Cmd.DO_JUMP_TAG})
+_TAKE_OFFS = frozenset({Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF})
+_BEFORE_TAKE_OFF = frozenset({Cmd.DO_AUX_FUNCTION, Cmd.NAV_DELAY})
+_NAVIGATION_BEYOND = frozenset({Cmd.NAV_SET_YAW_SPEED, Cmd.NAV_SCRIPT_TIME, Cmd.NAV_ATTITUDE_TIME})
 # Commands that complete at once on every vehicle, without a status text.
 _INSTANT = frozenset(
     {
-        _C.DO_GRIPPER, _C.DO_SET_SERVO, _C.DO_SET_RELAY, _C.DO_REPEAT_SERVO, _C.DO_REPEAT_RELAY,
-        _C.DO_DIGICAM_CONFIGURE, _C.DO_DIGICAM_CONTROL, _C.DO_SET_CAM_TRIGG_DIST, _C.DO_PARACHUTE,
-        _C.DO_SEND_SCRIPT_MESSAGE, _C.DO_SPRAYER, _C.DO_AUX_FUNCTION, _C.DO_SET_RESUME_REPEAT_DIST,
-        _C.DO_GIMBAL_MANAGER_PITCHYAW, _C.JUMP_TAG, _C.IMAGE_START_CAPTURE, _C.IMAGE_STOP_CAPTURE,
-        _C.SET_CAMERA_ZOOM, _C.SET_CAMERA_FOCUS, _C.SET_CAMERA_SOURCE, _C.VIDEO_START_CAPTURE,
-        _C.VIDEO_STOP_CAPTURE,
+        Cmd.DO_GRIPPER, Cmd.DO_SET_SERVO, Cmd.DO_SET_RELAY, Cmd.DO_REPEAT_SERVO, Cmd.DO_REPEAT_RELAY,
+        Cmd.DO_DIGICAM_CONFIGURE, Cmd.DO_DIGICAM_CONTROL, Cmd.DO_SET_CAM_TRIGG_DIST, Cmd.DO_PARACHUTE,
+        Cmd.DO_SEND_SCRIPT_MESSAGE, Cmd.DO_SPRAYER, Cmd.DO_AUX_FUNCTION, Cmd.DO_SET_RESUME_REPEAT_DIST,
+        Cmd.DO_GIMBAL_MANAGER_PITCHYAW, Cmd.JUMP_TAG, Cmd.IMAGE_START_CAPTURE, Cmd.IMAGE_STOP_CAPTURE,
+        Cmd.SET_CAMERA_ZOOM, Cmd.SET_CAMERA_FOCUS, Cmd.SET_CAMERA_SOURCE, Cmd.VIDEO_START_CAPTURE,
+        Cmd.VIDEO_STOP_CAPTURE,
     }
 )  # fmt: skip
 
@@ -52,7 +52,7 @@ class MissionMode(ArduPilotMode):
         self.is_waiting: bool = False  # True from entering the mode until the mission starts.
         self.handlers: dict[int, Callable[[MissionItem], None]] = {}
 
-    def disarmed(self) -> None:
+    def on_disarmed(self) -> None:
         """Called after the motors have stopped."""
         # Disarming restarts an unfinished mission, which then waits on the ground.
         if self.vehicle.mode is self:
@@ -72,9 +72,9 @@ class MissionMode(ArduPilotMode):
         if self.is_waiting and vehicle.mode is self and vehicle.navigation.origin is not None:
             self.is_waiting = False
             vehicle.mission.start_or_resume()
-            self.mission_started()
+            self.on_mission_started()
 
-    def mission_started(self) -> None:
+    def on_mission_started(self) -> None:
         """Called after the mission has started or resumed in this mode."""
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
@@ -99,7 +99,7 @@ class MissionMode(ArduPilotMode):
 
 def is_navigation(item: MissionItem) -> bool:
     """Return True for a navigation command, only one of which runs at a time."""
-    return item.command <= _C.NAV_LAST or item.command in _NAVIGATION_BEYOND
+    return item.command <= Cmd.NAV_LAST or item.command in _NAVIGATION_BEYOND
 
 
 class MissionRun:
@@ -110,10 +110,11 @@ class MissionRun:
         self._list = vehicle.missions.commands
         self._state = MissionState.NOT_STARTED
         self.nav_index: int = 0  # Index of the navigation command that runs or will be resumed.
-        self._nav: MissionItem | None = None
-        self._do: tuple[int, MissionItem] | None = None
-        self._do_index = 0
-        self._jumps: dict[int, int] = {}
+        self._running_nav: MissionItem | None = None  # The running navigation command.
+        # The running "do" or "condition" command with its index, and the index of the last one that was started.
+        self._running_do: tuple[int, MissionItem] | None = None
+        self._last_do_index = 0
+        self._jumps: dict[int, int] = {}  # Number of jumps done, by index of the jump command.
 
     @property
     def is_present(self) -> bool:
@@ -147,8 +148,8 @@ class MissionRun:
         return MissionCurrent(seq, self.count, self.state, int(self._vehicle.mode.needs_mission))
 
     def starts_with_take_off(self) -> bool:
-        begin = _FIRST if self._restarts or not self.nav_index else self.nav_index
-        return self.is_take_off(begin)
+        first_index = _FIRST if self._restarts or not self.nav_index else self.nav_index
+        return self.is_take_off(first_index)
 
     def is_take_off(self, index: int) -> bool:
         """Return True if the first navigation command from ``index`` on is a take-off, delays excepted."""
@@ -160,15 +161,19 @@ class MissionRun:
     def navigation_from(self, index: int) -> Iterator[tuple[int, MissionItem]]:
         """Yield at most sixteen navigation commands in the order of execution, following jumps."""
         for _ in range(16):
-            found = self._next(index, counts=False)
-            for _ in range(_MAX_STEPS):
-                if found is None or is_navigation(found[1]):
-                    break
-                found = self._next(found[0] + 1, counts=False)
-            if found is None or not is_navigation(found[1]):
+            navigation = self._next_navigation(index)
+            if navigation is None:
                 return
-            yield found
-            index = found[0] + 1
+            yield navigation
+            index = navigation[0] + 1
+
+    def _next_navigation(self, index: int) -> tuple[int, MissionItem] | None:
+        for _ in range(1 + _MAX_STEPS):
+            command = self._next(index, count_jumps=False)
+            if command is None or is_navigation(command[1]):
+                return command
+            index = command[0] + 1
+        return None
 
     @property
     def _restarts(self) -> bool:
@@ -176,17 +181,17 @@ class MissionRun:
 
     def start_or_resume(self) -> None:
         """Start or resume the mission, as MIS_RESTART selects."""
-        has_place = self._state != MissionState.COMPLETE and self._list.command(self.nav_index) is not None
-        if self._restarts or not has_place:
+        can_resume = self._state != MissionState.COMPLETE and self._list.command(self.nav_index) is not None
+        if self._restarts or not can_resume:
             self._start()
         else:
             self._state = MissionState.ACTIVE
-            self.set_current(self._do[0] if self._do is not None else self.nav_index)
+            self.set_current(self._running_do[0] if self._running_do is not None else self.nav_index)
 
     def _start(self) -> None:
         self._state = MissionState.ACTIVE
         self.reset()
-        if not self._advance():
+        if not self._start_next_navigation():
             self._complete()
 
     def stop(self) -> None:
@@ -196,12 +201,12 @@ class MissionRun:
 
     def reset(self) -> None:
         """Reset progress and jump counters, e.g. because the vehicle was disarmed."""
-        self.nav_index, self._nav, self._do, self._do_index = 0, None, None, 0
+        self.nav_index, self._running_nav, self._running_do, self._last_do_index = 0, None, None, 0
         self._jumps.clear()
 
-    def disarmed(self) -> None:
+    def on_disarmed(self) -> None:
         self.reset()
-        self._vehicle.call_later(0.0, self._mode.disarmed)
+        self._vehicle.call_later(0.0, self._mode.on_disarmed)
 
     def clear(self) -> None:
         """Called when the mission has been cleared."""
@@ -212,30 +217,31 @@ class MissionRun:
         """Continue from this command; return False if it does not exist."""
         if index >= self._list.count or self._list.count == 1:
             return False
-        self._do, self._do_index, self._nav = None, 0, None
+        self._running_do, self._last_do_index, self._running_nav = None, 0, None
         if index == 0 or self._state == MissionState.COMPLETE:
             self._jumps.clear()
         index = max(index, _FIRST)
         if self.is_running:
-            done = self._advance(index)
-            if not done:
+            is_started = self._start_next_navigation(index)
+            if not is_started:
                 self._complete()
-            return done
-        return self._set_place(index)
+            return is_started
+        return self._set_resume_index(index)
 
-    def _set_place(self, index: int) -> bool:
-        """Set the command at which a stopped mission will resume."""
+    def _set_resume_index(self, index: int) -> bool:
+        """Set the command at which a stopped mission will resume; return False if there is none from ``index`` on."""
         for _ in range(_MAX_STEPS):
-            found = self._next(index, counts=True)
-            if found is None:
+            command = self._next(index, count_jumps=True)
+            if command is None:
                 break
-            if is_navigation(found[1]):
-                self.nav_index, self._nav = found
+            command_index, item = command
+            if is_navigation(item):
+                self.nav_index, self._running_nav = command
                 self._state = MissionState.NOT_STARTED
                 return True
-            if self._do is None:
-                self._do, self._do_index = found, found[0]
-            index = found[0] + 1
+            if self._running_do is None:
+                self._running_do, self._last_do_index = command, command_index
+            index = command_index + 1
         self.nav_index = 0
         return False
 
@@ -243,45 +249,46 @@ class MissionRun:
         """Check whether the running commands are complete, and start the next commands."""
         if not self.is_running or not self._list.count:
             return
-        if self._nav is None or self._is_complete(self.nav_index, self._nav):
-            self._nav = None
-            if not self._advance():
+        if self._running_nav is None or self._is_complete(self.nav_index, self._running_nav):
+            self._running_nav = None
+            if not self._start_next_navigation():
                 self._complete()
                 return
-        if self._do is None:
-            self._advance_do()
-        elif self._is_complete(*self._do):
-            self._do = None
+        if self._running_do is None:
+            self._start_next_do()
+        elif self._is_complete(*self._running_do):
+            self._running_do = None
 
-    def _advance(self, start: int = 0) -> bool:
+    def _start_next_navigation(self, start: int = 0) -> bool:
         """Start the next navigation command, and the first other command before it."""
         index = start or (self.nav_index + 1 if self.nav_index else _FIRST)
-        self._do, self._do_index = None, 0
+        self._running_do, self._last_do_index = None, 0
         for _ in range(_MAX_STEPS):
-            found = self._next(index, counts=True)
-            if found is None:
+            command = self._next(index, count_jumps=True)
+            if command is None:
                 return False
-            index = found[0] + 1
-            if is_navigation(found[1]):
-                self.nav_index = found[0]
-                if self._begin(*found):
-                    self._nav = found[1]
+            command_index, item = command
+            index = command_index + 1
+            if is_navigation(item):
+                self.nav_index = command_index
+                if self._begin(command_index, item):
+                    self._running_nav = item
                     return True
-            elif self._do is None:
-                self._do, self._do_index = found, found[0]
-                self._begin(*found)
+            elif self._running_do is None:
+                self._running_do, self._last_do_index = command, command_index
+                self._begin(command_index, item)
         return False
 
-    def _advance_do(self) -> None:
+    def _start_next_do(self) -> None:
         """Start the next "do" command before the next navigation command."""
-        if not self._do_index:
+        if not self._last_do_index:
             return
-        found = self._next(self._do_index + 1, counts=False)
-        if found is None or is_navigation(found[1]):
-            self._do_index = 0
+        command = self._next(self._last_do_index + 1, count_jumps=False)
+        if command is None or is_navigation(command[1]):
+            self._last_do_index = 0
             return
-        self._do, self._do_index = found, found[0]
-        self._begin(*found)
+        self._running_do, self._last_do_index = command, command[0]
+        self._begin(*command)
 
     def _begin(self, index: int, item: MissionItem) -> bool:
         name = command_name(item.command)
@@ -297,44 +304,46 @@ class MissionRun:
         self._state = MissionState.COMPLETE
         self._mode.end_mission()
 
-    def _next(self, index: int, *, counts: bool) -> tuple[int, MissionItem] | None:
-        """Return the first command from ``index`` on, following jumps. ``counts`` decrements their repetitions."""
+    def _next(self, index: int, *, count_jumps: bool) -> tuple[int, MissionItem] | None:
+        """Return the first command from ``index`` on, following jumps.
+
+        With ``count_jumps``, each jump uses up one of its repetitions; else the call only looks ahead.
+        """
         first_jump = 0
         for _ in range(_MAX_JUMPS):
-            while (item := self._list.command(index)) is not None and item.command not in (
-                _C.DO_JUMP,
-                _C.DO_JUMP_TAG,
-            ):
-                return index, item
+            item = self._list.command(index)
             if item is None:
                 return None
+            if item.command not in (Cmd.DO_JUMP, Cmd.DO_JUMP_TAG):
+                return index, item
             target = self._target(item)
-            if self._list.command(target) is None or (not counts and first_jump == index):
+            is_endless = not count_jumps and first_jump == index
+            if self._list.command(target) is None or is_endless:
                 return None
             first_jump = first_jump or index
-            index = target if self._jump(index, int(item.param2), counts=counts) else index + 1
+            index = target if self._jumps_now(index, int(item.param2), count_jumps=count_jumps) else index + 1
         return None
 
     def _target(self, item: MissionItem) -> int:
-        if item.command == _C.DO_JUMP:
+        if item.command == Cmd.DO_JUMP:
             return int(item.param1)
         for index in range(_FIRST, self._list.count):
             tag = self._list.command(index)
-            if tag is not None and tag.command == _C.JUMP_TAG and tag.param1 == item.param1:
+            if tag is not None and tag.command == Cmd.JUMP_TAG and tag.param1 == item.param1:
                 return index
         return 0
 
-    def _jump(self, index: int, times: int, *, counts: bool) -> bool:
+    def _jumps_now(self, index: int, times: int, *, count_jumps: bool) -> bool:
         """Return True if the jump at ``index`` has repetitions left."""
-        done = self._jumps.get(index, 0)
-        if times != _UNLIMITED and done >= times:
-            if counts:
-                self._jumps.pop(index, None)
+        jumps_done = self._jumps.get(index, 0)
+        if times != _UNLIMITED and jumps_done >= times:
+            if count_jumps:
+                self._jumps.pop(index, None)  # The next execution of this command jumps ``times`` times again.
             return False
-        if counts:
-            self._jumps[index] = done + 1
-            of = "unlimited" if times == _UNLIMITED else str(times)
-            self._vehicle.info(f"Mission: {index} Jump {done + 1}/{of}")
+        if count_jumps:
+            self._jumps[index] = jumps_done + 1
+            total = "unlimited" if times == _UNLIMITED else str(times)
+            self._vehicle.info(f"Mission: {index} Jump {jumps_done + 1}/{total}")
         return True
 
 
@@ -348,6 +357,6 @@ def set_home_from(vehicle: ArduPilotHost, item: MissionItem) -> None:
     """Execute DO_SET_HOME of a mission: set home to the item's position, or else to the vehicle's position."""
     point: Ned | None = vehicle.motion.place
     if item.param1 != 1 and (item.x, item.y, item.z) != (0, 0, 0):
-        point = vehicle.point(int(item.x), int(item.y), item.z, item.frame)
+        point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
     if point is not None:
         vehicle.navigation.set_home(point, lock=False)

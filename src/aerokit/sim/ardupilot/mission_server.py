@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavMissionType, MavSeverity
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionType, MavSeverity
+from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.mavlink.message import Message
 from aerokit.missions import MissionItem
 from aerokit.protocols.servers.missions import (
@@ -34,7 +35,6 @@ from aerokit.sim.vehicle import sender_of
 _DEGREE = 1e7
 _MAX_COMMANDS, _MAX_RALLY_POINTS = 650, 46
 _GUIDED_TARGET, _ALTITUDE_CHANGE = 2, 3
-_R = MavMissionResult
 
 
 class ArduPilotMissionServer(MissionServer):
@@ -70,21 +70,21 @@ class ArduPilotMissionServer(MissionServer):
         return [] if items is None else items.items()
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Store items like a file upload; return the MAV_MISSION_RESULT. Only missions support ``clear=False``."""
+        """Store items like the upload of a file; return a MAV_MISSION_RESULT. ``clear=False`` is for missions only."""
         if mission_type == MavMissionType.MISSION:
             if clear:
                 self._clear_list(self.commands)
             return self.commands.write_file(list(items), start)
         if not clear:
-            return _R.ERROR
+            return Result.ERROR
         if mission_type == MavMissionType.FENCE:
             return self.fence.replace(items, self._warn)
         self.rally.clear()
         for seq, item in enumerate(items):
             result = self.rally.put(seq, item, len(items) - 1)
-            if result != _R.ACCEPTED:
+            if result != Result.ACCEPTED:
                 return result
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def _home(self) -> MissionItem:
         home = self._vehicle.navigation.home
@@ -119,17 +119,18 @@ class ArduPilotMissionServer(MissionServer):
         kind = message.mission_type
         if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
-            return _R.UNSUPPORTED
+            return Result.UNSUPPORTED
+        # During an upload, only another upload (which the base class judges) and single requests are served.
         if kind in self._uploads and not isinstance(message, (m.MissionCount, m.MissionRequest)):
-            return _R.DENIED
-        return None if kind in self._lists else _R.UNSUPPORTED
+            return Result.DENIED
+        return None if kind in self._lists else Result.UNSUPPORTED
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         if request.mission_type in self._lists:
             super()._on_request(request, channel)
 
     def _refuse_item(self, request: AnyRequest, result: int, channel: Channel) -> None:
-        if result == _R.INVALID_SEQUENCE and isinstance(request, m.MissionRequestInt):
+        if result == Result.INVALID_SEQUENCE and isinstance(request, m.MissionRequestInt):
             kind = request.mission_type
             self._vehicle.send(m.MissionCount(*sender_of(request), self.count(kind), kind), channel)
         super()._refuse_item(request, result, channel)
@@ -138,16 +139,16 @@ class ArduPilotMissionServer(MissionServer):
         return self._lists[mission_type].item(seq)
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
-        to, kind = sender_of(request), request.mission_type
+        client, kind = sender_of(request), request.mission_type
         # The firmware compares the item's command, instead of its index, with the index of the current item.
         current = kind == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
         if isinstance(request, m.MissionRequestInt):
-            return item_message_int(item, request.seq, to, kind, current=current)
+            return item_message_int(item, request.seq, client, kind, current=current)
         place: tuple[float, float] = (item.x, item.y)
         if has_location(item.command):
             place = (float32(item.x * float32(1e-7)), float32(item.y * float32(1e-7)))
         self._warn_once(request, "got MISSION_REQUEST; use MISSION_REQUEST_INT!")
-        return item_message_float(item, place, request.seq, to, kind, int(current))
+        return item_message_float(item, place, request.seq, client, kind, int(current))
 
     def _refuse_size(self, count: m.MissionCount, channel: Channel) -> None:
         super()._refuse_size(count, channel)
@@ -163,7 +164,7 @@ class ArduPilotMissionServer(MissionServer):
         refusal = self._refusal(request, channel)
         if refusal is None and not 0 <= start <= end <= self.count(kind):
             self._warn("Flight plan update rejected")
-            refusal = _R.ERROR
+            refusal = Result.ERROR
         if refusal is not None:
             self._acknowledge(sender_of(request), kind, refusal, channel)
             return
@@ -194,7 +195,7 @@ class ArduPilotMissionServer(MissionServer):
         elif kind == MavMissionType.MISSION and message.current in (_GUIDED_TARGET, _ALTITUDE_CHANGE):
             self._answer_item(message, self._guide(item, message.current), channel)
         elif kind not in self._lists:
-            self._answer_item(message, _R.UNSUPPORTED, channel)
+            self._answer_item(message, Result.UNSUPPORTED, channel)
         else:
             if isinstance(message, m.MissionItem) and kind in self._uploads:
                 self._warn_once(message, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
@@ -218,17 +219,18 @@ class ArduPilotMissionServer(MissionServer):
         """Do nothing: ArduPilot ignores this message."""
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
-        kind, to = request.mission_type, sender_of(request)
+        kind, client = request.mission_type, sender_of(request)
         upload = self._uploads.get(kind)
-        result: int = _R.UNSUPPORTED
-        if upload is not None and upload.client != to:
-            self._acknowledge(to, kind, _R.DENIED, channel)
-            result = _R.ERROR
+        result: int = Result.UNSUPPORTED
+        if upload is not None and upload.client != client:
+            # The firmware sends two acknowledgements.
+            self._acknowledge(client, kind, Result.DENIED, channel)
+            result = Result.ERROR
         elif kind in self._lists:
             if upload is not None:
                 self._drop(upload)
-            result = _R.ACCEPTED if self._clear_list(self._lists[kind]) else _R.ERROR
-        self._acknowledge(to, kind, result, channel)
+            result = Result.ACCEPTED if self._clear_list(self._lists[kind]) else Result.ERROR
+        self._acknowledge(client, kind, result, channel)
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
         """Set the current item; MISSION_CURRENT has the requested index, even if another item runs."""
@@ -236,24 +238,24 @@ class ArduPilotMissionServer(MissionServer):
             self._vehicle.send(self._vehicle.mission.message(request.seq), channel)
 
     def _clear_list(self, items: ItemList) -> bool:
-        done = items.clear()
-        if done and items is self.commands:
+        is_cleared = items.clear()
+        if is_cleared and items is self.commands:
             self._vehicle.mission.clear()
-        return done
+        return is_cleared
 
     def _guide(self, item: MissionItem, current: int) -> int:
         """Handle an item whose ``current`` field makes it a target for GUIDED."""
-        kept = stored(item, self._vehicle.KIND)
-        if isinstance(kept, int):
-            return kept
+        stored_item = stored(item, self._vehicle.KIND)
+        if isinstance(stored_item, int):
+            return stored_item
         if current == _ALTITUDE_CHANGE:
-            return _R.ACCEPTED
+            return Result.ACCEPTED
         vehicle = self._vehicle
-        point = vehicle.point(int(kept.x), int(kept.y), kept.z, kept.frame)
-        if vehicle.mode is not vehicle.guided or kept.command != MavCmd.NAV_WAYPOINT or point is None:
-            return _R.ERROR
+        point = vehicle.world_point(int(stored_item.x), int(stored_item.y), stored_item.z, stored_item.frame)
+        if vehicle.mode is not vehicle.guided or stored_item.command != MavCmd.NAV_WAYPOINT or point is None:
+            return Result.ERROR
         vehicle.guided.go_to(point)
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
 
 def _without_floats(message: AnyItem) -> MissionItem | int:
@@ -264,7 +266,7 @@ def _without_floats(message: AnyItem) -> MissionItem | int:
     if not has_location(item.command):
         return item.replace(x=whole(item.x), y=whole(item.y))
     if not abs(item.x) <= 90.0:
-        return _R.INVALID_PARAM5_X
+        return Result.INVALID_PARAM5_X
     if not abs(item.y) <= 180.0:
-        return _R.INVALID_PARAM6_Y
+        return Result.INVALID_PARAM6_Y
     return item.replace(x=int(float32(item.x * _DEGREE)), y=int(float32(item.y * _DEGREE)))

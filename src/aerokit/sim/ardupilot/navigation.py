@@ -44,18 +44,18 @@ class ArduPilotNavigation:
 
     def start(self) -> None:
         """Schedule the events of the boot timeline."""
-        line, later = self._vehicle.timeline, self._vehicle.call_later
-        unaligned = line.ready + 0.5 * (line.estimator_active - line.ready)
-        later(unaligned, lambda: self._set_flags(int(Ekf.UNINITIALIZED)))
-        later(line.estimator_active, self._activate)
-        later(line.tilt_aligned, lambda: self._report_cores("tilt alignment complete"))
-        later(line.yaw_aligned, self._align)
-        later(line.gps_detected, self._detect_gps)
-        later(line.gps_fix, self._get_fix)
-        later(line.origin_set, self._set_origin)
-        later(line.healthy, self._become_healthy)
-        later(line.position_good, self._use_gps)
-        later(line.yaw_aligned, self._watch_external)
+        timeline, call_later = self._vehicle.timeline, self._vehicle.call_later
+        unaligned_at = timeline.ready + 0.5 * (timeline.estimator_active - timeline.ready)
+        call_later(unaligned_at, lambda: self._set_flags(int(Ekf.UNINITIALIZED)))
+        call_later(timeline.estimator_active, self._activate)
+        call_later(timeline.tilt_aligned, lambda: self._report_cores("tilt alignment complete"))
+        call_later(timeline.yaw_aligned, self._align)
+        call_later(timeline.gps_detected, self._detect_gps)
+        call_later(timeline.gps_fix, self._get_fix)
+        call_later(timeline.origin_set, self._set_origin)
+        call_later(timeline.healthy, self._become_healthy)
+        call_later(timeline.position_good, self._use_gps)
+        call_later(timeline.yaw_aligned, self._watch_external)
 
     @property
     def has_position(self) -> bool:
@@ -194,20 +194,26 @@ class ArduPilotNavigation:
             self._vehicle.info("AHRS: EKF3 active")
 
     def _check_gps(self) -> None:
-        now, lost = self._vehicle.now, self.gps_is_lost or not self.is_gps_detected
-        if lost and math.isnan(self._lost_at):
-            self._lost_at, self.fix_type = now, GpsFixType.NO_FIX
-        elif lost and self.uses_external:
-            return
-        elif lost and self.has_position and now - self._lost_at >= _POSITION_TIMEOUT_S:
-            self.flags = _DEAD_RECKONING | (Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0)
-        elif lost and self.flags != _ATTITUDE_ONLY and now - self._lost_at >= _AIDING_TIMEOUT_S:
-            self.flags = _ATTITUDE_ONLY
-            self._report_cores("stopped aiding")
-        elif not lost and self.fix_type < GpsFixType.TYPE_3D_FIX:
+        if self.gps_is_lost or not self.is_gps_detected:
+            self._follow_gps_loss()
+        elif self.fix_type < GpsFixType.TYPE_3D_FIX:
             self._lost_at, self.fix_type = math.nan, GpsFixType.RTK_FIXED
             if self.origin is not None and not self.has_position and not self.uses_external:
                 self._use_gps()
+
+    def _follow_gps_loss(self) -> None:
+        """Lose the fix at once and the position after 7 s; stop aiding the estimator after 15 s."""
+        if math.isnan(self._lost_at):
+            self._lost_at, self.fix_type = self._vehicle.now, GpsFixType.NO_FIX
+            return
+        lost_for = self._vehicle.now - self._lost_at
+        if self.uses_external:
+            return
+        if self.has_position and lost_for >= _POSITION_TIMEOUT_S:
+            self.flags = _DEAD_RECKONING | (Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0)
+        elif self.flags != _ATTITUDE_ONLY and lost_for >= _AIDING_TIMEOUT_S:
+            self.flags = _ATTITUDE_ONLY
+            self._report_cores("stopped aiding")
 
 
 def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable[[Ned], bool] = lambda _: True) -> Ned:
@@ -216,20 +222,20 @@ def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable
     Rally points farther away than RALLY_LIMIT_KM are ignored (0: no limit). With RALLY_INCL_HOME the result is home if
     it is nearer than the rally points.
     """
-    here = (vehicle.motion.north, vehicle.motion.east)
+    current = (vehicle.motion.north, vehicle.motion.east)
     parameters = vehicle.parameters
     points = (
-        vehicle.point(int(item.x), int(item.y), item.z, item.frame)
+        vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
         for item in vehicle.missions.items(MavMissionType.RALLY)
     )
     places = [point for point in points if point is not None and is_allowed(point)]
     if not places:
         return home
-    nearest = min(places, key=lambda place: math.dist(place[:2], here))
-    distance, limit = math.dist(nearest[:2], here), parameters["RALLY_LIMIT_KM"] * 1000.0
+    nearest = min(places, key=lambda place: math.dist(place[:2], current))
+    distance, limit = math.dist(nearest[:2], current), parameters["RALLY_LIMIT_KM"] * 1000.0
     if limit > 0 and distance > limit:
         return home
-    if parameters["RALLY_INCL_HOME"] and distance >= math.dist(home[:2], here):
+    if parameters["RALLY_INCL_HOME"] and distance >= math.dist(home[:2], current):
         return home
     return nearest
 
@@ -252,7 +258,8 @@ class SmartPath:
         self._vehicle = vehicle
         self._only_armed = only_armed
         self._points: list[Ned] = []
-        self._cleaned = 0
+        self._cleaned_count = 0  # Number of points after the last simplification.
+        # Times of the last known position, recorded point and warning.
         self._good_at = self._saved_at = self._warned_at = -math.inf
         self._is_started = False
         self.is_active: bool = False  # True while SMART_RTL is possible.
@@ -268,7 +275,7 @@ class SmartPath:
         """Discard the path and start a new path at the vehicle; without a position, the path is inactive."""
         parameters = self._vehicle.parameters
         self._points.clear()
-        self._cleaned, self.is_active, self._is_started = 0, False, True
+        self._cleaned_count, self.is_active, self._is_started = 0, False, True
         if parameters["SRTL_POINTS"] <= 0 or parameters["SRTL_ACCURACY"] <= 0:
             return
         if self._vehicle.navigation.has_position:
@@ -279,15 +286,15 @@ class SmartPath:
     def take_way_back(self) -> list[Ned]:
         """Return the simplified path, last point first, and clear the recorded path."""
         accuracy = self._vehicle.parameters["SRTL_ACCURACY"]
-        way = prune(simplify(self._points, _BEND * accuracy), _LOOP * accuracy)
+        path = prune(simplify(self._points, _BEND * accuracy), _LOOP * accuracy)
         self._points.clear()
-        self._cleaned = 0
-        return way[::-1]
+        self._cleaned_count = 0
+        return path[::-1]
 
-    def restore(self, way: Sequence[Ned]) -> None:
+    def restore(self, way_back: Sequence[Ned]) -> None:
         """Record again those points of `take_way_back` that were not reached."""
-        self._points[:] = list(way)[::-1]
-        self._cleaned = len(self._points)
+        self._points[:] = list(way_back)[::-1]
+        self._cleaned_count = len(self._points)
 
     def update(self) -> None:
         """Record the current position if it is far enough from the last point."""
@@ -309,19 +316,18 @@ class SmartPath:
             self._deactivate("buffer full")
 
     def _add(self, place: Ned) -> bool:
+        """Record a place if it is far enough from the last point; return False if there is no space for it."""
         parameters = self._vehicle.parameters
         accuracy, maximum = parameters["SRTL_ACCURACY"], int(parameters["SRTL_POINTS"])
         if self._points and math.dist(self._points[-1], place) < accuracy:
             return True
-        if len(self._points) - self._cleaned >= _CLEAN_UP_AFTER_POINTS or len(self._points) >= maximum:
+        if len(self._points) - self._cleaned_count >= _CLEAN_UP_AFTER_POINTS or len(self._points) >= maximum:
             self._points = simplify(self._points, _BEND * accuracy)
             if len(self._points) >= maximum - _LOW_SPACE_POINTS:
                 self._points = prune(self._points, _LOOP * accuracy)
-            self._cleaned = len(self._points)
-        if (
-            len(self._points) >= maximum - _LOW_SPACE_POINTS
-            and self._vehicle.now - self._warned_at > _LOW_SPACE_REPORT_INTERVAL_S
-        ):
+            self._cleaned_count = len(self._points)
+        is_space_low = len(self._points) >= maximum - _LOW_SPACE_POINTS
+        if is_space_low and self._vehicle.now - self._warned_at > _LOW_SPACE_REPORT_INTERVAL_S:
             self._warned_at = self._vehicle.now
             self._vehicle.info("SmartRTL Low on space!")
         if len(self._points) >= maximum:
@@ -355,20 +361,23 @@ def prune(path: Sequence[Ned], tolerance: float) -> list[Ned]:
     first = 0
     while first < len(points) - 3:
         for last in range(len(points) - 2, first + 1, -1):
-            meeting = _closest_approach(points[first], points[first + 1], points[last], points[last + 1])
-            if meeting is not None and meeting[0] < tolerance:
-                points[first + 1 : last + 1] = [meeting[1]]
+            approach = _closest_approach(points[first], points[first + 1], points[last], points[last + 1])
+            if approach is None:
+                continue
+            distance, midpoint = approach
+            if distance < tolerance:
+                points[first + 1 : last + 1] = [midpoint]
                 break
         first += 1
     return points
 
 
-def _minus(one: Ned, other: Ned) -> Ned:
-    return (one[0] - other[0], one[1] - other[1], one[2] - other[2])
+def _vector(start: Ned, end: Ned) -> Ned:
+    return (end[0] - start[0], end[1] - start[1], end[2] - start[2])
 
 
-def _dot(one: Ned, other: Ned) -> float:
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+def _dot(first: Ned, second: Ned) -> float:
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 def _along(start: Ned, line: Ned, share: float) -> Ned:
@@ -376,22 +385,25 @@ def _along(start: Ned, line: Ned, share: float) -> Ned:
 
 
 def _distance_to_line(point: Ned, start: Ned, end: Ned) -> float:
-    line = _minus(end, start)
-    length2 = _dot(line, line)
-    share = 0.0 if length2 == 0.0 else max(0.0, min(1.0, _dot(_minus(point, start), line) / length2))
+    line = _vector(start, end)
+    squared_length = _dot(line, line)
+    share = 0.0  # Part of the line before the place that is nearest to the point.
+    if squared_length != 0.0:
+        share = max(0.0, min(1.0, _dot(_vector(start, point), line) / squared_length))
     return math.dist(point, _along(start, line, share))
 
 
-def _closest_approach(one: Ned, one_end: Ned, other: Ned, other_end: Ned) -> tuple[float, Ned] | None:
+def _closest_approach(start1: Ned, end1: Ned, start2: Ned, end2: Ned) -> tuple[float, Ned] | None:
     """Return the distance of two line segments and the midpoint between them; None for parallel segments."""
-    line1, line2, between = _minus(one_end, one), _minus(other_end, other), _minus(one, other)
-    a, b, c = _dot(line1, line1), _dot(line1, line2), _dot(line2, line2)
-    d, e = _dot(line1, between), _dot(line2, between)
-    determinant = a * c - b * b
-    if determinant < 1e-6 * max(a * c, 1e-9):
+    line1, line2, between = _vector(start1, end1), _vector(start2, end2), _vector(start2, start1)
+    dot11, dot12, dot22 = _dot(line1, line1), _dot(line1, line2), _dot(line2, line2)
+    dot1, dot2 = _dot(line1, between), _dot(line2, between)
+    determinant = dot11 * dot22 - dot12 * dot12
+    if determinant < 1e-6 * max(dot11 * dot22, 1e-9):
         return None
-    share1 = max(0.0, min(1.0, (b * e - c * d) / determinant))
-    share2 = max(0.0, min(1.0, (b * share1 + e) / c))
-    share1 = max(0.0, min(1.0, (b * share2 - d) / a))
-    place1, place2 = _along(one, line1, share1), _along(other, line2, share2)
-    return math.dist(place1, place2), _along(place1, _minus(place2, place1), 0.5)
+    # The nearest places as shares of the segments. Each is found for the other, limited to its segment.
+    share1 = max(0.0, min(1.0, (dot12 * dot2 - dot22 * dot1) / determinant))
+    share2 = max(0.0, min(1.0, (dot12 * share1 + dot2) / dot22))
+    share1 = max(0.0, min(1.0, (dot12 * share2 - dot1) / dot11))
+    place1, place2 = _along(start1, line1, share1), _along(start2, line2, share2)
+    return math.dist(place1, place2), _along(place1, _vector(place1, place2), 0.5)

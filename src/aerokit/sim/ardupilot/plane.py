@@ -37,7 +37,8 @@ class PlaneArming(ArduPilotArming[PlaneHost]):
 
     def own_reasons(self) -> list[str]:
         parameters, mode = self.vehicle.parameters, self.vehicle.mode
-        roll, up, down = (parameters[name] for name in ("ROLL_LIMIT_DEG", "PTCH_LIM_MAX_DEG", "PTCH_LIM_MIN_DEG"))
+        max_roll = parameters["ROLL_LIMIT_DEG"]
+        max_pitch, min_pitch = parameters["PTCH_LIM_MAX_DEG"], parameters["PTCH_LIM_MIN_DEG"]
         airspeed = int(parameters["AIRSPEED_MIN"])
         is_long_shorter = parameters["FS_LONG_TIMEOUT"] < parameters["FS_SHORT_TIMEOUT"]
         checks = (
@@ -45,9 +46,9 @@ class PlaneArming(ArduPilotArming[PlaneHost]):
                 is_long_shorter and parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED,
                 "FS_LONG_TIMEOUT < FS_SHORT_TIMEOUT",
             ),
-            (roll < _MIN_ANGLE_DEG, f"ROLL_LIMIT_DEG too small ({roll:.1f})"),
-            (up < _MIN_ANGLE_DEG, f"PTCH_LIM_MAX_DEG too small ({up:.1f})"),
-            (down > -_MIN_ANGLE_DEG, f"PTCH_LIM_MIN_DEG too large ({down:.1f})"),
+            (max_roll < _MIN_ANGLE_DEG, f"ROLL_LIMIT_DEG too small ({max_roll:.1f})"),
+            (max_pitch < _MIN_ANGLE_DEG, f"PTCH_LIM_MAX_DEG too small ({max_pitch:.1f})"),
+            (min_pitch > -_MIN_ANGLE_DEG, f"PTCH_LIM_MIN_DEG too large ({min_pitch:.1f})"),
             (airspeed < _MIN_AIRSPEED_M_S, f"AIRSPEED_MIN too low ({airspeed} < {_MIN_AIRSPEED_M_S})"),
             (not mode.can_arm, f"{mode.name} mode not armable"),
         )
@@ -124,7 +125,7 @@ class SimulatedPlane(PlaneHost):
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def make_commands(self) -> dict[int, CommandHandler]:
-        # NAV_TAKEOFF needs lifting rotors; ArduPlane has no command to land.
+        # NAV_TAKEOFF needs the lifting rotors of a QuadPlane; ArduPlane has no command to land.
         return {
             **common_commands(self),
             MavCmd.NAV_TAKEOFF: lambda _: MavResult.FAILED,
@@ -183,7 +184,7 @@ class SimulatedPlane(PlaneHost):
         """Fly to a place and circle there. Param 3 is the radius; param 4 other than 0 means anticlockwise."""
         if command.is_long:  # COMMAND_LONG does not specify the altitude frame that ArduPilot requires here.
             return MavResult.UNSUPPORTED
-        point = self.point(*command.place(), command.z, command.altitude_frame)
+        point = self.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:
             return MavResult.DENIED
         if self.mode is not self.guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
@@ -192,8 +193,8 @@ class SimulatedPlane(PlaneHost):
             return MavResult.FAILED
         self.guided.go_to(point)
         if command.param3 > 0:
-            anticlockwise = not math.isnan(command.param4) and command.param4 != 0
-            self.guided.radius = -command.param3 if anticlockwise else command.param3
+            is_anticlockwise = not math.isnan(command.param4) and command.param4 != 0
+            self.guided.radius = -command.param3 if is_anticlockwise else command.param3
         return MavResult.ACCEPTED
 
     def _change_speed(self, command: ReceivedCommand) -> int:
@@ -204,4 +205,5 @@ class SimulatedPlane(PlaneHost):
         if command.param1 == SpeedType.AIRSPEED and self.is_valid_airspeed(command.param2):
             mode.speed = command.param2
             return MavResult.ACCEPTED
-        return MavResult.ACCEPTED if command.param1 == SpeedType.GROUNDSPEED else MavResult.FAILED
+        is_ground_speed = command.param1 == SpeedType.GROUNDSPEED
+        return MavResult.ACCEPTED if is_ground_speed else MavResult.FAILED

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import AttitudeTargetTypemask as Mask
-from aerokit.mavlink.enums import HeadingType, MavCmd, MavFrame, MavResult, MavSeverity, PlaneMode, SpeedType
+from aerokit.mavlink.enums import HeadingType, MavFrame, MavResult, MavSeverity, PlaneMode, SpeedType
+from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance
@@ -21,7 +22,6 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
 from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 
-_C = MavCmd
 _FLY, _LOITER, _CLIMB, _LAND = range(4)
 _REACHED_HEIGHT_M = 5.0
 _ON_CIRCLE_SHARE = 1.3
@@ -37,22 +37,22 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         super().__init__(plane)
         self._manoeuvre = _LOITER
         self._landing: PlaneLanding | None = None
-        self._since = math.nan
+        self._on_circle_since = math.nan
         self._turned = 0.0
         self._last_bearing = 0.0
         self._condition_from = 0.0
-        self._start: Ned = (0.0, 0.0, 0.0)
+        self._leg_start: Ned = (0.0, 0.0, 0.0)
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
-            _C.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
-            **dict.fromkeys((_C.NAV_WAYPOINT, _C.NAV_SPLINE_WAYPOINT), lambda item: self._go(item, _FLY)),
-            **dict.fromkeys((_C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME), self._loiter),
-            **dict.fromkeys((_C.NAV_LOITER_TURNS, _C.NAV_LOITER_TO_ALT), self._loiter),
-            _C.NAV_LAND: self._land,
-            _C.NAV_RETURN_TO_LAUNCH: self._return,
-            _C.CONDITION_DELAY: self._wait,
-            _C.DO_CHANGE_SPEED: self._change_speed,
-            _C.DO_SET_HOME: self._set_home,
-            **dict.fromkeys((_C.DO_LAND_START, _C.DO_RETURN_PATH_START, _C.DO_FENCE_ENABLE), lambda _: None),
+            Cmd.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
+            **dict.fromkeys((Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT), lambda item: self._go(item, _FLY)),
+            **dict.fromkeys((Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME), self._loiter),
+            **dict.fromkeys((Cmd.NAV_LOITER_TURNS, Cmd.NAV_LOITER_TO_ALT), self._loiter),
+            Cmd.NAV_LAND: self._land,
+            Cmd.NAV_RETURN_TO_LAUNCH: self._return,
+            Cmd.CONDITION_DELAY: self._wait,
+            Cmd.DO_CHANGE_SPEED: self._change_speed,
+            Cmd.DO_SET_HOME: self._set_home,
+            **dict.fromkeys((Cmd.DO_LAND_START, Cmd.DO_RETURN_PATH_START, Cmd.DO_FENCE_ENABLE), lambda _: None),
         }
 
     @property
@@ -67,7 +67,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         """Start or resume the mission; without a mission change to RTL."""
         plane = self.vehicle
         if plane.mode is self and plane.is_armed and plane.mission.is_running:
-            return True
+            return True  # Arming in AUTO enters the mode again.
         super().enter(force=force)
         self._manoeuvre = _LOITER
         plane.call_later(0.0, self._begin if plane.mission.is_present else self._return_at_once)
@@ -77,7 +77,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if self.vehicle.mode is self and not self.vehicle.mission.is_running:
             self.vehicle.mission.start_or_resume()
 
-    def disarmed(self) -> None:
+    def on_disarmed(self) -> None:
         """Does nothing: disarming has already reset the progress."""
 
     def update(self, dt: float) -> None:
@@ -97,14 +97,15 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self._count_turns()
 
     def _count_turns(self) -> None:
+        """Add up the angle that the plane has turned around the place since it reached the circle."""
         wing = self.vehicle.wing
         if self._place is None:
             return
         bearing = math.atan2(wing.east - self._place[1], wing.north - self._place[0])
-        if not math.isnan(self._since):
+        if not math.isnan(self._on_circle_since):
             self._turned += abs(wrap_pi(bearing - self._last_bearing))
         elif self._is_on_circle:
-            self._since = self.vehicle.now
+            self._on_circle_since = self.vehicle.now
         self._last_bearing = bearing
 
     @property
@@ -115,7 +116,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
     def is_complete(self, index: int, item: MissionItem) -> bool:
         if self.vehicle.mode is not self or not self.vehicle.is_armed or not self._is_done(index, item):
             return False
-        if item.command <= _C.NAV_LAST:
+        if item.command <= Cmd.NAV_LAST:
             self.vehicle.send(m.MissionItemReached(index))
         return True
 
@@ -130,59 +131,65 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
         plane, command = self.vehicle, item.command
-        if command == _C.NAV_TAKEOFF:
+        if command == Cmd.NAV_TAKEOFF:
             assert self._place is not None
             is_high = plane.wing.down <= self._place[2]
-            return is_high and self._report(f"Takeoff complete at {plane.altitude_m:.2f}m")
-        if command in (_C.NAV_WAYPOINT, _C.NAV_SPLINE_WAYPOINT):
+            return self._report_if(is_high, f"Takeoff complete at {plane.altitude_m:.2f}m")
+        if command in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT):
             return self._has_passed(index)
-        if command == _C.NAV_LOITER_TIME:
-            return plane.now - self._since >= item.param1 and self._report("Loiter time complete")
-        if command == _C.NAV_LOITER_TURNS:
-            return self._turned >= 2 * math.pi * item.param1 and self._report("Loiter orbits complete")
-        if command == _C.NAV_LOITER_TO_ALT:
+        if command == Cmd.NAV_LOITER_TIME:
+            return self._report_if(plane.now - self._on_circle_since >= item.param1, "Loiter time complete")
+        if command == Cmd.NAV_LOITER_TURNS:
+            return self._report_if(self._turned >= 2 * math.pi * item.param1, "Loiter orbits complete")
+        if command == Cmd.NAV_LOITER_TO_ALT:
             assert self._place is not None
             is_at_height = abs(plane.wing.down - self._place[2]) < _REACHED_HEIGHT_M
-            return is_at_height and self._is_on_circle and self._report("Loiter to alt complete")
-        if command == _C.CONDITION_DELAY:
+            return self._report_if(is_at_height and self._is_on_circle, "Loiter to alt complete")
+        if command == Cmd.CONDITION_DELAY:
             return plane.now - self._condition_from > max(0.0, item.param1)
-        if command in (_C.NAV_LOITER_UNLIM, _C.NAV_LAND, _C.NAV_RETURN_TO_LAUNCH):
+        if command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH):
             return False
         self.warn_if_unknown(item)
         return True
 
-    def _report(self, text: str) -> bool:
-        self.vehicle.info(text)
-        return True
+    def _report_if(self, is_done: bool, text: str) -> bool:
+        """Send the text if the command is done; return ``is_done``."""
+        if is_done:
+            self.vehicle.info(text)
+        return is_done
 
     def _has_passed(self, index: int) -> bool:
         """Return True within WP_RADIUS of the waypoint, or once the plane has passed it."""
         assert self._place is not None
-        wing, (north, east, _), start = self.vehicle.wing, self._place, self._start
+        wing, (north, east, _), start = self.vehicle.wing, self._place, self._leg_start
         distance = horizontal_distance(self.vehicle, self._place)
         if distance <= self.vehicle.parameters["WP_RADIUS"]:
-            return self._report(f"Reached waypoint #{index} dist {int(distance)}m")
-        along = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
-        return along > 0 and self._report(f"Passed waypoint #{index} dist {int(distance)}m")
+            self.vehicle.info(f"Reached waypoint #{index} dist {int(distance)}m")
+            return True
+        # The dot product of the leg and the way from the waypoint to the plane is positive beyond the waypoint.
+        beyond = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
+        return self._report_if(beyond > 0, f"Passed waypoint #{index} dist {int(distance)}m")
 
     def _go(self, item: MissionItem, manoeuvre: int) -> None:
-        wing, before = self.vehicle.wing, self._place
-        self._start = wing.place
-        point = self.vehicle.point(int(item.x), int(item.y), item.z, item.frame) or self._start
-        north, east = self._start[:2] if (item.x, item.y) == (0, 0) else point[:2]
-        down = point[2] if item.z != 0 else (wing.down if before is None else before[2])
+        """Start a leg. Zero coordinates mean those of the plane; a zero altitude means that of the previous leg."""
+        self._leg_start = self.vehicle.wing.place
+        point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or self._leg_start
+        north, east = self._leg_start[:2] if (item.x, item.y) == (0, 0) else point[:2]
+        down = point[2]
+        if item.z == 0:
+            down = self._leg_start[2] if self._place is None else self._place[2]
         self._place, self._manoeuvre = (north, east, down), manoeuvre
-        self._since, self._turned, self.radius = math.nan, 0.0, 0.0
+        self._on_circle_since, self._turned, self.radius = math.nan, 0.0, 0.0
 
     def _loiter(self, item: MissionItem) -> None:
         self._go(item, _LOITER)
-        self.radius: float = item.param2 if item.command == _C.NAV_LOITER_TO_ALT else item.param3
+        self.radius: float = item.param2 if item.command == Cmd.NAV_LOITER_TO_ALT else item.param3
 
     def _land(self, item: MissionItem) -> None:
         self._go(item, _LAND)
         wing, plane = self.vehicle.wing, self.vehicle
-        point = plane.point(int(item.x), int(item.y), item.z, item.frame)
-        north, east = self._start[:2] if point is None or (item.x, item.y) == (0, 0) else point[:2]
+        point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
+        north, east = self._leg_start[:2] if point is None or (item.x, item.y) == (0, 0) else point[:2]
         self._landing = PlaneLanding(plane, (north, east, wing.ground_down if point is None else point[2]))
         plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
 
@@ -202,7 +209,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         plane = self.vehicle
         point: Ned | None = plane.wing.place
         if item.param1 != 1:  # On Plane, unlike on Copter, zeros are a position.
-            point = plane.point(int(item.x), int(item.y), item.z, item.frame)
+            point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
         if point is not None:
             plane.navigation.set_home(point, lock=False)
 
@@ -215,6 +222,8 @@ _INVALID_ALTITUDES = (0.0, -1.0)
 
 @dataclass(frozen=True)
 class _TimedValue:
+    """A value of a set-point, and when it was received."""
+
     value: float
     since: float
 
@@ -251,33 +260,35 @@ class PlaneGuided(PlaneNavigatingMode):
 
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
         """Follow bank, pitch and throttle if the mask selects them. The mask bit of a rate selects the angle."""
-        ignored, now = message.type_mask, self.vehicle.now
+        mask, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
-        whole = not ignored & Mask.ATTITUDE_IGNORE and ignored & _RATES == _RATES
-        if whole or not ignored & Mask.BODY_ROLL_RATE_IGNORE:
+        selects_all_angles = not mask & Mask.ATTITUDE_IGNORE and mask & _RATES == _RATES
+        if selects_all_angles or not mask & Mask.BODY_ROLL_RATE_IGNORE:
             self._bank = _TimedValue(roll, now)
-        if whole or not ignored & Mask.BODY_PITCH_RATE_IGNORE:
+        if selects_all_angles or not mask & Mask.BODY_PITCH_RATE_IGNORE:
             self._pitch = _TimedValue(pitch, now)
-        if not ignored & Mask.THROTTLE_IGNORE:
+        if not mask & Mask.THROTTLE_IGNORE:
             self._throttle = _TimedValue(max(0.0, min(1.0, message.thrust)), now)
 
     def update(self, dt: float) -> None:
         wing, now = self.vehicle.wing, self.vehicle.now
-        banks, pitches, throttles = (
+        has_bank, has_pitch, has_throttle = (
             now - target.since < _ATTITUDE_TIMEOUT_S for target in (self._bank, self._pitch, self._throttle)
         )
-        if self.vehicle.is_landed or not (banks or pitches or throttles or self._course is not None):
+        has_target = has_bank or has_pitch or has_throttle or self._course is not None
+        if self.vehicle.is_landed or not has_target:
             super().update(dt)
             return
-        speed = 2.0 * self._throttle.value * self.vehicle.cruise_m_s if throttles else self.airspeed
+        limits = wing.wing_limits
+        speed = 2.0 * self._throttle.value * self.vehicle.cruise_m_s if has_throttle else self.airspeed
         climb = wing.climb_to(wing.down if self._place is None else self._place[2])
         climb = max(-self._climb_limit, min(self._climb_limit, climb))
-        if pitches:
-            climb = max(-wing.wing.sink_m_s, min(wing.wing.climb_m_s, speed * math.sin(self._pitch.value)))
-        if not banks and self._course is not None:
+        if has_pitch:
+            climb = max(-limits.sink_m_s, min(limits.climb_m_s, speed * math.sin(self._pitch.value)))
+        if not has_bank and self._course is not None:
             wing.head(self._course, speed, climb)
             return
-        bank = max(-wing.wing.bank_rad, min(wing.wing.bank_rad, self._bank.value)) if banks else 0.0
+        bank = max(-limits.bank_rad, min(limits.bank_rad, self._bank.value)) if has_bank else 0.0
         wing.bank_and_climb(speed, bank, climb)
 
 
@@ -311,7 +322,7 @@ class PlaneSetpoints:
         plane = self._plane
         if not self._is_guided:
             return
-        point = plane.point(0, 0, message.alt, message.coordinate_frame)
+        point = plane.world_point(0, 0, message.alt, message.coordinate_frame)
         if point is None:
             plane.info(f"Unknown mavlink coordinate frame {message.coordinate_frame}")
             plane.send_text(MavSeverity.WARNING, "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT")
@@ -334,10 +345,10 @@ def guided_commands(plane: PlaneHost) -> dict[int, CommandHandler]:
         return handle
 
     return {
-        _C.GUIDED_CHANGE_SPEED: in_guided(_change_speed),
-        _C.GUIDED_CHANGE_ALTITUDE: in_guided(_change_altitude),
-        _C.GUIDED_CHANGE_HEADING: in_guided(_change_heading),
-        _C.DO_CHANGE_ALTITUDE: lambda command: _change_target_altitude(plane, command),
+        Cmd.GUIDED_CHANGE_SPEED: in_guided(_change_speed),
+        Cmd.GUIDED_CHANGE_ALTITUDE: in_guided(_change_altitude),
+        Cmd.GUIDED_CHANGE_HEADING: in_guided(_change_heading),
+        Cmd.DO_CHANGE_ALTITUDE: lambda command: _change_target_altitude(plane, command),
     }
 
 
@@ -355,7 +366,7 @@ def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCom
 
     The firmware refuses the altitudes 0 and -1.
     """
-    point = plane.point(0, 0, command.z, command.altitude_frame)
+    point = plane.world_point(0, 0, command.z, command.altitude_frame)
     if command.z in _INVALID_ALTITUDES or point is None:
         return MavResult.DENIED
     guided.change_altitude(point[2], abs(command.param3) or _UNLIMITED_M_S)
@@ -377,7 +388,7 @@ def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand)
 
 def _change_target_altitude(plane: PlaneHost, command: ReceivedCommand) -> int:
     """Change the altitude: param 1 in metres, param 2 a MAV_FRAME. Accepted in every mode, but only GUIDED uses it."""
-    point = plane.point(0, 0, command.param1, whole(command.param2))
+    point = plane.world_point(0, 0, command.param1, whole(command.param2))
     if point is None:
         return MavResult.DENIED
     guided = plane.mode_of(PlaneGuided)

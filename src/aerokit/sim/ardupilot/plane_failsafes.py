@@ -72,8 +72,8 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def _is_radio_bad(self) -> bool:
         plane = self.vehicle
-        low = plane.parameters["THR_FAILSAFE"] != 0 and plane.rc[2] <= plane.parameters["THR_FS_VALUE"]
-        return low or plane.now - self.radio_received_at > _SILENT_S
+        is_throttle_low = plane.parameters["THR_FAILSAFE"] != 0 and plane.rc[2] <= plane.parameters["THR_FS_VALUE"]
+        return is_throttle_low or plane.now - self.radio_received_at > _SILENT_S
 
     def _check_radio(self) -> None:
         plane = self.vehicle
@@ -82,14 +82,14 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         is_bad = self._is_radio_bad()
         bad_for = self._radio_bad.seconds(is_bad, plane.now)
         if not is_bad:
-            self._set_radio(False)
+            self._set_radio(is_lost=False)
         elif plane.parameters["THR_FAILSAFE"] == 1 and bad_for >= _COUNT_S - 1e-6:
-            self._set_radio(True)
+            self._set_radio(is_lost=True)
 
-    def _set_radio(self, lost: bool) -> None:
-        if lost != self.radio:
-            self.radio = lost
-            self.warn(f"Throttle failsafe {'on' if lost else 'off'}")
+    def _set_radio(self, *, is_lost: bool) -> None:
+        if is_lost != self.radio:
+            self.radio = is_lost
+            self.warn(f"Throttle failsafe {'on' if is_lost else 'off'}")
 
     def _check_short(self) -> None:
         action = int(self.vehicle.parameters["FS_SHORT_ACTN"])
@@ -102,11 +102,11 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     def _start_short(self, action: int) -> None:
         plane = self.vehicle
         self.state, self._short_since = _SHORT, plane.now
-        self._mode_before = before = plane.mode.number
-        if before in _PILOTED or (before in _NAVIGATING and action != _SHORT_BEST_GUESS):
+        mode = self._mode_before = plane.mode.number
+        if mode in _PILOTED or (mode in _NAVIGATING and action != _SHORT_BEST_GUESS):
             plane.set_mode(_SHORT_MODES.get(action, PlaneMode.CIRCLE))
         self._mode_after = plane.mode.number
-        if self._mode_after != before:
+        if self._mode_after != self._mode_before:
             self.warn(f"RC Short Failsafe: switched to {plane.mode.name}")
         else:
             self.warn("RC Short Failsafe On")
@@ -126,20 +126,23 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         plane = self.vehicle
         if plane.mode.is_landing:
             return
-        since = self._short_since if self.state == _SHORT else self.radio_received_at
+        lost_since = self._short_since if self.state == _SHORT else self.radio_received_at
         timeout = plane.parameters["FS_LONG_TIMEOUT"]
-        enabled = int(plane.parameters["FS_GCS_ENABL"])
-        in_auto = enabled == _IN_AUTO and plane.mode.number == PlaneMode.AUTO
-        if self.radio and plane.now - since > timeout:
+        gcs_option = int(plane.parameters["FS_GCS_ENABL"])
+        checks_gcs = gcs_option in (_HEARTBEAT, _HEARTBEAT_OR_RSSI)
+        if gcs_option == _IN_AUTO:
+            checks_gcs = plane.mode.number == PlaneMode.AUTO
+        if self.radio and plane.now - lost_since > timeout:
             self._start_long(_LONG)
-        elif (in_auto or enabled in (_HEARTBEAT, _HEARTBEAT_OR_RSSI)) and self.ground_station_silence > timeout:
+        elif checks_gcs and self.ground_station_silence > timeout:
             self.ground_station = True
             self._start_long(_GCS)
 
     def _check_end_of_long(self) -> None:
         parameters = self.vehicle.parameters
-        name = "FS_LONG_TIMEOUT" if parameters["FS_SHORT_ACTN"] == _SHORT_DISABLED else "FS_SHORT_TIMEOUT"
-        if self.state == _GCS and self.ground_station_silence < parameters[name]:
+        has_short = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
+        timeout = parameters["FS_SHORT_TIMEOUT" if has_short else "FS_LONG_TIMEOUT"]
+        if self.state == _GCS and self.ground_station_silence < timeout:
             self.ground_station: bool = False
             self._end_long("GCS Failsafe Off")
         elif self.state == _LONG and not self.radio:
@@ -150,6 +153,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         self.warn(text)
 
     def _start_long(self, state: int) -> None:
+        """Execute FS_LONG_ACTN, which has other effects in piloted modes, in RTL and in missions."""
         plane = self.vehicle
         plane.rc.release_overrides()
         self.state = state
@@ -159,7 +163,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             glides = action in (_LONG_GLIDE, _LONG_PARACHUTE)
             if self._is_in_take_off and not glides:
                 self._is_pending = True
-            else:
+            else:  # Action 0 continues in AUTO and GUIDED, but returns in these modes.
                 self.change_to(*_LONG_MODES.get(action or _LONG_RTL, ()))
         elif mode == PlaneMode.RTL:
             if action in (_LONG_AUTO, _LONG_AUTOLAND):
@@ -187,9 +191,8 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         elif not is_landing and (lands or action in (_BATTERY_RTL, _AUTOLAND_OR_RTL)):
             if lands and self._land_by_mission():
                 return
-            first = (PlaneMode.AUTOLAND,) if action == _AUTOLAND_OR_RTL else ()
-            if not self.vehicle.mode.is_landing:
-                self.change_to(*first, PlaneMode.RTL)
+            preferred = (PlaneMode.AUTOLAND,) if action == _AUTOLAND_OR_RTL else ()
+            self.change_to(*preferred, PlaneMode.RTL)
 
     def refuse_termination(self) -> None:
         """Send the reason why the flight is not terminated: AFS_ENABLE is 0, or AFS_TERM_ACTION is not set."""
@@ -202,11 +205,11 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         """Change to AUTO at DO_LAND_START; return False if the mission does not contain it."""
         plane = self.vehicle
         items = enumerate(plane.missions.commands.items())
-        start = next((index for index, item in items if item.command == MavCmd.DO_LAND_START), None)
-        if start is None:
+        land_start = next((index for index, item in items if item.command == MavCmd.DO_LAND_START), None)
+        if land_start is None:
             self.warn("Unable to start landing sequence")
             return False
-        plane.mission.set_current(start)
+        plane.mission.set_current(land_start)
         self.warn("Landing sequence start", MavSeverity.INFO)
         return plane.set_mode(PlaneMode.AUTO)
 
@@ -237,18 +240,18 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
                 self.vehicle.set_mode(self._mode_before)
             self.caused_mode = False
 
-    def act(self, new: int) -> None:
+    def act(self, new_breaches: int) -> None:
         plane = self.vehicle
         if self.caused_mode:
             return
-        self.report("breached", new)
-        before = plane.mode.number
+        self.report("breached", new_breaches)
+        mode = plane.mode.number
         if self._action == _RTL:
-            self._turn_back(before, PlaneMode.RTL)
-        elif self._action == _AUTOLAND and before != PlaneMode.AUTOLAND:
-            self._turn_back(before, PlaneMode.AUTOLAND, PlaneMode.RTL)
+            self._turn_back(mode, PlaneMode.RTL)
+        elif self._action == _AUTOLAND and mode != PlaneMode.AUTOLAND:
+            self._turn_back(mode, PlaneMode.AUTOLAND, PlaneMode.RTL)
         elif self._action in (_GUIDED, _GUIDED_THROTTLE):
-            self._turn_back(before, PlaneMode.GUIDED)
+            self._turn_back(mode, PlaneMode.GUIDED)
             plane.guided.go_to(self.return_place())
 
     def return_place(self) -> Ned:
@@ -270,7 +273,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
         north, east = next(points, home[:2])
         return (north, east, home[2] - height)
 
-    def cleared(self) -> None:
+    def on_cleared(self) -> None:
         if self.vehicle.is_armed and not self.caused_mode:
             self.vehicle.send_text(MavSeverity.NOTICE, "Fence breach cleared")
 
@@ -279,14 +282,14 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             return None
         return MavSeverity.NOTICE, f"Mode change to {mode.name} denied, in fence recovery"
 
-    def mode_changed(self) -> None:
-        super().mode_changed()
+    def on_mode_changed(self) -> None:
+        super().on_mode_changed()
         self.recover_by_hand()
 
     @property
     def _action(self) -> int:
         return int(self.vehicle.parameters["FENCE_ACTION"])
 
-    def _turn_back(self, before: int, *modes: int) -> None:
+    def _turn_back(self, mode_before: int, *modes: int) -> None:
         self.caused_mode: bool = any(self.vehicle.set_mode(mode) for mode in modes)
-        self._mode_before = before
+        self._mode_before = mode_before

@@ -22,7 +22,7 @@ class PlaneHost(ArduPilotVehicle):
         return self.wing
 
     def _read_limits(self) -> None:
-        limits, parameters = self.wing.wing, self.parameters
+        limits, parameters = self.wing.wing_limits, self.parameters
         limits.airspeed_min_m_s = parameters["AIRSPEED_MIN"]
         limits.airspeed_max_m_s = parameters["AIRSPEED_MAX"]
         limits.climb_m_s = parameters["TECS_CLMB_MAX"]
@@ -61,10 +61,10 @@ class PlaneHost(ArduPilotVehicle):
         wing = self.wing
         self.lift_off()
         if wing.is_on_ground:
-            wing.bank_and_climb(self.cruise_m_s, 0.0, wing.wing.climb_m_s)
+            wing.bank_and_climb(self.cruise_m_s, 0.0, wing.wing_limits.climb_m_s)
         else:
             yaw = wing.yaw if self.take_off_yaw is None else self.take_off_yaw
-            wing.head(yaw, self.cruise_m_s, wing.wing.climb_m_s)
+            wing.head(yaw, self.cruise_m_s, wing.wing_limits.climb_m_s)
 
 
 _FLARE_SINK_M_S = 0.5
@@ -82,9 +82,9 @@ class PlaneLanding:
     def __init__(self, plane: PlaneHost, point: Ned, start: Ned | None = None) -> None:
         self._plane = plane
         self.point: Ned = point
-        self._start = start
-        self._from: Ned = plane.wing.place
-        self._flares = self._is_reported = False
+        self._fly_to_first = start  # None once the approach has begun.
+        self._approach_start: Ned = plane.wing.place
+        self._is_flaring = self._is_reported = False
         self._stopped_at = math.nan
 
     def update(self, dt: float) -> None:
@@ -93,22 +93,22 @@ class PlaneLanding:
             self._wait()
         elif wing.is_on_ground:
             wing.roll_out()
-        elif self._start is not None:
-            self._join(self._start)
+        elif self._fly_to_first is not None:
+            self._fly_to_start(self._fly_to_first)
         else:
             self._approach()
 
-    def _join(self, start: Ned) -> None:
+    def _fly_to_start(self, start: Ned) -> None:
         wing = self._plane.wing
         distance = math.hypot(start[0] - wing.north, start[1] - wing.east)
         if distance < _JOINED_M and abs(wing.down - start[2]) < _JOINED_M / 4:
-            self._from, self._start = wing.place, None
+            self._approach_start, self._fly_to_first = wing.place, None
             return
         wing.fly_to(*start, airspeed=self._plane.cruise_m_s)
 
     def _approach(self) -> None:
         plane, wing, (north, east, down) = self._plane, self._plane.wing, self.point
-        course = math.atan2(east - self._from[1], north - self._from[0])
+        course = math.atan2(east - self._approach_start[1], north - self._approach_start[0])
         cos_course, sin_course = math.cos(course), math.sin(course)
         # Metres to the point along the approach line (negative beyond the point), and metres beside that line.
         remaining = (north - wing.north) * cos_course + (east - wing.east) * sin_course
@@ -116,17 +116,20 @@ class PlaneLanding:
         flare_time = wing.velocity_down * plane.parameters["LAND_FLARE_SEC"]
         if down - wing.down < max(plane.parameters["LAND_FLARE_ALT"], flare_time):
             self._flare(down - wing.down, remaining)
-        length = max(1.0, math.hypot(north - self._from[0], east - self._from[1]))
-        wanted = down + (self._from[2] - down) * max(0.0, remaining) / length
-        slope_sink = (down - self._from[2]) * wing.ground_speed_m_s / length
-        climb = -_FLARE_SINK_M_S if self._flares else -slope_sink + wing.climb_to(wanted)
-        speed = wing.wing.airspeed_min_m_s if self._flares else _APPROACH_SHARE * plane.cruise_m_s
+        if self._is_flaring:
+            climb, speed = -_FLARE_SINK_M_S, wing.wing_limits.airspeed_min_m_s
+        else:
+            length = max(1.0, math.hypot(north - self._approach_start[0], east - self._approach_start[1]))
+            down_on_slope = down + (self._approach_start[2] - down) * max(0.0, remaining) / length
+            slope_sink = (down - self._approach_start[2]) * wing.ground_speed_m_s / length
+            climb, speed = -slope_sink + wing.climb_to(down_on_slope), _APPROACH_SHARE * plane.cruise_m_s
         wing.head(course + math.atan2(aside, _CORRECTION_LENGTH_M), speed, climb)
 
     def _flare(self, height: float, remaining: float) -> None:
-        if self._flares:
+        if self._is_flaring:
             return
-        self._flares, wing = True, self._plane.wing
+        self._is_flaring = True
+        wing = self._plane.wing
         speed, sink = wing.ground_speed_m_s, wing.velocity_down
         self._plane.info(f"Flare {height:.1f}m sink={sink:.2f} speed={speed:.1f} dist={remaining:.1f}")
 
@@ -141,8 +144,8 @@ class PlaneLanding:
             plane.info("Auto disarmed")
             if not self._is_reported:
                 self._is_reported = True
-                aside = math.hypot(self.point[0] - wing.north, self.point[1] - wing.east)
-                plane.info(f"Distance from LAND point={aside:.2f}m")
+                distance = math.hypot(self.point[0] - wing.north, self.point[1] - wing.east)
+                plane.info(f"Distance from LAND point={distance:.2f}m")
 
 
 _MID_STICK, _STICK_RANGE, _LOW_THROTTLE = 1500, 500, 1100
@@ -176,11 +179,11 @@ class PlanePilotedMode(PlaneModeBase):
             wing.roll_out()
             return
         plane.lift_off()
-        climb = self.stick(1) * wing.wing.climb_m_s  # Pulling the stick gives positive values.
+        climb = self.stick(1) * wing.wing_limits.climb_m_s  # Pulling the stick gives positive values.
         if plane.rc[2] <= _LOW_THROTTLE:
-            climb = min(climb, 0.0) - wing.wing.glide_sink_m_s
-        speed = max(throttle * 2 * plane.cruise_m_s, 0.0)
-        wing.bank_and_climb(speed, self.stick(0) * wing.wing.bank_rad, climb)
+            climb = min(climb, 0.0) - wing.wing_limits.glide_sink_m_s
+        speed = max(0.0, throttle * 2 * plane.cruise_m_s)  # Half throttle is cruise speed.
+        wing.bank_and_climb(speed, self.stick(0) * wing.wing_limits.bank_rad, climb)
 
 
 class PlaneAltitudeMode(PlaneModeBase):
@@ -209,7 +212,7 @@ class PlaneAltitudeMode(PlaneModeBase):
     def steer(self, climb: float) -> None:
         """Bank as the roll stick commands, with this climb rate."""
         wing = self.vehicle.wing
-        wing.bank_and_climb(self.vehicle.cruise_m_s, self.stick(0) * wing.wing.bank_rad, climb)
+        wing.bank_and_climb(self.vehicle.cruise_m_s, self.stick(0) * wing.wing_limits.bank_rad, climb)
 
 
 class PlaneCruise(PlaneAltitudeMode):
@@ -240,7 +243,7 @@ class PlaneCircle(PlaneAltitudeMode):
 
     def steer(self, climb: float) -> None:
         wing = self.vehicle.wing
-        wing.bank_and_climb(self.vehicle.cruise_m_s, _CIRCLE_BANK_SHARE * wing.wing.bank_rad, climb)
+        wing.bank_and_climb(self.vehicle.cruise_m_s, _CIRCLE_BANK_SHARE * wing.wing_limits.bank_rad, climb)
 
 
 class PlaneNavigatingMode(PlaneModeBase):
@@ -318,8 +321,8 @@ class PlaneTakeOff(PlaneNavigatingMode):
     def _start(self) -> None:
         plane, wing = self.vehicle, self.vehicle.wing
         height, distance = plane.parameters["TKOFF_ALT"], plane.parameters["TKOFF_DIST"]
-        along = (distance * math.cos(wing.yaw), distance * math.sin(wing.yaw))
-        self._place = (wing.north + along[0], wing.east + along[1], plane.home_or_ground[2] - height)
+        north, east = wing.north + distance * math.cos(wing.yaw), wing.east + distance * math.sin(wing.yaw)
+        self._place = (north, east, plane.home_or_ground[2] - height)
         self._climbs = wing.down > self._place[2] + _TAKE_OFF_DONE_M
         heading = math.degrees(wing.yaw) % 360.0
         text = "Climbing to TKOFF alt then loitering" if self._climbs else "Above TKOFF alt - loitering"
@@ -347,9 +350,9 @@ class PlaneAutoland(PlaneNavigatingMode):
             plane.send_text(MavSeverity.WARNING, "Takeoff initial direction not set")
             return False
         home = plane.home_or_ground
-        far, height = plane.parameters["AUTOLAND_WP_DIST"], plane.parameters["AUTOLAND_WP_ALT"]
+        distance, height = plane.parameters["AUTOLAND_WP_DIST"], plane.parameters["AUTOLAND_WP_ALT"]
         north, east = math.cos(plane.take_off_yaw), math.sin(plane.take_off_yaw)
-        start = (home[0] - far * north, home[1] - far * east, home[2] - height)
+        start = (home[0] - distance * north, home[1] - distance * east, home[2] - height)
         self._place, self._landing = home, PlaneLanding(plane, home, start)
         return True
 

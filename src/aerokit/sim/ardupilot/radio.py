@@ -18,6 +18,7 @@ _OVERRIDABLE, _CHANNELS = 16, 18
 # Values of SIM_RC_FAIL.
 _NO_PULSES, _LOW_THROTTLE = 1, 2
 _LOW_THROTTLE_PWM = 950
+# Values of RC_CHANNELS_OVERRIDE; _RELEASE_UPPER releases one of the channels 9 to 18.
 _UNCHANGED, _RELEASE_UPPER = 0xFFFF, 0xFFFE
 _ROLL, _PITCH, _THROTTLE, _YAW, _FORWARD, _LATERAL = range(6)
 
@@ -38,7 +39,7 @@ class ArduPilotRadio:
 
     def __getitem__(self, index: int) -> int:
         if index in self._overrides:
-            value, since = self._overrides[index]
+            value, since = self._overrides[index]  # The value 0 releases the channel.
             if value and self._vehicle.now - since < self._override_time():
                 return value
         if index == _THROTTLE and self._failure == _LOW_THROTTLE:
@@ -64,8 +65,8 @@ class ArduPilotRadio:
         vehicle = self._vehicle
         if not (vehicle.faults.rc_lost or self._failure == _NO_PULSES):
             return True
-        limit = vehicle.now - self._override_time()
-        return any(value and since > limit for value, since in self._overrides.values())
+        expired_before = vehicle.now - self._override_time()
+        return any(value and since > expired_before for value, since in self._overrides.values())
 
     def override(self, pulses: Mapping[int, int]) -> None:
         """Override channels (index → µs) for RC_OVERRIDE_TIME; 0 releases a channel."""
@@ -95,10 +96,10 @@ class ArduPilotRadio:
             return
         vehicle.failsafes.ground_station_seen_at = vehicle.now
         for index in range(_OVERRIDABLE):
-            value = getattr(override, f"chan{index + 1}_raw")
-            if value == _UNCHANGED or (value == 0 and index >= len(self._sticks)):
+            value, is_upper = getattr(override, f"chan{index + 1}_raw"), index >= len(self._sticks)
+            if value == _UNCHANGED or (value == 0 and is_upper):  # In an upper channel, 0 means unchanged, too.
                 continue
-            if value == _RELEASE_UPPER and index >= len(self._sticks):
+            if value == _RELEASE_UPPER and is_upper:
                 value = 0
             self._overrides[index] = (value, vehicle.now)
 
@@ -127,7 +128,7 @@ class ArduPilotJoystick:
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
         """Return pulses in microseconds by channel index; 0 releases a channel."""
-        if axes.z < 0:
+        if axes.z < 0:  # Copter has no negative thrust (GCS_MAVLink_Copter.cpp).
             return {}
         return {
             _ROLL: self.pulse(_ROLL, axes.y),
@@ -141,7 +142,9 @@ class ArduPilotJoystick:
         if value == _NO_VALUE:
             return 0
         low, high = self.setting(f"RC{channel + 1}_MIN", 1100.0), self.setting(f"RC{channel + 1}_MAX", 1900.0)
-        share = ((-value if reverse else value) - lowest) / (1000 - lowest)
+        if reverse:
+            value = -value
+        share = (value - lowest) / (1000 - lowest)
         return int(low + (high - low) * share) & 0xFFFF  # The firmware does not check the range of an axis.
 
     def setting(self, name: str, default: float) -> float:
@@ -166,11 +169,11 @@ class SubJoystick(ArduPilotJoystick):
         gain = max(0.1, min(1.0, self.setting("JS_GAIN_DEFAULT", 0.5)))
         throttle_scale = 2 * _SUB_SCALE * gain * self.setting("JS_THR_GAIN", 1.0)
         throttle = axes.z * throttle_scale + _CENTRE - 500 * throttle_scale
-        levers = {
+        offsets = {
             _ROLL: axes.s, _PITCH: axes.t, _YAW: axes.r * _SUB_SCALE * gain,
             _FORWARD: axes.x * _SUB_SCALE * gain, _LATERAL: axes.y * _SUB_SCALE * gain,
         }  # fmt: skip
-        pulses = {channel: _CENTRE + value for channel, value in levers.items()} | {_THROTTLE: throttle}
+        pulses = {channel: _CENTRE + offset for channel, offset in offsets.items()} | {_THROTTLE: throttle}
         return {channel: int(max(_SUB_MIN_PWM, min(_SUB_MAX_PWM, pulse))) for channel, pulse in pulses.items()}
 
 

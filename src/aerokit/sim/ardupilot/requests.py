@@ -35,8 +35,9 @@ _SUPPORTED_MESSAGES: dict[Kind, frozenset[int]] = {
     "sub": _ALL_KINDS,
 }
 
+# Streams use at most 80 % of the main loop of 400 Hz (GCS_Common.cpp, cap_message_interval).
 _MIN_INTERVAL_S, _MAX_INTERVAL_S = 0.0025 / 0.8, 60.0
-_MESSAGE_INTERVAL_IDS = 1 << 16
+_MESSAGE_INTERVAL_IDS = 1 << 16  # Ids that fit the field of MESSAGE_INTERVAL.
 _MIN_TERRAIN_REQUEST_INTERVAL_S = 2.0
 
 DISPLAY_VALUES: dict[str, float] = {
@@ -135,7 +136,7 @@ class ArduPilotMessageRequests:
             if stream in self._groups:
                 self._stream_group(stream, rate, channel, self._vehicle.now)
                 self._store_rate(f"{self._prefix(channel)}{_RATE_PARAMETERS[stream]}", rate)
-        if requested == Stream.ALL:
+        if requested == Stream.ALL:  # ADSB is a further group, without messages in the simulation.
             self._store_rate(f"{self._prefix(channel)}ADSB", rate)
 
     def start_channel(self, channel: Channel, first: float) -> None:
@@ -151,8 +152,8 @@ class ArduPilotMessageRequests:
     def restart(self) -> None:
         """Restore the saved rates, because of a reboot."""
         parameters = self._vehicle.parameters
-        for name, (saved, present) in self._saved.items():
-            if parameters[name] == present:
+        for name, (saved, changed) in self._saved.items():
+            if parameters[name] == changed:  # else PARAM_SET has set and saved another value meanwhile
                 parameters[name] = saved
         self._saved.clear()
 
@@ -160,11 +161,12 @@ class ArduPilotMessageRequests:
         vehicle, parameters = self._vehicle, self._vehicle.parameters
         if name not in parameters or parameters[name] == rate:
             return
-        if vehicle.KIND != "plane":
-            self._saved[name] = (self._saved.get(name, (parameters[name], rate))[0], rate)
+        saved, _ = self._saved.get(name, (parameters[name], rate))  # The value before the first change since boot.
         parameters[name] = rate
         if vehicle.KIND == "plane":
             vehicle.announce_parameter(name)
+        else:
+            self._saved[name] = (saved, rate)
 
     def _stream_group(self, stream: int, rate: float, channel: Channel, first: float) -> None:
         group_interval = max(1.0 / rate, _MIN_INTERVAL_S) if rate > 0 else 0.0

@@ -43,7 +43,8 @@ class RoverArming(ArduPilotArming[RoverHost]):
         rover = self.vehicle
         if not rover.mode.needs_position and rover.parameters["ARMING_NEED_LOC"] != _NEEDS_LOCATION:
             return ()
-        if reasons := super().position_reasons() or super().ahrs_reasons():
+        reasons = super().position_reasons() or super().ahrs_reasons()
+        if reasons:
             return reasons
         if rover.failsafes.estimator:
             return ("EKF failsafe",)
@@ -53,9 +54,11 @@ class RoverArming(ArduPilotArming[RoverHost]):
         reasons = []
         if self.is_checked(ArmingCheck.PARAMETERS) and not self.vehicle.parameters["WP_SPEED"] > 0:
             reasons.append("WP_SPEED too low")
-        return reasons + ([] if self.vehicle.mode.can_arm else ["Mode not armable"])
+        if not self.vehicle.mode.can_arm:
+            reasons.append("Mode not armable")
+        return reasons
 
-    def armed(self) -> None:
+    def on_armed(self) -> None:
         self.vehicle.path.reset()
 
     def disarm(self, *, force: bool = True) -> bool:
@@ -125,21 +128,22 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         if not parameters["FS_THR_ENABLE"]:
             self.radio = False
             return
-        low = rover.rc[2] < parameters["FS_THR_VALUE"]
-        self.radio: bool = low or rover.now - self.radio_received_at > _SILENT_S
-        self._trigger(_RADIO, self.radio)
+        is_throttle_low = rover.rc[2] < parameters["FS_THR_VALUE"]
+        self.radio: bool = is_throttle_low or rover.now - self.radio_received_at > _SILENT_S
+        self._update_link(_RADIO, is_lost=self.radio)
 
     def _check_ground_station(self) -> None:
         parameters = self.vehicle.parameters
         if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
             return
         self.ground_station: bool = self.ground_station_silence >= parameters["FS_GCS_TIMEOUT"]
-        self._trigger(_GCS, self.ground_station)
+        self._update_link(_GCS, is_lost=self.ground_station)
 
-    def _trigger(self, name: str, lost: bool) -> None:
-        rover, was_any = self.vehicle, bool(self._lost)
-        self._lost = self._lost | {name} if lost else self._lost - {name}
-        if self._lost and not was_any:
+    def _update_link(self, name: str, *, is_lost: bool) -> None:
+        """Record whether a link is lost, and start or end the common failsafe of both links."""
+        rover, was_any_lost = self.vehicle, bool(self._lost)
+        self._lost = self._lost | {name} if is_lost else self._lost - {name}
+        if self._lost and not was_any_lost:
             self._lost_since = rover.now
         if self._triggered and not self._lost:
             self.warn(f"{name} Failsafe Cleared", MavSeverity.INFO)
@@ -191,8 +195,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     def _check_wheels(self) -> None:
         """Detect a rover that does not move although its mode drives it (FS_CRASH_CHECK)."""
         rover, action = self.vehicle, int(self.vehicle.parameters["FS_CRASH_CHECK"])
-        tries = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
-        is_stuck = bool(action) and tries and rover.motion.ground_speed_m_s < _STUCK_M_S
+        tries_to_drive = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
+        is_stuck = bool(action) and tries_to_drive and rover.motion.ground_speed_m_s < _STUCK_M_S
         if self._stuck.seconds(is_stuck, rover.now) >= _STUCK_S:
             self._stuck.reset()
             self.warn("Crash: Going to HOLD", MavSeverity.EMERGENCY)
@@ -214,20 +218,21 @@ class RoverFence(ArduPilotFence[RoverHost]):
     CHECKS_DISARMED: ClassVar[bool] = True
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
-    def act(self, new: int) -> None:
+    def act(self, new_breaches: int) -> None:
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
         if action == REPORT_ONLY:
             return
-        if self.beyond_m(new) > _HOLD_BEYOND_M:
+        if self.beyond_m(new_breaches) > _HOLD_BEYOND_M:
             vehicle.set_mode(RoverMode.HOLD)
         elif action == _TERMINATE:
             vehicle.arming.disarm()
         else:
-            self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in _MODES.get(action, ()))
+            modes = _MODES.get(action, ())
+            self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)  # until one is not refused
 
-    def mode_changed(self) -> None:
-        super().mode_changed()
+    def on_mode_changed(self) -> None:
+        super().on_mode_changed()
         self.recover_by_hand()
 
 
@@ -328,12 +333,14 @@ class SimulatedRover(RoverHost):
 
     @property
     def base_mode(self) -> int:
-        base, name = int(MavModeFlag.CUSTOM_MODE_ENABLED), self.mode.name
-        if name in _MANUAL_INPUT:
-            base |= MavModeFlag.MANUAL_INPUT_ENABLED
-        if name in _GUIDED_MODES:
-            base |= MavModeFlag.GUIDED_ENABLED
-        return base | MavModeFlag.SAFETY_ARMED if self.motors.is_armed else base
+        flags, mode_name = int(MavModeFlag.CUSTOM_MODE_ENABLED), self.mode.name
+        if mode_name in _MANUAL_INPUT:
+            flags |= MavModeFlag.MANUAL_INPUT_ENABLED
+        if mode_name in _GUIDED_MODES:
+            flags |= MavModeFlag.GUIDED_ENABLED
+        if self.motors.is_armed:
+            flags |= MavModeFlag.SAFETY_ARMED
+        return flags
 
     @property
     def is_at_rest(self) -> bool:

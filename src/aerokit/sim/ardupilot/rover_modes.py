@@ -15,7 +15,7 @@ from aerokit.sim.vehicle_motion import GroundMotion
 
 _ARRIVED_M, _STANDING_M_S = 0.3, 0.1
 _FULL_STEERING_RAD_S = math.radians(90.0)
-_THROTTLE = 2
+_STEERING, _THROTTLE = 0, 2
 
 
 class RoverHost(RoverSubVehicle):
@@ -45,16 +45,17 @@ class RoverHost(RoverSubVehicle):
         """Return True if the rover has reached a place where it stops, or just passed it."""
         motion = self.motion
         north, east = place[0] - motion.north, place[1] - motion.east
-        away = math.hypot(north, east)
-        behind = abs(wrap_pi(math.atan2(east, north) - motion.yaw)) > math.pi / 2
-        near = self.parameters["WP_RADIUS"] / 2.0
-        return away <= _ARRIVED_M or (behind and away <= near and motion.ground_speed_m_s > _STANDING_M_S)
+        distance = math.hypot(north, east)
+        is_behind = abs(wrap_pi(math.atan2(east, north) - motion.yaw)) > math.pi / 2
+        is_moving = motion.ground_speed_m_s > _STANDING_M_S
+        has_just_passed = is_behind and is_moving and distance <= self.parameters["WP_RADIUS"] / 2.0
+        return distance <= _ARRIVED_M or has_just_passed
 
     def has_passed(self, place: Ned) -> bool:
         """Return True within WP_RADIUS of a place that the rover only passes."""
         motion = self.motion
-        away = math.hypot(place[0] - motion.north, place[1] - motion.east)
-        return away <= self.parameters["WP_RADIUS"]
+        distance = math.hypot(place[0] - motion.north, place[1] - motion.east)
+        return distance <= self.parameters["WP_RADIUS"]
 
 
 class _Mode(ArduPilotMode):
@@ -66,7 +67,7 @@ class _Manual(_Mode):
     has_manual_throttle = True
 
     def update(self, dt: float) -> None:
-        throttle, steering = self.vehicle.stick(_THROTTLE), self.vehicle.stick(0)
+        throttle, steering = self.vehicle.stick(_THROTTLE), self.vehicle.stick(_STEERING)
         self.vehicle.motion.drive(throttle * self.vehicle.top_speed, steering * _FULL_STEERING_RAD_S)
 
 
@@ -86,7 +87,7 @@ class _Rtl(_Mode):
     def __init__(self, rover: RoverHost) -> None:
         super().__init__(rover)
         self.speed = 0.0
-        self._way: list[Ned] = []
+        self._path: list[Ned] = []
 
     def enter(self, *, force: bool) -> bool:
         rover, home = self.vehicle, self.vehicle.navigation.home
@@ -95,27 +96,28 @@ class _Rtl(_Mode):
         self._set_out([best_return_place(rover, home, is_allowed=rover.fence.contains)])
         return True
 
-    def _set_out(self, way: list[Ned]) -> None:
-        self._way, self._has_arrived = way, False
+    def _set_out(self, path: list[Ned]) -> None:
+        self._path, self._has_arrived = path, False
         self.speed = self.vehicle.parameters["RTL_SPEED"] or self.vehicle.parameters["WP_SPEED"]
 
     @property
     def destination(self) -> Ned | None:
-        return self._way[0] if self._way else None
+        return self._path[0] if self._path else None
 
     def update(self, dt: float) -> None:
         rover = self.vehicle
-        if not self._way:
+        if not self._path:
             rover.motion.stop()
             if not self._has_arrived:
                 self._has_arrived = True
                 rover.info("Reached destination")
             return
-        is_last = len(self._way) == 1
-        if rover.has_arrived(self._way[0]) if is_last else rover.has_passed(self._way[0]):
-            del self._way[0]
+        next_place, is_last = self._path[0], len(self._path) == 1
+        is_reached = rover.has_arrived(next_place) if is_last else rover.has_passed(next_place)
+        if is_reached:
+            del self._path[0]
         else:
-            north, east, _ = self._way[0]
+            north, east, _ = next_place
             rover.motion.drive_to(north, east, speed=self.speed, stops=is_last)
 
 
@@ -131,7 +133,7 @@ class _SmartRtl(_Rtl):
         return True
 
     def leave(self) -> None:
-        self.vehicle.path.restore(self._way)
+        self.vehicle.path.restore(self._path)
 
 
 class RoverAuto(RoverSubAuto):
@@ -207,26 +209,34 @@ class RoverGuided(_Mode):
         self._place, self._target, self._target_at = None, target, self.vehicle.now
 
     def update(self, dt: float) -> None:
-        rover, place, target = self.vehicle, self._place, self._target
-        if place is not None:
-            if not self._has_arrived and rover.has_arrived(place):
-                self._has_arrived = True
-                rover.send(MissionItemReached(0))
-            if not self._has_arrived:
-                rover.motion.drive_to(place[0], place[1], speed=self.speed)
-                return
-        elif target is not None and rover.now - self._target_at <= target.timeout_s:
+        rover, target = self.vehicle, self._target
+        if self._place is not None:
+            self._drive_to(self._place)
+        elif target is None:
+            rover.motion.stop()
+        elif rover.now - self._target_at <= target.timeout_s:
             self._follow(target)
-            return
-        elif target is not None:
+        else:
             self._target = None
             rover.send_text(MavSeverity.WARNING, "target not received last 3secs, stopping")
-        rover.motion.stop()
+            rover.motion.stop()
+
+    def _drive_to(self, place: Ned) -> None:
+        rover = self.vehicle
+        if not self._has_arrived and rover.has_arrived(place):
+            self._has_arrived = True
+            rover.send(MissionItemReached(0))
+        if self._has_arrived:
+            rover.motion.stop()
+        else:
+            rover.motion.drive_to(place[0], place[1], speed=self.speed)
 
     def _follow(self, target: GuidedTarget) -> None:
         north, east, _ = target.velocity or (0.0, 0.0, 0.0)
         motion = self.vehicle.motion
-        speed = min(self.vehicle.waypoint_speed, math.hypot(north, east)) * (-1.0 if target.backwards else 1.0)
+        speed = min(self.vehicle.waypoint_speed, math.hypot(north, east))
+        if target.backwards:
+            speed = -speed
         if target.yaw_rate is not None:
             motion.drive(speed, target.yaw_rate)
         elif speed == 0.0:

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, cast
 
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, SpeedType
+from aerokit.mavlink.enums import MavCmd as Cmd
+from aerokit.mavlink.enums import MavFrame, MavResult, SpeedType
 from aerokit.mavlink.messages import (
     MissionItemReached,
     SetAttitudeTarget,
@@ -85,15 +86,15 @@ class GuidedSetpoints:
 
     def _on_local(self, message: SetPositionTargetLocalNed, _: Channel) -> None:
         if message.coordinate_frame in _FIXED | self.BODY_FRAMES:
-            self._apply(message, self.vehicle.local_point(message, self.BODY_FRAMES), has_yaw=True)
+            self._follow(message, self.vehicle.local_point(message, self.BODY_FRAMES), has_yaw=True)
 
     def _on_global(self, message: SetPositionTargetGlobalInt, _: Channel) -> None:
         frame = message.coordinate_frame
-        point = self.vehicle.point(message.lat_int, message.lon_int, message.alt, frame)
+        point = self.vehicle.world_point(message.lat_int, message.lon_int, message.alt, frame)
         if point is not None or not Setpoint.of(message).has_position:
-            self._apply(message, point, has_yaw=self.GLOBAL_YAW)
+            self._follow(message, point, has_yaw=self.GLOBAL_YAW)
 
-    def _apply(self, message: PositionTarget, point: Ned | None, *, has_yaw: bool) -> None:
+    def _follow(self, message: PositionTarget, point: Ned | None, *, has_yaw: bool) -> None:
         setpoint, frame = Setpoint.of(message), message.coordinate_frame
         if not self._is_guided:
             return
@@ -104,13 +105,15 @@ class GuidedSetpoints:
         velocity = setpoint.velocity if setpoint.has_velocity else None
         if not is_finite(position, velocity):
             return
-        here = self.vehicle.motion.yaw if frame in self.RELATIVE_YAW_FRAMES else 0.0
-        yaw = None if setpoint.yaw is None or not has_yaw else setpoint.yaw + here
-        rate = setpoint.yaw_rate if has_yaw else None
-        backwards = message.vx < 0 and not (yaw is None and rate is None)
+        yaw = yaw_rate = None
+        if has_yaw:
+            yaw, yaw_rate = setpoint.yaw, setpoint.yaw_rate
+        if yaw is not None and frame in self.RELATIVE_YAW_FRAMES:
+            yaw += self.vehicle.motion.yaw
+        backwards = message.vx < 0 and (yaw is not None or yaw_rate is not None)
         if velocity is not None and frame in self.BODY_FRAMES:
             velocity = rotated(velocity, self.vehicle.motion.yaw)
-        target = GuidedTarget(position, velocity, backwards, yaw, rate)
+        target = GuidedTarget(position, velocity, backwards, yaw, yaw_rate)
         if self.is_complete(target):
             self.mode.set_target(target)
 
@@ -155,24 +158,23 @@ class RoverSubVehicle(ArduPilotVehicle):
         self.motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
 
     def make_commands(self) -> dict[int, CommandHandler]:
-        return {**common_commands(self), MavCmd.DO_CHANGE_SPEED: self._change_speed}
+        return {**common_commands(self), Cmd.DO_CHANGE_SPEED: self._change_speed}
 
     def _change_speed(self, command: ReceivedCommand) -> int:
         if command.param1 in (SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED):
             return MavResult.DENIED
-        kinds = (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
-        if not self.mode.can_change_speed or command.param1 not in kinds or not command.param2 > 0:
+        horizontal_speeds = (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
+        if not self.mode.can_change_speed or command.param1 not in horizontal_speeds or not command.param2 > 0:
             return MavResult.FAILED
         cast("Any", self.mode).speed = command.param2
         return MavResult.ACCEPTED
 
 
-_C = MavCmd
-_WAYPOINTS = frozenset({_C.NAV_WAYPOINT, _C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME})
-_HOME = _C.NAV_RETURN_TO_LAUNCH
+_WAYPOINTS = frozenset({Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME})
+
 _WITHOUT_EFFECT = (
-    _C.DO_SET_ROI, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_NONE, _C.DO_FENCE_ENABLE, _C.DO_GUIDED_LIMITS,
-    _C.CONDITION_DISTANCE,
+    Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE, Cmd.DO_FENCE_ENABLE, Cmd.DO_GUIDED_LIMITS,
+    Cmd.CONDITION_DISTANCE,
 )  # fmt: skip
 
 
@@ -188,10 +190,10 @@ class RoverSubAuto(MissionMode):
         self._reached_at: float | None = None
         self._wait_until = 0.0
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
-            **dict.fromkeys((*_WAYPOINTS, _HOME), self._go),
-            **dict.fromkeys((_C.NAV_DELAY, _C.CONDITION_DELAY), self._wait),
-            _C.DO_CHANGE_SPEED: self._change_speed,
-            _C.DO_SET_HOME: lambda item: set_home_from(vehicle, item),
+            **dict.fromkeys((*_WAYPOINTS, Cmd.NAV_RETURN_TO_LAUNCH), self._go),
+            **dict.fromkeys((Cmd.NAV_DELAY, Cmd.CONDITION_DELAY), self._wait),
+            Cmd.DO_CHANGE_SPEED: self._change_speed,
+            Cmd.DO_SET_HOME: lambda item: set_home_from(vehicle, item),
             **dict.fromkeys(_WITHOUT_EFFECT, lambda _: None),
         }
 
@@ -255,12 +257,12 @@ class RoverSubAuto(MissionMode):
     def _is_done(self, index: int, item: MissionItem) -> bool:
         command, now = item.command, self.vehicle.now
         if command in _WAYPOINTS:
-            return self._has_stayed(index, item) and command != _C.NAV_LOITER_UNLIM
-        if command == _HOME:
+            return self._has_stayed(index, item) and command != Cmd.NAV_LOITER_UNLIM
+        if command == Cmd.NAV_RETURN_TO_LAUNCH:
             return self._place is None or self.has_arrived(self._place)
-        if command in (_C.NAV_DELAY, _C.CONDITION_DELAY):
+        if command in (Cmd.NAV_DELAY, Cmd.CONDITION_DELAY):
             return now >= self._wait_until
-        if command == _C.CONDITION_DISTANCE:
+        if command == Cmd.CONDITION_DISTANCE:
             return horizontal_distance(self.vehicle, self._place) < item.param1
         self.warn_if_unknown(item)
         return True
@@ -276,20 +278,22 @@ class RoverSubAuto(MissionMode):
 
     def _go(self, item: MissionItem) -> None:
         vehicle = self.vehicle
-        here: Ned = self._place or vehicle.motion.place
+        current: Ned = self._place or vehicle.motion.place
         self._reached_at = None
-        if item.command == _HOME:
-            self._place, self._stops = vehicle.navigation.home or here, True
+        if item.command == Cmd.NAV_RETURN_TO_LAUNCH:
+            self._place, self._stops = vehicle.navigation.home or current, True
             return
-        point = vehicle.point(int(item.x), int(item.y), item.z, item.frame)
-        north, east = here[:2] if point is None or (item.x, item.y) == (0, 0) else point[:2]
-        self._place = (north, east, here[2] if point is None or item.z == 0 else point[2])
+        # Zero coordinates and an invalid position mean the current place.
+        point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or current
+        north, east = current[:2] if (item.x, item.y) == (0, 0) else point[:2]
+        self._place = (north, east, current[2] if item.z == 0 else point[2])
         following = next(vehicle.mission.navigation_from(vehicle.mission.nav_index + 1), None)
-        self._stops = item.param1 > 0 or following is None or following[1].command not in _WAYPOINTS
+        is_waypoint_next = following is not None and following[1].command in _WAYPOINTS
+        self._stops = item.param1 > 0 or not is_waypoint_next
 
     def _wait(self, item: MissionItem) -> None:
         self._wait_until = self.vehicle.now + max(0.0, item.param1)
-        if item.command == _C.NAV_DELAY:
+        if item.command == Cmd.NAV_DELAY:
             self._place = None
             self.vehicle.info(f"Delaying {int(item.param1)} sec")
 

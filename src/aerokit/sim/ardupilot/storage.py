@@ -28,6 +28,7 @@ _SYSTEM_TEXTS = {
     "timers.txt": "TIMERV1\n",
 }
 
+# Bytes of a MAVLink 2 frame, without signature.
 _PARAM_VALUE_FRAME, _FTP_FRAME, _LOG_DATA_FRAME = 37, 266, 109
 _PARAMETERS_SHARE, _BURST_SHARE, _LOG_SHARE = 0.3, 1 / 3, 0.5
 
@@ -87,6 +88,7 @@ class ArduPilotStorage:
             self.files.remove_file(f"{LOG_FOLDER}/{name}")
 
     def _apply(self, name: str, value: float) -> None:
+        """Set a parameter that an uploaded file contains."""
         parameters = self._vehicle.parameters
         if name not in self._vehicle.faults.read_only_parameters:
             parameters[name] = rounded(self.parameters.clamped(name, value), parameters.type(name))
@@ -144,8 +146,10 @@ class ArduPilotSigning(VehicleSigning):
 
     def _save(self) -> None:
         if self.key is not None:
-            used = [channel.signing.timestamp for channel in self._ardupilot.channels if channel.signing is not None]
-            self.timestamp: int = max([self.timestamp, *used])
+            of_ports = [
+                channel.signing.timestamp for channel in self._ardupilot.channels if channel.signing is not None
+            ]
+            self.timestamp: int = max([self.timestamp, *of_ports])
 
 
 def _accept_all(_: Frame) -> bool:

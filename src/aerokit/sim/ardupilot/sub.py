@@ -57,11 +57,11 @@ class SubArming(ArduPilotArming[SubHost]):
 
     def _has_disarm_button(self) -> bool:
         parameters = self.vehicle.parameters
-        names = [f"BTN{number}_" for number in _BUTTONS if f"BTN{number}_FUNCTION" in parameters]
-        plain = {int(parameters[f"{name}FUNCTION"]) for name in names}
-        if not names or plain & _DISARMS:
+        prefixes = [f"BTN{number}_" for number in _BUTTONS if f"BTN{number}_FUNCTION" in parameters]
+        functions = {int(parameters[f"{prefix}FUNCTION"]) for prefix in prefixes}
+        if not prefixes or functions & _DISARMS:
             return True
-        return _SHIFT in plain and any(int(parameters[f"{name}SFUNCTION"]) in _DISARMS for name in names)
+        return _SHIFT in functions and any(int(parameters[f"{prefix}SFUNCTION"]) in _DISARMS for prefix in prefixes)
 
 
 # Actions of FS_GCS_ENABLE; 1 only warns.
@@ -106,20 +106,20 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
     def _check_radio(self) -> None:
         """Apply FS_THR_ENABLE: 1 warns, 2 surfaces."""
         sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_THR_ENABLE"])
-        receives = sub.rc.is_receiving
-        if receives:
+        is_receiving = sub.rc.is_receiving
+        if is_receiving:
             self.radio_received_at: float = sub.now
-        low = receives and sub.rc[2] < sub.parameters["FS_THR_VALUE"]
-        lost = low or sub.now - self.radio_received_at >= _SILENT_S
+        is_throttle_low = is_receiving and sub.rc[2] < sub.parameters["FS_THR_VALUE"]
+        is_lost = is_throttle_low or sub.now - self.radio_received_at >= _SILENT_S
         if not enabled:
-            lost = False
-        elif not receives and not lost:
+            is_lost = False
+        elif not is_receiving and not is_lost:  # A short silence neither starts nor ends the failsafe.
             return
-        if lost == self.radio:
+        if is_lost == self.radio:
             return
-        self.radio = lost
-        self.warn("RC Failsafe" if lost else "Radio Failsafe Cleared")
-        if lost and enabled == _RADIO_SURFACE:
+        self.radio = is_lost
+        self.warn("RC Failsafe" if is_lost else "Radio Failsafe Cleared")
+        if is_lost and enabled == _RADIO_SURFACE:
             sub.set_mode(SubMode.SURFACE)
 
     def _check_pilot(self) -> None:
@@ -211,14 +211,14 @@ class SubSetpoints(GuidedSetpoints):
         """Follow attitude and thrust together for one second."""
         if message.type_mask & (AttitudeMask.ATTITUDE_IGNORE | AttitudeMask.THROTTLE_IGNORE):
             return
-        share = 2.0 * (max(0.0, min(1.0, message.thrust)) - 0.5)
-        name = "WPNAV_SPEED_UP" if share > 0 else "WPNAV_SPEED_DN"
-        climb = share * self.vehicle.parameters[name] / 100.0
+        climb_share = 2.0 * (max(0.0, min(1.0, message.thrust)) - 0.5)
+        max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
+        climb = climb_share * self.vehicle.parameters[max_climb_parameter] / 100.0
         _, _, yaw = euler_from_quaternion(*message.q)
         self.mode.set_target(GuidedTarget(None, (0.0, 0.0, -climb), False, yaw, timeout_s=1.0))
 
 
-_HOLDING_THROTTLE, _PER_CLIMB = 0.45, 0.44
+_HOLDING_THROTTLE, _THROTTLE_PER_CLIMB_M_S = 0.45, 0.44
 _AMPERES_AT_FULL = 26.3
 _THROTTLE = 2
 
@@ -233,7 +233,7 @@ class SubMotors(ArduPilotMotors):
         return float(thrust**2.7) * _AMPERES_AT_FULL
 
     def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
-        throttle = _HOLDING_THROTTLE - _PER_CLIMB * motion.velocity_down
+        throttle = _HOLDING_THROTTLE - _THROTTLE_PER_CLIMB_M_S * motion.velocity_down
         if self.vehicle.mode.has_manual_throttle:
             throttle = (self.vehicle.rc[_THROTTLE] - 1000) / 1000.0
         self.throttle: float = max(0.0, min(1.0, throttle)) if self.is_armed else 0.0
@@ -291,10 +291,12 @@ class SimulatedSub(SubHost):
 
     @property
     def base_mode(self) -> int:
-        base = int(_BASE)
+        flags = int(_BASE)
         if self.mode.name in _GUIDED_MODES:
-            base |= MavModeFlag.GUIDED_ENABLED
-        return base | MavModeFlag.SAFETY_ARMED if self.motors.is_armed else base
+            flags |= MavModeFlag.GUIDED_ENABLED
+        if self.motors.is_armed:
+            flags |= MavModeFlag.SAFETY_ARMED
+        return flags
 
     @property
     def is_at_rest(self) -> bool:

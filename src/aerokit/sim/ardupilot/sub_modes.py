@@ -42,16 +42,16 @@ class SubHost(RoverSubVehicle):
         """Move towards a place at a speed in m/s; WPNAV_SPEED_UP and WPNAV_SPEED_DN limit the vertical speed."""
         motion, parameters = self.motion, self.parameters
         north, east, down = self._below_surface(place)
-        up, dn = parameters["WPNAV_SPEED_UP"] / 100.0, parameters["WPNAV_SPEED_DN"] / 100.0
-        ahead = math.hypot(north - motion.north, east - motion.east)
-        if looks_ahead and ahead > _MIN_LOOK_AHEAD_M:
+        max_climb, max_descent = parameters["WPNAV_SPEED_UP"] / 100.0, parameters["WPNAV_SPEED_DN"] / 100.0
+        distance = math.hypot(north - motion.north, east - motion.east)
+        if looks_ahead and distance > _MIN_LOOK_AHEAD_M:
             motion.face(math.atan2(east - motion.east, north - motion.north))
-        slope = abs(down - motion.down)
-        horizontal = speed * min(1.0, ahead / max(slope, 1e-3))
-        vertical = speed * min(1.0, slope / max(ahead, 1e-3))
-        motion.seek_position(
-            north, east, down, speed=max(horizontal, 0.05), climb=min(up, vertical), descent=min(dn, vertical)
-        )
+        # The two speeds have the ratio of the two distances, so that the path is straight.
+        depth_difference = abs(down - motion.down)
+        horizontal = max(speed * min(1.0, distance / max(depth_difference, 1e-3)), 0.05)
+        vertical = speed * min(1.0, depth_difference / max(distance, 1e-3))
+        climb, descent = min(max_climb, vertical), min(max_descent, vertical)
+        motion.seek_position(north, east, down, speed=horizontal, climb=climb, descent=descent)
 
     def _below_surface(self, place: Ned) -> Ned:
         return (place[0], place[1], max(place[2], self.motion.ground_down))
@@ -65,7 +65,7 @@ class _Mode(ArduPilotMode):
         share = self.vehicle.stick(index)
         return 0.0 if abs(share) < _DEADZONE else share
 
-    def sideways(self) -> tuple[float, float]:
+    def horizontal_velocity_from_sticks(self) -> tuple[float, float]:
         """Turn as the yaw stick commands; return the commanded velocity north and east in m/s."""
         motion = self.vehicle.motion
         motion.turn(self.stick(_YAW) * _FULL_STICK_TURN_RAD_S)
@@ -87,9 +87,9 @@ class _Manual(_Mode):
     def update(self, dt: float) -> None:
         climb = self.climb()
         if climb == 0.0:
-            self.vehicle.motion.push(*self.sideways())
+            self.vehicle.motion.push(*self.horizontal_velocity_from_sticks())
         else:
-            self.vehicle.motion.seek_velocity(*self.sideways(), -climb)
+            self.vehicle.motion.seek_velocity(*self.horizontal_velocity_from_sticks(), -climb)
 
 
 class _AltHold(_Mode):
@@ -98,7 +98,7 @@ class _AltHold(_Mode):
     needs_position = False
 
     def update(self, dt: float) -> None:
-        self.vehicle.motion.seek_velocity(*self.sideways(), -self.climb())
+        self.vehicle.motion.seek_velocity(*self.horizontal_velocity_from_sticks(), -self.climb())
 
 
 class _Surface(_AltHold):
@@ -110,7 +110,8 @@ class _Surface(_AltHold):
         if self.vehicle.is_at_surface:
             self.vehicle.set_mode(SubMode.ALT_HOLD)
         else:
-            self.vehicle.motion.seek_velocity(*self.sideways(), -self.vehicle.parameters["WPNAV_SPEED_UP"] / 100.0)
+            climb = self.vehicle.parameters["WPNAV_SPEED_UP"] / 100.0
+            self.vehicle.motion.seek_velocity(*self.horizontal_velocity_from_sticks(), -climb)
 
 
 class SubAuto(RoverSubAuto):
@@ -181,17 +182,20 @@ class SubGuided(_Mode):
 
     def update(self, dt: float) -> None:
         motion, target = self.vehicle.motion, self._target
-        fresh = target is not None and self.vehicle.now - self._target_at <= target.timeout_s
+        if target is not None and self.vehicle.now - self._target_at > target.timeout_s:
+            target = None
         if self._place is not None:
             self.vehicle.travel(self._place, self.speed, looks_ahead=False)
-        elif target is not None and target.velocity is not None and fresh:
+        elif target is not None and target.velocity is not None:
             motion.seek_velocity(*target.velocity)
         else:
             motion.seek_velocity(0.0, 0.0, 0.0)
         if self._heading is not None:
             motion.face(self._heading)
+        elif target is not None and target.yaw_rate is not None:
+            motion.turn(target.yaw_rate)
         else:
-            motion.turn(target.yaw_rate or 0.0 if target is not None and fresh else 0.0)
+            motion.turn(0.0)
 
 
 SUB_MODES: tuple[Callable[[SubHost], ArduPilotMode], ...] = (

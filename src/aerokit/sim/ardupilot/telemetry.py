@@ -107,8 +107,8 @@ _UNCONTROLLED: dict[Kind, tuple[tuple[int, tuple[int, ...]], ...]] = {
 def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
     """Return the present, enabled and healthy sensors of SYS_STATUS."""
     sensors, nav, kind = _SENSORS[vehicle.KIND], vehicle.navigation, vehicle.KIND
-    off = next((bits for bits, modes in _UNCONTROLLED[kind] if vehicle.mode.number in modes), 0)
-    controls = sensors.always | sensors.control & ~off
+    uncontrolled = next((bits for bits, modes in _UNCONTROLLED[kind] if vehicle.mode.number in modes), 0)
+    controls = sensors.always | (sensors.control & ~uncontrolled)
     present = sensors.working | sensors.control | sensors.unhealthy | _PREARM | _AHRS | _LOGGING
     enabled = sensors.working | sensors.unhealthy | _PREARM | controls
     health = sensors.working | sensors.only_healthy | _LOGGING | controls
@@ -122,10 +122,10 @@ def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
         enabled |= _LOGGING
     if vehicle.rangefinder_reach_m > 0.0:
         present, enabled, health = present | _LASER, enabled | _LASER, health | _LASER
-    is_present, is_enforced, is_kept = vehicle.fence.health
-    present |= _FENCE if is_present else 0
-    enabled |= _FENCE if is_enforced else 0
-    health |= _FENCE if is_kept else 0
+    has_fence, is_fence_enabled, is_fence_healthy = vehicle.fence.health
+    present |= _FENCE if has_fence else 0
+    enabled |= _FENCE if is_fence_enabled else 0
+    health |= _FENCE if is_fence_healthy else 0
     health |= _PREARM if vehicle.arming.passes else 0
     if not vehicle.failsafes.is_radio_healthy:
         health &= ~_RADIO
@@ -177,8 +177,8 @@ def _extended_sys_state(vehicle: ArduPilotVehicle) -> m.ExtendedSysState:
         state = MavLandedState.LANDING
     elif vehicle.mode.is_taking_off:
         state = MavLandedState.TAKEOFF
-    lifts = MavVtolState.MC if vehicle.KIND == "copter" else MavVtolState.UNDEFINED
-    return m.ExtendedSysState(lifts, state)
+    vtol_state = MavVtolState.MC if vehicle.KIND == "copter" else MavVtolState.UNDEFINED
+    return m.ExtendedSysState(vtol_state, state)
 
 
 def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
@@ -188,8 +188,8 @@ def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
     if vehicle.failsafes.battery_is_critical:
         charge = MavBatteryChargeState.CRITICAL
     current, consumed = round(battery.current_a * 100), round(battery.consumed_mah)
-    energy, percent = round(battery.consumed_wh * 36), int(battery.percent)
-    return m.BatteryStatus(0, 0, 0, _UNKNOWN_TEMPERATURE, voltages, current, consumed, energy, percent, 0, charge)
+    hectojoules, percent = round(battery.consumed_wh * 36), int(battery.percent)
+    return m.BatteryStatus(0, 0, 0, _UNKNOWN_TEMPERATURE, voltages, current, consumed, hectojoules, percent, 0, charge)
 
 
 def _system_time(vehicle: ArduPilotVehicle) -> m.SystemTime:
@@ -214,13 +214,17 @@ def _vibration(vehicle: ArduPilotVehicle) -> m.Vibration:
 
 
 def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
-    current = round(vehicle.battery.current_a * 25)
-    rpm = round(vehicle.motors.throttle * 15000)
-    count = int(vehicle.uptime * 100) & 0xFFFF
-    voltage = round(vehicle.battery.voltage_v * 100)
-    fitted = [int(index in _MOTORS[vehicle.KIND]) for index in range(4)]
-    voltages, currents, rpms, counts = ([value * bit for bit in fitted] for value in (voltage, current, rpm, count))
-    return m.EscTelemetry1To4(bytes(32 * bit for bit in fitted), voltages, currents, (0,) * 4, rpms, counts)
+    has_motor = [index in _MOTORS[vehicle.KIND] for index in range(4)]
+
+    def per_motor(value: int) -> list[int]:
+        return [value if fitted else 0 for fitted in has_motor]
+
+    voltages = per_motor(round(vehicle.battery.voltage_v * 100))
+    currents = per_motor(round(vehicle.battery.current_a * 25))  # A quarter of the current, in 0.01 A.
+    rpms = per_motor(round(vehicle.motors.throttle * 15000))
+    counts = per_motor(int(vehicle.uptime * 100) & 0xFFFF)
+    temperatures = bytes(per_motor(32))
+    return m.EscTelemetry1To4(temperatures, voltages, currents, (0,) * 4, rpms, counts)
 
 
 def _autopilot_version(vehicle: ArduPilotVehicle) -> m.AutopilotVersion:
@@ -289,9 +293,10 @@ def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
 def _rover_outputs(rover: RoverHost) -> m.ServoOutputRaw:
     """Build SERVO_OUTPUT_RAW with steering on output 1 (also while disarmed) and the motor on output 3."""
     if rover.mode.has_manual_throttle:
-        away = abs(rover.rc[0] - _MIDDLE) - _ROVER_DEADZONE
-        size = min(_STICK_RANGE, int(away * _STICK_RANGE / (_STICK_RANGE - _ROVER_DEADZONE)))
-        steering = 0 if away <= 0 else size if rover.rc[0] > _MIDDLE else -size
+        deflection = rover.rc[0] - _MIDDLE
+        beyond_deadzone = max(0, abs(deflection) - _ROVER_DEADZONE)
+        size = min(_STICK_RANGE, int(beyond_deadzone * _STICK_RANGE / (_STICK_RANGE - _ROVER_DEADZONE)))
+        steering = size if deflection > 0 else -size
     else:
         steering = round(_STICK_RANGE * rover.motion.yaw_rate / rover.motion.wheels.turn_rate_rad_s)
     throttle = round(_STICK_RANGE * rover.motors.throttle)
@@ -305,10 +310,10 @@ def _sub_outputs(sub: SubHost) -> m.ServoOutputRaw:
         yaw, forward, lateral, roll = (
             _stick(sub.rc[index]) for index in (_SUB_YAW, _SUB_FORWARD, _SUB_LATERAL, _SUB_ROLL)
         )
-        up = 1.0 - 2.0 * sub.motors.throttle
+        vertical = 1.0 - 2.0 * sub.motors.throttle
         shares = (
             yaw - forward + lateral, -yaw - forward - lateral, -yaw + forward + lateral, yaw + forward - lateral,
-            up + roll, up - roll,
+            vertical + roll, vertical - roll,
         )  # fmt: skip
         thrusters = [_surface(share) for share in shares]
     return _servo_outputs(sub, *thrusters, 0, _MIDDLE, 0, _MIDDLE)

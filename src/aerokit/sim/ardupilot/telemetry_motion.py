@@ -35,14 +35,14 @@ def _attitude(vehicle: ArduPilotVehicle) -> m.Attitude:
 def _attitude_quaternion(vehicle: ArduPilotVehicle) -> m.AttitudeQuaternion | None:
     if not vehicle.navigation.has_attitude:
         return None
-    q = quaternion_from_euler(*_angles(vehicle.motion))
-    return m.AttitudeQuaternion(vehicle.time_boot_ms, *q, *_angular_rates(vehicle.motion))
+    quaternion = quaternion_from_euler(*_angles(vehicle.motion))
+    return m.AttitudeQuaternion(vehicle.time_boot_ms, *quaternion, *_angular_rates(vehicle.motion))
 
 
 def _attitude_target(vehicle: ArduPilotVehicle) -> m.AttitudeTarget:
     motion = vehicle.motion
-    q = quaternion_from_euler(*_angles(motion))
-    return m.AttitudeTarget(vehicle.time_boot_ms, 0, q, 0.0, 0.0, motion.yaw_rate, vehicle.motors.throttle)
+    quaternion = quaternion_from_euler(*_angles(motion))
+    return m.AttitudeTarget(vehicle.time_boot_ms, 0, quaternion, 0.0, 0.0, motion.yaw_rate, vehicle.motors.throttle)
 
 
 def _ahrs(vehicle: ArduPilotVehicle) -> m.Ahrs:
@@ -73,11 +73,11 @@ def _vfr_hud(vehicle: ArduPilotVehicle) -> m.VfrHud:
 
 
 def _acceleration(vehicle: ArduPilotVehicle) -> Three:
-    """Return the acceleration in milli-g."""
+    """Return the acceleration that the accelerometers measure, in milli-g."""
     motion = vehicle.motion
-    lift = -GRAVITY_M_S2 + (0.0 if vehicle.is_landed else motion.acceleration_down)
+    acceleration_down = 0.0 if vehicle.is_landed else motion.acceleration_down
     x, y = 1000 * math.sin(motion.pitch), -1000 * math.sin(motion.roll)
-    return (_int16(x), _int16(y), _int16(lift / GRAVITY_M_S2 * 1000))
+    return (_int16(x), _int16(y), _int16((-GRAVITY_M_S2 + acceleration_down) / GRAVITY_M_S2 * 1000))
 
 
 def _magnetic_field(vehicle: ArduPilotVehicle) -> Three:
@@ -126,8 +126,11 @@ _VELOCITY_ONLY = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE | _NO_YAW
 _POSITION_ONLY = (
     Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE | Mask.AX_IGNORE | Mask.AY_IGNORE | Mask.AZ_IGNORE | _NO_YAW
 )  # fmt: skip
+# Undefined bits that ArduPilot sets in the global message only (GCS_MAVLink_Copter.cpp).
+_LAST_BYTE = 0xF000
 # Size and lower left corner of the terrain block around the vehicle, in metres and degrees.
 _GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
+_RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which the vehicle stands.
 
 
 def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
@@ -169,8 +172,8 @@ def _ekf_status(vehicle: ArduPilotVehicle) -> m.EkfStatusReport | None:
     flags = vehicle.navigation.flags
     if flags is None:
         return None
-    size = 0.02 if flags & _POS_HORIZ_ABS else 0.0
-    return m.EkfStatusReport(flags, size, size, size / 2, size, 0.0, 0.0)
+    variance = 0.02 if flags & _POS_HORIZ_ABS else 0.0
+    return m.EkfStatusReport(flags, variance, variance, variance / 2, variance, 0.0, 0.0)
 
 
 def _home_position(vehicle: ArduPilotVehicle) -> m.HomePosition | None:
@@ -198,7 +201,8 @@ def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | Non
         return None
     place = vehicle.navigation.frame.to_global(*target)
     position = (place.latitude_e7, place.longitude_e7, place.altitude_m)
-    return m.PositionTargetGlobalInt(vehicle.time_boot_ms, 0, _POSITION_ONLY | 0xF000, *position, *(0.0,) * 8)
+    mask = _POSITION_ONLY | _LAST_BYTE
+    return m.PositionTargetGlobalInt(vehicle.time_boot_ms, 0, mask, *position, *(0.0,) * 8)
 
 
 def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
@@ -238,8 +242,8 @@ def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
     place = vehicle.navigation.position
     if place is None:
         return m.TerrainReport(0, 0, 100, 0.0, 0.0, 56, 0)
-    missing = 0 if vehicle.KIND == "sub" else 504
-    return m.TerrainReport(place.latitude_e7, place.longitude_e7, 0, 0.0, place.altitude_m, missing, 0)
+    pending_blocks = 0 if vehicle.KIND == "sub" else 504
+    return m.TerrainReport(place.latitude_e7, place.longitude_e7, 0, 0.0, place.altitude_m, pending_blocks, 0)
 
 
 def _terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
@@ -268,7 +272,7 @@ def _distance_sensor(vehicle: ArduPilotVehicle) -> m.DistanceSensor | None:
 def _height_above_ground(vehicle: ArduPilotVehicle) -> float | None:
     if vehicle.rangefinder_reach_m <= 0.0:
         return None
-    return vehicle.motion.ground_down - vehicle.motion.down + 0.2
+    return vehicle.motion.ground_down - vehicle.motion.down + _RANGEFINDER_HEIGHT_M
 
 
 MOTION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {

@@ -158,7 +158,8 @@ class ArduPilotVehicle(ArduPilotHost):
         self.calibrations.reset()
         self.external.reset()
         self.rc.release_overrides()
-        self._modes: dict[int, ArduPilotMode] = {mode.number: mode for mode in (make(self) for make in self.MODES)}
+        modes = [make_mode(self) for make_mode in self.MODES]
+        self._modes: dict[int, ArduPilotMode] = {mode.number: mode for mode in modes}
         self.reset_controllers()
         self.mission: MissionRun = MissionRun(self, self.auto)
         self.missions.reset()
@@ -236,7 +237,7 @@ class ArduPilotVehicle(ArduPilotHost):
     def is_addressed(self, message: Message) -> bool:
         """Return True also for absent components of this system, as in the firmware (MAVLink_routing.cpp)."""
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
-        return system in (0, self.system_id) and all(component != other.component_id for other in self.components)
+        return system in (0, self.system_id) and all(component != present.component_id for present in self.components)
 
     def boot(self) -> None:
         """Restart the servers and schedule the events of the boot."""
@@ -255,6 +256,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.info("AHRS: DCM active")
         self.arming.start()
         self.failsafes.start()
+        # Half a second in SITL; a shorter boot scales it.
         self.call_later(0.25 * self.timeline.ready, self._leave_boot)
 
     def _leave_boot(self) -> None:
@@ -271,12 +273,10 @@ class ArduPilotVehicle(ArduPilotHost):
     def restart(self) -> None:
         """Reboot: send nothing for a while, then boot again with default stream rates and estimates."""
         self.parameters["STAT_BOOTCNT"] += 1
-        if not self.motion.is_on_ground:
-            self.motion.down = self.motion.ground_down
-        self.motion.settle()
+        self.motion.settle()  # The fall after a reboot in flight is not simulated.
         self._reset()
         for channel in self.channels:
-            channel.closes_clients = True
+            channel.closes_clients = True  # The TCP server of the firmware ends, too.
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
@@ -293,24 +293,21 @@ class ArduPilotVehicle(ArduPilotHost):
         if mode is None:
             self.send_text(*self.unknown_mode(number))
             return False
-        if (denied := self.fence.refusal(mode)) is not None:
-            self.send_text(*denied)
+        refusal_by_fence = self.fence.refusal(mode)
+        if refusal_by_fence is not None:
+            self.send_text(*refusal_by_fence)
             return False
-        armed, has_position = (
-            self.motors.is_armed,
-            self.navigation.has_position and not self.failsafes.estimator,
-        )
-        reason = None
-        if armed and mode.needs_position and not has_position:
-            reason = "requires position"
-        elif not mode.enter(force=not armed):
-            reason = mode.refused_because
-        if reason is not None:
-            self.send_text(MavSeverity.WARNING, self.refusal(mode, reason))
+        is_armed = self.motors.is_armed
+        has_position = self.navigation.has_position and not self.failsafes.estimator
+        if is_armed and mode.needs_position and not has_position:
+            self.send_text(MavSeverity.WARNING, self.refusal(mode, "requires position"))
+            return False
+        if not mode.enter(force=not is_armed):
+            self.send_text(MavSeverity.WARNING, self.refusal(mode, mode.refused_because))
             return False
         self.mode.leave()
         self.mode = mode
-        self.fence.mode_changed()
+        self.fence.on_mode_changed()
         self.call_later(0.0, lambda: self.send_built(m.Heartbeat.ID))
         return True
 
@@ -346,7 +343,9 @@ class ArduPilotVehicle(ArduPilotHost):
             return builder(self) if self.is_initialised or message_id in _BEFORE_READY else None
         if message_id == m.Timesync.ID:
             return m.Timesync(0, int(self.uptime * 1e9) + self.system_id)
-        return m.AvailableModesMonitor(0) if message_id == m.AvailableModesMonitor.ID else None
+        if message_id == m.AvailableModesMonitor.ID:
+            return m.AvailableModesMonitor(0)
+        return None
 
     def tick(self, dt: float) -> None:
         if self.motors.is_armed:
@@ -356,7 +355,7 @@ class ArduPilotVehicle(ArduPilotHost):
             self.move(dt)
         self.battery.drain(self.motors.current_a, dt)
         if not self.motors.is_armed and self.is_landed and self.motors.is_idle:
-            self.set_ticking(False)
+            self.set_ticking(False)  # Nothing moves until the vehicle is armed.
 
     def _on_set_mode(self, request: m.SetMode, _: Channel) -> None:
         self.set_mode_from(request.base_mode, request.custom_mode)

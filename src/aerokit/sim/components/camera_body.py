@@ -128,7 +128,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
     @property
     def image_count(self) -> int:
         """Number of images on the card."""
-        return len(self.captures.images)
+        return self.captures.image_count
 
     def angles(self) -> tuple[float, float, float] | None:
         """Roll, pitch and yaw (from north) of the view in radians; None if unknown."""
@@ -151,8 +151,8 @@ class CameraBody(SimulatedComponent, CameraDevice):
 
     async def set_source(self, source: int) -> bool:
         """Accept RGB, and IR on a thermal camera."""
-        own = CameraSource.IR if self.thermal_celsius else CameraSource.RGB
-        return source in (CameraSource.DEFAULT, CameraSource.RGB, own)
+        is_thermal = self.thermal_celsius is not None
+        return source in (CameraSource.DEFAULT, CameraSource.RGB) or (source == CameraSource.IR and is_thermal)
 
     async def reset_settings(self) -> None:
         self.reset_lens()
@@ -192,7 +192,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
             CameraImageCaptured,
             self.time_boot_ms,
             round(getattr(self.vehicle, "unix_time", 0.0) * 1e6),
-            0,
+            0,  # camera_id of a camera that is a separate component
             0 if place is None else place.latitude_e7,
             0 if place is None else place.longitude_e7,
             0 if place is None else round(place.altitude_m * 1000),
@@ -204,7 +204,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
     def store_image(self, image: CameraImageCaptured) -> str | None:
         if not self.card.store(self.image_mib):
             return None
-        path = f"/DCIM/IMG_{len(self.captures.images) + 1:04d}.JPG"
+        path = f"/DCIM/IMG_{self.captures.image_count + 1:04d}.JPG"
         picture = self.picture
         self.files.put(path, picture if isinstance(picture, bytes) else picture(image))
         return f"mftp://{path}"

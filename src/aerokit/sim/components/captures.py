@@ -164,8 +164,8 @@ def tracked_place(component: SimulatedComponent, flags: int, angles: Angles | No
     if pose is None or angles is None or angles[1] > _MAX_GROUND_PITCH_RAD:
         return []
     _, pitch, yaw = angles
-    away = pose.height_m / math.tan(-pitch)
-    place = LocalFrame(pose.place).to_global(away * math.cos(yaw), away * math.sin(yaw), pose.height_m)
+    distance = pose.height_m / math.tan(-pitch)
+    place = LocalFrame(pose.place).to_global(distance * math.cos(yaw), distance * math.sin(yaw), pose.height_m)
     return [
         m.CameraTrackingGeoStatus(
             flags,
@@ -174,12 +174,12 @@ def tracked_place(component: SimulatedComponent, flags: int, angles: Angles | No
             place.altitude_m,
             _ACCURACY_M,
             _ACCURACY_M,
+            0.0,  # velocity north, east and down
             0.0,
             0.0,
-            0.0,
-            _UNKNOWN,
-            math.hypot(away, pose.height_m),
-            _UNKNOWN,
+            _UNKNOWN,  # accuracy of the velocity
+            math.hypot(distance, pose.height_m),
+            _UNKNOWN,  # heading and its accuracy
             _UNKNOWN,
         )
     ]

@@ -175,7 +175,7 @@ class SimulatedComponent:
         if system not in (0, self.system_id) or component not in (0, self.component_id):
             return False
         if component == 0 and isinstance(message, CommandLong | CommandInt):
-            return message.command in self._commands
+            return message.command in self._commands  # An unknown broadcast command is for other components.
         return True
 
     def answer_with(self, message_id: int, command: ReceivedCommand) -> int:

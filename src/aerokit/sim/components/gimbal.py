@@ -26,7 +26,7 @@ from aerokit.sim.components.component import SimulatedComponent, pose_of
 from aerokit.sim.motion import GlobalPoint
 
 _STATUS_INTERVAL_S = 1.0
-_STILL: Angles = (0.0, 0.0, 0.0)
+_ZERO: Angles = (0.0, 0.0, 0.0)
 
 
 class SimulatedGimbal(SimulatedComponent, GimbalMount):
@@ -74,10 +74,11 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         """Position to point at; None without a region of interest."""
         self.followed: int = 0
         """System id of the followed vehicle; 0 if none."""
-        self._from: Angles = _STILL
+        # The gimbal turns from these angles, at this time, towards the target, which moves at these rates.
+        self._from: Angles = _ZERO
         self._since = 0.0
-        self._target: Angles = _STILL
-        self._rates: Angles = _STILL
+        self._target: Angles = _ZERO
+        self._rates: Angles = _ZERO
         self._is_locked = False
 
     def start(self) -> None:
@@ -116,11 +117,11 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
 
     def angles(self) -> Angles:
         """Return roll and pitch (from the horizon) and yaw (from the vehicle's nose) in radians."""
-        moved = [
+        angles = [
             _towards(start, target, self.slew_rad_s * (self.now - self._since))
             for start, target in zip(self._from, self._wanted(), strict=True)
         ]
-        return (moved[0], moved[1], moved[2])
+        return (angles[0], angles[1], angles[2])
 
     def heading(self) -> float:
         """Return the heading of the vehicle in radians; 0 if unknown."""
@@ -141,9 +142,9 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         if pose is None:
             return self._target
         frame = self.vehicle.frame  # type: ignore[attr-defined]
-        north, east = frame.to_local(region.latitude_e7, region.longitude_e7)
-        current = frame.to_local(pose.place.latitude_e7, pose.place.longitude_e7)
-        north, east = north - current[0], east - current[1]
+        region_north, region_east = frame.to_local(region.latitude_e7, region.longitude_e7)
+        vehicle_north, vehicle_east = frame.to_local(pose.place.latitude_e7, pose.place.longitude_e7)
+        north, east = region_north - vehicle_north, region_east - vehicle_east
         pitch = math.atan2(region.altitude_m - pose.place.altitude_m, math.hypot(north, east))
         return (0.0, pitch, math.atan2(east, north))
 
@@ -183,8 +184,8 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
 
     def _begin(self, flags: int) -> None:
         self._from, self._since = self.angles(), self.now
-        self._target = _STILL
-        self._rates = _STILL
+        self._target = _ZERO
+        self._rates = _ZERO
         self.region = None
         self.followed = 0
         self.flags = flags

@@ -26,11 +26,11 @@ _SIDE_INTERVAL_S = 0.8
 _PERCENT_PER_SIDE = 17
 
 
-def _side_texts(sensor: str, count: int) -> list[str]:
-    """Return the texts before the measurement of the next side, after ``count`` sides (calibration_routines.cpp)."""
-    side = _SIDES[-1 - count]
+def _side_texts(sensor: str, sides_done: int) -> list[str]:
+    """Return the texts before the measurement of the next side, after ``sides_done`` (calibration_routines.cpp)."""
+    side = _SIDES[-1 - sides_done]
     return [
-        f"pending: {' '.join(_SIDES[: len(_SIDES) - count])}",
+        f"pending: {' '.join(_SIDES[: len(_SIDES) - sides_done])}",
         "hold vehicle still on a pending side",
         "detected rest position, hold still...",
         f"{side} orientation detected",
@@ -50,7 +50,7 @@ class Px4Calibration:
         self._px4 = px4
         self.side_s: float = math.inf
         self._sensor = ""
-        self._number = 0
+        self._run_number = 0
 
     @property
     def is_running(self) -> bool:
@@ -70,7 +70,7 @@ class Px4Calibration:
             self._measure(*_AUTOMATIC_CALIBRATIONS[sensor])
         elif sensor in _SIDE_INSTRUCTIONS:
             self._start(sensor)
-            self._begin_side(0, self._number)
+            self._begin_side(0, self._run_number)
         elif sensor == "esc":
             # As check_battery_disconnected in esc_calibration.cpp, because the simulated battery is always connected.
             self._px4.send_text(MavSeverity.CRITICAL, "[cal] calibration failed: Disconnect battery and try again")
@@ -82,40 +82,43 @@ class Px4Calibration:
 
     def _start(self, sensor: str) -> None:
         self._sensor = sensor
-        self._number += 1
+        self._run_number += 1
         self._px4.info(f"[cal] calibration started: 2 {sensor}")
 
     def _measure(self, percents: Sequence[int], step_s: float) -> None:
         self._send_later([f"progress <{percent}>" for percent in percents], step_s)
-        number = self._number
-        self._px4.call_later((len(percents) + 1) * step_s, lambda: self._end(number))
+        run_number = self._run_number
+        self._px4.call_later((len(percents) + 1) * step_s, lambda: self._end(run_number))
 
     def _send_later(self, texts: Sequence[str], step_s: float) -> None:
-        for place, text in enumerate(texts):
-            self._px4.call_later(place * step_s, partial(self._send, text, self._number))
+        for index, text in enumerate(texts):
+            self._px4.call_later(index * step_s, partial(self._send, text, self._run_number))
 
-    def _send(self, text: str, number: int) -> None:
-        if self.is_running and number == self._number:
+    def _send(self, text: str, run_number: int) -> None:
+        if self.is_running and run_number == self._run_number:
             self._px4.info(f"[cal] {text}")
 
-    def _begin_side(self, count: int, number: int) -> None:
-        if not self.is_running or number != self._number:
+    def _begin_side(self, sides_done: int, run_number: int) -> None:
+        if not self.is_running or run_number != self._run_number:
             return
-        if count == len(_SIDES):
-            self._end(number)
+        if sides_done == len(_SIDES):
+            self._end(run_number)
             return
-        self._send_later(_side_texts(self._sensor, count), _SIDE_INTERVAL_S)
+        texts = _side_texts(self._sensor, sides_done)
+        self._send_later(texts, _SIDE_INTERVAL_S)
         if math.isfinite(self.side_s):
-            self._px4.call_later(6 * _SIDE_INTERVAL_S + self.side_s, lambda: self._end_side(count, number))
+            delay_s = len(texts) * _SIDE_INTERVAL_S + self.side_s
+            self._px4.call_later(delay_s, lambda: self._end_side(sides_done, run_number))
 
-    def _end_side(self, count: int, number: int) -> None:
-        if self.is_running and number == self._number:
-            done = f"{_SIDES[-1 - count]} side done, rotate to a different side"
-            self._send_later([f"progress <{min(100, _PERCENT_PER_SIDE * (count + 1))}>", done, done], 0.02)
-            self._px4.call_later(0.2, lambda: self._begin_side(count + 1, number))
+    def _end_side(self, sides_done: int, run_number: int) -> None:
+        if self.is_running and run_number == self._run_number:
+            done = f"{_SIDES[-1 - sides_done]} side done, rotate to a different side"
+            percent = min(100, _PERCENT_PER_SIDE * (sides_done + 1))
+            self._send_later([f"progress <{percent}>", done, done], 0.02)
+            self._px4.call_later(0.2, lambda: self._begin_side(sides_done + 1, run_number))
 
-    def _end(self, number: int) -> None:
-        if self.is_running and number == self._number:
+    def _end(self, run_number: int) -> None:
+        if self.is_running and run_number == self._run_number:
             self._px4.info(f"[cal] calibration done: {self._sensor}")
             self._sensor = ""
 
@@ -214,8 +217,9 @@ class Px4Arming:
         px4 = self._px4
         if px4.mode not in modes.STICK_MODES:
             return True
-        throttle = px4.sticks.throttle
-        return throttle <= _CENTRE_THROTTLE if px4.mode in _CLIMB_MODES else throttle < _LOW_THROTTLE
+        if px4.mode in _CLIMB_MODES:  # The throttle stick controls the climb rate.
+            return px4.sticks.throttle <= _CENTRE_THROTTLE
+        return px4.sticks.throttle < _LOW_THROTTLE
 
     def disarm(self, by: str, *, force: bool = False) -> bool:
         """Stop the motors and return True; without ``force`` return False in flight."""

@@ -148,11 +148,12 @@ class Px4Vehicle(Px4Host):
         self.calibration: Px4Calibration = Px4Calibration(self)
         self.arming: Px4Arming = Px4Arming(self, self.calibration)
         self.throttle: float = 0.0
+        # Arming does not move a home that a client has set.
         self.home_is_set_by_hand = False
         self.mode_after_landing: Px4Mode = modes.HOLD
         self.vtol_state: int = 0
         """MAV_VTOL_STATE that is reported; assign it to simulate a VTOL, whose motion stays that of this vehicle."""
-        self._touched_at = math.nan
+        self._touchdown_at = math.nan
         self._landed_at = math.nan
         self._has_flown = False
         self.flight: Px4Flight = self._make_flight()
@@ -210,7 +211,7 @@ class Px4Vehicle(Px4Host):
         self.gimbal.start()
         self.call_later(0.3 * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
-        self.failsafes.listen()
+        self.failsafes.listen()  # again, because a restart has created new failsafes
         self.failsafes.start()
         self.call_later(self._boot_time_s, self._set_ready)
 
@@ -227,9 +228,8 @@ class Px4Vehicle(Px4Host):
         first = max(self.now, self.booted_at + _HEARTBEAT_BOOT_SHARE * self._boot_time_s)
         self.rates.start(channel, self.channels.index(channel), first)
         ready_at = max(self.now, self.booted_at + self._boot_time_s)
-        self.call_at(
-            ready_at, lambda: self.send_built(m.GpsGlobalOrigin.ID, channel)
-        )  # PX4 sends the origin once, and again when it changes.
+        # PX4 sends the origin only once, and again when it changes.
+        self.call_at(ready_at, lambda: self.send_built(m.GpsGlobalOrigin.ID, channel))
 
     def restart(self) -> None:
         self.motion.down = self.motion.ground_down
@@ -283,6 +283,7 @@ class Px4Vehicle(Px4Host):
         self.is_in_failsafe = False
         self.intended_mode = mode
         self.failsafes.override()
+        # A request for the current mode restarts the mission, or holds the current position.
         if mode == self.mode == modes.MISSION:
             self.mission.enter()
         elif mode == self.mode:
@@ -296,11 +297,13 @@ class Px4Vehicle(Px4Host):
     def can_run(self, mode: Px4Mode) -> bool:
         """Return True if the requirements of the mode are met: sticks, mission, set-points or position."""
         traits = modes.MODES.get(mode)
-        if traits is None or self.arming.is_terminated or (mode == modes.MISSION and not self.mission.is_valid):
+        if traits is None or self.arming.is_terminated:
             return False
-        if (traits.needs_sticks and not self.sticks.are_fresh) or (
-            mode == modes.OFFBOARD and not self.offboard.is_fresh
-        ):
+        if mode == modes.MISSION and not self.mission.is_valid:
+            return False
+        if mode == modes.OFFBOARD and not self.offboard.is_fresh:
+            return False
+        if traits.needs_sticks and not self.sticks.are_fresh:
             return False
         return self.has_position or not traits.needs_position
 
@@ -312,7 +315,7 @@ class Px4Vehicle(Px4Host):
             self.send(m.CommandLong(self.system_id, 0, MavCmd.NAV_RETURN_TO_LAUNCH, 0, *(0.0,) * 7))
 
     def leave_ground(self) -> None:
-        self.is_landed, self._has_flown, self._touched_at = False, True, math.nan
+        self.is_landed, self._has_flown, self._touchdown_at = False, True, math.nan
         self.info("Takeoff detected")
 
     def on_sticks_moved(self, size: float) -> None:
@@ -350,17 +353,17 @@ class Px4Vehicle(Px4Host):
         self.throttle = 0.0
         if self.is_armed and not self.is_landed:
             lift = max(0.0, 1.0 - self.motion.acceleration_down / GRAVITY_M_S2)
-            lean = math.cos(self.motion.roll) * math.cos(self.motion.pitch)
-            self.throttle = min(1.0, _HOVER_THROTTLE * lift / max(0.5, lean))
+            vertical_share_of_thrust = max(0.5, math.cos(self.motion.roll) * math.cos(self.motion.pitch))
+            self.throttle = min(1.0, _HOVER_THROTTLE * lift / vertical_share_of_thrust)
         self.battery.drain(self.throttle * _AMPERES_AT_FULL, dt)
 
     def _detect_landing(self) -> None:
-        wants_up = self.is_armed and self.flight.lifts_off
-        if not self._is_down() or wants_up or self.arming.is_terminated:
-            self._touched_at = math.nan
-        elif math.isnan(self._touched_at):
-            self._touched_at = self.now
-        elif self.now - self._touched_at >= _LAND_DETECTOR_S or not self.is_armed:
+        is_lifting_off = self.is_armed and self.flight.lifts_off
+        if not self._is_down() or is_lifting_off or self.arming.is_terminated:
+            self._touchdown_at = math.nan
+        elif math.isnan(self._touchdown_at):
+            self._touchdown_at = self.now
+        elif self.now - self._touchdown_at >= _LAND_DETECTOR_S or not self.is_armed:
             self.is_landed = True
             self._landed_at = self.now
             self.motion.settle()

@@ -8,13 +8,15 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
     FailureType,
     FailureUnit,
-    MavCmd,
     MavFrame,
     MavModeFlag,
     MavResult,
     MavSeverity,
     MavType,
     MavVtolState,
+)
+from aerokit.mavlink.enums import (
+    MavCmd as Cmd,
 )
 from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, whole
 from aerokit.sim.px4 import modes
@@ -23,19 +25,18 @@ from aerokit.sim.px4.modes import Px4Mode
 from aerokit.sim.px4.payload import gimbal_commands
 from aerokit.sim.px4.telemetry import available_modes
 
-_C = MavCmd
 # Commands that are accepted without a visible effect.
 _ACCEPTED = (
-    _C.NAV_ROI, _C.NAV_VTOL_TAKEOFF, _C.DO_SET_ACTUATOR, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_WPNEXT_OFFSET,
-    _C.DO_SET_ROI_NONE, _C.DO_SET_ROI, _C.DO_SET_SAFETY_SWITCH_STATE,
+    Cmd.NAV_ROI, Cmd.NAV_VTOL_TAKEOFF, Cmd.DO_SET_ACTUATOR, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_WPNEXT_OFFSET,
+    Cmd.DO_SET_ROI_NONE, Cmd.DO_SET_ROI, Cmd.DO_SET_SAFETY_SWITCH_STATE,
 )  # fmt: skip
 
 # Commands without an answer, because their modules do not run in this configuration.
 _UNANSWERED = (
-    _C.NAV_DELAY, _C.DO_DIGICAM_CONTROL, _C.DO_MOUNT_CONFIGURE, _C.DO_MOUNT_CONTROL, _C.DO_SET_CAM_TRIGG_DIST,
-    _C.DO_SET_CAM_TRIGG_INTERVAL, _C.PREFLIGHT_UAVCAN, _C.REQUEST_CAMERA_INFORMATION, _C.SET_CAMERA_MODE,
-    _C.SET_CAMERA_ZOOM, _C.SET_CAMERA_FOCUS, _C.DO_GIMBAL_MANAGER_PITCHYAW, _C.DO_GIMBAL_MANAGER_CONFIGURE,
-    _C.DO_TRIGGER_CONTROL, _C.DO_WINCH,
+    Cmd.NAV_DELAY, Cmd.DO_DIGICAM_CONTROL, Cmd.DO_MOUNT_CONFIGURE, Cmd.DO_MOUNT_CONTROL, Cmd.DO_SET_CAM_TRIGG_DIST,
+    Cmd.DO_SET_CAM_TRIGG_INTERVAL, Cmd.PREFLIGHT_UAVCAN, Cmd.REQUEST_CAMERA_INFORMATION, Cmd.SET_CAMERA_MODE,
+    Cmd.SET_CAMERA_ZOOM, Cmd.SET_CAMERA_FOCUS, Cmd.DO_GIMBAL_MANAGER_PITCHYAW, Cmd.DO_GIMBAL_MANAGER_CONFIGURE,
+    Cmd.DO_TRIGGER_CONTROL, Cmd.DO_WINCH,
 )  # fmt: skip
 
 _GRIP_DURATION_S = 1.3
@@ -43,20 +44,20 @@ _TUNING_STEP_S, _TUNING_PROGRESS = 2.0, (0, 20, 40, 60, 80, 95)
 _TRANSITION_S, _NO_TRANSITION = 4.0, frozenset({modes.TAKEOFF, modes.LAND, modes.RTL, modes.ORBIT})
 _UNKNOWN_PROGRESS = 255
 _STORAGE_ACTIONS = range(5)
-_ACTUATORS, _FIRST_OUTPUT_FUNCTION = (range(1, 13), range(33, 41)), 1000
+_MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000
 
 
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
     handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)
-    handlers[_C.DO_LAND_START] = lambda _: MavResult.CANCELLED
-    handlers[_C.CONTROL_HIGH_LATENCY] = lambda _: _refuse_high_latency(px4)
-    handlers[_C.INJECT_FAILURE] = lambda command: _inject_failure(px4, command)
-    handlers[_C.LOGGING_START] = lambda command: px4.log_stream.start(command)
-    handlers[_C.LOGGING_STOP] = lambda command: px4.log_stream.stop(command)
-    handlers[_C.DO_GRIPPER] = lambda _: CommandProgress((_UNKNOWN_PROGRESS,), _GRIP_DURATION_S)
-    handlers[_C.ACTUATOR_TEST] = lambda command: _test_actuator(px4, command)
-    handlers[_C.PREFLIGHT_STORAGE] = lambda command: _store(px4, command)
+    handlers[Cmd.DO_LAND_START] = lambda _: MavResult.CANCELLED
+    handlers[Cmd.CONTROL_HIGH_LATENCY] = lambda _: _refuse_high_latency(px4)
+    handlers[Cmd.INJECT_FAILURE] = lambda command: _inject_failure(px4, command)
+    handlers[Cmd.LOGGING_START] = lambda command: px4.log_stream.start(command)
+    handlers[Cmd.LOGGING_STOP] = lambda command: px4.log_stream.stop(command)
+    handlers[Cmd.DO_GRIPPER] = lambda _: CommandProgress((_UNKNOWN_PROGRESS,), _GRIP_DURATION_S)
+    handlers[Cmd.ACTUATOR_TEST] = lambda command: _test_actuator(px4, command)
+    handlers[Cmd.PREFLIGHT_STORAGE] = lambda command: _store(px4, command)
     return handlers
 
 
@@ -71,10 +72,10 @@ def _inject_failure(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
     """Acknowledge a failure of the motors or the battery, like SIH. The failure has no effect."""
     if not px4.parameters.get("SYS_FAILURE_EN", 0):
         return MavResult.DENIED
-    unit, kind = whole(command.param1), whole(command.param2)
+    unit, failure_type = whole(command.param1), whole(command.param2)
     if unit not in _FAILURES:
         return None
-    return MavResult.ACCEPTED if kind in _FAILURES[FailureUnit(unit)] else MavResult.UNSUPPORTED
+    return MavResult.ACCEPTED if failure_type in _FAILURES[FailureUnit(unit)] else MavResult.UNSUPPORTED
 
 
 def _refuse_high_latency(px4: Px4Vehicle) -> int:
@@ -87,7 +88,7 @@ def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
     if px4.is_armed:
         return MavResult.DENIED
     function = whole(command.x)
-    is_known = any(function in numbers for numbers in _ACTUATORS) or function >= _FIRST_OUTPUT_FUNCTION
+    is_known = function in _MOTORS or function in _SERVOS or function >= _FIRST_OUTPUT_FUNCTION
     return MavResult.ACCEPTED if is_known else None
 
 
@@ -100,6 +101,7 @@ def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
 
 _FORCE_MAGIC = 21196.0
 _ALIASES: dict[Px4Mode, Px4Mode] = {(modes.AUTO, 0): modes.MISSION, modes.ORBIT: modes.POSITION}
+# _NAN_AS_INT: the upper half of a double NaN.
 _INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
 
 
@@ -110,38 +112,39 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         **other_commands(px4),
         **px4.camera_trigger.commands(),
         **gimbal_commands(px4.gimbal),
-        MavCmd.COMPONENT_ARM_DISARM: flight.arm_or_disarm,
-        MavCmd.DO_SET_MODE: flight.set_mode,
-        MavCmd.NAV_TAKEOFF: flight.take_off,
-        MavCmd.DO_SET_STANDARD_MODE: flight.set_standard_mode,
-        MavCmd.NAV_LAND: flight.land,
-        MavCmd.NAV_LAND_LOCAL: flight.land_precisely,
-        MavCmd.DO_ORBIT: flight.orbit,
-        MavCmd.DO_VTOL_TRANSITION: flight.transition,
-        MavCmd.DO_AUTOTUNE_ENABLE: flight.tune,
-        MavCmd.DO_CHANGE_ALTITUDE: flight.change_altitude,
-        MavCmd.DO_FLIGHTTERMINATION: flight.terminate,
-        MavCmd.NAV_RETURN_TO_LAUNCH: flight.return_to_launch,
-        MavCmd.DO_REPOSITION: flight.reposition,
-        MavCmd.DO_CHANGE_SPEED: flight.change_speed,
-        MavCmd.MISSION_START: flight.start_mission,
-        MavCmd.DO_SET_HOME: flight.set_home,
-        MavCmd.EXTERNAL_WIND_ESTIMATE: px4.external.set_wind,
-        MavCmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),
-        MavCmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
-        MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,
+        Cmd.COMPONENT_ARM_DISARM: flight.arm_or_disarm,
+        Cmd.DO_SET_MODE: flight.set_mode,
+        Cmd.NAV_TAKEOFF: flight.take_off,
+        Cmd.DO_SET_STANDARD_MODE: flight.set_standard_mode,
+        Cmd.NAV_LAND: flight.land,
+        Cmd.NAV_LAND_LOCAL: flight.land_precisely,
+        Cmd.DO_ORBIT: flight.orbit,
+        Cmd.DO_VTOL_TRANSITION: flight.transition,
+        Cmd.DO_AUTOTUNE_ENABLE: flight.tune,
+        Cmd.DO_CHANGE_ALTITUDE: flight.change_altitude,
+        Cmd.DO_FLIGHTTERMINATION: flight.terminate,
+        Cmd.NAV_RETURN_TO_LAUNCH: flight.return_to_launch,
+        Cmd.DO_REPOSITION: flight.reposition,
+        Cmd.DO_CHANGE_SPEED: flight.change_speed,
+        Cmd.MISSION_START: flight.start_mission,
+        Cmd.DO_SET_HOME: flight.set_home,
+        Cmd.EXTERNAL_WIND_ESTIMATE: px4.external.set_wind,
+        Cmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),
+        Cmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
+        Cmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,
     }
 
 
 def refusal_by_place(command: ReceivedCommand, *, checks_frame: bool) -> int | None:
     """Return the MAV_RESULT of an invalid position or frame; None if the command is valid."""
     if command.is_long:
-        is_left_open = all(_INT32_MAX - 128 < value <= _INT32_MAX + 256 for value in (command.x, command.y))
-        return MavResult.DENIED if is_left_open else None
+        # INT32_MAX as float32, which is rounded to a multiple of 128.
+        is_int32_max = all(_INT32_MAX - 128 < value <= _INT32_MAX + 256 for value in (command.x, command.y))
+        return MavResult.DENIED if is_int32_max else None
     if command.x == command.y == _NAN_AS_INT:
         return MavResult.DENIED
-    is_wrong = checks_frame and command.frame != MavFrame.GLOBAL_INT
-    return MavResult.COMMAND_UNSUPPORTED_MAV_FRAME if is_wrong else None
+    is_wrong_frame = checks_frame and command.frame != MavFrame.GLOBAL_INT
+    return MavResult.COMMAND_UNSUPPORTED_MAV_FRAME if is_wrong_frame else None
 
 
 def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
@@ -150,8 +153,9 @@ def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
         return MavResult.TEMPORARILY_REJECTED
     mode = _ALIASES.get(mode, mode)
     if mode not in modes.SELECTABLE:
-        what = "auto" if mode[0] == modes.AUTO else "main"
-        px4.send_text(MavSeverity.CRITICAL, f"Unsupported {what} mode")
+        level = "auto" if mode[0] == modes.AUTO else "main"
+        px4.send_text(MavSeverity.CRITICAL, f"Unsupported {level} mode")
+        # PX4 1.16 accepts an unknown mode, but does not enter it.
         return MavResult.ACCEPTED if px4.version.startswith("1.16") else MavResult.TEMPORARILY_REJECTED
     return _change(px4, mode)
 
@@ -170,15 +174,15 @@ class _Flight:
 
     def arm_or_disarm(self, command: ReceivedCommand) -> int | None:
         force = command.param2 == _FORCE_MAGIC
-        wanted = round(command.param1) if math.isfinite(command.param1) else None
-        if wanted == 1:
-            done = self._px4.arming.arm()  # PX4 checks external arm commands even if they are forced.
-        elif wanted == 0:
-            done = self._px4.arming.disarm("external command", force=force)
+        arm = round(command.param1) if math.isfinite(command.param1) else None
+        if arm == 1:
+            is_done = self._px4.arming.arm()  # PX4 checks external arm commands even if they are forced.
+        elif arm == 0:
+            is_done = self._px4.arming.disarm("external command", force=force)
         else:
             self._px4.send_text(MavSeverity.CRITICAL, f"Unsupported ARM_DISARM param: {command.param1:.3f}")
             return None
-        return MavResult.ACCEPTED if done else MavResult.TEMPORARILY_REJECTED
+        return MavResult.ACCEPTED if is_done else MavResult.TEMPORARILY_REJECTED
 
     def set_mode(self, command: ReceivedCommand) -> int:
         """Set a mode and acknowledge twice: PX4's link module always accepts, then the commander sends the result."""
@@ -268,9 +272,9 @@ class _Flight:
         north, east, down = self._destination(command)
         radius = command.param1 if math.isfinite(command.param1) else orbit.radius_m
         speed = abs(command.param2) if math.isfinite(command.param2) else orbit.speed_m_s
-        if px4.VEHICLE_TYPE == MavType.FIXED_WING:
-            px4.flight.target, result = (north, east, down), self._change(modes.HOLD)
-            px4.flight.radius_m = radius
+        if px4.VEHICLE_TYPE == MavType.FIXED_WING:  # A plane circles its target in HOLD.
+            result = self._change(modes.HOLD)  # sets the target to the current position
+            px4.flight.target, px4.flight.radius_m = (north, east, down), radius
             return result
         if not orbit.plan(radius, speed, (north, east), down):
             px4.send_text(MavSeverity.CRITICAL, "Orbit radius limit exceeded")
@@ -294,15 +298,15 @@ class _Flight:
 
     def transition(self, command: ReceivedCommand) -> int | None:
         """Report a transition, then the state of param 1. A vehicle that is not a VTOL does not answer."""
-        px4, wanted = self._px4, whole(command.param1)
+        px4, requested_state = self._px4, whole(command.param1)
         if not px4.vtol_state:
             return None
-        if wanted not in (MavVtolState.MC, MavVtolState.FW) or px4.mode in _NO_TRANSITION:
+        if requested_state not in (MavVtolState.MC, MavVtolState.FW) or px4.mode in _NO_TRANSITION:
             return MavResult.TEMPORARILY_REJECTED
-        is_forward = wanted == MavVtolState.FW
-        if px4.vtol_state != wanted:
+        is_forward = requested_state == MavVtolState.FW
+        if px4.vtol_state != requested_state:
             px4.vtol_state = MavVtolState.TRANSITION_TO_FW if is_forward else MavVtolState.TRANSITION_TO_MC
-            px4.call_later(_TRANSITION_S, lambda: setattr(px4, "vtol_state", wanted))
+            px4.call_later(_TRANSITION_S, lambda: setattr(px4, "vtol_state", requested_state))
         return MavResult.ACCEPTED
 
     def change_altitude(self, command: ReceivedCommand) -> int:
@@ -345,7 +349,8 @@ class _Flight:
             return MavResult.ACCEPTED
         if self._px4.is_armed or command.param1 not in (1.0, 2.0):
             return MavResult.DENIED
-        self._px4.call_later(0.2, self._px4.restart if command.param1 == 1.0 else self._px4.shut_down)
+        action = self._px4.restart if command.param1 == 1.0 else self._px4.shut_down
+        self._px4.call_later(0.2, action)  # The acknowledgement is sent first.
         return MavResult.ACCEPTED
 
 
@@ -356,9 +361,9 @@ _ACKNOWLEDGED_ONLY = frozenset({m.Heartbeat.ID})
 def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     requests = _Requests(px4)
     handlers: dict[int, CommandHandler] = {
-        MavCmd.REQUEST_MESSAGE: requests.request_message,
-        MavCmd.SET_MESSAGE_INTERVAL: requests.set_interval,
-        MavCmd.GET_MESSAGE_INTERVAL: requests.get_interval,
+        Cmd.REQUEST_MESSAGE: requests.request_message,
+        Cmd.SET_MESSAGE_INTERVAL: requests.set_interval,
+        Cmd.GET_MESSAGE_INTERVAL: requests.get_interval,
     }
     for command, message_id in _LEGACY_REQUESTS.items():
         handlers[command] = lambda request, message_id=message_id: requests.send_now(message_id, request)  # type: ignore[misc]
@@ -367,11 +372,11 @@ def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
 
 # Commands that request a single message.
 _LEGACY_REQUESTS = {
-    MavCmd.REQUEST_AUTOPILOT_CAPABILITIES: m.AutopilotVersion.ID,
-    MavCmd.REQUEST_PROTOCOL_VERSION: m.ProtocolVersion.ID,
-    MavCmd.REQUEST_STORAGE_INFORMATION: m.StorageInformation.ID,
-    MavCmd.REQUEST_FLIGHT_INFORMATION: m.FlightInformation.ID,
-    MavCmd.GET_HOME_POSITION: m.HomePosition.ID,
+    Cmd.REQUEST_AUTOPILOT_CAPABILITIES: m.AutopilotVersion.ID,
+    Cmd.REQUEST_PROTOCOL_VERSION: m.ProtocolVersion.ID,
+    Cmd.REQUEST_STORAGE_INFORMATION: m.StorageInformation.ID,
+    Cmd.REQUEST_FLIGHT_INFORMATION: m.FlightInformation.ID,
+    Cmd.GET_HOME_POSITION: m.HomePosition.ID,
 }
 
 

@@ -13,8 +13,10 @@ if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
     from aerokit.sim.vehicle import SimulatedVehicle
 
-_PIECE, _DATA, _NO_START = 70, 249, 255
+# Size of the data fields of SERIAL_CONTROL and of LOGGING_DATA.
+_PIECE, _DATA = 70, 249
 _STEP_S, _MAX_TRIES = 0.05, 50
+_DEFINITION_BLOCKS = 2
 _HEADER = b"ULog\x01\x12\x35\x01" + bytes(8)
 
 
@@ -37,14 +39,17 @@ class Px4Shell:
         output = line + self._output(line.decode(errors="replace").strip()) + b"pxh> "
         for start in range(0, len(output), _PIECE):
             piece = output[start : start + _PIECE]
-            target = sender_of(message)
-            reply = m.SerialControl(10, SerialControlFlag.REPLY, 0, 0, len(piece), piece.ljust(_PIECE, b"\0"), *target)
+            shell, is_reply = SerialControlDev.DEV_SHELL, SerialControlFlag.REPLY
+            data = piece.ljust(_PIECE, b"\0")
+            reply = m.SerialControl(shell, is_reply, 0, 0, len(piece), data, *sender_of(message))
             self._px4.send(reply, channel)
 
     def _output(self, command: str) -> bytes:
         if command.startswith("echo "):
             return command.removeprefix("echo ").encode() + b"\n"
-        return f"Invalid command: {command}\ntype 'help' for a list of commands\n".encode() if command else b""
+        if not command:
+            return b""
+        return f"Invalid command: {command}\ntype 'help' for a list of commands\n".encode()
 
 
 class Px4LogStream:
@@ -54,7 +59,7 @@ class Px4LogStream:
         self._px4 = px4
         self._station: tuple[int, int] | None = None
         self._channel: Channel | None = None
-        self._sequence = self._tries = self._written = 0
+        self._sequence = self._tries = self._acknowledged = 0
         px4.on(m.LoggingAck, self._on_ack)
 
     def start(self, command: ReceivedCommand) -> int:
@@ -63,7 +68,7 @@ class Px4LogStream:
         if command.param1:
             return MavResult.UNSUPPORTED
         self._station, self._channel = command.sender, command.channel
-        self._sequence = self._tries = self._written = 0
+        self._sequence = self._tries = self._acknowledged = 0
         self._px4.call_later(_STEP_S, self._run)
         return MavResult.ACCEPTED
 
@@ -72,23 +77,27 @@ class Px4LogStream:
         return MavResult.ACCEPTED
 
     def _on_ack(self, ack: m.LoggingAck, _: Channel) -> None:
-        if ack.sequence == self._sequence and self._written < 2:
-            self._sequence, self._written, self._tries = self._sequence + 1, self._written + 1, 0
+        if ack.sequence == self._sequence and self._sends_definitions:
+            self._sequence, self._acknowledged, self._tries = self._sequence + 1, self._acknowledged + 1, 0
+
+    @property
+    def _sends_definitions(self) -> bool:
+        return self._acknowledged < _DEFINITION_BLOCKS
 
     def _run(self) -> None:
         if self._station is None:
             return
         self._tries += 1
-        if self._tries > _MAX_TRIES and self._written < 2:
+        if self._tries > _MAX_TRIES and self._sends_definitions:
             self._station = None
             return
-        kind = m.LoggingDataAcked if self._written < 2 else m.LoggingData
-        data = _HEADER if self._written == 0 else b""
-        data += b"".join(_ulog_message(n) for n in range(2))
-        first = len(_HEADER) if self._written == 0 else 0
-        padded = data.ljust(_DATA, b"\0")
-        self._px4.send(kind(*self._station, self._sequence & 0xFFFF, len(data), first, padded), self._channel)
-        if self._written >= 2:
+        message_class = m.LoggingDataAcked if self._sends_definitions else m.LoggingData
+        header = _HEADER if self._acknowledged == 0 else b""
+        data = header + b"".join(_ulog_message(number) for number in range(2))
+        sequence, first_message_offset, padded = self._sequence & 0xFFFF, len(header), data.ljust(_DATA, b"\0")
+        block = message_class(*self._station, sequence, len(data), first_message_offset, padded)
+        self._px4.send(block, self._channel)
+        if not self._sends_definitions:
             self._sequence += 1
         self._px4.call_later(_STEP_S, self._run)
 

@@ -83,7 +83,8 @@ class Px4External:
             self._px4.send_built(m.GpsGlobalOrigin.ID, channel)
 
     def _on_timesync(self, message: m.Timesync, _: Channel) -> None:
-        self.clock_answers += message.tc1 != 0
+        is_answer = message.tc1 != 0
+        self.clock_answers += is_answer
 
 
 class PrecisionLanding:
@@ -91,11 +92,11 @@ class PrecisionLanding:
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self._search_from: float | None = None
+        self._search_began_at: float | None = None
         self._searches = 0
 
     def enter(self) -> None:
-        self._search_from, self._searches = None, 0
+        self._search_began_at, self._searches = None, 0
 
     def update(self) -> None:
         px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
@@ -103,7 +104,7 @@ class PrecisionLanding:
         if target is None or self._searches > limits["PLD_MAX_SRCH"]:
             self._search()
             return
-        self._search_from = None
+        self._search_began_at = None
         north, east = target[0] - motion.north, target[1] - motion.east
         is_above = math.hypot(north, east) <= max(limits["PLD_HACC_RAD"], 0.05)
         descent = px4.flight.descent_speed_m_s if is_above else 0.0
@@ -111,11 +112,11 @@ class PrecisionLanding:
 
     def _search(self) -> None:
         px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
-        if self._search_from is None:
-            self._search_from, self._searches = px4.now, self._searches + 1
-        is_over = px4.now - self._search_from > limits["PLD_SRCH_TOUT"]
+        if self._search_began_at is None:
+            self._search_began_at, self._searches = px4.now, self._searches + 1
+        is_over = px4.now - self._search_began_at > limits["PLD_SRCH_TOUT"]
         if is_over or self._searches > limits["PLD_MAX_SRCH"]:
             px4.flight.descend()
             return
-        height = px4.home[2] - limits["PLD_SRCH_ALT"]
-        motion.seek_position(motion.north, motion.east, height, speed=1.0, climb=2.0, descent=1.0)
+        search_down = px4.home[2] - limits["PLD_SRCH_ALT"]
+        motion.seek_position(motion.north, motion.east, search_down, speed=1.0, climb=2.0, descent=1.0)

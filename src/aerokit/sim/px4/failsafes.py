@@ -13,17 +13,17 @@ from collections.abc import Iterator, Sequence
 from enum import IntEnum
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavBatteryChargeState, MavCmd, MavMissionType, MavSeverity, MavType
+from aerokit.mavlink.enums import MavBatteryChargeState, MavMissionType, MavSeverity, MavType
+from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.missions import MissionItem
 from aerokit.sim.channel import Channel
 from aerokit.sim.motion import Ned
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.links import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
-from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, ORBIT, RTL, Px4Mode
+from aerokit.sim.px4.modes import AUTO, HOLD, LAND, MISSION, OFFBOARD, ORBIT, RTL, Px4Mode
 
-_C = MavCmd
-_POLYGONS = {_C.NAV_FENCE_POLYGON_VERTEX_INCLUSION: True, _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False}
-_CIRCLES = {_C.NAV_FENCE_CIRCLE_INCLUSION: True, _C.NAV_FENCE_CIRCLE_EXCLUSION: False}
+_POLYGONS = {Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: True, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False}
+_CIRCLES = {Cmd.NAV_FENCE_CIRCLE_INCLUSION: True, Cmd.NAV_FENCE_CIRCLE_EXCLUSION: False}
 _NO_ACTION, _WARNING = 0, 1
 
 
@@ -57,15 +57,15 @@ class Px4Fence:
     def breaches_at(self, place: Ned) -> list[str]:
         """Return the texts of breaches at a point (metres north, east, down)."""
         px4, (north, east, down) = self._px4, place
-        farthest, highest = px4.parameters["GF_MAX_HOR_DIST"], px4.parameters["GF_MAX_VER_DIST"]
-        found = []
-        if 0 < farthest < math.hypot(north - px4.home[0], east - px4.home[1]):
-            found.append(TOO_FAR)
-        if 0 < highest < px4.home[2] - down:
-            found.append(TOO_HIGH)
+        max_distance, max_height = px4.parameters["GF_MAX_HOR_DIST"], px4.parameters["GF_MAX_VER_DIST"]  # 0: no limit
+        breaches = []
+        if 0 < max_distance < math.hypot(north - px4.home[0], east - px4.home[1]):
+            breaches.append(TOO_FAR)
+        if 0 < max_height < px4.home[2] - down:
+            breaches.append(TOO_HIGH)
         if not self._is_inside(north, east):
-            found.append(OUTSIDE)
-        return found
+            breaches.append(OUTSIDE)
+        return breaches
 
     def _is_inside(self, north: float, east: float) -> bool:
         if not self._is_valid or not self._px4.missions.count(MavMissionType.FENCE):
@@ -74,10 +74,11 @@ class Px4Fence:
 
     def _areas_allow(self, north: float, east: float) -> bool:
         areas = list(self._areas(north, east))
-        if any(inside for is_inclusion, inside in areas if not is_inclusion):
+        is_inside_inclusions = [is_inside for is_inclusion, is_inside in areas if is_inclusion]
+        is_inside_exclusions = [is_inside for is_inclusion, is_inside in areas if not is_inclusion]
+        if any(is_inside_exclusions):
             return False
-        inclusions = [inside for is_inclusion, inside in areas if is_inclusion]
-        return not inclusions or any(inclusions)
+        return not is_inside_inclusions or any(is_inside_inclusions)
 
     def _areas(self, north: float, east: float) -> Iterator[tuple[bool, bool]]:
         """Yield two values for each area: True if it is an inclusion, and True if the point is inside it."""
@@ -87,13 +88,13 @@ class Px4Fence:
             if item.command in _POLYGONS:
                 count = max(1, int(item.param1))
                 corners = [self._place(item) for item in items[index : index + count]]
-                yield _POLYGONS[MavCmd(item.command)], _is_in_polygon(corners, north, east)
+                yield _POLYGONS[Cmd(item.command)], _is_in_polygon(corners, north, east)
                 index += count
                 continue
             if item.command in _CIRCLES:
                 centre = self._place(item)
                 inside = math.dist(centre, (north, east)) <= item.param1
-                yield _CIRCLES[MavCmd(item.command)], inside
+                yield _CIRCLES[Cmd(item.command)], inside
             index += 1
 
     def _items(self) -> Sequence[MissionItem]:
@@ -104,13 +105,17 @@ class Px4Fence:
 
 
 def _is_in_polygon(corners: Sequence[tuple[float, float]], north: float, east: float) -> bool:
-    inside, previous = False, corners[-1]
+    """Return True if a ray from the point to the north crosses the border an odd number of times."""
+    is_inside, previous = False, corners[-1]
     for corner in corners:
-        if (corner[1] > east) != (previous[1] > east):
+        side_spans_ray = (corner[1] > east) != (previous[1] > east)
+        if side_spans_ray:
             share = (east - corner[1]) / (previous[1] - corner[1])
-            inside ^= north < corner[0] + share * (previous[0] - corner[0])
+            crossing_north = corner[0] + share * (previous[0] - corner[0])
+            if north < crossing_north:
+                is_inside = not is_inside
         previous = corner
-    return inside
+    return is_inside
 
 
 _INTERVAL_S = 0.2
@@ -128,10 +133,10 @@ class FailsafeAction(IntEnum):
     TERMINATE = 6
 
 
-_A = FailsafeAction
-_LINK_ACTIONS = {1: _A.HOLD, 2: _A.RETURN, 3: _A.LAND, 5: _A.TERMINATE, 6: _A.DISARM}
-_FENCE_ACTIONS = {1: _A.WARN, 2: _A.HOLD, 3: _A.RETURN, 4: _A.TERMINATE, 5: _A.LAND}
-_MODES: dict[FailsafeAction, Px4Mode] = {_A.HOLD: HOLD, _A.RETURN: RTL, _A.LAND: LAND}
+Action = FailsafeAction
+_LINK_ACTIONS = {1: Action.HOLD, 2: Action.RETURN, 3: Action.LAND, 5: Action.TERMINATE, 6: Action.DISARM}
+_FENCE_ACTIONS = {1: Action.WARN, 2: Action.HOLD, 3: Action.RETURN, 4: Action.TERMINATE, 5: Action.LAND}
+_MODES: dict[FailsafeAction, Px4Mode] = {Action.HOLD: HOLD, Action.RETURN: RTL, Action.LAND: LAND}
 _BATTERY_TEXTS = {
     MavBatteryChargeState.LOW: (MavSeverity.CRITICAL, "Low battery"),
     MavBatteryChargeState.CRITICAL: (MavSeverity.CRITICAL, "Critical battery"),
@@ -147,7 +152,7 @@ class Px4Failsafes:
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.fence: Px4Fence = Px4Fence(px4)
-        self.action: FailsafeAction = _A.NONE  # Current action.
+        self.action: FailsafeAction = Action.NONE  # Current action.
         self.battery_state = MavBatteryChargeState.OK
         """State of charge; it never improves while armed."""
         self.has_station: bool = False  # True while heartbeats of a ground station are received.
@@ -156,10 +161,11 @@ class Px4Failsafes:
         self._battery_at_arming = MavBatteryChargeState.OK
         self._reported_battery_level = MavBatteryChargeState.OK
         self._breaches: list[str] = []
+        # Actions by cause. A cause that has ended stays here while its action lasts.
         self._active: dict[str, FailsafeAction] = {}
-        self._failing: frozenset[str] = frozenset()
+        self._failing: frozenset[str] = frozenset()  # Causes that exist at present.
         self._holds_until = -math.inf
-        self._is_taken_over = False
+        self._is_overridden = False  # True after the user has changed the mode during a failsafe.
 
     def listen(self) -> None:
         self._px4.on(m.Heartbeat, self._on_heartbeat)
@@ -170,7 +176,7 @@ class Px4Failsafes:
     @property
     def acts(self) -> bool:
         """True if the current action is more than a warning."""
-        return self.action > _A.WARN
+        return self.action > Action.WARN
 
     def _on_heartbeat(self, beat: m.Heartbeat, channel: Channel) -> None:
         if beat.type != MavType.GCS:
@@ -207,11 +213,12 @@ class Px4Failsafes:
         """Return the action of COM_LOW_BAT_ACT: 0 warns, 2 lands, 3 returns (and lands in an emergency)."""
         state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
         if state == MavBatteryChargeState.OK:
-            return _A.NONE
-        if state == MavBatteryChargeState.LOW or state <= self._battery_at_arming or action not in (2, 3):
-            return _A.WARN
+            return Action.NONE
+        is_known_at_arming = state <= self._battery_at_arming
+        if state == MavBatteryChargeState.LOW or is_known_at_arming or action not in (2, 3):
+            return Action.WARN
         lands = action == 2 or state == MavBatteryChargeState.EMERGENCY
-        return _A.LAND if lands else _A.RETURN
+        return Action.LAND if lands else Action.RETURN
 
     def arming_reasons(self) -> list[str]:
         """Return the texts of the failures that prevent arming."""
@@ -230,47 +237,54 @@ class Px4Failsafes:
         self._reset()
 
     def _reset(self) -> None:
-        self.action, self._is_taken_over, self._holds_until = _A.NONE, False, -math.inf
+        self.action, self._is_overridden, self._holds_until = Action.NONE, False, -math.inf
         self._active, self._breaches, self._failing = {}, [], frozenset()
 
     def _active_failures(self) -> dict[str, FailsafeAction]:
-        found = {
+        actions = {
             "battery": self._battery_action(),
             "station": self._station_action(),
             "sticks": self._sticks_action(),
             "fence": self._fence_action(),
         }
-        return {cause: action for cause, action in found.items() if action}
+        return {cause: action for cause, action in actions.items() if action != Action.NONE}
 
     def _station_action(self) -> FailsafeAction:
         if self.has_station or self._px4.intended_mode == LAND or self._is_excepted("COM_DLL_EXCEPT"):
-            return _A.NONE
-        return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_DLL_ACT"]), _A.NONE)
+            return Action.NONE
+        return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_DLL_ACT"]), Action.NONE)
 
     def _sticks_action(self) -> FailsafeAction:
         """Return the action for lost sticks, if they have been received since arming."""
         sticks = self._px4.sticks
         self._had_manual_control = self._had_manual_control or sticks.are_fresh
-        if (
-            not self._had_manual_control
-            or sticks.are_fresh
-            or not sticks.are_wanted
-            or self._is_excepted("COM_RCL_EXCEPT")
-        ):
-            return _A.NONE
-        return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_RCL_ACT"]), _A.NONE)
+        is_lost = self._had_manual_control and not sticks.are_fresh
+        if not is_lost or not sticks.are_wanted or self._is_excepted("COM_RCL_EXCEPT"):
+            return Action.NONE
+        return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_RCL_ACT"]), Action.NONE)
 
     def can_be_overridden(self, moved: float) -> bool:
         """Return True if a stick movement of this size (2 is end to end) ends the current mode."""
-        values, mode = self._px4.parameters, self._px4.mode
-        bit = 1 if mode[0] == 4 or mode == ORBIT else 2 if mode == OFFBOARD else 0
-        return bool(round(values["COM_RC_OVERRIDE"]) & bit) and moved * 100 >= values["COM_RC_STICK_OV"]
+        parameters, mode = self._px4.parameters, self._px4.mode
+        mode_bit = 0  # of COM_RC_OVERRIDE
+        if mode[0] == AUTO or mode == ORBIT:
+            mode_bit = 1
+        elif mode == OFFBOARD:
+            mode_bit = 2
+        is_allowed = bool(round(parameters["COM_RC_OVERRIDE"]) & mode_bit)
+        return is_allowed and moved * 100 >= parameters["COM_RC_STICK_OV"]
 
     def _is_excepted(self, parameter: str) -> bool:
         """Return True if the parameter excludes this mode: bit 1 MISSION, 2 other automatic modes, 4 OFFBOARD."""
         mode = self._px4.intended_mode
-        bit = {MISSION: 1, OFFBOARD: 4}.get(mode, 2 if mode[0] == 4 else 0)
-        return bool(round(self._px4.parameters[parameter]) & bit)
+        mode_bit = 0
+        if mode == MISSION:
+            mode_bit = 1
+        elif mode == OFFBOARD:
+            mode_bit = 4
+        elif mode[0] == AUTO:
+            mode_bit = 2
+        return bool(round(self._px4.parameters[parameter]) & mode_bit)
 
     def _fence_action(self) -> FailsafeAction:
         breaches = self.fence.breaches
@@ -278,7 +292,9 @@ class Px4Failsafes:
             if text not in self._breaches:
                 self._px4.send_text(MavSeverity.CRITICAL, text)
         self._breaches = breaches
-        return _FENCE_ACTIONS.get(round(self._px4.parameters["GF_ACTION"]), _A.WARN) if breaches else _A.NONE
+        if not breaches:
+            return Action.NONE
+        return _FENCE_ACTIONS.get(round(self._px4.parameters["GF_ACTION"]), Action.WARN)
 
     def check(self) -> None:
         """Check for failures and execute the action; does nothing after a flight termination."""
@@ -299,51 +315,53 @@ class Px4Failsafes:
         A new failure starts the delay and ends an override. An action stays active until the mode is changed.
         """
         for cause, action in failing.items():
-            if cause not in self._active and action >= _A.HOLD:
-                self._is_taken_over = False
-            worse = action > self._active.get(cause, _A.WARN)
-            if worse and self.action <= _A.HOLD and self._holds_until < self._px4.now:
+            if cause not in self._active and action >= Action.HOLD:
+                self._is_overridden = False
+            is_worse = action > self._active.get(cause, Action.WARN)
+            if is_worse and self.action <= Action.HOLD and self._holds_until < self._px4.now:
                 self._holds_until = self._px4.now + self._px4.parameters["COM_FAIL_ACT_T"]
-        kept = {cause: action for cause, action in self._active.items() if action >= _A.HOLD}
-        self._active, self._failing = {**kept, **failing}, frozenset(failing)
+        still_acting = {cause: action for cause, action in self._active.items() if action >= Action.HOLD}
+        self._active, self._failing = {**still_acting, **failing}, frozenset(failing)
 
     def _choose(self) -> FailsafeAction:
-        worst = max(self._active.values(), default=_A.NONE)
+        """Return the most severe action, reduced while it is overridden, already under way or delayed."""
+        worst = max(self._active.values(), default=Action.NONE)
         intended = self._px4.intended_mode
-        if self._is_taken_over and worst < _A.DISARM:
-            return min(worst, _A.WARN)
-        if worst == _A.RETURN and intended in (LAND, RTL):
-            return _A.WARN
-        if worst in (_A.RETURN, _A.LAND) and self.action <= _A.HOLD and self._px4.now < self._holds_until:
-            return _A.HOLD
+        if self._is_overridden and worst < Action.DISARM:
+            return min(worst, Action.WARN)
+        if worst == Action.RETURN and intended in (LAND, RTL):
+            return Action.WARN
+        if worst in (Action.RETURN, Action.LAND) and self.action <= Action.HOLD and self._px4.now < self._holds_until:
+            return Action.HOLD
         return worst
 
     def _execute(self, action: FailsafeAction) -> None:
         if action == self.action:
             return
         px4, previous, self.action = self._px4, self.action, action
-        px4.is_in_failsafe = action > _A.WARN
-        if max(previous, _A.WARN) < action < _A.TERMINATE:
+        px4.is_in_failsafe = action > Action.WARN
+        if max(previous, Action.WARN) < action < Action.TERMINATE:
             self._report(action)
-        if action == _A.DISARM:
+        if action == Action.DISARM:
             px4.arming.disarm("failsafe", force=True)
-        elif action == _A.TERMINATE:
+        elif action == Action.TERMINATE:
             px4.arming.terminate()
         elif action in _MODES:
             px4.switch_to(_MODES[action])
-        elif previous > _A.WARN:
+        elif previous > Action.WARN:
             px4.switch_to(px4.intended_mode)
 
     def _report(self, action: FailsafeAction) -> None:
-        left = self._holds_until - self._px4.now
-        waits = action == _A.HOLD and max(self._active.values()) > _A.HOLD
-        text = f"Failsafe activated: entering Hold for {left:.0f} seconds" if waits else "Failsafe activated"
+        text = "Failsafe activated"
+        is_delay = action == Action.HOLD and max(self._active.values()) > Action.HOLD
+        if is_delay:
+            text += f": entering Hold for {self._holds_until - self._px4.now:.0f} seconds"
         self._px4.send_text(MavSeverity.CRITICAL, text)
 
     def override(self) -> None:
         """Handle a mode change by the user: drop failures that have ended, and reduce the action to a warning."""
         self._active = {cause: action for cause, action in self._active.items() if cause in self._failing}
-        if self.action > _A.WARN:
-            self._is_taken_over = bool(self._active)
-            self.action = _A.WARN
+        if self.action > Action.WARN:
+            self._is_overridden = bool(self._active)
+            self.action = Action.WARN
             self._holds_until = -math.inf

@@ -7,7 +7,7 @@ import math
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionType
 from aerokit.missions import MissionItem
-from aerokit.sim.motion import Ned, approach_speed
+from aerokit.sim.motion import BRAKING_SHARE, Ned, approach_speed
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.external import PrecisionLanding
 from aerokit.sim.px4.host import Px4Host
@@ -41,16 +41,17 @@ class Px4Orbit:
     def update(self) -> None:
         motion = self._px4.motion
         north, east = motion.north - self.middle[0], motion.east - self.middle[1]
-        angle, distance = math.atan2(east, north), math.hypot(north, east)
-        turning = math.copysign(1.0, self.radius_m)
-        along = angle + turning * math.pi / 2
-        outwards = max(-self.speed_m_s, min(self.speed_m_s, _BACK_TO_CIRCLE_PER_S * (abs(self.radius_m) - distance)))
+        angle, distance = math.atan2(east, north), math.hypot(north, east)  # from the middle to the vehicle
+        turn_sign = math.copysign(1.0, self.radius_m)
+        tangent = angle + turn_sign * math.pi / 2
+        speed = self.speed_m_s
+        outwards = max(-speed, min(speed, _BACK_TO_CIRCLE_PER_S * (abs(self.radius_m) - distance)))
         motion.seek_velocity(
-            self.speed_m_s * math.cos(along) + outwards * math.cos(angle),
-            self.speed_m_s * math.sin(along) + outwards * math.sin(angle),
+            speed * math.cos(tangent) + outwards * math.cos(angle),
+            speed * math.sin(tangent) + outwards * math.sin(angle),
             max(-1.0, min(1.0, self.down - motion.down)),
         )
-        motion.face(angle + math.pi)
+        motion.face(angle + math.pi)  # towards the middle
 
     def status(self) -> m.OrbitExecutionStatus:
         px4 = self._px4
@@ -60,19 +61,20 @@ class Px4Orbit:
         )
 
 
+# Values of RTL_TYPE.
 _NEAREST, _RALLY_FIRST = (0, 3), 1
 _RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def return_destination(px4: Px4Host) -> Ned:
     """Return the destination of a return: north, east, and the down coordinate that its heights refer to."""
-    kind = round(px4.parameters["RTL_TYPE"])
-    points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
-    if kind not in (*_NEAREST, _RALLY_FIRST) or not points:
+    rtl_type = round(px4.parameters["RTL_TYPE"])
+    rally_points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
+    if rtl_type not in (*_NEAREST, _RALLY_FIRST) or not rally_points:
         return px4.home
-    candidates = points if kind == _RALLY_FIRST else [px4.home, *points]
-    here = (px4.motion.north, px4.motion.east)
-    return min(candidates, key=lambda place: math.dist(here, place[:2]))
+    candidates = rally_points if rtl_type == _RALLY_FIRST else [px4.home, *rally_points]
+    current = (px4.motion.north, px4.motion.east)
+    return min(candidates, key=lambda place: math.dist(current, place[:2]))
 
 
 def _place(px4: Px4Host, item: MissionItem) -> Ned:
@@ -101,7 +103,7 @@ class Px4Flight:
         self.precision_landing: PrecisionLanding = PrecisionLanding(vehicle)
         self.orbit: Px4Orbit = Px4Orbit(vehicle)
         self._phase = ""
-        self._ramp_from = 0.0
+        self._ramp_began_at = 0.0
         self._is_default_height = False
 
     @property
@@ -159,24 +161,24 @@ class Px4Flight:
         elif mode == modes.ORBIT:
             self.orbit.update()
         elif mode == modes.TERMINATION:
-            pass
+            pass  # The motors are off.
         else:
             self.go()
 
     def _lift_off(self) -> None:
         vehicle = self._vehicle
         if self.lifts_off and vehicle.now - vehicle.arming.since >= _SPOOL_UP_S:
-            self._ramp_from = vehicle.now
+            self._ramp_began_at = vehicle.now
             vehicle.leave_ground()
 
     def _take_off(self) -> None:
         vehicle = self._vehicle
-        ramp = (vehicle.now - self._ramp_from) / max(0.1, vehicle.parameters["MPC_TKO_RAMP_T"])
+        ramp = (vehicle.now - self._ramp_began_at) / max(0.1, vehicle.parameters["MPC_TKO_RAMP_T"])
         climb = vehicle.parameters["MPC_TKO_SPEED"] * max(0.05, min(1.0, ramp))
         vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=climb, descent=1.0)
         if abs(vehicle.motion.down - self.target[2]) < _ARRIVED_M:
             target = self.target
-            vehicle.switch_to(modes.HOLD)
+            vehicle.switch_to(modes.HOLD)  # replaces the target by the current position
             self.target = target
 
     def plan_take_off(self, down: float | None = None) -> None:
@@ -197,8 +199,8 @@ class Px4Flight:
 
     def go(self) -> None:
         vehicle, limits = self._vehicle, self._vehicle.parameters
-        up, down = limits["MPC_Z_V_AUTO_UP"], limits["MPC_Z_V_AUTO_DN"]
-        vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=up, descent=down)
+        climb, descent = limits["MPC_Z_V_AUTO_UP"], limits["MPC_Z_V_AUTO_DN"]
+        vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=climb, descent=descent)
         self._point()
 
     def _point(self) -> None:
@@ -225,10 +227,11 @@ class Px4Flight:
         vehicle = self._vehicle
         self.destination = return_destination(vehicle)
         north, east, down = vehicle.motion.north, vehicle.motion.east, vehicle.motion.down
-        above = self.destination[2] - down
-        height = max(vehicle.parameters["RTL_RETURN_ALT"], above)
-        if math.hypot(north - self.destination[0], east - self.destination[1]) < vehicle.parameters["RTL_MIN_DIST"]:
-            height = max(vehicle.parameters["RTL_DESCEND_ALT"], above)
+        current_height = self.destination[2] - down
+        distance = math.hypot(north - self.destination[0], east - self.destination[1])
+        height = max(vehicle.parameters["RTL_RETURN_ALT"], current_height)
+        if distance < vehicle.parameters["RTL_MIN_DIST"]:
+            height = max(vehicle.parameters["RTL_DESCEND_ALT"], current_height)
         self.target = (north, east, min(down, self.destination[2] - height))
         amsl = vehicle.frame.origin.altitude_m - self.target[2]
         text = f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)"
@@ -252,4 +255,4 @@ class Px4Flight:
 
 def velocity_towards(offset: float, limit: float, acceleration: float) -> float:
     """Return a signed speed along one axis towards a point ``offset`` metres away."""
-    return math.copysign(min(limit, approach_speed(abs(offset), 1.0, 0.7 * acceleration)), offset)
+    return math.copysign(min(limit, approach_speed(abs(offset), 1.0, BRAKING_SHARE * acceleration)), offset)

@@ -57,6 +57,8 @@ class Px4Ftp(SessionFtpServer[FileTree]):
         return answer
 
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        if len(request.data[: request.size].partition(b"\0")[0]) + 2 >= request.size:
+        old_name = request.data[: request.size].partition(b"\0")[0]
+        has_new_name = len(old_name) + 2 < request.size
+        if not has_new_name:
             return request.refuse_errno(peer.errno)  # The error of an earlier failure, as in the firmware.
         return super()._rename(peer, request)

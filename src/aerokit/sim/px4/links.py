@@ -40,32 +40,35 @@ class Px4Events:
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self._next = _INITIAL_SEQUENCE
+        self._next_sequence = _INITIAL_SEQUENCE
 
     def current(self) -> CurrentEventSequence:
-        return CurrentEventSequence((self._next - 1) & 0xFFFF, 0)
+        return CurrentEventSequence((self._next_sequence - 1) & 0xFFFF, 0)
 
     def send_for(self, text: str) -> None:
         """Send the event that corresponds to a status text, if there is one."""
         event = _event_of(text)
         if event is None:
             return
-        (number, arguments), px4 = event, self._px4
-        px4.send(Event(0, 0, number, px4.time_boot_ms, self._next, _INFO_LEVELS, arguments))
-        self._next = (self._next + 1) & 0xFFFF
+        event_id, arguments = event
+        px4 = self._px4
+        px4.send(Event(0, 0, event_id, px4.time_boot_ms, self._next_sequence, _INFO_LEVELS, arguments))
+        self._next_sequence = (self._next_sequence + 1) & 0xFFFF
 
 
 def _event_of(text: str) -> tuple[int, bytes] | None:
+    """Return id and arguments of the event that corresponds to a status text; None if there is none."""
     if text in _EVENT_IDS:
         return _EVENT_IDS[text], b""
-    for start, number, causes in (
-        ("Armed by ", _ARMED, _ARMED_BY),
-        ("Disarmed by ", _DISARMED, _DISARMED_BY),
-    ):
-        if text.startswith(start):
-            return number, bytes([causes.get(text[len(start) :], 0)])
-    found = _RETURN_TEXT.fullmatch(text)
-    return None if found is None else (_RETURN, struct.pack("<ii", int(found[1]), int(found[2])))
+    if text.startswith("Armed by "):
+        return _ARMED, bytes([_ARMED_BY.get(text.removeprefix("Armed by "), 0)])
+    if text.startswith("Disarmed by "):
+        return _DISARMED, bytes([_DISARMED_BY.get(text.removeprefix("Disarmed by "), 0)])
+    return_text = _RETURN_TEXT.fullmatch(text)
+    if return_text is None:
+        return None
+    altitude, height = int(return_text[1]), int(return_text[2])
+    return _RETURN, struct.pack("<ii", altitude, height)
 
 
 NO_STATION = "Preflight Fail: No connection to the GCS"
@@ -73,6 +76,7 @@ TOO_FAR = "Geofence: exceeding maximum distance to Home"
 TOO_HIGH = "Geofence: exceeding maximum altitude above Home"
 OUTSIDE = "Geofence: approaching or outside geofence"
 
+# Texts that PX4 sends without the final tab, which tells clients that an event has the same content.
 _WITHOUT_TAB = (
     "Preflight Fail: ",
     "Geofence: ",
@@ -158,12 +162,12 @@ class Px4StreamRates:
     def start(self, channel: Channel, number: int, first: float) -> None:
         """Start the streams of link ``number`` at time ``first``."""
         mode = self._modes[min(number, len(self._modes) - 1)]
-        self._mode_of[channel], intervals_us = mode, {}
+        self._mode_of[channel] = mode
+        intervals_us = self._intervals_us[channel] = {}
         for message_id, rate in self._rates_at_start(mode).items():
             intervals_us[message_id] = _interval_us(rate)
             if rate and self._is_built(message_id) and message_id != m.GpsGlobalOrigin.ID:
                 channel.streams.set_interval(message_id, 1.0 / rate, first)
-        self._intervals_us[channel] = intervals_us
         for message_id, rate in _ALWAYS_HZ.items():
             channel.streams.set_interval(message_id, 1.0 / rate, first)
 
@@ -185,11 +189,11 @@ class Px4StreamRates:
         rates = _table()[self._mode_of[channel]]
         if message_id not in rates:
             return MavResult.FAILED
-        wanted = round(interval_us) if math.isfinite(interval_us) else 0
-        wanted = _interval_us(rates[message_id]) if wanted == 0 else max(_OFF, wanted)
-        self._intervals_us[channel][message_id] = wanted
+        requested_us = round(interval_us) if math.isfinite(interval_us) else 0
+        new_us = _interval_us(rates[message_id]) if requested_us == 0 else max(_OFF, requested_us)
+        self._intervals_us[channel][message_id] = new_us
         if self._is_built(message_id):
-            channel.streams.set_interval(message_id, max(0, wanted) / 1e6, now)
+            channel.streams.set_interval(message_id, max(0, new_us) / 1e6, now)
         return MavResult.ACCEPTED
 
     def on_requested(self, channel: Channel, message_id: int) -> None:

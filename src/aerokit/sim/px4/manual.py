@@ -27,14 +27,14 @@ class Px4Sticks:
         self.yaw: float = 0.0
         self.throttle: float = -1.0
         self.channels: tuple[int, ...] = ()  # Pulses of the last RC_CHANNELS_OVERRIDE in µs.
-        self._at = self._channels_at = -math.inf
+        self._moved_at = self._channels_at = -math.inf
         px4.on(m.ManualControl, self._on_manual_control)
         px4.on(m.RcChannelsOverride, self._on_override)
 
     @property
     def are_fresh(self) -> bool:
         """True if manual control is enabled and was received within COM_RC_LOSS_T seconds."""
-        return self.are_wanted and self._px4.now - self._at <= self._px4.parameters["COM_RC_LOSS_T"]
+        return self.are_wanted and self._px4.now - self._moved_at <= self._px4.parameters["COM_RC_LOSS_T"]
 
     @property
     def are_wanted(self) -> bool:
@@ -59,22 +59,22 @@ class Px4Sticks:
         self.channels, self._channels_at = tuple(values), self._px4.now
         numbers = [round(self._px4.parameters[name]) for name in _CHANNEL_PARAMETERS]
         if all(0 < number <= _CHANNELS for number in numbers):
-            roll, pitch, yaw, throttle = (_share(values[number - 1]) for number in numbers)
+            roll, pitch, yaw, throttle = (_stick_position(values[number - 1]) for number in numbers)
             self._move(roll, pitch, yaw, throttle)
 
     def _move(self, roll: float, pitch: float, yaw: float, throttle: float) -> None:
-        before, were_fresh = (self.roll, self.pitch, self.yaw, self.throttle), self.are_fresh
+        previous, were_fresh = (self.roll, self.pitch, self.yaw, self.throttle), self.are_fresh
         self.roll = roll
         self.pitch = pitch
         self.yaw = yaw
         self.throttle = throttle
-        self._at = self._px4.now
-        if were_fresh:
-            moved = max(abs(new - old) for new, old in zip((roll, pitch, yaw, throttle), before, strict=True))
-            self._px4.on_sticks_moved(moved)
+        self._moved_at = self._px4.now
+        if were_fresh:  # The first positions after a silence are no movement.
+            largest = max(abs(new - old) for new, old in zip((roll, pitch, yaw, throttle), previous, strict=True))
+            self._px4.on_sticks_moved(largest)
 
 
-def _share(pulse_us: int) -> float:
+def _stick_position(pulse_us: int) -> float:
     """Scale a pulse of 1000 to 2000 µs to -1 to 1; return 0 for an unused channel."""
     if pulse_us in (0, _UNUSED):
         return 0.0
@@ -86,8 +86,8 @@ def curved(value: float, share: float, dead_zone: float = 0.0) -> float:
     size = abs(value)
     if size <= dead_zone:
         return 0.0
-    moved = math.copysign((size - dead_zone) / (1.0 - dead_zone), value)
-    return share * moved**3 + (1.0 - share) * moved
+    deflection = math.copysign((size - dead_zone) / (1.0 - dead_zone), value)
+    return share * deflection**3 + (1.0 - share) * deflection
 
 
 _EXPO, _DEAD_ZONE = 0.6, 0.1
@@ -161,13 +161,13 @@ class Px4ManualFlight:
     def _height_velocity(self) -> float:
         """Return the commanded vertical velocity (m/s down); a centred stick holds the height."""
         px4, motion = self._px4, self._px4.motion
-        wanted = curved(px4.sticks.throttle, _EXPO, _DEAD_ZONE)
-        if wanted > 0:
+        throttle = curved(px4.sticks.throttle, _EXPO, _DEAD_ZONE)
+        if throttle > 0:
             self._down = None
-            return -wanted * px4.parameters["MPC_Z_VEL_MAX_UP"]
-        if wanted < 0:
+            return -throttle * px4.parameters["MPC_Z_VEL_MAX_UP"]
+        if throttle < 0:
             self._down = None
-            return -wanted * px4.parameters["MPC_Z_VEL_MAX_DN"]
+            return -throttle * px4.parameters["MPC_Z_VEL_MAX_DN"]
         if self._down is None:
             if abs(motion.velocity_down) > _AT_REST_M_S:
                 return 0.0
@@ -177,10 +177,10 @@ class Px4ManualFlight:
     @property
     def _thrust(self) -> float:
         """Thrust relative to hovering: 1 for a centred stick; the lowest stick commands MPC_MANTHR_MIN."""
-        values, throttle = self._px4.parameters, self._px4.sticks.throttle
-        hover, min_thrust = values["MPC_THR_HOVER"], values["MPC_MANTHR_MIN"]
-        thrust = hover + (throttle * (1.0 - hover) if throttle > 0 else throttle * (hover - min_thrust))
-        return thrust / hover
+        parameters, throttle = self._px4.parameters, self._px4.sticks.throttle
+        hover, min_thrust = parameters["MPC_THR_HOVER"], parameters["MPC_MANTHR_MIN"]
+        range_ = 1.0 - hover if throttle > 0 else hover - min_thrust
+        return (hover + throttle * range_) / hover
 
     def _velocity_of_thrust(self) -> float:
         """Return the vertical velocity (m/s down) to which the thrust accelerates."""

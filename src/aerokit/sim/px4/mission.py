@@ -9,26 +9,26 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavSeverity, MavType, MissionState
+from aerokit.mavlink.enums import MavCmd as Cmd
+from aerokit.mavlink.enums import MavFrame, MavSeverity, MavType, MissionState
 from aerokit.mavlink.messages import MissionItemReached
 from aerokit.missions import MissionItem
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, RTL, TAKEOFF
 
-_C = MavCmd
-_TAKE_OFFS = (_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF)
-_LANDINGS = (_C.NAV_LAND, _C.NAV_VTOL_LAND)
+_TAKE_OFFS = (Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF)
+_LANDINGS = (Cmd.NAV_LAND, Cmd.NAV_VTOL_LAND)
 _WITH_PLACE = (
-    _C.NAV_WAYPOINT,
-    _C.NAV_LOITER_UNLIM,
-    _C.NAV_LOITER_TIME,
-    _C.NAV_LOITER_TO_ALT,
+    Cmd.NAV_WAYPOINT,
+    Cmd.NAV_LOITER_UNLIM,
+    Cmd.NAV_LOITER_TIME,
+    Cmd.NAV_LOITER_TO_ALT,
     *_TAKE_OFFS,
     *_LANDINGS,
 )
 # Commands that can be uploaded, but make a mission invalid.
-_STORED_ONLY = (_C.CONDITION_DELAY, _C.CONDITION_DISTANCE, _C.NAV_FENCE_RETURN_POINT)
-_VTOL = (_C.NAV_VTOL_TAKEOFF, _C.NAV_VTOL_LAND)
+_STORED_ONLY = (Cmd.CONDITION_DELAY, Cmd.CONDITION_DISTANCE, Cmd.NAV_FENCE_RETURN_POINT)
+_VTOL = (Cmd.NAV_VTOL_TAKEOFF, Cmd.NAV_VTOL_LAND)
 _MAX_FIRST_DISTANCE_M = 10_000.0
 
 
@@ -40,10 +40,10 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     for number, item in enumerate(items, start=1):
         if item.command in _STORED_ONLY:
             return f"item {number}: unsupported cmd: {item.command:d}"
-        if item.command == _C.NAV_LAND and number == 1 and px4.is_landed:
+        if item.command == Cmd.NAV_LAND and number == 1 and px4.is_landed:
             return "starts with landing"
         if item.command in _TAKE_OFFS:
-            if _height(px4, item) <= 0.0:
+            if _height_above_home(px4, item) <= 0.0:
                 return "Takeoff altitude below home altitude!"
             if has_place:
                 return "takeoff not first waypoint item"
@@ -55,7 +55,8 @@ def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     """Check MIS_TKO_LAND_REQ: 1 requires a take-off, 2 (a plane's default) a landing, 3 both, 4 both or none."""
     if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # The multicopter's table lacks this parameter.
         return None
-    takes_off, lands = (any(item.command in kind for item in items) for kind in (_TAKE_OFFS, _LANDINGS))
+    takes_off = any(item.command in _TAKE_OFFS for item in items)
+    lands = any(item.command in _LANDINGS for item in items)
     required = round(px4.parameters["MIS_TKO_LAND_REQ"])
     if required == 1 and not takes_off:
         return "Takeoff waypoint required."
@@ -63,30 +64,33 @@ def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
         return "Landing waypoint/pattern required."
     if required == 3 and not (takes_off and lands):
         return "Takeoff or Landing item missing."
-    if required == 4 and takes_off != lands:
-        return f"Add {'Landing' if takes_off else 'Takeoff'} item or remove {'Takeoff' if takes_off else 'Landing'}."
+    if required == 4 and takes_off and not lands:
+        return "Add Landing item or remove Takeoff."
+    if required == 4 and lands and not takes_off:
+        return "Add Takeoff item or remove Landing."
     return None
 
 
-def _height(px4: Px4Host, item: MissionItem) -> float:
-    above_sea = item.frame == MavFrame.GLOBAL
-    return item.z - (px4.frame.origin.altitude_m - px4.home[2]) if above_sea else item.z
+def _height_above_home(px4: Px4Host, item: MissionItem) -> float:
+    home_amsl = px4.frame.origin.altitude_m - px4.home[2]
+    return item.z - home_amsl if item.frame == MavFrame.GLOBAL else item.z
 
 
 def _landing_problem(items: Sequence[MissionItem]) -> str | None:
-    start = approach = -1
+    """Check the order of DO_LAND_START, landing and return; return the firmware's text about a problem."""
+    land_start = approach = -1  # Indices of DO_LAND_START and of the item before the landing; -1 without one.
     for index, item in enumerate(items):
-        if item.command == _C.DO_LAND_START:
-            if start >= 0:
+        if item.command == Cmd.DO_LAND_START:
+            if land_start >= 0:
                 return "more than one land start."
-            start = index
+            land_start = index
         elif item.command in _LANDINGS:
             if index == 0:
                 return "starts with land waypoint."
             approach = index - 1
-        elif item.command == _C.NAV_RETURN_TO_LAUNCH and 0 <= start < index:
+        elif item.command == Cmd.NAV_RETURN_TO_LAUNCH and land_start >= 0:
             return "land start item before RTL item not possible."
-    return "invalid land start." if start > approach else None
+    return "invalid land start." if land_start > approach else None
 
 
 def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
@@ -94,7 +98,7 @@ def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
     for number, item in enumerate(items, start=1):
         if item.command in _WITH_PLACE:
             north, east = px4.frame.to_local(round(item.x), round(item.y))
-            if not px4.failsafes.fence.allows((north, east, px4.home[2] - _height(px4, item))):
+            if not px4.failsafes.fence.allows((north, east, px4.home[2] - _height_above_home(px4, item))):
                 return number
     return None
 
@@ -104,24 +108,17 @@ def warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     for item in items:
         if item.command in _WITH_PLACE:
             north, east = px4.frame.to_local(round(item.x), round(item.y))
-            away = math.hypot(north - px4.home[0], east - px4.home[1])
-            if away < _MAX_FIRST_DISTANCE_M:
+            distance = math.hypot(north - px4.home[0], east - px4.home[1])
+            if distance < _MAX_FIRST_DISTANCE_M:
                 return None
-            return f"First waypoint far away from home: {int(away)}m. Correct mission loaded?"
+            return f"First waypoint far away from home: {int(distance)}m. Correct mission loaded?"
     return None
 
 
 _REPEATS = 10
 _HEIGHT_REACHED_M = 0.8
-_PLACES = (
-    _C.NAV_WAYPOINT,
-    _C.NAV_LOITER_UNLIM,
-    _C.NAV_LOITER_TIME,
-    _C.NAV_LOITER_TO_ALT,
-    *_TAKE_OFFS,
-    *_LANDINGS,
-)
-_STAYING = (_C.NAV_WAYPOINT, _C.NAV_LOITER_TIME)
+
+_STAYING = (Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_TIME)
 _MAX_JUMPS = 100
 _ACTIVE_MODES = (MISSION, TAKEOFF, LAND)
 
@@ -135,12 +132,12 @@ class Px4Mission:
         self.reached: int = -1  # Index of the item that was reached last; -1 before the first.
         self.is_finished: bool = False  # True after the last item.
         self.is_valid: bool = False  # True if there is a mission that can be flown.
-        self._phase = ""
+        self._phase = ""  # "climb", "go" or "land".
         self._arrived_at = math.nan
-        self._jumps: dict[int, int] = {}
+        self._jumps: dict[int, int] = {}  # Number of jumps done, by index of the DO_JUMP.
         self._state = int(MissionState.NO_MISSION)
-        self._repeats = 0
-        self._must_report = False
+        self._repeats_left = 0
+        self._is_report_scheduled = False
 
     def start(self) -> None:
         """Called at boot: check the mission, and report the last item reached once a second."""
@@ -167,7 +164,7 @@ class Px4Mission:
             self._state = MissionState.NO_MISSION
         elif self.is_finished:
             self._state = MissionState.COMPLETE
-        elif self.mode == 1:
+        elif self._px4.mode in _ACTIVE_MODES:
             self._state = MissionState.ACTIVE
         elif self.reached >= 0:
             self._state = MissionState.PAUSED
@@ -196,19 +193,19 @@ class Px4Mission:
     def _check(self) -> None:
         """Check the stored mission and send the problems; an invalid mission stays stored, but is not flown."""
         items = self._px4.missions.commands
-        problem, doubt = rejection(self._px4, items), warning(self._px4, items)
-        outside = outside_fence(self._px4, items)
-        self.is_valid = bool(items) and problem is None and outside is None
-        if outside is not None:
-            self._px4.send_text(MavSeverity.CRITICAL, f"Geofence violation for waypoint {outside}")
+        problem, warning_text = rejection(self._px4, items), warning(self._px4, items)
+        outside_number = outside_fence(self._px4, items)
+        self.is_valid = bool(items) and problem is None and outside_number is None
+        if outside_number is not None:
+            self._px4.send_text(MavSeverity.CRITICAL, f"Geofence violation for waypoint {outside_number}")
         if problem is not None:
             self._px4.send_text(MavSeverity.CRITICAL, f"Mission rejected: {problem}")
-        if doubt is not None:
-            self._px4.send_text(MavSeverity.CRITICAL, doubt)
+        if warning_text is not None:
+            self._px4.send_text(MavSeverity.CRITICAL, warning_text)
 
     def forget_reached(self) -> None:
         """Reset the item that was reached last."""
-        self.reached, self._repeats = -1, 0
+        self.reached, self._repeats_left = -1, 0
 
     def set_current(self, seq: int) -> None:
         self.current = seq
@@ -231,27 +228,27 @@ class Px4Mission:
 
     def _begin_item(self) -> None:
         """Make the item the target; commands without a position are executed and skipped."""
-        for _ in range(_MAX_JUMPS + self.count):
+        for _ in range(_MAX_JUMPS + self.count):  # DO_JUMPs can form an endless loop.
             item, self._arrived_at = self._item, math.nan
             if item is None:
                 self._finish()
                 return
-            if item.command in _PLACES or item.command == _C.NAV_DELAY:
+            if item.command in _WITH_PLACE or item.command == Cmd.NAV_DELAY:
                 self._aim(item)
                 return
-            if item.command == _C.DO_JUMP:
-                self.current = self._jump(item)
+            if item.command == Cmd.DO_JUMP:
+                self.current = self._index_after_jump(item)
                 continue
-            self._do(item)
+            self._execute(item)
             self._reach()
             if not self._advance():
                 return
 
-    def _do(self, item: MissionItem) -> None:
+    def _execute(self, item: MissionItem) -> None:
         px4 = self._px4
-        if item.command == _C.DO_CHANGE_SPEED and item.param2 > 0:
+        if item.command == Cmd.DO_CHANGE_SPEED and item.param2 > 0:
             px4.flight.speed_m_s = min(item.param2, px4.flight.top_speed_m_s)
-        elif item.command == _C.NAV_RETURN_TO_LAUNCH:
+        elif item.command == Cmd.NAV_RETURN_TO_LAUNCH:
             px4.call_later(0.0, self._return)
 
     def _return(self) -> None:
@@ -260,20 +257,20 @@ class Px4Mission:
         if self._px4.change_mode(RTL):
             self._px4.info("Returning to launch")
 
-    def _jump(self, item: MissionItem) -> int:
+    def _index_after_jump(self, item: MissionItem) -> int:
         """Return the next index. PX4 counts the repetitions, and sends the changed item to the last client."""
-        done, index = self._jumps.get(self.current, 0), self.current
-        if done >= item.param2:
+        jumps_done, index = self._jumps.get(self.current, 0), self.current
+        if jumps_done >= item.param2:
             self._jumps.pop(index, None)
             return index + 1
-        self._jumps[index] = done + 1
+        self._jumps[index] = jumps_done + 1
         self._px4.missions.on_item_changed(index)
         return int(item.param1) if 0 <= item.param1 < self.count else index + 1
 
     def _aim(self, item: MissionItem) -> None:
         px4, motion = self._px4, self._px4.motion
         self._phase = "go"
-        if item.command == _C.NAV_DELAY:
+        if item.command == Cmd.NAV_DELAY:
             px4.flight.stay_here()
             return
         target = self._place(item)
@@ -296,14 +293,16 @@ class Px4Mission:
             px4.info(f"Climb to {px4.home[2] - down:.1f} meters above home")
 
     def _has_heading(self, item: MissionItem) -> bool:
-        return item.command == _C.NAV_WAYPOINT and math.isfinite(item.param4)
+        return item.command == Cmd.NAV_WAYPOINT and math.isfinite(item.param4)
 
     def _place(self, item: MissionItem) -> tuple[float, float, float]:
         """Return the position of an item. For PX4, latitude and longitude 0 are an ordinary position."""
         px4, motion = self._px4, self._px4.motion
         north, east = px4.frame.to_local(round(item.x), round(item.y))
-        above = px4.home[2] if item.frame == MavFrame.GLOBAL_RELATIVE_ALT else px4.frame.origin.altitude_m
-        return (north, east, above - item.z if math.isfinite(item.z) else motion.down)
+        if not math.isfinite(item.z):
+            return (north, east, motion.down)
+        reference = px4.home[2] if item.frame == MavFrame.GLOBAL_RELATIVE_ALT else px4.frame.origin.altitude_m
+        return (north, east, reference - item.z)
 
     def update(self) -> None:
         """Run one tick in flight: set the motion target and check if the item is reached."""
@@ -332,20 +331,20 @@ class Px4Mission:
                 self._begin_item()
 
     def _is_at_target(self, item: MissionItem) -> bool:
-        if item.command == _C.NAV_DELAY:
+        if item.command == Cmd.NAV_DELAY:
             return True
         motion, (north, east, down) = self._px4.motion, self._px4.flight.target
         radius = self._px4.parameters["NAV_ACC_RAD"]
-        if item.command == _C.NAV_WAYPOINT and item.param2 > 0:
+        if item.command == Cmd.NAV_WAYPOINT and item.param2 > 0:
             radius = item.param2
-        near = math.hypot(north - motion.north, east - motion.east) <= radius
-        return near and abs(down - motion.down) <= _HEIGHT_REACHED_M
+        is_near = math.hypot(north - motion.north, east - motion.east) <= radius
+        return is_near and abs(down - motion.down) <= _HEIGHT_REACHED_M
 
     def _is_done(self, item: MissionItem) -> bool:
-        if item.command == _C.NAV_LOITER_UNLIM:
+        if item.command == Cmd.NAV_LOITER_UNLIM:
             return False
-        waits = item.command in _STAYING or item.command == _C.NAV_DELAY
-        return self._px4.now - self._arrived_at >= (item.param1 if waits else 0.0)
+        stays = item.command in _STAYING or item.command == Cmd.NAV_DELAY
+        return not stays or self._px4.now - self._arrived_at >= item.param1
 
     def on_landed(self) -> None:
         """Handle a landing, which completes a landing item."""
@@ -383,17 +382,17 @@ class Px4Mission:
         if self.reached == self.current:
             return
         self.reached = self.current
-        self._repeats = _REPEATS
-        if not self._must_report:
-            self._must_report = True
+        self._repeats_left = _REPEATS
+        if not self._is_report_scheduled:
+            self._is_report_scheduled = True
             self._px4.call_later(0.0, self._send_reached)
 
     def _send_reached(self) -> None:
-        self._must_report = False
+        self._is_report_scheduled = False
         if self.reached >= 0:
             self._px4.send(MissionItemReached(self.reached))
 
     def _repeat_reached(self) -> None:
-        if self._repeats > 0 and self.reached >= 0 and self.count:
-            self._repeats -= 1
+        if self._repeats_left > 0 and self.reached >= 0 and self.count:
+            self._repeats_left -= 1
             self._px4.send(MissionItemReached(self.reached))

@@ -9,30 +9,31 @@ import struct
 import zlib
 from collections.abc import Callable, Sequence
 
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavMissionType, MavRoi
+from aerokit.mavlink.enums import MavCmd as Cmd
+from aerokit.mavlink.enums import MavFrame as Frame
+from aerokit.mavlink.enums import MavMissionResult, MavMissionType, MavRoi
 from aerokit.missions import MissionItem
 from aerokit.sim.missions import float32
 
-_C, _F = MavCmd, MavFrame
 _DATA = pkgutil.get_data(__name__, "mission_commands.csv")
 assert _DATA is not None
 _ROWS = list(csv.DictReader(_DATA.decode().splitlines()))
 # Command in a global frame → storage types of params 1 to 4, see `_CONVERSIONS`.
-_PLACES = {int(MavCmd[row["command"]]): row["with_place"] for row in _ROWS if row["with_place"]}
+_PLACES = {int(Cmd[row["command"]]): row["with_place"] for row in _ROWS if row["with_place"]}
 # Commands in MAV_FRAME_MISSION, of which all seven params are stored.
-_WITHOUT_PLACE = frozenset(int(MavCmd[row["command"]]) for row in _ROWS if row["without_place"] == "1")
+_WITHOUT_PLACE = frozenset(int(Cmd[row["command"]]) for row in _ROWS if row["without_place"] == "1")
 
-_ROI_COMMANDS = (_C.NAV_ROI, _C.DO_SET_ROI)
+_ROI_COMMANDS = (Cmd.NAV_ROI, Cmd.DO_SET_ROI)
 _ROI_WITH_PLACE = (MavRoi.NONE, MavRoi.LOCATION)
 _ROI_WITHOUT_PLACE = (MavRoi.NONE, MavRoi.WPNEXT, MavRoi.WPINDEX)
 _INT_FRAMES: dict[int, int] = {
-    _F.GLOBAL_INT: _F.GLOBAL,
-    _F.GLOBAL_RELATIVE_ALT_INT: _F.GLOBAL_RELATIVE_ALT,
+    Frame.GLOBAL_INT: Frame.GLOBAL,
+    Frame.GLOBAL_RELATIVE_ALT_INT: Frame.GLOBAL_RELATIVE_ALT,
 }
 _AS_INT = {plain: int_frame for int_frame, plain in _INT_FRAMES.items()}
-_POLYGONS = (_C.NAV_FENCE_POLYGON_VERTEX_INCLUSION, _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
+_POLYGONS = (Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
 _NO_MISSION_COMMANDS = frozenset(
-    {*_POLYGONS, _C.NAV_FENCE_CIRCLE_INCLUSION, _C.NAV_FENCE_CIRCLE_EXCLUSION, _C.NAV_RALLY_POINT}
+    {*_POLYGONS, Cmd.NAV_FENCE_CIRCLE_INCLUSION, Cmd.NAV_FENCE_CIRCLE_EXCLUSION, Cmd.NAV_RALLY_POINT}
 )
 _INT_MIN = -(1 << 31)
 _PI = float32(math.pi)
@@ -46,21 +47,21 @@ def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> Miss
     ``is_int`` is True for a MISSION_ITEM_INT, the only message in which PX4 accepts the frames 5 and 6.
     """
     frame = _INT_FRAMES.get(item.frame, item.frame) if is_int else item.frame
-    if frame in (_F.GLOBAL, _F.GLOBAL_RELATIVE_ALT):
-        kept = _with_place(item, frame)
-    elif frame == _F.MISSION:
-        kept = _without_place(item)
+    if frame in (Frame.GLOBAL, Frame.GLOBAL_RELATIVE_ALT):
+        stored_item = _with_place(item, frame)
+    elif frame == Frame.MISSION:
+        stored_item = _without_place(item)
     else:
         return MavMissionResult.UNSUPPORTED_FRAME
-    if isinstance(kept, int):
-        return kept
-    if mission_type == MavMissionType.MISSION and kept.command in _NO_MISSION_COMMANDS:
+    if isinstance(stored_item, int):
+        return stored_item
+    if mission_type == MavMissionType.MISSION and stored_item.command in _NO_MISSION_COMMANDS:
         return MavMissionResult.ERROR
     if mission_type == MavMissionType.FENCE:
-        if kept.command in _POLYGONS and kept.param1 < 3:
+        if stored_item.command in _POLYGONS and stored_item.param1 < 3:
             return MavMissionResult.ERROR
-        return _as_fence_point(kept)
-    return kept
+        return _as_fence_point(stored_item)
+    return stored_item
 
 
 def as_downloaded(item: MissionItem, *, as_int: bool) -> MissionItem:
@@ -68,30 +69,28 @@ def as_downloaded(item: MissionItem, *, as_int: bool) -> MissionItem:
     return item.replace(frame=_AS_INT.get(item.frame, item.frame)) if as_int else item
 
 
-def checksum(items: Sequence[MissionItem], before: int = 0) -> int:
-    """Return the opaque id of a list of items: a CRC-32 over the uploaded messages."""
-    crc = before
+def checksum(items: Sequence[MissionItem], previous: int = 0) -> int:
+    """Return the opaque id of a list of items: a CRC-32 over the uploaded messages.
+
+    ``previous`` is the CRC of the items before these.
+    """
+    crc = previous
     for item in items:
-        head = struct.pack("<BHB4f", item.frame, item.command, item.autocontinue, *_params(item))
-        place = struct.pack("<iif", item.x, item.y, item.z) if isinstance(item.x, int) else _floats(item)
-        crc = zlib.crc32(head + place, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
+        params = (item.param1, item.param2, item.param3, item.param4)
+        header = struct.pack("<BHB4f", item.frame, item.command, item.autocontinue, *params)
+        # MISSION_ITEM_INT has integers as x and y, MISSION_ITEM has floats.
+        place = struct.pack("<iif" if isinstance(item.x, int) else "<3f", item.x, item.y, item.z)
+        # zlib inverts the CRC at start and end, PX4 does not.
+        crc = zlib.crc32(header + place, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
     return crc
-
-
-def _params(item: MissionItem) -> tuple[float, float, float, float]:
-    return item.param1, item.param2, item.param3, item.param4
-
-
-def _floats(item: MissionItem) -> bytes:
-    return struct.pack("<3f", item.x, item.y, item.z)
 
 
 def _as_fence_point(item: MissionItem) -> MissionItem:
     """Return position, size and altitude of a fence item; PX4 does not store its altitude frame."""
-    if item.frame == _F.MISSION:
+    if item.frame == Frame.MISSION:
         return MissionItem(item.command, item.frame, item.param1, z=item.z, autocontinue=False)
     place = {"x": item.x, "y": item.y, "z": item.z}
-    return MissionItem(item.command, _F.GLOBAL, item.param1, **place, autocontinue=False)
+    return MissionItem(item.command, Frame.GLOBAL, item.param1, **place, autocontinue=False)
 
 
 def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
@@ -102,25 +101,27 @@ def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
     if command in _ROI_COMMANDS:
         if _whole(item.param1) not in _ROI_WITH_PLACE:
             return MavMissionResult.INVALID_PARAM1
-        command = _C.DO_SET_ROI
-    numbers = (item.param1, item.param2, item.param3, item.param4)
-    one, two, three, four = (_CONVERSIONS[kind](number) for kind, number in zip(layout, numbers, strict=True))
-    return item.replace(command=command, frame=frame, param1=one, param2=two, param3=three, param4=four)
+        command = Cmd.DO_SET_ROI
+    params = (item.param1, item.param2, item.param3, item.param4)
+    p1, p2, p3, p4 = (_CONVERSIONS[type_](param) for type_, param in zip(layout, params, strict=True))
+    return item.replace(command=command, frame=frame, param1=p1, param2=p2, param3=p3, param4=p4)
 
 
 def _without_place(item: MissionItem) -> MissionItem | int:
     if item.command not in _WITHOUT_PLACE:
         return MavMissionResult.UNSUPPORTED
-    one, two, command = item.param1, item.param2, item.command
-    if command == _C.DO_JUMP:
-        jump = _whole(one) & 0xFFFF
-        one, two = float(jump - 0x10000 if jump & 0x8000 else jump), float(_whole(two) & 0xFFFF)
+    p1, p2, command = item.param1, item.param2, item.command
+    if command == Cmd.DO_JUMP:  # The target is stored as int16, the number of repetitions as uint16.
+        target = _whole(p1) & 0xFFFF
+        if target & 0x8000:
+            target -= 0x10000
+        p1, p2 = float(target), float(_whole(p2) & 0xFFFF)
     if command in _ROI_COMMANDS:
-        if _whole(one) not in _ROI_WITHOUT_PLACE:
+        if _whole(p1) not in _ROI_WITHOUT_PLACE:
             return MavMissionResult.INVALID_PARAM1
-        command = _C.DO_SET_ROI
-    x, y = (_rounded(float32(number)) for number in (item.x, item.y))
-    return item.replace(command=command, frame=_F.MISSION, param1=one, param2=two, x=x, y=y)
+        command = Cmd.DO_SET_ROI
+    x, y = _rounded(float32(item.x)), _rounded(float32(item.y))
+    return item.replace(command=command, frame=Frame.MISSION, param1=p1, param2=p2, x=x, y=y)
 
 
 def _whole(value: float) -> int:

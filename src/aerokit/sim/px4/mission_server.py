@@ -12,7 +12,8 @@ from enum import Enum
 from typing import ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavFrame, MavMissionResult, MavMissionType, MavSeverity
+from aerokit.mavlink.enums import MavFrame, MavMissionType, MavSeverity
+from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import MissionItem
 from aerokit.protocols.servers.missions import (
     AnyItem,
@@ -35,7 +36,6 @@ _CAPACITIES: dict[int, int] = {
     MavMissionType.FENCE: 64,
     MavMissionType.RALLY: 32,
 }
-_R = MavMissionResult
 
 
 class TransferState(Enum):
@@ -69,8 +69,8 @@ class Px4MissionServer(MissionServer):
         self.requests_int: bool = not px4.version.startswith("1.16")
 
     def _link(self, channel: Channel) -> _Link:
-        fresh = _Link(_NO_PARTNER, channel, 0, 0, 0, 0.0, 0.0, self.requests_int)
-        return self._links.setdefault(channel, fresh)
+        unused = _Link(_NO_PARTNER, channel, 0, 0, 0, 0.0, 0.0, self.requests_int)
+        return self._links.setdefault(channel, unused)
 
     def reset(self) -> None:
         super().reset()
@@ -88,15 +88,15 @@ class Px4MissionServer(MissionServer):
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
         """Store a whole list and return the MAV_MISSION_RESULT. PX4 has no such operation."""
         if mission_type not in _CAPACITIES or start or not clear:
-            return _R.ERROR
-        good: list[MissionItem] = []
+            return Result.ERROR
+        stored_items: list[MissionItem] = []
         for item in items:
-            kept = stored(item, mission_type)
-            if isinstance(kept, int):
-                return kept
-            good.append(kept)
-        self._store(mission_type, good, checksum(items))
-        return _R.ACCEPTED
+            stored_item = stored(item, mission_type)
+            if isinstance(stored_item, int):
+                return stored_item
+            stored_items.append(stored_item)
+        self._store(mission_type, stored_items, checksum(items))
+        return Result.ACCEPTED
 
     def capacity(self, mission_type: int) -> int:
         """Return the capacity; 0 for an unknown type."""
@@ -158,13 +158,14 @@ class Px4MissionServer(MissionServer):
         item = self.item(link.mission_type, seq)
         assert item is not None
         link.requested_at = self._px4.now
-        to, kind, current = link.client, link.mission_type, self._px4.mission.current == seq
-        given = as_downloaded(item, as_int=link.uses_int)
+        client, kind, is_current = link.client, link.mission_type, self._px4.mission.current == seq
+        downloaded = as_downloaded(item, as_int=link.uses_int)
         if link.uses_int:
-            message: AnyItem = item_message_int(given, seq, to, kind, current=current)
+            message: AnyItem = item_message_int(downloaded, seq, client, kind, current=is_current)
         else:
-            scale = 1e-7 if item.frame != MavFrame.MISSION else 1.0
-            message = item_message_float(given, (item.x * scale, item.y * scale), seq, to, kind, int(current))
+            scale = 1.0 if item.frame == MavFrame.MISSION else 1e-7
+            place = (item.x * scale, item.y * scale)
+            message = item_message_float(downloaded, place, seq, client, kind, int(is_current))
         self._px4.send(message, link.channel)
 
     def _watch(self, upload: ListUpload) -> None:
@@ -198,8 +199,8 @@ class Px4MissionServer(MissionServer):
         link = self._link(channel)
         if link.next == self.count(link.mission_type):
             link.state = TransferState.IDLE
-        same = link.client == sender_of(request) and link.mission_type == request.mission_type
-        if link.state is TransferState.GETTING or (link.state is TransferState.SENDING and not same):
+        is_same_transfer = link.client == sender_of(request) and link.mission_type == request.mission_type
+        if link.state is TransferState.GETTING or (link.state is TransferState.SENDING and not is_same_transfer):
             self._px4.info("Mission download request ignored, already active")
             return
         count = self.count(request.mission_type)
@@ -223,7 +224,7 @@ class Px4MissionServer(MissionServer):
             self._send_item(link, request.seq)
         else:
             link.state = TransferState.IDLE
-            self._answer(link, _R.ERROR)
+            self._answer(link, Result.ERROR)
             self._warn("WPM: REJ. CMD: Req. WP was unexpected")
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
@@ -234,41 +235,41 @@ class Px4MissionServer(MissionServer):
         elif link.state is TransferState.SENDING and ack.mission_type == link.mission_type:
             link.received_at = self._px4.now
             link.state = TransferState.IDLE
-        elif link.state is TransferState.GETTING and ack.type == _R.UNSUPPORTED:
+        elif link.state is TransferState.GETTING and ack.type == Result.UNSUPPORTED:
             link.uses_int = not link.uses_int
             self._request_item(link)
-        elif link.state is TransferState.GETTING and ack.type == _R.OPERATION_CANCELLED:
+        elif link.state is TransferState.GETTING and ack.type == Result.OPERATION_CANCELLED:
             self._drop(link)
 
     def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
         link, sender = self._link(channel), sender_of(count)
         if link.state is TransferState.SENDING:
             self._warn("WPM: IGN MISSION_COUNT: Busy")
-            self._answer(link, _R.ERROR, sender)
+            self._answer(link, Result.ERROR, sender)
             return
         link.received_at = self._px4.now
         if link.state is TransferState.IDLE:
             self._accept(link, count)
         elif sender != link.client:
-            self._answer(link, _R.ERROR, sender)
+            self._answer(link, Result.ERROR, sender)
         elif link.next > 0:
             self._warn("WPM: REJ. CMD: Busy")
-            self._answer(link, _R.ERROR)
+            self._answer(link, Result.ERROR)
         else:
             self._request_item(link)
 
     def _accept(self, link: _Link, count: m.MissionCount) -> None:
         """Start an upload, refuse it, or store an empty list."""
         if self._uploads:
-            self._answer(link, _R.ERROR, sender_of(count))
+            self._answer(link, Result.ERROR, sender_of(count))
             return
         link.client, link.mission_type = sender_of(count), count.mission_type
         self._px4.mission.forget_reached()
         if count.count > self.capacity(link.mission_type):
-            self._answer(link, _R.NO_SPACE)
+            self._answer(link, Result.NO_SPACE)
         elif count.count == 0:
             self._store(link.mission_type, [], 0, 0)
-            self._answer(link, _R.ACCEPTED)
+            self._answer(link, Result.ACCEPTED)
         else:
             link.items, link.opaque_id, link.current = [], 0, -1
             link = self._begin_transfer(TransferState.GETTING, count, link.channel, count.count)
@@ -282,38 +283,41 @@ class Px4MissionServer(MissionServer):
         if sender_of(message) != link.client:
             self._warn("REJ. MIS ITEM: partner id mismatch")
         elif message.mission_type != link.mission_type:
-            self._answer(link, _R.ERROR)
+            self._answer(link, Result.ERROR)
         elif link.state is TransferState.GETTING:
             link.received_at = self._px4.now
             if message.seq == link.next:
                 self._receive_item(link, message)
         elif link.state is TransferState.IDLE and link.next == message.seq + 1:  # The client missed the answer.
-            self._acknowledge(link.client, link.mission_type, _R.ACCEPTED, channel, link.opaque_id)
+            self._acknowledge(link.client, link.mission_type, Result.ACCEPTED, channel, link.opaque_id)
         else:
-            why = "No transfer" if link.state is TransferState.IDLE else "Busy"
-            self._warn(f"IGN MISSION_ITEM: {why}")
-            self._answer(link, _R.ERROR)
+            reason = "No transfer" if link.state is TransferState.IDLE else "Busy"
+            self._warn(f"IGN MISSION_ITEM: {reason}")
+            self._answer(link, Result.ERROR)
 
     def _put(self, upload: ListUpload, message: AnyItem) -> int:
         link, item = self._link(upload.channel), item_from(message)
         is_int = isinstance(message, m.MissionItemInt)
-        place = item if is_int else item.replace(x=float(item.x), y=float(item.y))
-        whole = item if is_int or item.frame == MavFrame.MISSION else item.replace(x=_e7(item.x), y=_e7(item.y))
-        kept = stored(whole, link.mission_type, is_int=is_int)
-        if isinstance(kept, int):
-            if kept != _R.ERROR:
+        item_in_e7 = item
+        if not is_int and item.frame != MavFrame.MISSION:
+            item_in_e7 = item.replace(x=_e7(item.x), y=_e7(item.y))
+        stored_item = stored(item_in_e7, link.mission_type, is_int=is_int)
+        if isinstance(stored_item, int):
+            if stored_item != Result.ERROR:
                 self._warn("IGN MISSION_ITEM: Invalid item")
-            return kept
-        link.opaque_id = checksum([place], link.opaque_id)
-        link.items.append(kept)
+            return stored_item
+        # The checksum covers the values as received, which are floats in a MISSION_ITEM.
+        received = item if is_int else item.replace(x=float(item.x), y=float(item.y))
+        link.opaque_id = checksum([received], link.opaque_id)
+        link.items.append(stored_item)
         if message.current:
             link.current = message.seq
-        return _R.ACCEPTED
+        return Result.ACCEPTED
 
     def _finish(self, upload: ListUpload) -> None:
         link = self._link(upload.channel)
         self._store(link.mission_type, link.items, link.opaque_id, link.current)
-        self._end(link, _R.ACCEPTED)
+        self._end(link, Result.ACCEPTED)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
         """Clear a list, or all lists for MAV_MISSION_TYPE_ALL. During a transfer, only send a text."""
@@ -325,7 +329,7 @@ class Px4MissionServer(MissionServer):
         for kind in _CAPACITIES:
             if request.mission_type in (kind, MavMissionType.ALL):
                 self._store(kind, [], 0, 0)
-        self._answer(link, _R.ACCEPTED, sender_of(request))
+        self._answer(link, Result.ACCEPTED, sender_of(request))
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
         if self._link(channel).state is not TransferState.IDLE:
@@ -337,4 +341,5 @@ class Px4MissionServer(MissionServer):
 
 
 def _e7(degrees: float) -> int:
+    """Convert to degrees times 1e7; 0 for values that may not fit 32 bits."""
     return round(degrees * 1e7) if abs(degrees) < 200 else 0

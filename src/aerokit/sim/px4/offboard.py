@@ -28,9 +28,9 @@ _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFram
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
 
 
-def _three(parts: Iterable[float]) -> Ned:
-    first, second, third = parts
-    return (first, second, third)
+def _vector(components: Iterable[float]) -> Ned:
+    x, y, z = components
+    return (x, y, z)
 
 
 class Px4Offboard:
@@ -72,9 +72,9 @@ class Px4Offboard:
         if frame not in (MavFrame.LOCAL_NED, MavFrame.BODY_NED):
             self._warn(f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {frame} unsupported")
             return
-        body = frame == MavFrame.BODY_NED
-        position = _NAN3 if body else (target.x, target.y, target.z)
-        if not self._store(target, position, body=body):
+        is_body = frame == MavFrame.BODY_NED
+        position = _NAN3 if is_body else (target.x, target.y, target.z)  # PX4 ignores a position in the body frame.
+        if not self._store(target, position, is_body=is_body):
             self._warn("SET_POSITION_TARGET_LOCAL_NED invalid")
 
     def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
@@ -82,23 +82,23 @@ class Px4Offboard:
             frame = target.coordinate_frame
             self._warn(f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {frame}")
             return
-        frame_of_home = self._vehicle.frame
-        north, east = frame_of_home.to_local(target.lat_int, target.lon_int)
-        down = frame_of_home.origin.altitude_m - target.alt
+        local_frame = self._vehicle.frame
+        north, east = local_frame.to_local(target.lat_int, target.lon_int)
+        down = local_frame.origin.altitude_m - target.alt
         if target.coordinate_frame != MavFrame.GLOBAL_INT:
             down = self._vehicle.home[2] - target.alt
-        self._store(target, (north, east, down), body=False)
+        self._store(target, (north, east, down), is_body=False)
 
     def _warn(self, text: str) -> None:
         self._vehicle.send_text(MavSeverity.CRITICAL, text)
 
-    def _store(self, target: PositionTarget, position: Ned, *, body: bool) -> bool:
+    def _store(self, target: PositionTarget, position: Ned, *, is_body: bool) -> bool:
         """Store a set-point; return False if position, velocity and acceleration are all missing."""
         setpoint = Setpoint.of(target)
         position, velocity, acceleration = setpoint.axes(position)
-        if all(math.isnan(part) for part in (*position, *velocity, *acceleration)):
+        if all(map(math.isnan, (*position, *velocity, *acceleration))):
             return False
-        if body:
+        if is_body:
             yaw = self._vehicle.motion.yaw
             velocity, acceleration = rotated(velocity, yaw), rotated(acceleration, yaw)
         self._position, self._velocity, self._acceleration = position, velocity, acceleration
@@ -113,7 +113,7 @@ class Px4Offboard:
             if self._attitude is None or self._body_rates is None:
                 self._attitude = (motion.roll, motion.pitch, motion.yaw)
             self._body_rates = (target.body_roll_rate, target.body_pitch_rate, target.body_yaw_rate)
-        elif all(math.isfinite(part) for part in target.q):
+        elif all(map(math.isfinite, target.q)):
             self._attitude, self._body_rates = euler_from_quaternion(*target.q), None
         if math.isfinite(target.thrust):
             self._thrust = target.thrust
@@ -144,18 +144,13 @@ class Px4Offboard:
 
     def fly(self) -> None:
         motion = self._vehicle.motion
+        # The first call after another mode counts as one tick, which lasts at most 0.1 s.
         elapsed, self._flown_at = min(0.1, self._vehicle.now - self._flown_at), self._vehicle.now
         if self._attitude is not None:
-            if self._body_rates is not None:
-                turned = zip(self._attitude, self._body_rates, strict=True)
-                self._attitude = _three(angle + rate * elapsed for angle, rate in turned)
-            roll, pitch, yaw = self._attitude
-            climb = (max(0.0, min(1.0, self._thrust)) - 0.5) * 2.0 * _CLIMB_AT_FULL_THRUST_M_S
-            motion.seek_attitude(roll, pitch, -climb)
-            motion.face(yaw)
+            self._fly_attitude(self._attitude, elapsed)
             return
-        if all(math.isnan(part) for part in (*self._position, *self._velocity)):
-            motion.seek_acceleration(*(0.0 if math.isnan(part) else part for part in self._acceleration))
+        if all(map(math.isnan, (*self._position, *self._velocity))):
+            motion.seek_acceleration(*(0.0 if math.isnan(axis) else axis for axis in self._acceleration))
         else:
             motion.seek_velocity(*self._wanted_velocity())
         if math.isfinite(self._yaw):
@@ -163,16 +158,27 @@ class Px4Offboard:
         else:
             motion.turn(self._yaw_rate if math.isfinite(self._yaw_rate) else 0.0)
 
+    def _fly_attitude(self, attitude: tuple[float, float, float], elapsed: float) -> None:
+        motion = self._vehicle.motion
+        if self._body_rates is not None:
+            angles_and_rates = zip(attitude, self._body_rates, strict=True)
+            attitude = self._attitude = _vector(angle + rate * elapsed for angle, rate in angles_and_rates)
+        roll, pitch, yaw = attitude
+        climb = (max(0.0, min(1.0, self._thrust)) - 0.5) * 2.0 * _CLIMB_AT_FULL_THRUST_M_S
+        motion.seek_attitude(roll, pitch, -climb)
+        motion.face(yaw)
+
     def _wanted_velocity(self) -> Ned:
+        """Return the target velocity, plus the velocity towards the target position on axes that have one."""
         motion, limits = self._vehicle.motion, self._vehicle.parameters
         place = motion.place
         max_speeds = (limits["MPC_XY_VEL_MAX"],) * 2 + (limits["MPC_Z_V_AUTO_UP"],)
         accelerations = (motion.limits.acceleration_m_s2,) * 2 + (motion.limits.vertical_acceleration_m_s2,)
-        wanted = []
+        velocity = []
         for axis in range(3):
             speed = 0.0 if math.isnan(self._velocity[axis]) else self._velocity[axis]
             if math.isfinite(self._position[axis]):
                 offset = self._position[axis] - place[axis]
                 speed += velocity_towards(offset, max_speeds[axis], accelerations[axis])
-            wanted.append(max(-max_speeds[axis], min(max_speeds[axis], speed)))
-        return (wanted[0], wanted[1], wanted[2])
+            velocity.append(max(-max_speeds[axis], min(max_speeds[axis], speed)))
+        return _vector(velocity)

@@ -74,27 +74,31 @@ class Px4Gimbal:
 
     @property
     def flags(self) -> int:
+        """GIMBAL_DEVICE_FLAGS."""
         locks = self._flags & (Flags.ROLL_LOCK | Flags.PITCH_LOCK)
-        return locks | (GimbalDeviceFlags.YAW_LOCK if self.is_from_north else GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME)
+        yaw_flag = GimbalDeviceFlags.YAW_LOCK if self.is_from_north else GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
+        return locks | yaw_flag
 
     def angles(self) -> Angles:
         """Return roll, pitch and yaw of the set-point in radians."""
         if self._place is not None:
             return self._angles_to(self._place)
         seconds = min(self._px4.now - self._since, _RATE_TIMEOUT_S) * _RATE_FACTOR
-        moved = [angle + rate * seconds for angle, rate in zip(self._target, self._rates, strict=True)]
-        limited = [
+        angles = [angle + rate * seconds for angle, rate in zip(self._target, self._rates, strict=True)]
+        roll, pitch, yaw = (
             max(math.radians(low), min(math.radians(high), angle))
-            for angle, (low, high) in zip(moved, _LIMITS, strict=True)
-        ]
-        return (limited[0], limited[1], limited[2])
+            for angle, (low, high) in zip(angles, _LIMITS, strict=True)
+        )
+        return (roll, pitch, yaw)
 
     def _angles_to(self, place: tuple[int, int, float]) -> Angles:
-        north, east = self._px4.frame.to_local(place[0], place[1])
+        """Return the angles to a position: latitude and longitude in degrees times 1e7, and altitude AMSL."""
+        latitude_e7, longitude_e7, altitude_m = place
         motion = self._px4.motion
-        north, east = north - motion.north, east - motion.east
-        current = self._px4.frame.to_global(*motion.place)
-        pitch = math.atan2(place[2] - current.altitude_m, math.hypot(north, east))
+        place_north, place_east = self._px4.frame.to_local(latitude_e7, longitude_e7)
+        north, east = place_north - motion.north, place_east - motion.east
+        own_altitude_m = self._px4.frame.to_global(*motion.place).altitude_m
+        pitch = math.atan2(altitude_m - own_altitude_m, math.hypot(north, east))
         return (0.0, max(math.radians(_LIMITS[1][0]), pitch), math.atan2(east, north))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
@@ -135,15 +139,15 @@ class Px4Gimbal:
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
         if not self.is_fitted:
             return None
-        q = quaternion_from_euler(*self.angles())
+        quaternion = quaternion_from_euler(*self.angles())
         return m.GimbalDeviceAttitudeStatus(
-            0, 0, self._px4.time_boot_ms, self.flags, q, 0.0, 0.0, 0.0, 0, 0.0, 0.0, _DEVICE_ID
+            0, 0, self._px4.time_boot_ms, self.flags, quaternion, 0.0, 0.0, 0.0, 0, 0.0, 0.0, _DEVICE_ID
         )
 
     def manager_information(self) -> m.GimbalManagerInformation | None:
         if not self.is_fitted:
             return None
-        limits = [math.radians(end) for axis in _LIMITS for end in axis]
+        limits = [math.radians(limit) for low_and_high in _LIMITS for limit in low_and_high]
         return m.GimbalManagerInformation(self._px4.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
 
     def manager_status(self) -> m.GimbalManagerStatus | None:
@@ -173,20 +177,23 @@ def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
 
 def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
     """Set the ids in control. In PX4, -2 is the autopilot rather than the sender; -3 releases control."""
-    own = gimbal.own_ids
-    now = []
-    for number, before, mine, sender in zip(
-        (command.param1, command.param2), gimbal.in_control, own, command.sender, strict=True
-    ):
-        wanted = whole(number)
-        if wanted == _SELF:
-            now.append(mine)
-        elif wanted == _RELEASE:
-            now.append(0 if before == sender else before)
-        else:
-            now.append(wanted if 0 <= wanted <= 255 else before)
-    gimbal.in_control = (now[0], now[1])
+    # The firmware handles the system id (param 1) and the component id (param 2) separately.
+    system, component = (
+        _id_in_control(whole(requested), present, own, sender)
+        for requested, present, own, sender in zip(
+            (command.param1, command.param2), gimbal.in_control, gimbal.own_ids, command.sender, strict=True
+        )
+    )
+    gimbal.in_control = (system, component)
     return MavResult.ACCEPTED
+
+
+def _id_in_control(requested: int, present: int, own: int, sender: int) -> int:
+    if requested == _SELF:
+        return own
+    if requested == _RELEASE:
+        return 0 if present == sender else present
+    return requested if 0 <= requested <= 255 else present
 
 
 def _pitch_and_yaw(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
@@ -239,7 +246,7 @@ class Px4CameraTrigger:
         self.sends_image_captured = True  # True if the geotag module runs.
         self._is_enabled = False
         self._is_paused = False
-        self._series = 0
+        self._series_number = 0
         self._last_at = -math.inf
 
     @property
@@ -253,12 +260,12 @@ class Px4CameraTrigger:
 
     def restart(self) -> None:
         self.sequence, self._is_enabled, self._is_paused = 0, False, False
-        self._series += 1
+        self._series_number += 1
 
     def commands(self) -> dict[int, CommandHandler]:
         return {
             MavCmd.DO_DIGICAM_CONTROL: self._control,
-            MavCmd.DO_TRIGGER_CONTROL: self._switch,
+            MavCmd.DO_TRIGGER_CONTROL: self._enable_or_pause,
             MavCmd.DO_SET_CAM_TRIGG_INTERVAL: self._set_interval,
         }
 
@@ -271,7 +278,7 @@ class Px4CameraTrigger:
             self.shoot()
         return MavResult.ACCEPTED
 
-    def _switch(self, command: ReceivedCommand) -> int | None:
+    def _enable_or_pause(self, command: ReceivedCommand) -> int | None:
         """Handle DO_TRIGGER_CONTROL: param 1 enables, 2 resets the sequence, 3 pauses; -1 changes nothing."""
         if not self.is_fitted:
             return None
@@ -283,8 +290,8 @@ class Px4CameraTrigger:
         if whole(command.param1) in (0, 1):
             self._is_enabled = whole(command.param1) == 1
         if self.is_running and not was_running:
-            self._series += 1
-            self._take_next(self._series)
+            self._series_number += 1
+            self._take_next(self._series_number)
         return MavResult.ACCEPTED
 
     def _set_interval(self, command: ReceivedCommand) -> int | None:
@@ -295,7 +302,7 @@ class Px4CameraTrigger:
         return MavResult.ACCEPTED
 
     def _take_next(self, series: int) -> None:
-        if series == self._series and self.is_running:
+        if series == self._series_number and self.is_running:
             self.shoot()
             self._px4.call_later(self.interval_s, lambda: self._take_next(series))
 
@@ -309,20 +316,21 @@ class Px4CameraTrigger:
 
     def _send_captured(self, number: int) -> None:
         px4, pose = self._px4, pose_of(self._px4)
-        if pose is not None:
-            place = pose.place
-            px4.send(
-                m.CameraImageCaptured(
-                    px4.time_boot_ms,
-                    round(px4.unix_time * 1e6),
-                    _DEFAULT_CAMERA_ID,
-                    place.latitude_e7,
-                    place.longitude_e7,
-                    round(place.altitude_m * 1000),
-                    round(pose.height_m * 1000),
-                    quaternion_from_euler(pose.roll, pose.pitch, pose.yaw),
-                    number,
-                    1,
-                    "",
-                )
+        if pose is None:
+            return
+        place = pose.place
+        px4.send(
+            m.CameraImageCaptured(
+                px4.time_boot_ms,
+                round(px4.unix_time * 1e6),
+                _DEFAULT_CAMERA_ID,
+                place.latitude_e7,
+                place.longitude_e7,
+                round(place.altitude_m * 1000),
+                round(pose.height_m * 1000),
+                quaternion_from_euler(pose.roll, pose.pitch, pose.yaw),
+                number,
+                1,  # success
+                "",
             )
+        )

@@ -60,7 +60,7 @@ class Px4ParameterMount(ParameterPackMount):
         super().__init__(parameters, apply, block=DATA_SIZE)
 
     def open(self, path: str, *, writing: bool) -> FileHandle:
-        reader = super().open(path, writing=False)
+        reader = super().open(path, writing=False)  # checks the path, also for writing
         return _Writer(self._parameters, self._apply) if writing else reader
 
 
@@ -74,23 +74,23 @@ class _Writer(FileHandle):
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
         self._parameters = parameters
         self._apply = apply
-        self._pending = b""
+        self._pending = b""  # Received bytes that are not yet a complete entry.
         self._written = 0
-        self._header: tuple[int, int] | None = None
+        self._header: tuple[int, int] | None = None  # Number of entries and size of the file.
         self._count = 0
-        self._last = b""
+        self._previous_name = b""
         self._is_rejected = False
 
     def read(self, offset: int, size: int) -> bytes:
         raise FileFault(EINVAL)
 
     def write(self, offset: int, data: bytes) -> None:
-        new = data[max(0, self._written - offset) :]
-        self._is_rejected = self._is_rejected or offset > self._written
-        if self._is_rejected:
-            raise FileFault(EINVAL)
-        self._pending += new
-        self._written += len(new)
+        new_bytes = data[max(0, self._written - offset) :]
+        has_gap = offset > self._written
+        if self._is_rejected or has_gap:
+            self._reject()
+        self._pending += new_bytes
+        self._written += len(new_bytes)
         self._parse()
         if self._header is not None and self._written > self._header[1]:
             self._reject()
@@ -116,9 +116,10 @@ class _Writer(FileHandle):
             pass
 
     def _parse_row(self) -> bool:
+        """Apply the next entry; return False if it is not complete yet."""
         pending = self._pending = self._pending.lstrip(b"\0")
         try:
-            entry = read_entry(pending, 0, self._last) if pending else None
+            entry = read_entry(pending, 0, self._previous_name) if pending else None
         except RemoteProtocolError:
             self._reject()
         if entry is None:
@@ -128,7 +129,7 @@ class _Writer(FileHandle):
         name = entry.name.decode("ascii", "replace")
         if name in self._parameters:
             self._apply(name, entry.value)
-        self._pending, self._last, self._count = pending[entry.end :], entry.name, self._count + 1
+        self._pending, self._previous_name, self._count = pending[entry.end :], entry.name, self._count + 1
         return True
 
 
@@ -184,6 +185,7 @@ class Px4Storage:
         for number, log in enumerate(logs):
             self.files.put(_log_path(number), log.make, size=log.size)
         if not logs:
+            # Creates the empty folder.
             self.files.put(f"{LOG_FOLDER}/.keep", b"").remove_file(f"{LOG_FOLDER}/.keep")
 
     def _erase_logs(self) -> None:

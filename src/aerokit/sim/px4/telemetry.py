@@ -6,14 +6,15 @@ import math
 from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import EstimatorStatusFlags as Ekf
 from aerokit.mavlink.enums import (
-    EstimatorStatusFlags,
     GpsFixType,
     MavAutopilot,
     MavBatteryFunction,
     MavBatteryType,
     MavLandedState,
     MavModeFlag,
+    MavModeProperty,
     MavState,
     MavSysStatusSensor,
 )
@@ -24,6 +25,7 @@ from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.telemetry_details import IDENTITY_BUILDERS, SENSOR_BUILDERS
 
+# Sensor bits of SYS_STATUS: present, enabled, healthy, and healthy during the boot.
 _PRESENT, _ENABLED = 0x0300402F, 0x0301402F
 _HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
 _GPS_BIT, _RC_BIT = int(MavSysStatusSensor.GPS), int(MavSysStatusSensor.RC_RECEIVER)
@@ -37,20 +39,27 @@ _AVAILABLE_MODES = (
     modes.LAND, modes.FOLLOW_TARGET, modes.PRECISION_LAND, modes.ORBIT, modes.VTOL_TAKEOFF,
 )  # fmt: skip
 _EXTERNAL_MODES = 8
-_F = EstimatorStatusFlags
+_MODE_PROPERTIES: dict[modes.Px4Mode, int] = {
+    modes.ALTITUDE: 0,
+    modes.POSITION: 0,
+    modes.TERMINATION: MavModeProperty.ADVANCED | MavModeProperty.NOT_USER_SELECTABLE,
+}
+
 _ALL_BUT_STILL = (
-    _F.ATTITUDE | _F.VELOCITY_HORIZ | _F.VELOCITY_VERT | _F.POS_HORIZ_REL | _F.POS_HORIZ_ABS | _F.POS_VERT_ABS
-) | (_F.POS_VERT_AGL | _F.PRED_POS_HORIZ_REL | _F.PRED_POS_HORIZ_ABS)
-_BOOT_FLAGS = _F.ATTITUDE | _F.VELOCITY_VERT | _F.POS_VERT_ABS | _F.POS_VERT_AGL | _F.CONST_POS_MODE
-_POSITION_FLAGS = _F.VELOCITY_HORIZ | _F.POS_HORIZ_REL | _F.POS_HORIZ_ABS | _F.PRED_POS_HORIZ_ABS
+    Ekf.ATTITUDE | Ekf.VELOCITY_HORIZ | Ekf.VELOCITY_VERT | Ekf.POS_HORIZ_REL | Ekf.POS_HORIZ_ABS | Ekf.POS_VERT_ABS
+) | (Ekf.POS_VERT_AGL | Ekf.PRED_POS_HORIZ_REL | Ekf.PRED_POS_HORIZ_ABS)
+_BOOT_FLAGS = Ekf.ATTITUDE | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS | Ekf.POS_VERT_AGL | Ekf.CONST_POS_MODE
+_POSITION_FLAGS = Ekf.VELOCITY_HORIZ | Ekf.POS_HORIZ_REL | Ekf.POS_HORIZ_ABS | Ekf.PRED_POS_HORIZ_ABS
 
 
 def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
     mode = modes.TERMINATION if px4.arming.is_terminated else px4.mode
-    base = modes.MODES[mode].base_mode | (MavModeFlag.SAFETY_ARMED if px4.is_armed else 0)
+    base_mode = modes.MODES[mode].base_mode
+    if px4.is_armed:
+        base_mode |= MavModeFlag.SAFETY_ARMED
     if mode == modes.OFFBOARD and px4.offboard.is_fresh:
-        base |= MavModeFlag.STABILIZE_ENABLED
-    return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base, modes.custom_mode(px4.mode), _state(px4), 3)
+        base_mode |= MavModeFlag.STABILIZE_ENABLED
+    return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base_mode, modes.custom_mode(px4.mode), _state(px4), 3)
 
 
 def _state(px4: Px4Vehicle) -> MavState:
@@ -82,14 +91,14 @@ def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
 def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
     flags = _ALL_BUT_STILL
     if not px4.is_armed:
-        flags |= _F.CONST_POS_MODE
+        flags |= Ekf.CONST_POS_MODE
     if not px4.has_position:
         flags &= ~_POSITION_FLAGS
-        flags |= _F.POS_HORIZ_REL if px4.external.has_vision else 0
+        flags |= Ekf.POS_HORIZ_REL if px4.external.has_vision else 0
     if not px4.is_ready:
         flags = _BOOT_FLAGS
-    size = 0.02 if px4.is_ready else math.nan
-    return m.EstimatorStatus(px4.time_boot_us, flags, size, size, 0.003, size, 0.002, math.nan, 0.3, 0.3)
+    ratio = 0.02 if px4.is_ready else math.nan  # Test ratio of velocity, position and magnetometer.
+    return m.EstimatorStatus(px4.time_boot_us, flags, ratio, ratio, 0.003, ratio, 0.002, math.nan, 0.3, 0.3)
 
 
 def _extended_sys_state(px4: Px4Vehicle) -> m.ExtendedSysState:
@@ -107,17 +116,17 @@ def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
     battery = px4.battery
     voltages = (round(battery.voltage_v * 1000), *(0xFFFF,) * 9)
     return m.BatteryStatus(
-        0,
-        MavBatteryFunction.ALL,
-        MavBatteryType.LIPO,
-        32767,
-        voltages,
-        -100,
-        0,
-        -1,
-        int(battery.percent),
-        0,
-        px4.failsafes.battery_state,
+        id=0,
+        battery_function=MavBatteryFunction.ALL,
+        type=MavBatteryType.LIPO,
+        temperature=32767,  # Unknown. Current and energy are not measured either.
+        voltages=voltages,
+        current_battery=-100,
+        current_consumed=0,
+        energy_consumed=-1,
+        battery_remaining=int(battery.percent),
+        time_remaining=0,
+        charge_state=px4.failsafes.battery_state,
     )
 
 
@@ -136,14 +145,14 @@ def _attitude(px4: Px4Vehicle) -> m.Attitude:
 
 def _attitude_quaternion(px4: Px4Vehicle) -> m.AttitudeQuaternion:
     motion = px4.motion
-    q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
-    return m.AttitudeQuaternion(px4.time_boot_ms, *q, motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
+    quaternion = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
+    return m.AttitudeQuaternion(px4.time_boot_ms, *quaternion, motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
 
 
 def _attitude_target(px4: Px4Vehicle) -> m.AttitudeTarget:
     motion = px4.motion
-    q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
-    return m.AttitudeTarget(px4.time_boot_ms, 0, q, 0.0, 0.0, motion.yaw_rate, px4.throttle)
+    quaternion = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
+    return m.AttitudeTarget(px4.time_boot_ms, 0, quaternion, 0.0, 0.0, motion.yaw_rate, px4.throttle)
 
 
 def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
@@ -173,8 +182,9 @@ def _local_position(px4: Px4Vehicle) -> m.LocalPositionNed:
 
 def _altitude(px4: Px4Vehicle) -> m.Altitude:
     amsl = px4.frame.origin.altitude_m - px4.motion.down
-    above, ground = px4.altitude_m, px4.motion.ground_down
-    return m.Altitude(px4.time_boot_us, amsl, amsl, -px4.motion.down, above, -ground, ground - px4.motion.down)
+    above_home, ground_down = px4.altitude_m, px4.motion.ground_down
+    above_ground = ground_down - px4.motion.down
+    return m.Altitude(px4.time_boot_us, amsl, amsl, -px4.motion.down, above_home, -ground_down, above_ground)
 
 
 def _vfr_hud(px4: Px4Vehicle) -> m.VfrHud:
@@ -204,13 +214,13 @@ def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
         place.latitude_e7,
         place.longitude_e7,
         altitude,
-        70,
+        70,  # dilution of precision times 100, horizontal and vertical
         110,
         round(motion.ground_speed_m_s * 100),
         course,
-        10,
+        10,  # satellites
         altitude,
-        900,
+        900,  # accuracy of position and altitude in mm, and of the speed in mm/s
         1780,
         400,
     )
@@ -221,9 +231,9 @@ def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
         return None
     place = px4.frame.to_global(*px4.home)
     altitude = round(place.altitude_m * 1000)
-    q = (math.nan,) * 4 if px4.home_is_set_by_hand else (1.0, 0.0, 0.0, 0.0)
+    quaternion = (math.nan,) * 4 if px4.home_is_set_by_hand else (1.0, 0.0, 0.0, 0.0)
     return m.HomePosition(
-        place.latitude_e7, place.longitude_e7, altitude, *px4.home, q, 0.0, 0.0, 0.0, px4.time_boot_us
+        place.latitude_e7, place.longitude_e7, altitude, *px4.home, quaternion, 0.0, 0.0, 0.0, px4.time_boot_us
     )
 
 
@@ -241,10 +251,8 @@ def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
     motion = px4.motion
     yaw = motion.yaw
     if not px4.is_armed:
-        nan = math.nan
-        return m.PositionTargetLocalNed(
-            px4.time_boot_ms, 1, 63, nan, nan, nan, nan, nan, nan, 0.0, 0.0, 100.0, yaw, 0.0
-        )
+        position_and_velocity, acceleration = (math.nan,) * 6, (0.0, 0.0, 100.0)
+        return m.PositionTargetLocalNed(px4.time_boot_ms, 1, 63, *position_and_velocity, *acceleration, yaw, 0.0)
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     acceleration = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down)
     return m.PositionTargetLocalNed(
@@ -282,16 +290,17 @@ def _ping(px4: Px4Vehicle) -> m.Ping:
 
 def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
     """Return AVAILABLE_MODES. PX4 sends no name for a standard mode (RETURN, LAND …)."""
-    listed, count = _AVAILABLE_MODES, len(_AVAILABLE_MODES) + _EXTERNAL_MODES
+    count = len(_AVAILABLE_MODES) + _EXTERNAL_MODES
     messages = []
-    for index, mode in enumerate(listed, start=1):
-        number = _STANDARD.get(mode, 0)
-        text = "" if number else modes.MODES[mode].name
-        properties = 0 if mode in (modes.ALTITUDE, modes.POSITION) else 3 if mode == modes.TERMINATION else 1
-        messages.append(m.AvailableModes(count, index, number, modes.custom_mode(mode), properties, text))
-    for place in range(_EXTERNAL_MODES):
-        mode, index = (modes.AUTO, modes.EXTERNAL_1[1] + place), len(listed) + 1 + place
-        messages.append(m.AvailableModes(count, index, 0, modes.custom_mode(mode), 2, "(Mode not available)"))
+    for index, mode in enumerate(_AVAILABLE_MODES, start=1):
+        standard_mode = _STANDARD.get(mode, 0)
+        name = "" if standard_mode else modes.MODES[mode].name
+        properties = _MODE_PROPERTIES.get(mode, MavModeProperty.ADVANCED)
+        messages.append(m.AvailableModes(count, index, standard_mode, modes.custom_mode(mode), properties, name))
+    for number in range(_EXTERNAL_MODES):
+        mode, index = (modes.AUTO, modes.EXTERNAL_1[1] + number), len(_AVAILABLE_MODES) + 1 + number
+        properties = MavModeProperty.NOT_USER_SELECTABLE
+        messages.append(m.AvailableModes(count, index, 0, modes.custom_mode(mode), properties, "(Mode not available)"))
     return messages
 
 

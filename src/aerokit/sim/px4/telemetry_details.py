@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import StorageStatus
+from aerokit.mavlink.enums import MavEstimatorType, MavFrame, MavOdidStatus, StorageStatus
 from aerokit.mavlink.message import Message
 from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
 from aerokit.sim.px4.base import Px4Vehicle
@@ -35,8 +35,9 @@ def _storage_information(px4: Px4Vehicle) -> m.StorageInformation:
 
 def _flight_information(px4: Px4Vehicle) -> m.FlightInformation:
     armed_for = px4.now - px4.arming.since
-    since = int((px4.unix_time - armed_for) * 1e6) if px4.is_armed else 0
-    return m.FlightInformation(px4.time_boot_ms, since, 0 if px4.is_landed else since, 0)
+    armed_at_us = int((px4.unix_time - armed_for) * 1e6) if px4.is_armed else 0
+    take_off_us = 0 if px4.is_landed else armed_at_us
+    return m.FlightInformation(px4.time_boot_ms, armed_at_us, take_off_us, 0)
 
 
 def _component_metadata(px4: Px4Vehicle) -> m.ComponentMetadata:
@@ -58,25 +59,25 @@ def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
     course = round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0) % 360 * 100
     return m.OpenDroneIdLocation(
-        0,
-        0,
-        _BROADCAST_ID,
-        1 if px4.is_landed else 2,
-        course,
-        round(motion.ground_speed_m_s * 100),
-        round(-motion.velocity_down * 100),
-        place.latitude_e7,
-        place.longitude_e7,
-        place.altitude_m,
-        place.altitude_m,
-        0,
-        px4.altitude_m,
-        12,
-        5,
-        0,
-        3,
-        65535.0,
-        0,
+        target_system=0,
+        target_component=0,
+        id_or_mac=_BROADCAST_ID,
+        status=MavOdidStatus.GROUND if px4.is_landed else MavOdidStatus.AIRBORNE,
+        direction=course,
+        speed_horizontal=round(motion.ground_speed_m_s * 100),
+        speed_vertical=round(-motion.velocity_down * 100),
+        latitude=place.latitude_e7,
+        longitude=place.longitude_e7,
+        altitude_barometric=place.altitude_m,
+        altitude_geodetic=place.altitude_m,
+        height_reference=0,
+        height=px4.altitude_m,
+        horizontal_accuracy=12,
+        vertical_accuracy=5,
+        barometer_accuracy=0,
+        speed_accuracy=3,
+        timestamp=65535.0,
+        timestamp_accuracy=0,
     )
 
 
@@ -86,21 +87,21 @@ def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
     home = px4.frame.to_global(*px4.home)
     seconds = max(0, int(px4.unix_time) - _REMOTE_ID_EPOCH)
     return m.OpenDroneIdSystem(
-        0,
-        0,
-        _BROADCAST_ID,
-        0,
-        0,
-        home.latitude_e7,
-        home.longitude_e7,
-        1,
-        0,
-        -1000.0,
-        -1000.0,
-        0,
-        0,
-        home.altitude_m,
-        seconds,
+        target_system=0,
+        target_component=0,
+        id_or_mac=_BROADCAST_ID,
+        operator_location_type=0,
+        classification_type=0,
+        operator_latitude=home.latitude_e7,
+        operator_longitude=home.longitude_e7,
+        area_count=1,
+        area_radius=0,
+        area_ceiling=-1000.0,
+        area_floor=-1000.0,
+        category_eu=0,
+        class_eu=0,
+        operator_altitude_geo=home.altitude_m,
+        timestamp=seconds,
     )
 
 
@@ -145,7 +146,7 @@ def _distance_sensor(px4: Px4Vehicle) -> m.DistanceSensor:
     return m.DistanceSensor(px4.time_boot_ms, *_RANGE_FINDER_CM, distance, 0, 0, 25, 0)
 
 
-def _body(px4: Px4Vehicle) -> tuple[float, float, float]:
+def _measured_acceleration(px4: Px4Vehicle) -> tuple[float, float, float]:
     """Return the measured acceleration in m/s² forward, right, down."""
     motion = px4.motion
     north, east, down = (
@@ -162,7 +163,7 @@ def _body(px4: Px4Vehicle) -> tuple[float, float, float]:
     )
 
 
-def _field(px4: Px4Vehicle) -> tuple[float, float, float]:
+def _magnetic_field_gauss(px4: Px4Vehicle) -> tuple[float, float, float]:
     north, _, down = _FIELD_GAUSS
     return (north * math.cos(px4.motion.yaw), -north * math.sin(px4.motion.yaw), down)
 
@@ -172,15 +173,24 @@ def _highres_imu(px4: Px4Vehicle) -> m.HighresImu:
     rates = (motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
     pressure = _pressure_hpa(px4)
     return m.HighresImu(
-        px4.time_boot_us, *_body(px4), *rates, *_field(px4), pressure, 0.0, height, _SEA_LEVEL_C, _IMU_FIELDS
+        px4.time_boot_us,
+        *_measured_acceleration(px4),
+        *rates,
+        *_magnetic_field_gauss(px4),
+        pressure,
+        0.0,
+        height,
+        _SEA_LEVEL_C,
+        _IMU_FIELDS,
     )
 
 
 def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
     motion = px4.motion
-    force_x, force_y, force_z = (round(part / GRAVITY_M_S2 * 1000) for part in _body(px4))
+    # In milli-g, mrad/s and milligauss.
+    force_x, force_y, force_z = (round(axis / GRAVITY_M_S2 * 1000) for axis in _measured_acceleration(px4))
     rate_x, rate_y, rate_z = (round(rate * 1000) for rate in (motion.roll_rate, motion.pitch_rate, motion.yaw_rate))
-    field_x, field_y, field_z = (round(part * 1000) for part in _field(px4))
+    field_x, field_y, field_z = (round(axis * 1000) for axis in _magnetic_field_gauss(px4))
     time = px4.time_boot_ms
     return m.ScaledImu(
         time, force_x, force_y, force_z, rate_x, rate_y, rate_z, field_x, field_y, field_z, temperature=1500
@@ -189,24 +199,24 @@ def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
 
 def _odometry(px4: Px4Vehicle) -> m.Odometry:
     motion = px4.motion
-    q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
+    quaternion = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     rates = (motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
     return m.Odometry(
         px4.time_boot_us,
-        1,
-        1,
+        MavFrame.LOCAL_NED,
+        MavFrame.LOCAL_NED,
         motion.north,
         motion.east,
         motion.down,
-        q,
+        quaternion,
         *velocity,
         *rates,
         _COVARIANCE,
         _COVARIANCE,
-        0,
-        8,
-        0,
+        reset_counter=0,
+        estimator_type=MavEstimatorType.AUTOPILOT,
+        quality=0,
     )
 
 
@@ -215,10 +225,10 @@ def _rc_channels(px4: Px4Vehicle) -> m.RcChannels | None:
     if not px4.sticks.has_channels:
         return None
     channels = px4.sticks.channels
-    used = 8 if not any(channels[8:]) else len(channels)
-    pulses = {f"chan{number}_raw": pulse for number, pulse in enumerate(channels[:used], start=1)}
-    unused = {f"chan{number}_raw": _UNUSED_CHANNEL for number in range(used + 1, len(channels) + 1)}
-    return m.RcChannels(time_boot_ms=px4.time_boot_ms, chancount=used, rssi=100, **pulses, **unused)
+    used_count = len(channels) if any(channels[8:]) else 8
+    used = {f"chan{number}_raw": pulse for number, pulse in enumerate(channels[:used_count], start=1)}
+    unused = {f"chan{number}_raw": _UNUSED_CHANNEL for number in range(used_count + 1, len(channels) + 1)}
+    return m.RcChannels(time_boot_ms=px4.time_boot_ms, chancount=used_count, rssi=100, **used, **unused)
 
 
 def _manual_control(px4: Px4Vehicle) -> m.ManualControl:
@@ -248,9 +258,9 @@ def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:
         return m.TimeEstimateToTarget(-1, -1, -1, -1, -1)
     motion, flight = px4.motion, px4.flight
     height = max(px4.parameters["RTL_RETURN_ALT"], px4.altitude_m)
-    away = math.hypot(motion.north - px4.home[0], motion.east - px4.home[1])
-    seconds = (height - px4.altitude_m) / _CLIMB_M_S + away / flight.cruise_speed_m_s + height / _DESCENT_M_S
-    return m.TimeEstimateToTarget(round(seconds), -1, -1, -1, -1)
+    distance = math.hypot(motion.north - px4.home[0], motion.east - px4.home[1])
+    climb_s, descent_s = (height - px4.altitude_m) / _CLIMB_M_S, height / _DESCENT_M_S
+    return m.TimeEstimateToTarget(round(climb_s + distance / flight.cruise_speed_m_s + descent_s), -1, -1, -1, -1)
 
 
 def _link_status(px4: Px4Vehicle) -> m.LinkNodeStatus:

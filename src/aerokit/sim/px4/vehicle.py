@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavType
+from aerokit.mavlink.enums import MavCmd as Cmd
+from aerokit.mavlink.enums import MavType
 from aerokit.mavlink.message import Message
 from aerokit.missions import MissionItem
 from aerokit.sim.channel import Channel
@@ -60,15 +61,18 @@ class SimulatedPx4(Px4Vehicle):
         return refusal_by_place(command, checks_frame=not self.version.startswith("1.16"))
 
     def _on_set_mode(self, request: m.SetMode, channel: Channel) -> None:
+        """Handle SET_MODE, which PX4 acknowledges like DO_SET_MODE."""
         main, sub = modes.mode_from_custom(request.custom_mode)
         command = ReceivedCommand(
-            MavCmd.DO_SET_MODE, request.base_mode, main, sub, 0, 0, 0, 0, None, channel, sender_of(request)
+            Cmd.DO_SET_MODE, request.base_mode, main, sub, 0, 0, 0, 0, None, channel, sender_of(request)
         )
         self.commands.answer(command, set_mode(self, request.base_mode, (main, sub)))
 
 
 _FLARE_M = 3.0
-_AHEAD_S = 2.5
+_GLIDE_SPEED_FACTOR = 1.3
+# A target this far ahead makes `FixedWing.climb_to` descend at the wanted sink rate.
+_SINK_TARGET_S = 2.5
 _FLARE_SINK_M_S = 0.5
 _HEIGHT_REACHED_M = 10.0
 
@@ -116,7 +120,7 @@ class Px4PlaneFlight(Px4Flight):
             self._return()
         elif mode == modes.MISSION:
             mission.update()
-        elif mode == modes.OFFBOARD and math.isfinite(sum(plane.offboard.position)):
+        elif mode == modes.OFFBOARD and all(map(math.isfinite, plane.offboard.position)):
             self.target = plane.offboard.position
             self.circle()
         elif mode in modes.STICK_MODES and plane.sticks.are_fresh:
@@ -126,11 +130,11 @@ class Px4PlaneFlight(Px4Flight):
 
     def _follow_sticks(self) -> None:
         """Control bank, climb and airspeed by the sticks in every manual mode; forward is down."""
-        sticks, values = self._plane.sticks, self._plane.parameters
-        climb = -sticks.pitch * values["FW_T_CLMB_MAX" if sticks.pitch < 0 else "FW_T_SINK_MAX"]
-        slowest, fastest = values["FW_AIRSPD_MIN"], values["FW_AIRSPD_MAX"]
-        speed = slowest + (sticks.throttle + 1.0) / 2 * (fastest - slowest)
-        self._motion.bank_and_climb(speed, math.radians(values["FW_R_LIM"]) * sticks.roll, climb)
+        sticks, parameters = self._plane.sticks, self._plane.parameters
+        climb = -sticks.pitch * parameters["FW_T_CLMB_MAX" if sticks.pitch < 0 else "FW_T_SINK_MAX"]
+        min_speed, max_speed = parameters["FW_AIRSPD_MIN"], parameters["FW_AIRSPD_MAX"]
+        speed = min_speed + (sticks.throttle + 1.0) / 2 * (max_speed - min_speed)
+        self._motion.bank_and_climb(speed, math.radians(parameters["FW_R_LIM"]) * sticks.roll, climb)
         self.stay_here()
 
     def go(self) -> None:
@@ -152,12 +156,12 @@ class Px4PlaneFlight(Px4Flight):
         if self._motion.down > self.target[2]:
             return
         place = (self._motion.north, self._motion.east, self.target[2])
-        self._plane.switch_to_hold()
+        self._plane.switch_to_hold()  # sets the target to the current altitude
         self.target = place
 
     def circle_down(self) -> None:
         sink = self._plane.parameters["FW_T_SINK_MIN"]
-        self.target = (*self.target[:2], self._motion.down + sink * _AHEAD_S)
+        self.target = (*self.target[:2], self._motion.down + sink * _SINK_TARGET_S)
         self._touch_down(self.circle)
 
     def descend(self) -> None:
@@ -176,11 +180,10 @@ class Px4PlaneFlight(Px4Flight):
 
     def _glide(self) -> None:
         motion = self._motion
-        away = math.hypot(self.target[0] - motion.north, self.target[1] - motion.east)
-        height = away * math.tan(math.radians(self._plane.parameters["FW_LND_ANG"]))
+        north, east = self.target[0] - motion.north, self.target[1] - motion.east
+        height = math.hypot(north, east) * math.tan(math.radians(self._plane.parameters["FW_LND_ANG"]))
         climb = min(0.0, motion.climb_to(motion.ground_down - height))
-        course = math.atan2(self.target[1] - motion.east, self.target[0] - motion.north)
-        motion.head(course, self._plane.parameters["FW_AIRSPD_MIN"] * 1.3, climb)
+        motion.head(math.atan2(east, north), self._plane.parameters["FW_AIRSPD_MIN"] * _GLIDE_SPEED_FACTOR, climb)
 
     def _return(self) -> None:
         """Climb, fly to the destination, circle down to RTL_DESCEND_ALT; land unless RTL_LAND_DELAY is negative."""
@@ -194,24 +197,25 @@ class Px4PlaneFlight(Px4Flight):
         if self._phase == "climb":
             self._phase, self.target = "return", (*self.destination[:2], self.target[2])
         elif self._phase == "return":
-            descend = plane.parameters["RTL_DESCEND_ALT"]
+            loiter_down = self.destination[2] - plane.parameters["RTL_DESCEND_ALT"]
             self.radius_m = plane.parameters["RTL_LOITER_RAD"]
             self._phase = "loiter"
-            self.target: Ned = (*self.destination[:2], max(self.target[2], self.destination[2] - descend))
+            self.target: Ned = (*self.destination[:2], max(self.target[2], loiter_down))
+        elif self._phase == "loiter" and plane.parameters["RTL_LAND_DELAY"] < 0:
+            self._phase = "done"
+            plane.info("RTL: completed, loitering")
         elif self._phase == "loiter":
-            self._phase = "done" if plane.parameters["RTL_LAND_DELAY"] < 0 else "land"
-            done = self._phase == "done"
-            plane.info("RTL: completed, loitering" if done else "RTL: land at destination")
+            self._phase = "land"
+            plane.info("RTL: land at destination")
 
     def _is_near(self) -> bool:
-        away = math.hypot(self.target[0] - self._motion.north, self.target[1] - self._motion.east)
-        return away <= abs(self.radius_m) + self._plane.parameters["NAV_ACC_RAD"]
+        distance = math.hypot(self.target[0] - self._motion.north, self.target[1] - self._motion.east)
+        return distance <= abs(self.radius_m) + self._plane.parameters["NAV_ACC_RAD"]
 
 
-_C = MavCmd
-_TAKE_OFFS = (_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF)
-_LANDINGS = (_C.NAV_LAND, _C.NAV_VTOL_LAND)
-_CIRCLES = (_C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME, _C.NAV_LOITER_TO_ALT)
+_TAKE_OFFS = (Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF)
+_LANDINGS = (Cmd.NAV_LAND, Cmd.NAV_VTOL_LAND)
+_CIRCLES = (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_LOITER_TO_ALT)
 _TURN_S = 2.0
 
 
@@ -229,9 +233,11 @@ class Px4PlaneMission(Px4Mission):
     def _aim(self, item: MissionItem) -> None:
         super()._aim(item)
         flight = self._plane.flight
-        radius = {_C.NAV_LOITER_UNLIM: item.param3, _C.NAV_LOITER_TIME: item.param3}.get(
-            MavCmd(item.command), item.param2 if item.command == _C.NAV_LOITER_TO_ALT else 0.0
-        )
+        radius = 0.0
+        if item.command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME):
+            radius = item.param3
+        elif item.command == Cmd.NAV_LOITER_TO_ALT:
+            radius = item.param2
         default = self._plane.parameters["NAV_LOITER_RAD"]
         flight.radius_m = radius if radius and math.isfinite(radius) else default
         if item.command in _LANDINGS:
@@ -247,20 +253,20 @@ class Px4PlaneMission(Px4Mission):
         elif self._phase == "climb":
             flight.climb_out()
             if self._plane.motion.down <= flight.target[2]:
-                self._leave_climb(item)
+                self._end_climb(item)
         else:
             self._go(item)
 
-    def _leave_climb(self, item: MissionItem) -> None:
+    def _end_climb(self, item: MissionItem) -> None:
         if item.command in _TAKE_OFFS:
-            self._pass(item)
+            self._complete_item(item)
         else:
             self._phase = "go"
             self._plane.flight.target = self._place(item)
 
     def _go(self, item: MissionItem) -> None:
         flight = self._plane.flight
-        if item.command in _CIRCLES or item.command == _C.NAV_DELAY:
+        if item.command in _CIRCLES or item.command == Cmd.NAV_DELAY:
             flight.circle()
         else:
             flight.fly_straight()
@@ -269,24 +275,25 @@ class Px4PlaneMission(Px4Mission):
         if math.isnan(self._arrived_at):
             self._arrived_at = self._plane.now
         if self._is_done(item):
-            self._pass(item)
+            self._complete_item(item)
 
-    def _pass(self, item: MissionItem) -> None:
+    def _complete_item(self, item: MissionItem) -> None:
         self._reach()
         if item.autocontinue and self._advance():
             self._begin_item()
 
     def _is_at_target(self, item: MissionItem) -> bool:
-        if item.command == _C.NAV_DELAY:
+        if item.command == Cmd.NAV_DELAY:
             return True
         plane, motion = self._plane, self._plane.motion
         north, east, down = plane.flight.target
-        radius = max(plane.parameters["NAV_ACC_RAD"], item.param2 if item.command == _C.NAV_WAYPOINT else 0.0)
-        radius = max(radius, _TURN_S * motion.airspeed_m_s)
-        if item.command in _CIRCLES:
+        radius = max(plane.parameters["NAV_ACC_RAD"], _TURN_S * motion.airspeed_m_s)
+        if item.command == Cmd.NAV_WAYPOINT:
+            radius = max(radius, item.param2)
+        elif item.command in _CIRCLES:
             radius += abs(plane.flight.radius_m)
-        near = math.hypot(north - motion.north, east - motion.east) <= radius
-        return near and abs(down - motion.down) <= plane.parameters["NAV_FW_ALT_RAD"]
+        is_near = math.hypot(north - motion.north, east - motion.east) <= radius
+        return is_near and abs(down - motion.down) <= plane.parameters["NAV_FW_ALT_RAD"]
 
     def _hold(self) -> None:
         """Change to HOLD after the mission, and keep the target."""

@@ -15,7 +15,7 @@ import anyio
 
 from aerokit.errors import InvalidArgument, LinkOpenError
 from aerokit.transport.link import OrderRefusalListener, Peer
-from aerokit.transport.zenoh.control_lease import VehicleSideTracker, refusals_in
+from aerokit.transport.zenoh.control_lease import VehicleSideTracker, rejection_frames
 from aerokit.transport.zenoh.keys import (
     CONTROL_MODES,
     Beacon,
@@ -23,7 +23,7 @@ from aerokit.transport.zenoh.keys import (
     KeySpace,
     RefusalNotice,
     check_name,
-    read_sent_at,
+    decode_sent_at,
 )
 from aerokit.transport.zenoh.session import (
     MAX_PAYLOAD_BYTES,
@@ -83,7 +83,7 @@ class ZenohConnect(NetworkLink):
         self._keys = KeySpace(fleet, name)
         self._options = options or NetworkOptions()
         self._open_timeout_s = open_timeout_s
-        self._takes_control = control == "take"
+        self._takes_control = control == "take"  # False again once a beacon shows that this client has control
         self._tracker = VehicleSideTracker(random.getrandbits(32), "never" if control == "never" else "free")
         self._alive: set[str] = set()  # keys of vehicle sides that the network reports
         self._publisher: Any = None
@@ -102,7 +102,7 @@ class ZenohConnect(NetworkLink):
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`. Drops data while beacons are missing."""
         if self._publisher is not None:
-            self._put(bytes(data), self._mode_now())
+            self._put(bytes(data), self._requested_mode())
 
     # ---------------------------------------------------------------------------------- opening and closing
 
@@ -120,8 +120,9 @@ class ZenohConnect(NetworkLink):
         raise LinkOpenError(f"cannot open {self.address}: {self._describe_missing()}")
 
     def _declare(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        # This function and the callbacks run on threads.
-        def callback(process: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
+        # This function and the callbacks run on threads of zenoh, so each callback posts to the event loop. A sample
+        # that is not a PUT is a DELETE: the vehicle side was closed, or a liveliness token has ended.
+        def posting(process: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
             def on_sample(sample: Any) -> None:
                 is_put, payload = sample.kind == zenoh.SampleKind.PUT, payload_of(sample)
                 if len(payload) <= MAX_PAYLOAD_BYTES:
@@ -134,12 +135,12 @@ class ZenohConnect(NetworkLink):
             queue.post(partial(self._on_liveliness, str(sample.key_expr), is_put))
 
         keys, client = self._keys, self.client
-        frames, liveliness = callback(self._on_frames), session.liveliness()
+        on_frames, liveliness = posting(self._on_frames), session.liveliness()
         self._declared = [
-            session.declare_subscriber(keys.to_all_clients, frames),
-            session.declare_subscriber(keys.from_vehicle(client), frames),
-            session.declare_subscriber(keys.notices(client), callback(self._on_notice)),
-            session.declare_subscriber(keys.beacon, callback(self._on_beacon)),
+            session.declare_subscriber(keys.to_all_clients, on_frames),
+            session.declare_subscriber(keys.from_vehicle(client), on_frames),
+            session.declare_subscriber(keys.notices(client), posting(self._on_notice)),
+            session.declare_subscriber(keys.beacon, posting(self._on_beacon)),
             # Subscribe to the whole fleet, so that the error text can list its names.
             liveliness.declare_subscriber(KeySpace(keys.fleet, "*").alive(), on_liveliness, history=True),
             liveliness.declare_token(keys.client(client)),
@@ -154,14 +155,14 @@ class ZenohConnect(NetworkLink):
     # ---------------------------------------------------------------------------------- receiving
 
     def _on_frames(self, data: bytes, attachment: bytes, _is_put: bool) -> None:
-        sent = read_sent_at(attachment)
-        if sent is not None and self._tracker.accepts(*sent, self._now()):
+        epoch_and_time = decode_sent_at(attachment)
+        if epoch_and_time is not None and self._tracker.accepts(*epoch_and_time, self._now()):
             self._deliver(data)
 
     def _on_beacon(self, data: bytes, attachment: bytes, is_put: bool) -> None:
-        if not is_put:
-            sent = read_sent_at(attachment)
-            if sent is not None and sent[0] == self._tracker.epoch:
+        if not is_put:  # the vehicle side deletes its beacon when it closes
+            epoch_and_time = decode_sent_at(attachment)
+            if epoch_and_time is not None and epoch_and_time[0] == self._tracker.epoch:
                 self._tracker.reset()
                 self._lose("the vehicle side was closed")
             return
@@ -171,7 +172,7 @@ class ZenohConnect(NetworkLink):
         self._first_beacon.set()
         if self._takes_control:
             self._takes_control = beacon.lease_holder != self.client
-            self._put(b"", self._mode_now())
+            self._put(b"", self._requested_mode())
 
     def _on_notice(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:
         notice = RefusalNotice.decode(data)
@@ -179,15 +180,19 @@ class ZenohConnect(NetworkLink):
             return
         self._drop(notice.count)
         if isinstance(self._receiver, OrderRefusalListener):
-            answers = refusals_in(notice.answer)
+            answers = rejection_frames(notice.answer)
             self._receiver.order_refused(notice.message, notice.reason, notice.lease_holder, answers)
 
     def _on_liveliness(self, key: str, is_alive: bool) -> None:
-        (self._alive.add if is_alive else self._alive.discard)(key)
+        if is_alive:
+            self._alive.add(key)
+        else:
+            self._alive.discard(key)
 
     # ---------------------------------------------------------------------------------- sending
 
-    def _mode_now(self) -> ControlMode | None:
+    def _requested_mode(self) -> ControlMode | None:
+        """Return the control mode for the next stamp; None: the mode of this client."""
         return "take" if self._takes_control else None
 
     def _put(self, data: bytes, mode: ControlMode | None) -> None:
@@ -220,12 +225,12 @@ class ZenohConnect(NetworkLink):
         self._schedule_poll()
 
     def _describe_missing(self) -> str:
-        names = sorted({key.split("/")[2] for key in self._alive})
+        names = sorted({key.split("/")[2] for key in self._alive})  # aerokit/FLEET/NAME/alive/EPOCH
         keys = self._keys
         if keys.name in names:
             return f"{keys.name} is on the network, but sent nothing for {self._open_timeout_s:g} s"
-        others = f" (available: {', '.join(names)})" if names else " (the fleet is empty)"
-        return f"no vehicle side named {keys.name} in the fleet {keys.fleet}{others}"
+        hint = f" (available: {', '.join(names)})" if names else " (the fleet is empty)"
+        return f"no vehicle side named {keys.name} in the fleet {keys.fleet}{hint}"
 
 
 def _own_name() -> str:

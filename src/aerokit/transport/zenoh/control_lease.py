@@ -66,7 +66,7 @@ READ_FILES = frozenset(
     )
 )  # fmt: skip
 
-_OPCODE_AT = 3  # https://mavlink.io/en/services/ftp.html#payload
+_OPCODE_OFFSET = 3  # https://mavlink.io/en/services/ftp.html#payload
 
 _TEXT_PREFIX = "network: "
 
@@ -74,14 +74,14 @@ _MAX_TEXT_LENGTH = 50  # length of the text in STATUSTEXT
 
 _MAX_KINDS = 64
 
-_READ_IDS = frozenset(message_id for message_id, row in INDEX.items() if row[0] in READ_MESSAGES)
+_READ_IDS = frozenset(message_id for message_id, (class_name, *_) in INDEX.items() if class_name in READ_MESSAGES)
 
 COMMANDS = ("COMMAND_LONG", "COMMAND_INT")
 
 _MISSION_WRITES = ("MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_WRITE_PARTIAL_LIST")
 
 
-def is_read(frame: Frame) -> bool:
+def is_read_only(frame: Frame) -> bool:
     """Return True if any client may send this frame. Unknown messages count as commands."""
     if frame.message_id in _READ_IDS:  # the common case, without decoding
         return True
@@ -89,16 +89,16 @@ def is_read(frame: Frame) -> bool:
         return getattr(_decoded(frame), "command", 0) in READ_COMMANDS
     if frame.message_id == FileTransferProtocol.ID:
         payload: bytes = getattr(_decoded(frame), "payload", b"")
-        return len(payload) > _OPCODE_AT and payload[_OPCODE_AT] in READ_FILES
+        return len(payload) > _OPCODE_OFFSET and payload[_OPCODE_OFFSET] in READ_FILES
     return False
 
 
-def refusals_in(answer: bytes) -> tuple[bytes, ...]:
+def rejection_frames(answer: bytes) -> tuple[bytes, ...]:
     """Return the frames of an answer that reject a command; all others are ignored."""
-    return tuple(frame.raw for frame in Framer().receive(answer) if _is_refusal(_decoded(frame)))
+    return tuple(frame.raw for frame in Framer().receive(answer) if _is_rejection(_decoded(frame)))
 
 
-def _is_refusal(message: Message | None) -> bool:
+def _is_rejection(message: Message | None) -> bool:
     if isinstance(message, CommandAck):
         return message.result == MavResult.TEMPORARILY_REJECTED
     if isinstance(message, Statustext):
@@ -152,8 +152,8 @@ class ClientFilter:
         self._client, self._lease = client, lease
         self._framer = _framer()
         self._nonce: int | None = None  # nonce of the program that uses this client name
-        self._nonce_at = 0.0
-        self._notices: dict[str, tuple[float, int]] = {}  # message → time of last notice, refusals since then
+        self._nonce_at = 0.0  # time at which that program was last heard
+        self._notices: dict[str, tuple[float, int]] = {}  # message name → time of the last notice, refusals since then
 
     def receive(self, data: bytes, mode: ControlMode, now: float, nonce: int = 0) -> tuple[bytes, list[RefusalNotice]]:
         """Process a fresh datagram. Return the accepted frames, and the notices for the client.
@@ -168,15 +168,18 @@ class ClientFilter:
         frames = self._framer.receive(data, now)
         if self._framer.waiting:  # datagrams have complete frames: drop a partial one
             self._framer = _framer()
+        may_control = mode != "never" and not is_namesake
         for frame in frames:
-            may_control = mode != "never" and not is_namesake
-            if is_read(frame) or (may_control and self._lease.acquire(self._client, now)):
+            if is_read_only(frame) or (may_control and self._lease.acquire(self._client, now)):
                 accepted.append(frame.raw)
                 continue
             holder = self._lease.holder(now) if may_control else None
-            reason = "this link is read-only (control=never)" if holder is None else f"{holder} has control"
             if is_namesake:
                 reason = f"another program uses the client name {self._client}"
+            elif holder is None:
+                reason = "this link is read-only (control=never)"
+            else:
+                reason = f"{holder} has control"
             notices += self._refuse(frame, _decoded(frame), reason, holder, now)
         return b"".join(accepted), notices
 
@@ -194,7 +197,7 @@ class ClientFilter:
         """
         notices: list[RefusalNotice] = []
         for frame in _framer().receive(data, now):
-            if is_read(frame):
+            if is_read_only(frame):
                 self.refused += 1
             else:
                 notices += self._refuse(frame, _decoded(frame), "it arrived too late", None, now, is_late=True)
@@ -213,14 +216,15 @@ class ClientFilter:
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME
         answer = b"" if message is None or is_late else _answer(frame, message, reason)
-        noticed_at, waiting = self._notices.get(name, (-NOTICE_INTERVAL_S, 0))
+        noticed_at, unreported = self._notices.get(name, (-NOTICE_INTERVAL_S, 0))
+        # A notice with an answer is never delayed, because the program waits for it.
         if not answer and now - noticed_at < NOTICE_INTERVAL_S:
-            self._notices[name] = (noticed_at, waiting + 1)
+            self._notices[name] = (noticed_at, unreported + 1)
             return []
         if len(self._notices) >= _MAX_KINDS:
             self._notices.clear()
         self._notices[name] = (now, 0)
-        return [RefusalNotice(name, reason, holder, answer, waiting + 1)]
+        return [RefusalNotice(name, reason, holder, answer, unreported + 1)]
 
 
 def _framer() -> Framer:
@@ -235,17 +239,17 @@ def _decoded(frame: Frame) -> Message | None:
 
 def _answer(frame: Frame, message: Message, reason: str) -> bytes:
     """Return the frames by which a vehicle would reject a message; empty if none exist, or for broadcasts."""
-    fields: object = message
+    fields: object = message  # `object`, because type checkers do not know that other messages have these fields, too
     system: int = getattr(fields, "target_system", 0)
-    component: int = getattr(fields, "target_component", 0) or 1
+    component: int = getattr(fields, "target_component", 0) or 1  # the autopilot answers for all components (0)
     answer: Message | None = None
     if message.NAME in COMMANDS:
         command: int = getattr(fields, "command", 0)
         result = MavResult.TEMPORARILY_REJECTED
         answer = CommandAck(command, result, 0, 0, frame.system_id, frame.component_id)
     elif message.NAME in _MISSION_WRITES:
-        kind: int = getattr(fields, "mission_type", 0)
-        answer = MissionAck(frame.system_id, frame.component_id, MavMissionResult.DENIED, kind)
+        mission_type: int = getattr(fields, "mission_type", 0)
+        answer = MissionAck(frame.system_id, frame.component_id, MavMissionResult.DENIED, mission_type)
     if answer is None or system == 0:
         return b""
     text = Statustext(MavSeverity.WARNING, f"{_TEXT_PREFIX}{reason}"[:_MAX_TEXT_LENGTH])
@@ -285,13 +289,7 @@ class FreshnessChecker:
     def accepts(self, client: str, stamp: Stamp | None, now: float) -> bool:
         """Return True if a datagram with this stamp is fresh and new. Refused datagrams are counted."""
         self._expire(now)
-        is_fresh = (
-            stamp is not None
-            and stamp.epoch == self.epoch
-            and bool(self._sent)
-            and self._sent[0][0] <= stamp.beacon <= self._sent[-1][0]
-        )
-        if stamp is None or not is_fresh:
+        if stamp is None or not self._is_fresh(stamp):
             self.late += 1
             return False
         key = client, stamp.nonce
@@ -303,6 +301,12 @@ class FreshnessChecker:
         if len(self._sequences) > _MAX_NONCES:
             self._sequences.popitem(last=False)
         return True
+
+    def _is_fresh(self, stamp: Stamp) -> bool:
+        if stamp.epoch != self.epoch or not self._sent:
+            return False
+        (oldest_number, _), (newest_number, _) = self._sent[0], self._sent[-1]
+        return oldest_number <= stamp.beacon <= newest_number
 
     def _expire(self, now: float) -> None:
         while self._sent and now - self._sent[0][1] > MAX_DELAY_S:
@@ -317,16 +321,17 @@ class DelayEstimator:
 
     def __init__(self) -> None:
         self._min_offset: float | None = None  # our time minus the sender's
-        self._at = 0.0
+        self._measured_at = 0.0
 
     def delay(self, sent_s: float, now: float) -> float:
         """Return the delay in seconds of data sent at ``sent_s`` on the sender's clock and received at ``now``."""
         offset = now - sent_s
-        smallest = None if self._min_offset is None else self._min_offset + _MAX_DRIFT * (now - self._at)
-        if smallest is None or offset <= smallest:
-            self._min_offset, self._at = offset, now
-            return 0.0
-        return offset - smallest
+        if self._min_offset is not None:
+            min_offset = self._min_offset + _MAX_DRIFT * (now - self._measured_at)
+            if offset > min_offset:
+                return offset - min_offset
+        self._min_offset, self._measured_at = offset, now
+        return 0.0
 
 
 class VehicleSideTracker:
@@ -344,8 +349,8 @@ class VehicleSideTracker:
         self.received_at: float = 0.0
         """Time of the last valid beacon."""
         self._nonce, self._mode = nonce, mode
-        self._beacon = 0
-        self._sequence = 0
+        self._beacon = 0  # number of the last valid beacon; 0: none
+        self._sequence = 0  # number of the last datagram sent
         self._delays = DelayEstimator()
 
     def receive_beacon(self, beacon: Beacon, now: float) -> bool:

@@ -38,20 +38,20 @@ _STAMP = struct.Struct(">BBIIII")  # version, control mode, epoch, beacon, nonce
 _SENT = struct.Struct(">BIQ")  # version, epoch, milliseconds on the sender's clock
 
 
-def check_name(what: str, name: str) -> str:
+def check_name(argument: str, name: str) -> str:
     """Return ``name`` if it may be part of a key.
 
     Names have up to 63 letters, digits, ``_``, ``.`` and ``-``, and start with a letter or digit. A client must not be
-    named "all". ``what`` is the argument's name for the error text.
+    named "all". ``argument`` is the argument's name for the error text.
 
     Raises:
         InvalidArgument: the name is not allowed.
     """
-    if what == "client" and name == _ALL_CLIENTS:
-        raise InvalidArgument(f"client = {name!r} is not allowed: this key is for all clients")
+    if argument == "client" and name == _ALL_CLIENTS:
+        raise InvalidArgument(f"client = {name!r} is not allowed: this name stands for all clients")
     if not _NAME.fullmatch(name):
         raise InvalidArgument(
-            f"{what} = {name!r} is not allowed: up to 63 letters, digits, '_', '.' and '-', a letter or digit first"
+            f"{argument} = {name!r} is not allowed: up to 63 letters, digits, '_', '.' and '-', a letter or digit first"
         )
     return name
 
@@ -112,7 +112,7 @@ class Beacon(Snapshot):
 
     @classmethod
     def decode(cls, data: bytes) -> Beacon | None:
-        fields = _object(data)
+        fields = _decode_object(data)
         epoch, number, holder = fields.get("epoch"), fields.get("number"), fields.get("holder")
         clock = fields.get("clock_s")
         if not (_is_u32(epoch) and _is_u32(number) and isinstance(clock, (int, float))):
@@ -162,13 +162,20 @@ class RefusalNotice(Snapshot):
     """Refused messages since the last notice."""
 
     def encode(self) -> bytes:
-        fields = {"version": VERSION, "event": "order_refused", "message": self.message, "reason": self.reason}
-        rest = {"holder": self.lease_holder, "answer": self.answer.hex(), "count": self.count}
-        return json.dumps({**fields, **rest}).encode()
+        fields = {
+            "version": VERSION,
+            "event": "order_refused",
+            "message": self.message,
+            "reason": self.reason,
+            "holder": self.lease_holder,
+            "answer": self.answer.hex(),
+            "count": self.count,
+        }
+        return json.dumps(fields).encode()
 
     @classmethod
     def decode(cls, data: bytes) -> RefusalNotice | None:
-        fields = _object(data)
+        fields = _decode_object(data)
         if fields.get("event") != "order_refused":
             return None
         message, reason, holder = fields.get("message"), fields.get("reason"), fields.get("holder")
@@ -186,12 +193,12 @@ class RefusalNotice(Snapshot):
         )
 
 
-def sent_at(epoch: int, clock_s: float) -> bytes:
+def encode_sent_at(epoch: int, clock_s: float) -> bytes:
     """Return the attachment of a vehicle side's datagrams: send time on its own clock."""
     return _SENT.pack(VERSION, epoch, int(clock_s * 1000))
 
 
-def read_sent_at(data: bytes) -> tuple[int, float] | None:
+def decode_sent_at(data: bytes) -> tuple[int, float] | None:
     """Return epoch and seconds from an attachment; None if it is invalid."""
     if len(data) != _SENT.size:
         return None
@@ -199,7 +206,8 @@ def read_sent_at(data: bytes) -> tuple[int, float] | None:
     return (epoch, milliseconds / 1000) if version == VERSION else None
 
 
-def _object(data: bytes) -> dict[str, object]:
+def _decode_object(data: bytes) -> dict[str, object]:
+    """Return the fields of a JSON object of this protocol version; empty if it is invalid."""
     try:
         fields = json.loads(data)
     except (ValueError, RecursionError):

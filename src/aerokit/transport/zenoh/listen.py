@@ -20,7 +20,7 @@ from aerokit.transport.zenoh.control_lease import (
     ControlLease,
     FreshnessChecker,
 )
-from aerokit.transport.zenoh.keys import Beacon, KeySpace, RefusalNotice, Stamp, check_name, sent_at
+from aerokit.transport.zenoh.keys import Beacon, KeySpace, RefusalNotice, Stamp, check_name, encode_sent_at
 from aerokit.transport.zenoh.session import (
     MAX_PAYLOAD_BYTES,
     LoopQueue,
@@ -70,8 +70,8 @@ class ZenohListen(NetworkLink):
         self._refused = 0  # number of refused messages of former clients
         self._zenoh: Any = None
         self._publisher: Any = None
-        self._has_others = self._is_serving = False
-        self._rival = asyncio.Event()
+        self._may_have_rival = self._is_serving = False
+        self._rival_found = asyncio.Event()  # set when another vehicle side sends a beacon under this name
         self._beacon_at = 0.0
 
     @property
@@ -98,9 +98,9 @@ class ZenohListen(NetworkLink):
         """See `Link.write`. Data for all clients is sent once."""
         if self._session is None or not self._is_serving:
             return
-        attachment = sent_at(self._freshness.epoch, self._now())
+        attachment = encode_sent_at(self._freshness.epoch, self._now())
         if peer is None:
-            self._try(lambda: self._publisher.put(bytes(data), attachment=attachment))
+            self._put_or_drop(lambda: self._publisher.put(bytes(data), attachment=attachment))
         elif peer in self._clients:
             self._put(self._keys.from_vehicle(str(peer)), bytes(data), attachment)
         else:
@@ -115,9 +115,10 @@ class ZenohListen(NetworkLink):
         self._queue = LoopQueue(call)
         self._session = await open_session(self.address, self._options, partial(self._find_rivals, self._queue))
         self._released.clear()
-        if self._has_others:
+        if self._may_have_rival:
             with anyio.move_on_after(_RIVAL_TIMEOUT_S):
-                await self._rival.wait()
+                await self._rival_found.wait()
+                # Reached only if another vehicle side has sent a beacon before the time-out.
                 raise LinkOpenError(f"cannot open {self.address}: another program serves this name")
         self._is_serving = True
         self._serve(self._queue)
@@ -133,11 +134,12 @@ class ZenohListen(NetworkLink):
 
         self._zenoh = zenoh
         self._declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
-        self._has_others = any(
+        self._may_have_rival = any(
             True for _ in session.liveliness().get(self._keys.alive(), timeout=_RIVAL_QUERY_TIMEOUT_S)
         )
 
     def _serve(self, queue: LoopQueue[Callable[[], object]]) -> None:
+        """Declare what clients need. The callbacks run on threads of zenoh, and post to the event loop."""
         zenoh, session, keys = self._zenoh, self._session, self._keys
 
         def on_datagram(sample: Any) -> None:
@@ -164,7 +166,8 @@ class ZenohListen(NetworkLink):
         self._clients.clear()
         if session is not None and self._is_serving:
             self._is_serving = False
-            goodbye = sent_at(self._freshness.epoch, 0.0)
+            # Deleting the beacon tells clients that we have closed.
+            goodbye = encode_sent_at(self._freshness.epoch, 0.0)
             drop = self._zenoh.CongestionControl.DROP
             with contextlib.suppress(Exception):
                 session.delete(self._keys.beacon, congestion_control=drop, attachment=goodbye)
@@ -176,9 +179,10 @@ class ZenohListen(NetworkLink):
         if client is None:
             return
         client.received_at = now
-        stamp, late = Stamp.decode(attachment), self._freshness.late
+        stamp, late_before = Stamp.decode(attachment), self._freshness.late
         if not self._freshness.accepts(name, stamp, now) or stamp is None:
-            if self._freshness.late > late:
+            is_late = self._freshness.late > late_before  # otherwise the datagram is a duplicate
+            if is_late:
                 self._send_notices(name, client.refuse_late(data, now))
             return
         if stamp.mode == "take":
@@ -199,7 +203,7 @@ class ZenohListen(NetworkLink):
         return client
 
     def _remove_silent_client(self) -> None:
-        # A client without a liveliness token, or whose end was missed, must not block new clients.
+        # A client that never had a liveliness token, or whose leaving was missed, must not block new clients.
         oldest = min(self._clients, key=lambda name: self._clients[name].received_at)
         if self._now() - self._clients[oldest].received_at > CLIENT_TIMEOUT_S:
             self._remove_client(str(oldest))
@@ -219,9 +223,9 @@ class ZenohListen(NetworkLink):
 
     def _on_beacon(self, data: bytes) -> None:
         beacon = Beacon.decode(data)
-        if beacon is None or beacon.epoch == self._freshness.epoch or self._rival.is_set():
+        if beacon is None or beacon.epoch == self._freshness.epoch or self._rival_found.is_set():
             return
-        self._rival.set()
+        self._rival_found.set()
         if self._is_serving:
             logger.warning("%s: another program serves the same name; clients keep the first one", self.address)
 
@@ -240,9 +244,9 @@ class ZenohListen(NetworkLink):
         drop = self._zenoh.CongestionControl.DROP
         session = self._session
         if session is not None:
-            self._try(lambda: session.put(key, data, congestion_control=drop, attachment=attachment))
+            self._put_or_drop(lambda: session.put(key, data, congestion_control=drop, attachment=attachment))
 
-    def _try(self, put: Callable[[], object]) -> None:
+    def _put_or_drop(self, put: Callable[[], object]) -> None:
         try:
             put()
         except Exception:  # zenoh's error after the end of the session

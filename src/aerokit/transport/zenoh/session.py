@@ -34,7 +34,7 @@ class LoopQueue(Generic[ItemT]):
         self.dropped: int = 0
         """Number of dropped items."""
         self._loop = asyncio.get_running_loop()
-        self._process: Callable[[ItemT], object] | None = process
+        self._process: Callable[[ItemT], object] | None = process  # None after close()
         self._limit = limit
         self._waiting: deque[ItemT] = deque()
         self._is_scheduled = False
@@ -138,7 +138,7 @@ class NetworkLink(BaseLink):
     def __init__(self, address: str) -> None:
         super().__init__(address)
         self._session: Any = None
-        self._declared: list[Any] = []  # declarations end when they are garbage-collected
+        self._declared: list[Any] = []  # kept, because a declaration ends when it is garbage-collected
         self._queue: LoopQueue[Callable[[], object]] | None = None
         self._timer: asyncio.TimerHandle | None = None
 
@@ -190,6 +190,7 @@ async def open_session(address: str, options: NetworkOptions, prepare: Callable[
 
 
 def close_session(session: Any, closed: Callable[[], object]) -> None:
+    """Close a session on a thread, because closing may block, and then call ``closed()``."""
 
     def work() -> None:
         with contextlib.suppress(Exception):  # the session is closed in any case
@@ -205,6 +206,7 @@ def close_session(session: Any, closed: Callable[[], object]) -> None:
 
 
 def call(function: Callable[[], object]) -> object:
+    """Call a function: the ``process`` argument of a `LoopQueue` of functions."""
     return function()
 
 
@@ -227,7 +229,8 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         raise InvalidArgument(f"{address}: {_reason(error)}") from error
-    for key, value in (_DROP_AT_ONCE, *(_SETTINGS if not options.config else ())):
+    defaults = () if options.config else _SETTINGS  # a configuration file replaces them
+    for key, value in (_DROP_AT_ONCE, *defaults):
         with contextlib.suppress(zenoh.ZError):  # this version of zenoh does not know the option
             config.insert_json5(key, json.dumps(value))
     return config
@@ -245,15 +248,15 @@ def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
         yield "scouting/multicast/enabled", False
         yield "scouting/delay", 0  # do not wait for discovered peers
         if not options.listen:
-            yield "listen/endpoints", []
+            yield "listen/endpoints", []  # by default, a peer listens on all interfaces
 
 
 def _reason(error: Exception) -> str:
     """Return the error text without zenoh's source location."""
     text = str(error).split(" at /", 1)[0].strip().rstrip("!.") or type(error).__name__
     if text.startswith(_CONNECT_FAILED):
-        where = ", ".join(_ENDPOINTS.findall(text)) or text
-        return f"cannot connect to {where} (is a router or peer running there, and is this its address?)"
+        endpoints = ", ".join(_ENDPOINTS.findall(text)) or text
+        return f"cannot connect to {endpoints} (is a router or peer running there, and is this its address?)"
     return text.replace(": [", ": ")
 
 

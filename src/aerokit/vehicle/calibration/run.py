@@ -202,7 +202,7 @@ class CalibrationRun:
         finally:
             self.finish()
 
-    def _is_cancelled(self, command: float) -> bool:
+    def _is_cancelled(self, cancel_command: float) -> bool:
         """Return True if the vehicle has confirmed the cancellation: ArduPilot by COMMAND_ACK, PX4 by HEARTBEAT.
 
         PX4's acknowledgements are no confirmation, because PX4 sends two with different results.
@@ -210,8 +210,9 @@ class CalibrationRun:
         if self._has_rebooted:
             return True
         assert self._cancelled_at is not None
-        if command != MavCmd.PREFLIGHT_CALIBRATION:
-            return self.session.commands.accepted_at(int(command)) >= self._cancelled_at
+        # PX4 is cancelled by PREFLIGHT_CALIBRATION with zeros, ArduPilot by commands of their own.
+        if cancel_command != MavCmd.PREFLIGHT_CALIBRATION:
+            return self.session.commands.accepted_at(int(cancel_command)) >= self._cancelled_at
         status = self.session.telemetry.system_status
         return status.updated_at > self._cancelled_at and status.latest != MavState.CALIBRATING
 

@@ -76,7 +76,7 @@ class LensMixin(CameraMixin):
         await self._set("zoom_to", HAS_ZOOM, ZOOM, CameraZoomType.RANGE, percent)
 
     async def zoom_to_focal_length(self, millimetres: float) -> None:
-        """Zoom to a focal length, above 0 to 10,000 mm; errors as for :meth:`zoom_step`."""
+        """Zoom to a focal length, above 0 and at most 10,000 mm; errors as for :meth:`zoom_step`."""
         check_range("millimetres", millimetres, 0, 10_000, above=True)
         await self._set("zoom_to_focal_length", HAS_ZOOM, ZOOM, CameraZoomType.FOCAL_LENGTH, millimetres)
 
@@ -114,7 +114,7 @@ class LensMixin(CameraMixin):
         await self._set("focus_to", HAS_FOCUS, FOCUS, SetFocusType.RANGE, percent)
 
     async def focus_at(self, metres: float) -> None:
-        """Focus at a distance, above 0 to 100,000 m; errors as for :meth:`focus_step`."""
+        """Focus at a distance, above 0 and at most 100,000 m; errors as for :meth:`focus_step`."""
         check_range("metres", metres, 0, 100_000, above=True)
         await self._set("focus_at", HAS_FOCUS, FOCUS, SetFocusType.METERS, metres)
 
@@ -195,7 +195,7 @@ class TrackingMixin(CameraMixin):
             x: 0 (left) to 1 (right).
             y: 0 (top) to 1 (bottom).
             radius: radius of the object as a fraction of the image width, 0 (one pixel) to 1.
-            status_hz: rate of ``camera.tracking``, above 0 to 50.
+            status_hz: rate of ``camera.tracking``, above 0 and at most 50.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
@@ -223,7 +223,7 @@ class TrackingMixin(CameraMixin):
             top: 0 to 1.
             right: 0 to 1, right of ``left``.
             bottom: 0 to 1, below ``top``.
-            status_hz: rate of ``camera.tracking``, above 0 to 50.
+            status_hz: rate of ``camera.tracking``, above 0 and at most 50.
         """
         for name, value in zip(EDGE_NAMES, (left, top, right, bottom), strict=True):
             check_range(name, value, 0, 1)

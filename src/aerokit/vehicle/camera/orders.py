@@ -54,7 +54,7 @@ class _ResendGuard:
 
 
 class CameraOrders:
-    """Base class of `CameraLink`: orders and commands to one camera."""
+    """Base class of `CameraLink`: sends commands to one camera, and withdraws them when a newer order replaces them."""
 
     _context: VehicleContext
     _session: VehicleSession

@@ -235,7 +235,7 @@ class GimbalDevice:
         self.controllers.set(GimbalControllers(primary, secondary), self._source(message))
 
     def update_manager(self, component_id: int, rank: int, *, is_gone: bool) -> None:
-        """Choose between two managers: the one with the higher rank, or the earlier one unless it is gone."""
+        """Record a manager. It replaces the present manager if it has a higher rank, or if the present one is gone."""
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
         elif self.manager_id is None or rank > self._manager_rank or is_gone:

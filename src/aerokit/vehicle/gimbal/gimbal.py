@@ -87,7 +87,7 @@ class RoiMixin(GimbalMixin):
         Args:
             target: the position.
             wait: False: return when the manager has accepted the order.
-            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
 
         Raises:
@@ -125,7 +125,7 @@ class RoiMixin(GimbalMixin):
         Args:
             system_id: MAVLink system id of the other vehicle, 1 to 255.
             wait: False: return when the manager has accepted the order.
-            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
 
         Raises:

@@ -239,7 +239,7 @@ class PointingMixin(GimbalMixin):
                 then turns with the vehicle, so a yaw from north is right only at the time of the order.
             frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards.
             wait: False: return when the manager has accepted the order.
-            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
 
         Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. If the manager denies it, aerokit claims control until

@@ -1,4 +1,7 @@
-"""Subscriptions and cells for the messages of one component, with requests for the rates that they need."""
+"""Subscriptions to the messages of one component, and state cells with their latest values.
+
+Both request the rates that they need from the vehicle.
+"""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ __all__ = ["ActuatorControls", "AirPressure", "Aircraft", "Altitude", "Imu", "Od
 
 # Factors: thousandths of g to m/s², milligauss to microtesla, hectopascal to pascal, radians to degrees.
 MG_M_S2, MGAUSS_UT, HPA_PA, RAD_DEG = 9.80665e-3, 0.1, 100.0, math.degrees(1)
-# ALTITUDE.altitude_terrain below this is unknown; the temperature of a sensor that is unknown is sent as 0.
+# ALTITUDE.altitude_terrain below NO_TERRAIN_M means unknown, and so does a sensor temperature of 0.
 NO_TERRAIN_M, UNKNOWN_TEMPERATURE = -1000.0, 0
 MAX_AIRCRAFT = 64
 

@@ -198,7 +198,7 @@ class Telemetry(States):
             self._arrived_at = outer_arrived_at
 
     def _handler(self, class_name: str) -> Handler:
-        """Return the handler for a message class, which updates all cells that the message reports."""
+        """Return the handler for a message class: it updates the state cells of all values in the message."""
         special_handlers: Mapping[str, Handler] = {
             "AvailableModes": self._on_available_modes,
             "Statustext": self._on_status_text,
@@ -211,6 +211,7 @@ class Telemetry(States):
             for update in updates:
                 update(message, source)
 
+        # A ground station or companion may send heartbeats with the autopilot's ids.
         def on_heartbeat(message: Any, source: Source) -> None:
             if self._is_of_autopilot(message):
                 update_all(message, source)

@@ -28,7 +28,7 @@ def orders_in(crossings: list[TrafficEntry]) -> list[TrafficEntry]:
     return [
         crossing
         for crossing in crossings
-        if kind_of(crossing.message.NAME, is_for_one=True) is MessageKind.ORDER
+        if kind_of(crossing.message.NAME, has_target=True) is MessageKind.ORDER
         and getattr(crossing.message, "command", None) not in REQUEST_COMMANDS
     ]
 
