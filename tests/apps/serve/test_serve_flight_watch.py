@@ -205,6 +205,19 @@ def test_impact_on_hill_counts_once_vehicle_is_disarmed() -> None:
     assert flight.fly([(30.0, 0.0)] * 3)
 
 
+def test_jumping_height_after_impact_does_not_hide_crash() -> None:
+    """PX4's estimate after a fall, measured in its simulator."""
+    assert FakeFlight().fly([*sinking(40, 90.0, 0.0)[:-120], *[(0.0, 0.0), (1.1, 0.0), (0.0, 0.0), (-1.1, 0.0)] * 10])
+
+
+def test_slow_landing_after_hard_braking_is_no_crash() -> None:
+    flight, landing = FakeFlight(), [(2.0 - 0.05 * step, 0.5) for step in range(40)]
+    assert not flight.fly([*sinking(42, 15.0, 2.0)[:-115], *landing])
+    flight.landed_state.set(MavLandedState.ON_GROUND, flight.now)
+    flight.armed.set(False, flight.now)
+    assert not flight.fly([(0.0, 0.0)] * 40)
+
+
 def test_landing_long_after_hard_braking_is_no_crash() -> None:
     flight = FakeFlight()
     assert not flight.fly(sinking(41, 15.0, 0.8))

@@ -30,7 +30,10 @@ CRASH_EVIDENCE_WITHIN_S = 10.0
 """A vehicle that reports later that it is on the ground has perhaps landed there."""
 CRASH_HEIGHT_M = 3.0
 """A vehicle that still reports that it flies is taken for crashed only below this height above home."""
-CRASH_STILL_HEIGHT_M = 1.0
+CRASH_STILL_CLIMB_M_S = 0.3
+"""A vehicle that moves up or down faster after an impact is landing, or flies."""
+CRASH_STILL_HEIGHT_M = 2.5
+"""PX4's estimate of the height jumps by up to 2 m in the 5 s after an impact, while the vehicle lies there."""
 CRASH_STOP_M_S2 = 20.0
 """Such a vehicle must also have stopped with this deceleration, which motors do not reach close to the ground."""
 CRASH_ARMED_WITHIN_S = 30.0
@@ -141,7 +144,7 @@ class FlightWatch:
         elif not had_impact:
             self._begin(at, down_m_s)
         if self._impact_at is not None:
-            self._follow(at, max(velocity.ground_speed_m_s, abs(down_m_s)))
+            self._follow(at, velocity.ground_speed_m_s, abs(down_m_s))
 
     def _begin(self, at: float, down_m_s: float) -> None:
         self._forget_impact()
@@ -150,14 +153,15 @@ class FlightWatch:
         armed = self._vehicle.armed.latest
         self._is_over = not armed and at - self._armed_until > CRASH_ARMED_WITHIN_S
 
-    def _follow(self, at: float, speed_m_s: float) -> None:
+    def _follow(self, at: float, ground_speed_m_s: float, climb_m_s: float) -> None:
         if self._is_over or self._impact_at is None:
             return
         if self._crash is not None:
-            if self._vehicle.armed.latest and speed_m_s >= MOVING_M_S:
+            if self._vehicle.armed.latest and max(ground_speed_m_s, climb_m_s) >= MOVING_M_S:
                 self._end()
             return
-        if speed_m_s < STILL_M_S and self._is_at_impact_height():
+        is_still = ground_speed_m_s < STILL_M_S and climb_m_s < CRASH_STILL_CLIMB_M_S
+        if is_still and self._is_at_impact_height():
             self._still_since = min(self._still_since, at)
             self._still_samples += 1
         elif at - self._impact_at <= CRASH_STILL_WITHIN_S:
