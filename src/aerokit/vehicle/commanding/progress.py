@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal import geo
 from aerokit._internal.arguments import check_range
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavFrame, MavLandedState
+from aerokit.mavlink.enums import MavFrame, MavLandedState, MavSeverity
 from aerokit.position import Position
 from aerokit.vehicle.state.telemetry import height_above_home
 
@@ -38,6 +38,9 @@ FALL_SINK_M_S = 3.0
 
 FALL_EVIDENT_S = 0.5
 """After falling for this time, a vehicle sinks faster than ``FALL_SINK_M_S``, even with air resistance."""
+
+HIT_GROUND = "the vehicle hit the ground"
+"""Beginning of the clause about an impact."""
 
 FALL_STOP_S = 1.5
 """Maximum seconds from a fast descent to a standstill on the ground that together count as a fall."""
@@ -82,7 +85,7 @@ async def await_progress(
                 return
             if done_since is None and (reason := failure_reason()):
                 reason += _height_when_disarmed(session)
-                raise OperationRejected(f"{operation}: {reason}", reasons=session.texts_since(started))
+                raise OperationRejected(f"{operation}: {reason}", reasons=_reasons(session, reason, started))
             if max_silence_s is not None and session.watch.silent_for_s > max_silence_s:
                 raise HeartbeatTimeout(f"{operation}: {session.describe_link()}")
             if timeout is not None and now - started >= timeout:
@@ -92,6 +95,13 @@ async def await_progress(
             if stall_reason is not None and (stall := stall_reason()):
                 raise OperationTimeout(f"{operation}: {stall}; {describe()}; {session.describe_link()}")
             await changes.next(POLL_INTERVAL_S)
+
+
+def _reasons(session: VehicleSession, reason: str, since: float) -> tuple[str, ...]:
+    """Return the status texts that may explain a failure. Texts about normal progress do not explain an impact."""
+    texts = session.telemetry.texts_since(since)
+    is_impact = reason.startswith(HIT_GROUND)
+    return tuple(text.text for text in texts if not is_impact or text.severity < MavSeverity.INFO)
 
 
 def _height_when_disarmed(session: VehicleSession) -> str:

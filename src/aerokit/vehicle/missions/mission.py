@@ -98,7 +98,7 @@ class MissionEndDetector:
         session, now = self._session, self._session.connection.now()
         if self._vehicle_context.arbiter.newest not in (self._order, order):
             return "another order was given"
-        fall = self._ground.fall() if self._is_on_ground else None
+        fall = self._ground.fall()
         if fall:
             return f"{fall}, {self.describe()}"
         if self._ground.is_pending:  # `has_ended` has not decided yet whether this is a landing.
