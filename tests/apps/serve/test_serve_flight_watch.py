@@ -126,7 +126,7 @@ class FakeCell:
     """A state whose values and times the test sets."""
 
     def __init__(self, value: Any = None) -> None:
-        self.latest, self.updated_at = value, 0.0
+        self.latest, self.updated_at, self.age = value, 0.0, 0.0
         self.observers: list[Callable[[Any, Any], None]] = []
 
     def observe(self, callback: Callable[[Any, Any], None], *, every_arrival: bool = False) -> Callable[[], None]:
