@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from aerokit.vehicle.commanding.progress import FALL_SINK_M_S, HIT_GROUND, POSITION_MAX_AGE_S
 from aerokit.vehicle.state.telemetry import height_above_home
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from aerokit.vehicle.session.session import VehicleSession
 
@@ -112,6 +113,15 @@ class GroundCheck:
         self._reported_at: float | None = None
         self._reported_height_m: float | None = None
         self._settled_since = math.inf
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Process every velocity that arrives within the block, rather than only the last one before each check."""
+        detach = self._session.telemetry.velocity.observe(lambda *_: self._impact.update())
+        try:
+            yield
+        finally:
+            detach()
 
     @property
     def is_pending(self) -> bool:

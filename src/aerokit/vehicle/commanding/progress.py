@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 POLL_INTERVAL_S = 0.25
-"""Seconds between evaluations of the state when no message arrives, as during a silence of the vehicle."""
+"""Maximum seconds between two evaluations of the state, as during a silence of the vehicle."""
 
 MAX_SILENCE_S = 10.0
 """Default number of seconds without a heartbeat after which an operation fails."""
@@ -57,10 +57,12 @@ async def await_progress(
     max_silence_s: float | None = MAX_SILENCE_S,
     held_for: float = 0.0,
     stall_reason: Callable[[], str | None] | None = None,
+    at_positions: bool = True,
 ) -> None:
     """Return when ``is_done()`` has been true for ``held_for`` seconds.
 
-    All functions are called whenever the vehicle's state changes. ``operation`` is the name for error texts.
+    All functions are called every ``POLL_INTERVAL_S``, and whenever the mode, the arming or the landed state changes;
+    with ``at_positions`` also at each new position. ``operation`` is the name for error texts.
 
     Raises:
         OperationRejected: ``failure_reason()`` returned a reason why the operation cannot succeed.
@@ -71,7 +73,9 @@ async def await_progress(
     """
     started = session.connection.now()
     telemetry = session.telemetry
-    cells = (telemetry.mode, telemetry.armed, telemetry.position, telemetry.landed_state)
+    cells: list[StateCell[Any]] = [telemetry.mode, telemetry.armed, telemetry.landed_state]
+    if at_positions:
+        cells.append(telemetry.position)
     done_since: float | None = None
     with ChangeSignal(session, *cells) as changes:
         while True:
