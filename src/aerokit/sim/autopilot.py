@@ -157,9 +157,9 @@ class SimulatedAutopilot(SimulatedVehicle):
     """MAV_PROTOCOL_CAPABILITY flags."""
 
     files: FileTree
-    """Files on the memory card and generated files; they survive a reboot."""
+    """Files on the memory card and generated files, which survive a reboot."""
     signing: VehicleSigning
-    """Message signing; its key survives a reboot."""
+    """Message signing, whose key survives a reboot."""
     motion: Motion
 
     def __init__(

@@ -61,8 +61,8 @@ class ArduPilotParameterServer(ParameterServer):
     behaviour of the development version of 4.7. With ``errors``, as in the released version, the answer is PARAM_ERROR,
     and PARAM_SET is confirmed on the sender's port in addition to the broadcast.
 
-    One read request is served each millisecond. Up to 20 requests wait in a queue; further requests are lost. The
-    banner texts are sent before a list.
+    One read request is served each millisecond. Up to 20 requests wait in a queue, and further requests are lost.
+    The banner texts are sent before a list.
     """
 
     def __init__(

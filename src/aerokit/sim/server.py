@@ -40,7 +40,7 @@ class SimulatorServer:
     An exception in a vehicle or a callback closes the links and cancels the task that runs the block. The block then
     raises the exception.
 
-    Raises LinkOpenError if a link cannot be opened; the other links are closed again.
+    Raises LinkOpenError if a link cannot be opened. The other links are then closed again.
     """
 
     def __init__(

@@ -65,7 +65,7 @@ class AttachableComponent(Protocol):
         ...
 
     def join(self, vehicle: SimulatedVehicle) -> None:
-        """Join a vehicle; the vehicle calls this once."""
+        """Add the component to a vehicle. The vehicle calls this method once."""
         ...
 
 
@@ -95,7 +95,7 @@ class SimulatedVehicle:
     """Base of a simulated vehicle, which does no I/O. Subclasses define messages, streams and motion.
 
     `receive` and `step` take the time, `take_outbox` returns bytes, and `next_due` is the time of the next event.
-    The first link uses the first channel; call `open_channel` for each further link.
+    The first link uses the first channel. Call `open_channel` for each further link.
     """
 
     def __init__(
@@ -248,12 +248,12 @@ class SimulatedVehicle:
         return False
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Call a function at a simulated time; a reboot cancels the call."""
+        """Call a function at a simulated time. A reboot cancels the call."""
         self._timer_count += 1
         heappush(self._timers, (when, self._timer_count, action))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
-        """Call a function after ``delay`` simulated seconds; a reboot cancels the call."""
+        """Call a function after ``delay`` simulated seconds. A reboot cancels the call."""
         self.call_at(self.now + delay, action)
 
     def every(self, interval: float, action: Callable[[], None], *, first: float | None = None) -> None:

@@ -39,7 +39,7 @@ LIMIT = 256 * 1024
 
 
 class StalledQueue:
-    """Simulates a stalled TCP connection. The operating system accepts ``system_bytes``; further bytes are queued.
+    """Simulates a stalled TCP connection. The operating system accepts ``system_bytes``, and further bytes are queued.
 
     ``carry(data, peer)`` sends bytes. ``on_drop`` is called with the number of dropped writes, and ``on_stall`` with
     True or False when the connection stalls or continues.
@@ -130,7 +130,7 @@ class FaultyLink(Link):
     the default of both. Each direction has a separate random generator, derived from ``seed``, so that a program on
     virtual time gets the same faults in every run. With ``half_duplex``, only one direction transmits at a time.
 
-    The wrapped link must not be open; this link opens and closes it.
+    The wrapped link must not be open, because this link opens and closes it.
     """
 
     def __init__(

@@ -59,7 +59,7 @@ class RecordedParameters(ParameterProtocolServer):
         self._has_hash = is_complete and HASH_NAME in without_index
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
-        """Return the latest PARAM_VALUE that was written or played; before that, the first recorded one."""
+        """Return the latest PARAM_VALUE that was written or played or, before that, the first recorded one."""
         position, recorded = self._vehicle.position_s, self._recorded[name]
         latest = next((value for time, value in reversed(recorded) if time <= position), recorded[0][1])
         written = self._written.get(name, latest.param_value)
@@ -298,7 +298,7 @@ class RecordedVehicle(SimulatedVehicle):
         return None
 
     def _answer_to(self, command: ReceivedCommand) -> RecordedAnswer | None:
-        """Return the recorded answer to a command. Equal commands get successive answers; the last answer repeats."""
+        """Return the recorded answer to a command. Equal commands get successive answers, and the last answer repeats."""
         answers = self.recording.answers.get(command.command, [])
         params = (command.param1, command.param2, command.param3, command.param4)
         # The params are compared as texts, because NaN is not equal to NaN.
@@ -323,7 +323,7 @@ class RecordedVehicle(SimulatedVehicle):
         return self._on_command(command)
 
     def _latest_message(self, message_id: int) -> Message | None:
-        """Return the latest message with this id that was played; before that, the first recorded one.
+        """Return the latest message with this id that was played or, before that, the first recorded one.
 
         Return None if the recording contains no such message.
         """

@@ -57,7 +57,7 @@ class RecordedPlan:
 
 
 class RecordedFlight:
-    """What a recording tells about one vehicle. Times are seconds since the vehicle's first message, without long gaps.
+    """Content of a recording about one vehicle. Times are seconds since the vehicle's first message, without long gaps.
 
     If ``system_id`` is None, the vehicle is the first autopilot with a HEARTBEAT. Raises InvalidArgument if the
     recording contains no such vehicle, and OSError if the file cannot be read.

@@ -37,7 +37,7 @@ _ON_GROUND_M = 0.3
 class Track(Sequence[TrackPoint]):
     """The true points of a flight, from the oldest to the newest. The track grows while the vehicle runs.
 
-    Assertions raise AssertionError; all of them fail on an empty track.
+    Assertions raise AssertionError. All of them fail on an empty track.
     """
 
     def __init__(self, home: Position, points: Sequence[TrackPoint] = (), *, name: str = "track") -> None:
@@ -90,12 +90,12 @@ class Track(Sequence[TrackPoint]):
 
     @property
     def max_altitude_m(self) -> float:
-        """Maximum altitude above home."""
+        """Maximum altitude above home in metres."""
         return self._highest().altitude_m
 
     @property
     def max_distance_m(self) -> float:
-        """Maximum distance from home, along the ground."""
+        """Maximum distance from home in metres, along the ground."""
         return self._farthest(self.home)[0]
 
     @property
@@ -114,7 +114,7 @@ class Track(Sequence[TrackPoint]):
 
     @property
     def max_speed_m_s(self) -> float:
-        """Maximum ground speed."""
+        """Maximum ground speed in m/s."""
         return self._fastest().speed_m_s
 
     @property
@@ -124,7 +124,7 @@ class Track(Sequence[TrackPoint]):
 
     @property
     def length_m(self) -> float:
-        """Length of the path, including climbs."""
+        """Length of the path in metres, including climbs."""
         return sum(math.dist(start, end) for start, end in pairwise(self.local()))
 
     def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:

@@ -18,12 +18,12 @@ class TrackPoint:
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
-    """Altitude above home."""
+    """Altitude above home in metres."""
     armed: bool
     mode: str
     """Mode name, as in ``vehicle.mode``."""
     speed_m_s: float = 0.0
-    """Ground speed."""
+    """Ground speed in m/s."""
     battery_percent: float = 100.0
 
     @property

@@ -153,7 +153,7 @@ class ArduPilotCamera:
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
     def focus(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_SET_CAMERA_FOCUS. Focus by rate or in percent is accepted; autofocus is unsupported."""
+        """Handle MAV_CMD_SET_CAMERA_FOCUS. Focus by rate or in percent is accepted. Autofocus is UNSUPPORTED."""
         kind = whole(command.param1)
         if kind in (SetFocusType.STEP, SetFocusType.METERS) or kind not in list(SetFocusType):
             return MavResult.DENIED

@@ -263,7 +263,7 @@ class HomeAndOrigin:
             return self._make_home(vehicle.motion.place) if nav.has_position else Result.FAILED
         if command.param1 != 0.0:
             return Result.FAILED
-        # COMMAND_LONG has no frame; the firmware then takes the altitude as AMSL.
+        # COMMAND_LONG has no frame, and the firmware takes its altitude as AMSL.
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
         if frame not in _FRAMES:
             vehicle.info(f"Unknown mavlink coordinate frame {frame}")

@@ -168,7 +168,7 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
 class SimulatedCopter(CopterHost):
     """ArduCopter, as far as a client can observe it. `Motion` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`. It has 1,349 parameters; MNT1_TYPE 1 fits a gimbal with three axes.
+    Takes the arguments of `ArduPilotVehicle`. It has 1,349 parameters. MNT1_TYPE 1 fits a gimbal with three axes.
 
     Not simulated: braking before a fence, the terrain failsafe.
     """

@@ -296,7 +296,7 @@ class CopterAuto(MissionMode):
         self.vehicle.send(MissionItemReached(index))
 
     def end_mission(self) -> None:
-        """Hold the position in the air; disarm on the ground."""
+        """Hold the position in the air, or disarm on the ground."""
         if self.vehicle.is_landed:
             self.vehicle.arming.disarm()
         else:

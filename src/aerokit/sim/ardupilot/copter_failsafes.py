@@ -295,7 +295,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
-        """Disarm on the ground; execute FENCE_ACTION in the air."""
+        """Execute FENCE_ACTION in the air, or disarm on the ground."""
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
         if vehicle.is_landed:

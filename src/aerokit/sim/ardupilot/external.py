@@ -78,7 +78,7 @@ class ArduPilotExternal:
         self._target, self._target_at = (motion.north + north, motion.east + east), self._vehicle.now
 
     def set_wind(self, command: ReceivedCommand) -> int:
-        """Execute EXTERNAL_WIND_ESTIMATE; the wind has no effect."""
+        """Record the wind of EXTERNAL_WIND_ESTIMATE. It has no effect on the flight."""
         if command.param1 < 0 or not 0 <= command.param3 <= 360:
             return MavResult.DENIED
         self.wind = (command.param1, command.param3)

@@ -124,7 +124,7 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     @property
     def is_radio_healthy(self) -> bool:
-        """Health of the RC receiver in SYS_STATUS."""
+        """True if SYS_STATUS reports that the RC receiver is healthy."""
         return not self.is_radio_lost
 
     @property
@@ -145,7 +145,7 @@ class ArduPilotFailsafes(Generic[HostT]):
         self.vehicle.send_text(severity, text)
 
     def change_to(self, *modes: int) -> bool:
-        """Change to the first mode that is not refused; return False if all are refused."""
+        """Change to the first mode that is not refused. Return False if all modes are refused."""
         return any(self.vehicle.set_mode(mode) for mode in modes)
 
 

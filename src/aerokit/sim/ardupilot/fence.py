@@ -161,7 +161,7 @@ class ArduPilotFence(Generic[HostT]):
 
     @property
     def configured(self) -> int:
-        """FENCE_TYPE."""
+        """Kinds of fences in FENCE_TYPE, as a bit mask."""
         return int(self.vehicle.parameters["FENCE_TYPE"]) & _ALL
 
     @property
@@ -268,7 +268,7 @@ class ArduPilotFence(Generic[HostT]):
         return new_breaches
 
     def _update_breach(self, kind: int, beyond_m: float) -> bool:
-        """Record whether a limit is breached; return True for a new breach.
+        """Record whether a limit is breached. Return True for a new breach.
 
         A breach of a circle or an altitude limit that has grown by the backup distance counts as new.
         """

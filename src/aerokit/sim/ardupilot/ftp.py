@@ -72,7 +72,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             self._host.call_later(_WORKER_PERIOD_S, self._work)
 
     def _work(self) -> None:
-        """Process the queued requests. A burst interrupts this; the end of the burst calls this method again."""
+        """Process the queued requests. A burst interrupts this. The end of the burst calls this method again."""
         while self._queue and not self._is_bursting:
             request, channel = self._queue.popleft()
             peer = self._peer(request, channel)

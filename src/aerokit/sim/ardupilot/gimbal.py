@@ -90,7 +90,7 @@ class ArduPilotGimbal:
 
     @property
     def angles(self) -> tuple[float, float, float]:
-        """Roll, pitch and yaw of the servos in degrees; yaw is relative to the nose."""
+        """Roll, pitch and yaw of the servos in degrees. Yaw is relative to the nose."""
         if self.mode in _FIXED_ANGLE_MODES:
             return (self.target.roll, self.target.pitch, self.target.yaw)
         target, motion = self.target, self._vehicle.motion

@@ -313,7 +313,7 @@ class ArduPilotHost(SimulatedAutopilot):
     GIT_HASH: ClassVar[bytes] = b"5ae20c17"
 
     parameters: SimParameters
-    """Parameters by name. A test may change them; they survive a reboot."""
+    """Parameters by name. A test may change them, and they survive a reboot."""
     timeline: BootTimeline
     uid: bytes
     battery: SimulatedBattery
@@ -366,8 +366,8 @@ class ArduPilotHost(SimulatedAutopilot):
     def local_point(self, target: m.SetPositionTargetLocalNed, body_frames: Collection[int]) -> Ned:
         """Convert the position of a local set-point to the world frame.
 
-        In ``body_frames``, the position is relative to the vehicle's place and heading; in other frames than LOCAL_NED,
-        to the vehicle's place.
+        In LOCAL_NED, the position is relative to the estimator's origin, and in other frames to the vehicle's place. In
+        ``body_frames``, it is also rotated by the vehicle's heading.
         """
         offset, motion = (target.x, target.y, target.z), self.motion
         if target.coordinate_frame == MavFrame.LOCAL_NED:

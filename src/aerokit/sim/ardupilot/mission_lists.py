@@ -64,7 +64,7 @@ class ItemList:
 
 
 class CommandList(ItemList):
-    """The list of mission commands. Item 0 is home; the function ``home`` returns it at each download."""
+    """The list of mission commands. Item 0 is home, which the function ``home`` returns at each download."""
 
     name = "Mission"
 
@@ -264,7 +264,7 @@ class FenceList(ItemList):
         return True
 
     def store(self, items: Sequence[MissionItem], warn: Warn) -> int:
-        """Store a fence if it is valid and fits into the storage; otherwise send texts about the problem."""
+        """Store a fence if it is valid and fits into the storage. Otherwise send texts about the problem."""
         problem = _fence_problem(items)
         if problem is not None:
             warn(problem)
@@ -342,10 +342,10 @@ def _storage_needed(items: Sequence[MissionItem]) -> int:
         if vertices_left:
             vertices_left -= 1
             continue
-        size += 1  # The type of a polygon, circle or return point.
+        size += 1  # One byte for the type of a polygon, circle or return point.
         if item.command in _POLYGONS:
-            size += 1  # The number of vertices of a polygon.
+            size += 1  # One byte for the number of vertices.
             vertices_left = int(item.param1) - 1
         elif item.command in _CIRCLES:
-            size += 4  # The radius of a circle.
+            size += 4  # Four bytes for the radius.
     return size

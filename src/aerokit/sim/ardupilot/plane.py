@@ -181,7 +181,7 @@ class SimulatedPlane(PlaneHost):
         return self.change_to(PlaneMode.AUTO)
 
     def _reposition(self, command: ReceivedCommand) -> int:
-        """Fly to a place and circle there. Param 3 is the radius; any param 4 but 0 and NaN means anticlockwise."""
+        """Fly to a place and circle there. Param 3 is the radius. Any param 4 but 0 and NaN means anticlockwise."""
         if command.is_long:  # ArduPilot requires an altitude frame here, and COMMAND_LONG has none.
             return MavResult.UNSUPPORTED
         point = self.world_point(*command.place(), command.z, command.altitude_frame)

@@ -17,7 +17,7 @@ class PlaneHost(ArduPilotVehicle):
 
     def make_motion(self, wind: SimulatedWind | None) -> Motion:
         self.wing: FixedWing = FixedWing(self.rng, wind=wind)
-        """The motion model; the same object as ``motion``."""
+        """The motion model, which is the same object as ``motion``."""
         self._read_limits()
         return self.wing
 

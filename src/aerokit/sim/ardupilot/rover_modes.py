@@ -1,4 +1,4 @@
-"""Flight modes of a simulated ArduRover. FOLLOW, DOCK and INITIALISING are refused; SIMPLE drives like MANUAL."""
+"""Flight modes of a simulated ArduRover. FOLLOW, DOCK and INITIALISING are refused. SIMPLE drives like MANUAL."""
 
 from __future__ import annotations
 

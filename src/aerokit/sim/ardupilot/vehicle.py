@@ -106,7 +106,7 @@ class ArduPilotVehicle(ArduPilotHost):
         signing_key: SigningKey | None = None,
     ) -> None:
         self.parameters: SimParameters = parameters_of(self.KIND, parameter_count)
-        """Parameters by name. A test may change them; they survive a reboot."""
+        """Parameters by name. A test may change them, and they survive a reboot."""
         self.parameters["MAV_SYSID"] = system_id
         self.parameters.change(parameters or {})
         super().__init__(
@@ -132,7 +132,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.external: ArduPilotExternal = ArduPilotExternal(self)
         """Measurements received from companion computers."""
         self.missions: ArduPilotMissionServer = ArduPilotMissionServer(self)
-        """Mission, fence and rally points; they survive a reboot."""
+        """Mission, fence and rally points, which survive a reboot."""
         self._reset()
         self._listen()
         self.storage: ArduPilotStorage = ArduPilotStorage(

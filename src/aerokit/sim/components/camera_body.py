@@ -43,7 +43,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
     TYPE: ClassVar[int] = MavType.CAMERA
 
     parameters: ExtendedParameters
-    """Settings; available once the camera has joined a vehicle."""
+    """Settings, which exist once the camera has joined a vehicle."""
 
     def __init__(
         self,

@@ -68,7 +68,7 @@ class SimulatedComponent:
     addressed to the component, and ignored if it is a broadcast. The component's `faults` apply in addition to those of
     the vehicle.
 
-    A component belongs to one vehicle; adding it to a second vehicle raises InvalidArgument.
+    A component belongs to one vehicle. Adding it to a second vehicle raises InvalidArgument.
     """
 
     TYPE: ClassVar[int]

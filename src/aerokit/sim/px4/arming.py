@@ -43,7 +43,7 @@ def _side_texts(sensor: str, sides_done: int) -> list[str]:
 
 
 class Px4Calibration:
-    """Sensor calibration on the ground; one calibration runs at a time.
+    """Sensor calibration on the ground. Only one calibration runs at a time.
 
     ``side_s``: seconds that the measurement of each of the six poses takes. With infinity, as in SIH, the measurement
     of the first pose never ends.

@@ -109,7 +109,7 @@ class Px4Vehicle(Px4Host):
         self._pings = 0
         self.home: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self.missions: Px4MissionServer = Px4MissionServer(self)
-        """Mission, fence and rally points; they survive a reboot."""
+        """Mission, fence and rally points, which survive a reboot."""
         self.camera_trigger: Px4CameraTrigger = Px4CameraTrigger(self)
         """Camera trigger, enabled while the parameter TRIG_MODE is not 0."""
         self._reset()
@@ -152,7 +152,7 @@ class Px4Vehicle(Px4Host):
         self.home_is_set_by_client = False
         self.mode_after_landing: Px4Mode = modes.HOLD
         self.vtol_state: int = 0
-        """MAV_VTOL_STATE to report. Assign a value to simulate a VTOL; the motion of the vehicle does not change."""
+        """MAV_VTOL_STATE to report. Assign a value to simulate a VTOL. The motion of the vehicle does not change."""
         self._touchdown_at = math.nan
         self._landed_at = math.nan
         self._has_flown = False
@@ -311,7 +311,7 @@ class Px4Vehicle(Px4Host):
         return self.has_position or not traits.needs_position
 
     def switch_to(self, mode: Px4Mode) -> None:
-        """Change the mode; the next heartbeat reports it."""
+        """Change the mode, which the next heartbeat reports."""
         self.mode = mode
         self.flight.enter(mode)
         if mode == modes.RTL and self.is_armed:  # PX4 informs the other components of the vehicle about a return.

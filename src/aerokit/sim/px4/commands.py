@@ -87,7 +87,7 @@ def _refuse_high_latency(px4: Px4Vehicle) -> int:
 def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
     """Accept a test of a motor, a servo or an output function. The test has no visible effect.
 
-    Param 5 selects the actuator; numbers from 1000 on are output functions.
+    Param 5 selects the actuator. Numbers from 1000 on are output functions.
     """
     if px4.is_armed:
         return MavResult.DENIED
@@ -189,7 +189,7 @@ class _Flight:
         return MavResult.ACCEPTED if is_done else MavResult.TEMPORARILY_REJECTED
 
     def set_mode(self, command: ReceivedCommand) -> int:
-        """Set a mode and acknowledge twice. PX4's link module always accepts; then the commander sends the result."""
+        """Set a mode and acknowledge twice. PX4's link module always accepts, and then the commander sends the result."""
         self._px4.commands.answer(command, MavResult.ACCEPTED)
         return set_mode(self._px4, whole(command.param1), (whole(command.param2), whole(command.param3)))
 

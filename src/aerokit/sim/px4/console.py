@@ -53,7 +53,7 @@ class Px4Shell:
 
 
 class Px4LogStream:
-    """Streams a log. The definitions come first and must be acknowledged; data follows without acknowledgements."""
+    """Streams a log. The definitions come first and must be acknowledged. Data follows without acknowledgements."""
 
     def __init__(self, px4: SimulatedVehicle) -> None:
         self._px4 = px4

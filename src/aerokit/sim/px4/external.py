@@ -60,7 +60,7 @@ class Px4External:
         return self._target if is_fresh else None
 
     def set_wind(self, command: ReceivedCommand) -> int:
-        """Execute EXTERNAL_WIND_ESTIMATE; the wind has no effect."""
+        """Record the wind of EXTERNAL_WIND_ESTIMATE. It has no effect on the flight."""
         self.wind = (command.param1, command.param3)
         return MavResult.ACCEPTED
 

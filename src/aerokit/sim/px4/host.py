@@ -127,7 +127,7 @@ class Px4Host(SimulatedAutopilot):
     VEHICLE_TYPE: ClassVar[int]
 
     parameters: SimParameters
-    """Parameters; they survive a reboot."""
+    """Parameters, which survive a reboot."""
     frame: LocalFrame
     battery: SimulatedBattery
     home: Ned
@@ -167,7 +167,7 @@ class Px4Host(SimulatedAutopilot):
         raise NotImplementedError
 
     def switch_to(self, mode: Px4Mode) -> None:
-        """Change the mode; the next heartbeat reports it."""
+        """Change the mode, which the next heartbeat reports."""
         raise NotImplementedError
 
     def leave_ground(self) -> None:

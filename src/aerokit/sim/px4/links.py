@@ -1,4 +1,4 @@
-"""What a simulated PX4 sends on each link: stream rates, status texts, and events with the content of texts.
+"""Output of a simulated PX4 on each link: stream rates, status texts, and events with the content of texts.
 
 https://mavlink.io/en/services/events.html. Event ids and log levels are those of a recording of a real PX4. Not
 simulated: events without a text, the health report of the components, REQUEST_EVENT.

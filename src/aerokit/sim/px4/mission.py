@@ -1,7 +1,7 @@
 """Mission mode (AUTO.MISSION) of a simulated PX4.
 
 Simulated: take-off, waypoints with hold time, acceptance radius and heading, loitering, delays, landing, return,
-speed, jumps; other commands are skipped. Not simulated: regions of interest, circles.
+speed, jumps. Other commands are skipped. Not simulated: regions of interest, circles.
 """
 
 from __future__ import annotations

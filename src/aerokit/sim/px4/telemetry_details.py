@@ -116,7 +116,7 @@ IDENTITY_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.ProtocolVersion.ID: _protocol_version,
     m.ComponentMetadata.ID: _component_metadata,
 }
-"""Builders by message id; a builder returns None if there is nothing to send."""
+"""Functions that build messages, by message id. A function returns None if there is nothing to send."""
 
 
 _SEA_LEVEL_HPA, _SEA_LEVEL_C, _LAPSE_C_PER_M = 1013.25, 15.0, 0.0065
@@ -287,4 +287,4 @@ SENSOR_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.TimeEstimateToTarget.ID: _time_estimate,
     m.OrbitExecutionStatus.ID: _orbit_status,
 }
-"""Builders by message id; a builder returns None if there is nothing to send."""
+"""Functions that build messages, by message id. A function returns None if there is nothing to send."""
