@@ -298,7 +298,7 @@ class RecordedVehicle(SimulatedVehicle):
         return None
 
     def _answer_to(self, command: ReceivedCommand) -> RecordedAnswer | None:
-        """Return the recorded answer to a command. Equal commands get successive answers, and the last answer repeats."""
+        """Return the recorded answer to a command. Equal commands get successive answers. The last answer repeats."""
         answers = self.recording.answers.get(command.command, [])
         params = (command.param1, command.param2, command.param3, command.param4)
         # The params are compared as texts, because NaN is not equal to NaN.

@@ -189,7 +189,7 @@ class _Flight:
         return MavResult.ACCEPTED if is_done else MavResult.TEMPORARILY_REJECTED
 
     def set_mode(self, command: ReceivedCommand) -> int:
-        """Set a mode and acknowledge twice. PX4's link module always accepts, and then the commander sends the result."""
+        """Set a mode and acknowledge twice. PX4's link module always accepts. Then the commander sends the result."""
         self._px4.commands.answer(command, MavResult.ACCEPTED)
         return set_mode(self._px4, whole(command.param1), (whole(command.param2), whole(command.param3)))
 
