@@ -108,7 +108,8 @@ class StalledQueue:
             self._carry(data, peer)
             return
         self._accepted.append((data, peer))
-        if sum(len(piece) for piece, _ in self._accepted) >= self._system_limit:
+        accepted_bytes = sum(len(piece) for piece, _ in self._accepted)
+        if accepted_bytes >= self._system_limit:  # The operating system accepts no more bytes.
             for outbox in self._outboxes.values():
                 outbox.pause()
 

@@ -227,7 +227,7 @@ class Calibrations:
             return MavResult.FAILED
         if command.param1 == 1.0:
             vehicle.info("Initialising ArduPilot")
-            return CommandProgress((), _GYROS_S)
+            return CommandProgress(percents=(), interval_s=_GYROS_S)
         if command.param3 == 1.0:
             vehicle.info("Updating barometer calibration")
             vehicle.info("Barometer calibration complete")
@@ -238,16 +238,16 @@ class Calibrations:
         vehicle = self._vehicle
         if command.x == _Accelerometers.FULL:
             vehicle.info("Initialising ArduPilot")
-            return CommandProgress((), _GYROS_S, finish=self.accelerometers.start)
+            return CommandProgress(percents=(), interval_s=_GYROS_S, finish=self.accelerometers.start)
         if command.x == _Accelerometers.TRIM:
             vehicle.info("Initialising ArduPilot")
             text = "Trim OK: roll=0.00 pitch=0.00 yaw=0.00"
-            return CommandProgress((), _TRIM_S, finish=lambda: vehicle.info(text))
+            return CommandProgress(percents=(), interval_s=_TRIM_S, finish=lambda: vehicle.info(text))
         if command.x == _Accelerometers.SIMPLE:
             if vehicle.now - self._simple_calibration_at < _MIN_ACCELEROMETERS_INTERVAL_S:
                 return MavResult.TEMPORARILY_REJECTED
             self._simple_calibration_at = vehicle.now
             vehicle.info("Initialising ArduPilot")
-            return CommandProgress((), _ACCELEROMETERS_S)
+            return CommandProgress(percents=(), interval_s=_ACCELEROMETERS_S)
         is_forced = _FORCED in (command.x, command.param2)
         return MavResult.ACCEPTED if is_forced else MavResult.UNSUPPORTED

@@ -384,7 +384,7 @@ class CopterAuto(MissionMode):
 
     def _take_off(self, item: MissionItem) -> None:
         copter, down = self.vehicle, self.vehicle.motion.down
-        point = copter.world_point(0, 0, item.z, item.frame)
+        point = copter.world_point(0, 0, item.z, item.frame)  # Only the altitude is used.
         copter.yaw.hold()
         # A take-off never descends, and climbs at least `_MIN_TAKE_OFF_M` from the ground.
         min_climb = _MIN_TAKE_OFF_M if copter.is_landed else 0.0

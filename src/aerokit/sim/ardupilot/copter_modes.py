@@ -171,7 +171,7 @@ class CopterModeBase(ArduPilotMode):
     vehicle: CopterHost
 
 
-_REACHED_M, _AT_REST_M_S = 0.1, 0.2
+_REACHED_M, _AT_REST_M_S, _DRIFT_CORRECTION_M_S = 0.1, 0.2, 2.0
 
 
 class CopterTakeOff:
@@ -189,7 +189,7 @@ class CopterTakeOff:
         if copter.is_landed:
             copter.is_landed = not copter.motors.can_lift
             return
-        motion.seek_position(*self.target, speed=2.0, climb=climb_m_s, descent=1.0)
+        motion.seek_position(*self.target, speed=_DRIFT_CORRECTION_M_S, climb=climb_m_s, descent=1.0)
         if abs(motion.down - self.target[2]) < _REACHED_M and abs(motion.velocity_down) < _AT_REST_M_S:
             self.is_complete = True
 

@@ -325,7 +325,7 @@ class PlaneSetpoints:
         plane = self._plane
         if not self._is_guided:
             return
-        point = plane.world_point(0, 0, message.alt, message.coordinate_frame)
+        point = plane.world_point(0, 0, message.alt, message.coordinate_frame)  # Only the altitude is used.
         if point is None:
             plane.info(f"Unknown mavlink coordinate frame {message.coordinate_frame}")
             plane.send_text(MavSeverity.WARNING, "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT")
@@ -369,7 +369,7 @@ def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCom
 
     The firmware refuses the altitudes 0 and -1.
     """
-    point = plane.world_point(0, 0, command.z, command.altitude_frame)
+    point = plane.world_point(0, 0, command.z, command.altitude_frame)  # Only the altitude is used.
     if command.z in _INVALID_ALTITUDES or point is None:
         return MavResult.DENIED
     guided.change_altitude(point[2], abs(command.param3) or _UNLIMITED_M_S)
@@ -394,7 +394,7 @@ def _change_target_altitude(plane: PlaneHost, command: ReceivedCommand) -> int:
 
     The command is accepted in every mode, but has an effect only in GUIDED.
     """
-    point = plane.world_point(0, 0, command.param1, whole(command.param2))
+    point = plane.world_point(0, 0, command.param1, whole(command.param2))  # Only the altitude is used.
     if point is None:
         return MavResult.DENIED
     guided = plane.mode_of(PlaneGuided)

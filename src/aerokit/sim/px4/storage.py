@@ -88,18 +88,18 @@ class _Writer(FileHandle):
         new_bytes = data[max(0, self._written - offset) :]
         has_gap = offset > self._written
         if self._is_rejected or has_gap:
-            self._reject()
+            self._raise_rejected()
         self._pending += new_bytes
         self._written += len(new_bytes)
         self._parse()
         if self._header is not None and self._written > self._header[1]:
-            self._reject()
+            self._raise_rejected()
 
     def close(self) -> None:
         if self._is_rejected or self._pending or self._header != (self._count, self._written):
             raise FileFault(EINVAL)
 
-    def _reject(self) -> NoReturn:
+    def _raise_rejected(self) -> NoReturn:
         self._is_rejected = True
         raise FileFault(EINVAL)
 
@@ -110,7 +110,7 @@ class _Writer(FileHandle):
                 return
             magic, count, size = read_header(self._pending)
             if magic != MAGIC or size < HEADER.size:
-                self._reject()
+                self._raise_rejected()
             self._header, self._pending = (count, size), self._pending[HEADER.size :]
         while self._parse_row():
             pass
@@ -121,11 +121,11 @@ class _Writer(FileHandle):
         try:
             entry = read_entry(pending, 0, self._previous_name) if pending else None
         except RemoteProtocolError:
-            self._reject()
+            self._raise_rejected()
         if entry is None:
             return False
         if entry.default is not None:
-            self._reject()
+            self._raise_rejected()
         name = entry.name.decode("ascii", "replace")
         if name in self._parameters:
             self._apply(name, entry.value)
