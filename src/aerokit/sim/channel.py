@@ -195,10 +195,7 @@ class Channel:
         return [message for message in messages if message.received_frame and signing.accepts(message.received_frame)]
 
     def encode(self, message: Message, sender: tuple[int, int] | None = None) -> bytes:
-        """Return a frame with the sender's next sequence number.
-
-        The result is empty if the message does not exist in the MAVLink version 1 of this port.
-        """
+        """Return a frame with the next sequence number. It is empty if a MAVLink 1 port cannot send the message."""
         if self.version == 1 and message.ID > 255:
             return b""
         sender = self._own_ids if sender is None else sender

@@ -326,10 +326,7 @@ class SimulatedVehicle:
         self.handlers[message_class.ID] = handler
 
     def observe(self, message_class: type[Message], handler: Handler) -> None:
-        """Call a handler for all messages of a class, even if they are not addressed to this vehicle.
-
-        The handler is called in addition to the vehicle's own handler.
-        """
+        """Call a handler for all messages of a class, with any address, in addition to the vehicle's own handler."""
         self._observers.setdefault(message_class.ID, []).append(handler)
         self.handlers.setdefault(message_class.ID, _ignore)
 
@@ -339,10 +336,7 @@ class SimulatedVehicle:
         return system in (0, self.system_id) and component in (0, self.component_id)
 
     def send(self, message: Message, channel: Channel | None = None, sender: tuple[int, int] | None = None) -> None:
-        """Send a message on one channel, or on all channels if ``channel`` is None.
-
-        A frame that is lost because of `Faults` leaves a gap in the sequence numbers.
-        """
+        """Send a message on one channel, or on all if None. A frame lost by `Faults` leaves a sequence gap."""
         for port in self.channels if channel is None else (channel,):
             data = port.encode(message, sender)
             if not self.faults.drops_outgoing(message, self.rng):

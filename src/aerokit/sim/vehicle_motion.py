@@ -71,10 +71,7 @@ class FixedWing(Motion):
         self._wanted_climb = max(-self.wing_limits.sink_m_s, min(self.wing_limits.climb_m_s, climb))
 
     def head(self, course: float, airspeed: float, climb: float, *, turn_rate: float = 0.0) -> None:
-        """Fly a course over ground in radians from north, with wind correction.
-
-        ``turn_rate`` is the rate in rad/s at which the course changes.
-        """
+        """Fly a ground course (radians from north) with wind correction. The course changes at ``turn_rate`` rad/s."""
         speed = max(self._speed, self.wing_limits.airspeed_min_m_s)
         wind_north, wind_east = self._air_movement()
         crosswind = -wind_north * math.sin(course) + wind_east * math.cos(course)

@@ -94,10 +94,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return lambda: self._sources.remove(source) if source in self._sources else None
 
     def _run_once(self) -> None:
-        """Run one iteration of the loop. Without sockets, most iterations skip the poll of the selector.
-
-        The remaining polls notice signals and other threads.
-        """
+        """Run one iteration of the loop. Without sockets, poll only rarely, to notice signals and other threads."""
         self._iterations += 1
         ready, timers = self._ready, self._scheduled  # type: ignore[attr-defined]
         needs_poll = self._iterations >= _POLL_EVERY or not self._can_skip_polls
@@ -131,10 +128,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return not is_watched and len(self._registered) == self._own_registered_count
 
     def _next_timer(self) -> float:
-        """Discard the cancelled timers before the first active timer, and return the time of that timer.
-
-        Return infinity if there is no timer.
-        """
+        """Discard leading cancelled timers, and return the time of the next timer; infinity if there is no timer."""
         timers: list[Any] = self._scheduled  # type: ignore[attr-defined]
         while timers and timers[0]._cancelled:
             self._timer_cancelled_count -= 1  # type: ignore[attr-defined]

@@ -368,10 +368,7 @@ class _DeliveryQueue:
         return bool(self._waiting)
 
     def put(self, due: float, action: Callable[[], None]) -> None:
-        """Queue an action. If the action is due and the queue is empty, run the action at once.
-
-        A radio without faults therefore adds no delay.
-        """
+        """Queue an action. If it is due and the queue is empty, run it at once, so that no faults add no delay."""
         if due <= self.loop.time() and not self._waiting:
             action()
             return

@@ -114,10 +114,7 @@ def dronekit_address(served_flight: ServedFlight) -> str:
 
 @pytest.fixture
 def dronekit() -> Iterator[ModuleType]:
-    """The module `aerokit.dronekit`. During the test, ``import dronekit`` imports this module.
-
-    This does not work if DroneKit itself was imported before.
-    """
+    """`aerokit.dronekit`, which ``import dronekit`` imports meanwhile, unless DroneKit itself was imported before."""
     import sys
 
     import aerokit.dronekit as package

@@ -323,10 +323,7 @@ class RecordedVehicle(SimulatedVehicle):
         return self._on_command(command)
 
     def _latest_message(self, message_id: int) -> Message | None:
-        """Return the latest message with this id that was played or, before that, the first recorded one.
-
-        Return None if the recording contains no such message.
-        """
+        """Return the latest played message with this id, or else the first recorded one, or None."""
         stream = self.recording.stream
         own = (self.system_id, self.component_id)
         for _, frame in (*reversed(stream[: self._next]), *stream[self._next :]):

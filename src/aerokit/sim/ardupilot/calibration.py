@@ -165,10 +165,7 @@ class CompassCalibration:
         )
 
     def report(self) -> m.MagCalReport | None:
-        """Return the result of one compass, each compass in turn.
-
-        Return None before the end of a calibration, and after its result was accepted or cancelled.
-        """
+        """Return the results of the compasses in turn, after a calibration, until they are accepted or cancelled."""
         if not self._compass_mask or self.is_running:
             return None
         self._reported_compass = self._next_compass(self._reported_compass)

@@ -57,10 +57,7 @@ class ArduPilotCamera:
         return True
 
     def take_series(self, interval_s: float, count: int) -> bool:
-        """Take ``count`` images, one every ``interval_s`` seconds, the first one at once.
-
-        With a ``count`` of -1, the series continues until `stop` is called.
-        """
+        """Take ``count`` images (-1: until `stop`), one every ``interval_s`` seconds, the first one at once."""
         if not self.is_fitted:
             return False
         self.interval_s, self.remaining = interval_s, count

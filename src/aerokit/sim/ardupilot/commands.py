@@ -215,10 +215,7 @@ class _CommonCommands:
         return Result.ACCEPTED
 
     def look_at(self, command: ReceivedCommand) -> int:
-        """Set the region of interest of a vehicle with or without a gimbal.
-
-        Zero coordinates with a zero altitude, and DO_SET_ROI_NONE, clear the region.
-        """
+        """Set the region of interest, also without a gimbal. Zeros, and DO_SET_ROI_NONE, clear the region."""
         point = None
         if command.command != Cmd.DO_SET_ROI_NONE:
             point = self._vehicle.world_point(*command.place(), command.z, command.altitude_frame)

@@ -21,8 +21,7 @@ from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance, 
 from aerokit.sim.motion import Ned, wrap_pi
 
 _STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
-_TAKE_OFF_WITHOUT_THROTTLE = 2  # Bit of AUTO_OPTIONS.
-_RAISED_THROTTLE = 1100  # Pulse in µs above which the throttle stick counts as raised.
+_TAKE_OFF_WITHOUT_THROTTLE, _RAISED_THROTTLE = 2, 1100  # A bit of AUTO_OPTIONS, and a pulse in µs.
 
 
 class _Leg(Protocol):
@@ -87,8 +86,7 @@ class _CircleLeg:
         self._turned_rad += abs(rate) * dt
         self._report_new_turn()
         point, speed = self._point(), rate * self._radius
-        # Follow a point that moves along the circle: command the velocity of the point, plus 1 m/s towards the point
-        # for each metre between the copter and the point.
+        # Follow a point on the circle: command its velocity, plus 1 m/s for each metre between copter and point.
         motion.seek_velocity(
             point[0] - motion.north - speed * math.sin(self._angle),
             point[1] - motion.east + speed * math.cos(self._angle),
@@ -261,10 +259,7 @@ class CopterAuto(MissionMode):
             self.vehicle.yaw.update()
 
     def _check_upcoming(self) -> bool:
-        """Record the next three commands. Return True if an upload has changed them since the last call.
-
-        A change of the current index alone is not a change of the commands.
-        """
+        """Record the next three commands. Return True if an upload, instead of the progress, has changed them."""
         run, commands = self.vehicle.mission, self.vehicle.missions.commands
         has_same_index = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
         if commands.version == self._list_version and has_same_index:
@@ -337,10 +332,7 @@ class CopterAuto(MissionMode):
         return True
 
     def _has_landed(self, index: int) -> bool:
-        """Return True if the copter has landed and MIS_OPTIONS lets it continue with a following take-off.
-
-        Otherwise return False, and disarm the landed copter.
-        """
+        """Disarm the copter after landing. Return True if it continues with a take-off instead (MIS_OPTIONS)."""
         copter = self.vehicle
         if isinstance(self._leg, _FlyLeg):  # The copter first flies to the place of the landing.
             if self._leg.is_complete:
@@ -407,8 +399,7 @@ class CopterAuto(MissionMode):
         leg.enter(force=True)
 
     def _delay(self, item: MissionItem) -> None:
-        # A negative param 1 means a delay until a time of day, which is not simulated.
-        seconds = max(0.0, item.param1)
+        seconds = max(0.0, item.param1)  # A negative number, for a time of day, is not simulated.
         self._delay_until = self.vehicle.now + seconds
         self.vehicle.info(f"Delaying {int(seconds)} sec")
 

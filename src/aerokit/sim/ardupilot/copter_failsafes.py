@@ -246,10 +246,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return action
 
     def _disarm_if_landed(self, name: str) -> bool:
-        """Disarm a landed vehicle and return True.
-
-        Return False in the air, and on the ground if a mission is about to take off.
-        """
+        """Disarm a landed vehicle and return True. A vehicle in the air, or about to take off, stays armed (False)."""
         copter = self.vehicle
         if not copter.is_landed or (copter.mode.needs_mission and not copter.motors.is_idle):
             return False

@@ -212,10 +212,7 @@ class ArduPilotGimbal:
             self._vehicle.send(status)
 
     def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
-        """Apply GIMBAL_MANAGER_FLAGS with angles or rates (roll, pitch, yaw), and return the MAV_RESULT.
-
-        NaN angles or rates are not given.
-        """
+        """Apply GIMBAL_MANAGER_FLAGS with angles or rates, which are NaN if not given. Return the MAV_RESULT."""
         from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
         if flags & GimbalManagerFlags.RETRACT:
             self.set_mode(MavMountMode.RETRACT)

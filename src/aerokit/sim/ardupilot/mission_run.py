@@ -230,10 +230,7 @@ class MissionRun:
         return self._set_resume_index(index)
 
     def _set_resume_index(self, index: int) -> bool:
-        """Let a stopped mission resume at the first navigation command from ``index`` on.
-
-        Return False if there is no such command.
-        """
+        """Resume a stopped mission at the next navigation command from ``index`` on; return False without one."""
         for _ in range(_MAX_STEPS):
             command = self._next(index, count_jumps=True)
             if command is None:

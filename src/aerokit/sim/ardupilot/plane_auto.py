@@ -365,10 +365,7 @@ def _change_speed(plane: PlaneHost, guided: PlaneGuided, command: ReceivedComman
 
 
 def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    """Change the altitude. Param 3 is the climb rate in m/s, or 0 for the maximum rate.
-
-    The firmware refuses the altitudes 0 and -1.
-    """
+    """Change the altitude (the firmware refuses 0 and -1). Param 3 is the climb rate in m/s; 0 is the maximum."""
     point = plane.world_point(0, 0, command.z, command.altitude_frame)  # Only the altitude is used.
     if command.z in _INVALID_ALTITUDES or point is None:
         return MavResult.DENIED
@@ -390,10 +387,7 @@ def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand)
 
 
 def _change_target_altitude(plane: PlaneHost, command: ReceivedCommand) -> int:
-    """Change the altitude to param 1 metres in the MAV_FRAME of param 2.
-
-    The command is accepted in every mode, but has an effect only in GUIDED.
-    """
+    """Change the altitude to param 1 metres (MAV_FRAME param 2). Only GUIDED uses the altitude; all modes accept it."""
     point = plane.world_point(0, 0, command.param1, whole(command.param2))  # Only the altitude is used.
     if point is None:
         return MavResult.DENIED

@@ -248,10 +248,7 @@ class PlaneCircle(PlaneAltitudeMode):
 
 
 class PlaneNavigatingMode(PlaneModeBase):
-    """LOITER, and base of the modes that fly to a place and circle there.
-
-    By default, the place is where the mode was entered.
-    """
+    """LOITER, and base of the modes that fly to a place (by default, that of the mode change) and circle there."""
 
     flags: int = _NAVIGATES
 
@@ -284,10 +281,7 @@ class PlaneNavigatingMode(PlaneModeBase):
 
 
 class PlaneRtl(PlaneNavigatingMode):
-    """RTL: flies to a rally point or home and circles there, at RTL_ALTITUDE.
-
-    A negative RTL_ALTITUDE keeps the current altitude.
-    """
+    """RTL: circles above a rally point or home at RTL_ALTITUDE, or at the current altitude if that is negative."""
 
     can_arm = False
 

@@ -170,10 +170,7 @@ class SimulatedComponent:
         self.vehicle.call_at(when, action)
 
     def stream(self, message_id: int, interval_s: float, channel: Channel | None = None) -> None:
-        """Stream messages with this id on one channel, or on all channels if ``channel`` is None.
-
-        An interval of 0 stops the stream.
-        """
+        """Stream messages on one channel, or on all channels if ``channel`` is None. The interval 0 stops them."""
         self._streams.stream(message_id, interval_s, channel)
 
     def _is_addressed(self, message: Message) -> bool:
@@ -185,10 +182,7 @@ class SimulatedComponent:
         return True
 
     def answer_with(self, message_id: int, command: ReceivedCommand) -> int:
-        """Send the requested messages and return the MAV_RESULT.
-
-        The result is DENIED for an unknown message id, and FAILED if there is no such message at present.
-        """
+        """Send the requested messages. Return DENIED for an unknown id, FAILED if there is no message at present."""
         return self._streams.answer_with(message_id, command)
 
 

@@ -138,10 +138,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         return (self._limited(0, roll), self._limited(1, pitch), self._limited(2, yaw))
 
     def _angles_to(self, region: GlobalPoint) -> Angles:
-        """Return roll, pitch and yaw (from north) to a position.
-
-        If the position of the vehicle is unknown, return the current target.
-        """
+        """Return the angles to a position (yaw from north), or the present target if the vehicle has no position."""
         pose = pose_of(self.vehicle)
         if pose is None:
             return self._target

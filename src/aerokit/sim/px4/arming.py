@@ -27,10 +27,7 @@ _PERCENT_PER_SIDE = 17
 
 
 def _side_texts(sensor: str, sides_done: int) -> list[str]:
-    """Return the texts that precede the measurement of the next side (calibration_routines.cpp).
-
-    ``sides_done`` is the number of sides that were measured before.
-    """
+    """Return the texts before the measurement of a side, after ``sides_done`` sides (calibration_routines.cpp)."""
     side = _SIDES[-1 - sides_done]
     return [
         f"pending: {' '.join(_SIDES[: len(_SIDES) - sides_done])}",

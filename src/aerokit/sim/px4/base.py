@@ -244,10 +244,7 @@ class Px4Vehicle(Px4Host):
         self.reboot(math.inf)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Queue a status text, which is sent after the answer to the present command.
-
-        The text has an id and usually a final tab.
-        """
+        """Queue a status text, with an id and usually a final tab, which is sent after the answer to the command."""
         self.call_later(0.0, partial(self.events.send_for, text))
         text = on_the_wire(text)
         number, self._next_text_id = self._next_text_id, (self._next_text_id + 1) & 0xFFFF

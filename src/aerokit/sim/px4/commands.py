@@ -85,10 +85,7 @@ def _refuse_high_latency(px4: Px4Vehicle) -> int:
 
 
 def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Accept a test of a motor, a servo or an output function. The test has no visible effect.
-
-    Param 5 selects the actuator. Numbers from 1000 on are output functions.
-    """
+    """Accept a test of a motor, a servo or (numbers from 1000 on) an output function, without a visible effect."""
     if px4.is_armed:
         return MavResult.DENIED
     function = whole(command.x)

@@ -183,10 +183,7 @@ class Px4Flight:
             self.target = target
 
     def plan_take_off(self, down: float | None = None) -> None:
-        """Plan a vertical climb to ``down``.
-
-        None selects MIS_TAKEOFF_ALT above home, or the current height if the vehicle is higher.
-        """
+        """Plan a vertical climb to ``down``. None selects MIS_TAKEOFF_ALT above home, if the vehicle is not higher."""
         vehicle, motion = self._vehicle, self._vehicle.motion
         self._is_default_height = down is None
         if down is None:
@@ -219,10 +216,7 @@ class Px4Flight:
 
     @property
     def descent_speed_m_s(self) -> float:
-        """Speed of a landing at the present height.
-
-        It is MPC_Z_V_AUTO_DN above MPC_LAND_ALT1 and MPC_LAND_SPEED below MPC_LAND_ALT2.
-        """
+        """Speed of a landing: MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, MPC_LAND_SPEED below MPC_LAND_ALT2."""
         vehicle, limits = self._vehicle, self._vehicle.parameters
         fast, slow = limits["MPC_Z_V_AUTO_DN"], limits["MPC_LAND_SPEED"]
         high, low = limits["MPC_LAND_ALT1"], limits["MPC_LAND_ALT2"]

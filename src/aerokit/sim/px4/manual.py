@@ -82,10 +82,7 @@ def _stick_position(pulse_us: int) -> float:
 
 
 def curved(value: float, share: float, dead_zone: float = 0.0) -> float:
-    """Apply a dead zone (MPC_HOLD_DZ) and an expo curve to a stick position.
-
-    ``share`` (MPC_XY_MAN_EXPO) is the share of the cubic part of the curve.
-    """
+    """Apply a dead zone (MPC_HOLD_DZ) and a curve with a cubic ``share`` (MPC_XY_MAN_EXPO) to a stick position."""
     size = abs(value)
     if size <= dead_zone:
         return 0.0

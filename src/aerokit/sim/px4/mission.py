@@ -263,10 +263,7 @@ class Px4Mission:
             self._px4.info("Returning to launch")
 
     def _index_after_jump(self, item: MissionItem) -> int:
-        """Return the index of the item after a DO_JUMP.
-
-        PX4 counts the jumps in the stored item, and sends the changed item to the last client.
-        """
+        """Return the index of the item after a DO_JUMP. PX4 counts its jumps, and sends the item to the last client."""
         jumps_done, index = self._jumps.get(self.current, 0), self.current
         if jumps_done >= item.param2:
             self._jumps.pop(index, None)

@@ -228,10 +228,7 @@ class Px4MissionServer(MissionServer):
             self._warn("WPM: REJ. CMD: Req. WP was unexpected")
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
-        """End a download, or cancel an upload.
-
-        During an upload, UNSUPPORTED changes the requests from MISSION_REQUEST_INT to MISSION_REQUEST or back.
-        """
+        """End a download, or cancel an upload. UNSUPPORTED changes the kind of the requests of an upload."""
         link = self._link(channel)
         if sender_of(ack) != link.client:
             self._warn("REJ. WP CMD: partner id mismatch")

@@ -131,10 +131,7 @@ class Px4Offboard:
         self.updated_at = self._vehicle.now
 
     def watch(self) -> None:
-        """Switch to RTL when the set-points stop, and back to OFFBOARD when they resume.
-
-        Version 1.16 switches to POSITION instead of RTL.
-        """
+        """Switch to RTL (in version 1.16, to POSITION) when the set-points stop, and back when they resume."""
         vehicle = self._vehicle
         if vehicle.intended_mode != OFFBOARD or vehicle.failsafes.acts:
             return

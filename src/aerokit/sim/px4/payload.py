@@ -222,10 +222,7 @@ def _control_mount(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _set_roi(gimbal: Px4Gimbal, command: ReceivedCommand | None) -> int:
-    """Point at the position of a command, or reset the gimbal if ``command`` is None.
-
-    PX4 uses the altitude as AMSL in every frame.
-    """
+    """Point at the position of a command (AMSL in every frame), or reset the gimbal if ``command`` is None."""
     if command is None:
         gimbal.rest()
     elif math.isfinite(command.z):
