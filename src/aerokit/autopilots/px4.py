@@ -179,7 +179,7 @@ class Px4(Autopilot):
             self.arrival_radius_m: float = 120.0  # a plane circles with NAV_LOITER_RAD, 80 m by default
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
-        """Return the mode of these numbers. An external mode's registered name takes precedence over EXTERNAL1 etc."""
+        """Return the mode with these numbers. The registered name of an external mode replaces EXTERNAL1 etc."""
         if custom_mode in _EXTERNAL_MODES and custom_mode in extra:
             return Mode(extra[custom_mode], custom_mode, base_mode)
         return super().mode(custom_mode, base_mode, extra)
@@ -205,7 +205,7 @@ class Px4(Autopilot):
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
         """Return the name if it belongs to an external mode.
 
-        An external mode slot without a registered mode is called "(Mode not available)".
+        PX4 reports the name "(Mode not available)" for an external mode that is not registered.
         """
         if name.startswith("("):
             return None
@@ -233,7 +233,7 @@ class Px4(Autopilot):
         return () if self._cannot_fly else (("RTL_RETURN_ALT", 1.0),)
 
     def take_off_needs_home(self) -> bool:
-        """True: PX4's NAV_TAKEOFF needs an altitude above mean sea level."""
+        """Return True, because PX4's NAV_TAKEOFF needs an altitude above mean sea level."""
         return not self._cannot_fly
 
     def failing_sensors(self, present: int, enabled: int, health: int) -> tuple[str, ...]:

@@ -325,7 +325,7 @@ def whole_number(name: str, value: object, low: int, high: int) -> float:
     """Return the value as a float; raise :class:`InvalidArgument` unless it is a whole number from low to high."""
     if isinstance(value, int) and not isinstance(value, bool) and low <= value <= high:
         return float(value)
-    raise InvalidArgument(f"{name} = {value!r} is not allowed: a whole number from {low} to {high}")
+    raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a whole number from {low} to {high}")
 
 
 def heading(name: str, value: float | None) -> float:

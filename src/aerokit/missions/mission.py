@@ -97,7 +97,7 @@ class Mission(_ItemSequence):
         return cls(*without_home(items)) if home_is_item_0 else cls(items)
 
 
-# Commands for `inclusion` True and False.
+# Maps `inclusion` to the command.
 _POLYGON = {True: MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, False: MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION}
 
 _CIRCLE = {True: MavCmd.NAV_FENCE_CIRCLE_INCLUSION, False: MavCmd.NAV_FENCE_CIRCLE_EXCLUSION}
@@ -246,7 +246,7 @@ def _place(item: MissionItem, index: int) -> Position:
         place = Position(item.x / 1e7, item.y / 1e7)
     except InvalidArgument as error:
         raise RemoteProtocolError(f"item {index} ({item.name}): {error}") from error
-    # Only a return point has an altitude; `_return_item` writes 0 in the frame GLOBAL if it is unknown.
+    # Only a return point has an altitude. In the frame GLOBAL, 0 means that it is unknown (`_return_item`).
     has_altitude = item.command == MavCmd.NAV_FENCE_RETURN_POINT and (item.z != 0 or item.frame != MavFrame.GLOBAL)
     position_with_altitude = item.position if has_altitude else None
     return position_with_altitude or place

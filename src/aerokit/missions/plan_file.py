@@ -62,7 +62,7 @@ def write_plan_file(path: str | os.PathLike[str], plan: Plan | Mission) -> None:
 def parse_plan(text: str, name: str = "plan") -> Plan:
     """Parse the text of a file. Errors begin with ``name``."""
     document = load_json(text, name)
-    # Checked before the missing fields, because another kind of file lacks most of them.
+    # Check the kind of file before the missing fields, because a file of another kind lacks most of these fields.
     for key, allowed in (("fileType", "Plan"), ("version", 1)):
         member = document.child(key)
         if member is not None:
@@ -101,7 +101,7 @@ def format_plan(plan: Plan | Mission) -> str:
         raise InvalidArgument("the plan cannot be written: it was read from a file that is nested too deeply") from None
     except InvalidArgument:
         raise
-    except FileFormatError as error:  # the error is in the text from which the plan was read
+    except FileFormatError as error:  # The text from which the plan was read is invalid.
         raise InvalidArgument(f"the plan cannot be written: {error}") from error
     except ValueError as error:
         raise InvalidArgument("a number of the plan is not finite, and a .plan file cannot store it") from error

@@ -58,7 +58,7 @@ def _reset_items(pattern: JsonValue) -> list[MissionItem]:
 
 
 def _approach(pattern: JsonValue, frame: MavFrame, place: JsonValue) -> MissionItem:
-    # Either a waypoint, or a descent in a circle that is left tangentially. Older files have only circles.
+    # The approach is a waypoint, or a descent in a circle that is left tangentially. Older files have only circles.
     if not _flag(pattern, "useLoiterToAlt", default=True):
         return MissionItem(MavCmd.NAV_WAYPOINT, frame, 0.0, 0.0, 0.0, math.nan, *_place(place))
     radius = pattern["loiterRadius"].number(0)
@@ -113,14 +113,14 @@ def merged_entries(
 
     ``groups`` has the items of each old entry.
     """
-    # Entries before `head_end` are kept, and stand for the items before `first_new`.
+    # Keep the entries before `head_end`, which contain the items before `first_new`.
     head_end, first_new = 0, 0
     while head_end < len(groups):
         group = groups[head_end]
         if not _matches(group, items[first_new : first_new + len(group)]):
             break
         head_end, first_new = head_end + 1, first_new + len(group)
-    # Entries from `tail_start` on are kept, and stand for the items from `end_new` on.
+    # Keep the entries from `tail_start` on, which contain the items from `end_new` on.
     tail_start, end_new = len(groups), len(items)
     while tail_start > head_end:
         group = groups[tail_start - 1]
@@ -254,9 +254,9 @@ def load_json(text: str, name: str) -> JsonValue:
         return JsonValue(json.loads(text, parse_constant=_no_constant), name, "")
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
-        raise FileFormatError(f"{name}: {where}: not valid JSON: {error.msg}") from error
+        raise FileFormatError(f"{name}: {where}: the text is not valid JSON: {error.msg}") from error
     except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{name}: not valid JSON: {error}") from error
+        raise FileFormatError(f"{name}: the text is not valid JSON: {error}") from error
 
 
 def _no_constant(text: str) -> None:
@@ -275,7 +275,7 @@ class JsonValue:
 
     def error(self, expected: str) -> FileFormatError:
         """Create an error for a value that is not as expected."""
-        # The value is encoded incrementally, because a large value need not be formatted completely to be truncated.
+        # Encode only the beginning of the value, because a large value would take long and is shortened anyway.
         text = "".join(islice(json.JSONEncoder().iterencode(self.value), 41))
         if len(text) > 40:
             text = f"{text[:37]}..."

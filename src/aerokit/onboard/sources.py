@@ -22,7 +22,7 @@ _NOT_MEASURED = 0xFFFF
 
 @checks_arguments
 class ComponentSources:
-    """Sends measurements as this component. Each call sends one message to all; make a call for each measurement."""
+    """Sends measurements as this component. Each call sends one measurement, in one message to all programs."""
 
     def __init__(self, host: ComponentHost) -> None:
         self._host = host
@@ -57,9 +57,11 @@ class ComponentSources:
             ConnectionClosed, LinkLost: the connection has ended.
         """
         if not 0 < len(distances_m) <= MAX_DISTANCES:
-            raise InvalidArgument(f"distances_m has {len(distances_m)} values, 1 to {MAX_DISTANCES} are allowed")
+            raise InvalidArgument(f"distances_m has {len(distances_m)} values; 1 to {MAX_DISTANCES} are allowed")
         if not 0 <= min_m < max_m <= 655:
-            raise InvalidArgument(f"min_m, max_m = {min_m}, {max_m} are not allowed: 0 to 655, min below max")
+            raise InvalidArgument(
+                f"min_m, max_m = {min_m}, {max_m} are not allowed: both must be 0 to 655, and min_m below max_m"
+            )
         if not 0 < increment_deg <= 360:
             raise InvalidArgument(f"increment_deg = {increment_deg} is not allowed: above 0, at most 360")
         nothing_in_range = round(max_m * 100) + 1  # defined by OBSTACLE_DISTANCE
@@ -142,7 +144,8 @@ class ComponentSources:
 
         Args:
             right_deg: angle from straight down to the right, -90 to 90.
-            down_deg: angle from straight down towards the tail, -90 to 90. It is downwards in the camera's image.
+            down_deg: angle from straight down towards the tail, -90 to 90. The tail is at the bottom of the camera's
+                image.
             distance_m: distance to the beacon in metres, 0 or more.
             target_number: number of the beacon, 0 to 255.
 

@@ -95,7 +95,7 @@ _FORMATS = {
 
 
 class CalibrationReport(Snapshot):
-    """One ``[cal]`` text of PX4. ``kind`` is a key of ``_FORMATS``, or ``"text"``; ``text`` lacks ``[cal]``."""
+    """One ``[cal]`` text of PX4. ``kind`` is a key of ``_FORMATS``, or ``"text"``; ``text`` is without ``[cal]``."""
 
     kind: str
     text: str

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 # times a second.
 STILL_S, STILL_DEG = 0.4, 0.5
 
-# Pitch, roll, yaw from north, yaw from the nose. None: any angle is right.
+# Pitch, roll, yaw from north, yaw from the nose. None means that any angle is accepted.
 Angles = tuple[float | None, float | None, float | None, float | None]
 
 
@@ -49,7 +49,7 @@ class AngleTarget:
         return targets is not None and all(map(self._is_near, _angles_of(device.attitude.value), targets))
 
     def _is_near(self, angle: float | None, target: float | None) -> bool:
-        if target is None:  # Any angle is right.
+        if target is None:  # Any angle is accepted.
             return True
         return angle is not None and abs(math.remainder(angle - target, 360)) <= self._tolerance_deg
 
@@ -76,6 +76,7 @@ class RestTarget:
         if self._has_moved((pitch, roll, yaw)):
             self._last_angles, self._moved_at = (pitch, roll, yaw), updated_at
             return False
+        # A gimbal that is level and straight ahead counts as neutral, even if it does not report the flag.
         is_ahead = self._or_ahead and abs(pitch) <= 2 * STILL_DEG and abs(yaw) <= 2 * STILL_DEG
         return updated_at - self._moved_at >= STILL_S and bool(device.flags & self._flag or is_ahead)
 
@@ -91,8 +92,9 @@ class RestTarget:
 
 @contextmanager
 def attitude_stream(orders: GimbalOrders) -> Iterator[None]:
-    """Request the attitude from the autopilot during a block. Gimbals with their own component id send it by
-    themselves.
+    """Request the attitude from the autopilot during a block.
+
+    Gimbals with their own component id send their attitude without a request.
     """
     if orders.device.component_id not in (0, orders.session.component_id):
         yield
@@ -134,7 +136,7 @@ async def wait_until_there(
             remaining_s = deadline - session.connection.now()
             if remaining_s <= 0:
                 raise OperationTimeout(
-                    f"{description}: not reached within {timeout:g} s: {_describe_state(orders, since)},"
+                    f"{description}: the target was not reached within {timeout:g} s: {_describe_state(orders, since)},"
                     f" {target.describe()}; {session.describe_link()}"
                 )
             await changes.next(min(POLL_INTERVAL_S, remaining_s))
@@ -178,7 +180,7 @@ MIN_BEARING_DISTANCE_M = 1.0
 
 
 def ordered_angles(pitch: float, yaw: float, roll: float | None, *, from_nose: bool) -> Angles:
-    """Return the angles of an order. The yaw is None when pointing straight down or up: any yaw is right then."""
+    """Return the angles of an order. The yaw is None if the gimbal points straight down or up: any yaw is accepted."""
     is_vertical = abs(pitch) > MAX_PITCH_FOR_YAW_DEG
     from_north_deg = None if from_nose or is_vertical else yaw
     from_nose_deg = yaw if from_nose and not is_vertical else None
@@ -186,7 +188,7 @@ def ordered_angles(pitch: float, yaw: float, roll: float | None, *, from_nose: b
 
 
 def direction_to(context: VehicleContext, target: Position) -> Angles | None:
-    """Direction from the vehicle to a position; None while the vehicle's position or height is unknown."""
+    """Return the direction from the vehicle to a position; None while the vehicle's position or height is unknown."""
     cell = context.session.telemetry.position
     here = cell.latest
     if here is None or cell.age > POSITION_MAX_AGE_S:
@@ -202,7 +204,10 @@ def direction_to(context: VehicleContext, target: Position) -> Angles | None:
 
 
 def _height_above(here: Position, target: Position) -> float | None:
-    """Height of the target above the vehicle; None if it is unknown. A target without an altitude is at its height."""
+    """Return the height of the target above the vehicle; None if unknown.
+
+    A target without an altitude counts as being at the height of the vehicle.
+    """
     if target.altitude_relative_m is None and target.altitude_amsl_m is None:
         return 0.0
     if target.altitude_relative_m is not None and here.altitude_relative_m is not None:
@@ -236,7 +241,7 @@ class PointingMixin(GimbalMixin):
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
             roll_deg: from the horizon, −360 to 360. A roll other than 0 is sent by the older mount command. The gimbal
-                then turns with the vehicle, so a yaw from north is right only at the time of the order.
+                then turns with the vehicle, so a yaw from north is correct only at the time of the order.
             frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
@@ -353,6 +358,6 @@ class PointingMixin(GimbalMixin):
             # The same yaw may be written as −90 or 270.
             turns = (-360, 0, 360) if name == "yaw_deg" else (0,)
             is_allowed = any(lowest <= angle + turn <= highest for turn in turns)
-            if not is_allowed and highest - lowest < 360:
+            if not is_allowed and highest - lowest < 360:  # A gimbal that turns all the way round reaches every angle.
                 text = f"{self._orders.name} turns from {lowest:g} to {highest:g}"
                 raise InvalidArgument(f"{name} = {angle:g} is not allowed: {text}")

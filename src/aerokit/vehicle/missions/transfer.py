@@ -40,7 +40,8 @@ REFUSAL_TEXT_DELAY_S = 0.3
 class PlanChannel:
     """Transfers plans of one MAV_MISSION_TYPE. Items are numbered as the vehicle numbers them.
 
-    Errors use the item numbers of the program, and contain the vehicle's status texts and the state of the old items.
+    Errors use the item numbers of the program. They contain the vehicle's status texts, and tell which items the
+    vehicle has now.
     """
 
     def __init__(
@@ -108,7 +109,7 @@ class PlanChannel:
         return self._normalized(unpack_items(data, self.mission_type))
 
     def _normalized(self, items: tuple[MissionItem, ...]) -> tuple[MissionItem, ...]:
-        # Fences and rally points have no autocontinue; ArduPilot returns False for it.
+        # Fences and rally points have no autocontinue; ArduPilot returns False for them.
         if self.mission_type == MavMissionType.MISSION:
             return items
         return tuple(item.replace(autocontinue=True) for item in items)
@@ -234,7 +235,7 @@ class PlanTransfer(Generic[PlanT]):
 
     async def upload(self, plan: PlanT, method: str, *, only_changes: bool, verify: bool) -> None:
         items = plan.to_items()
-        if self._offset:  # The vehicle's own home, because older firmware might take another one in item 0 as its home.
+        if self._offset:  # Item 0 must be the vehicle's own home, because older firmware may move its home to item 0.
             items = with_home(items, self._context.home)
         if len(items) == self._offset:  # The plan is empty, except for home.
             await self.clear()
@@ -272,6 +273,7 @@ class PlanTransfer(Generic[PlanT]):
         return received.items
 
     async def _uses_file(self, method: str, *, is_upload: bool = False) -> bool:
+        """Return True if the plan is to be transferred as a file."""
         if method == "items":
             return False
         has_ftp = await self._channel.has_ftp()
@@ -284,7 +286,7 @@ class PlanTransfer(Generic[PlanT]):
         return has_ftp and self._cache.has_file is not False and not is_flying  # `has_file` is None until tried.
 
     def _on_file_error(self, error: Exception, method: str) -> None:
-        """Transfer no files from now on. Raise the error if the caller chose files, or if files have worked before."""
+        """Transfer no files from now on. Raise the error if the caller chose files, or if they have worked before."""
         if method == "ftp" or (self._cache.has_file and not isinstance(error, FileError)):
             raise error
         self._cache.has_file = False
@@ -301,7 +303,7 @@ class PlanTransfer(Generic[PlanT]):
             if result.is_confirmed:
                 raise
             raise MissionRejected(
-                f"{self._name}: the vehicle refused at about item {result.item}, and now has other items",
+                f"{self._name}: the vehicle refused the plan at about item {result.item}, and now has other items",
                 result=MavMissionResult.ERROR,
                 item=result.item,
                 reasons=error.differences,
@@ -320,18 +322,19 @@ class PlanTransfer(Generic[PlanT]):
             except VerificationFailed:
                 if method == "ftp":
                     raise
-        # There is no such file, or an item was refused. The mission protocol reports which item was refused and why.
+        # The vehicle has no such file, or has refused an item. The mission protocol reports which item and why.
         await self._send_items(items, method, verify=True)
 
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:
-        """Send only the differences; return False if the vehicle's plan is unknown, or sending differences is not
-        faster.
+        """Send only the differences.
+
+        Returns False if the whole plan must be sent, because the vehicle's plan is unknown or differs in many items.
         """
         autopilot = self._context.autopilot
         if autopilot.reports_mission_checksum:
             reported = self._context.plan_id(self._type, self._cache.updated_at)
             checksum = mission_checksum(items)
-            # The plan may have been replaced a moment ago, so the next report must have the same checksum.
+            # Another station may have just replaced the plan, so the next report must have the same checksum.
             if reported == checksum and await self._context.wait_for_plan_id(self._type, checksum):
                 return True
         if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changed_seqs(items), len(items)):
@@ -343,7 +346,7 @@ class PlanTransfer(Generic[PlanT]):
         if changed_seqs is None or not self._is_worthwhile(changed_seqs, len(items)):
             return False
         vehicle_items = list(self._cache.items or ())
-        # Unknown until all parts are confirmed, in case the call fails or is cancelled.
+        # The vehicle's plan is unknown until all parts are confirmed, because the call may fail or be cancelled.
         self._cache.forget(self._context.now())
         for part in _consecutive_ranges(changed_seqs):
             if not await self._send_part(items[part.start : part.stop], part.start, verify=verify):
@@ -363,7 +366,7 @@ class PlanTransfer(Generic[PlanT]):
         return True
 
     def _changed_seqs(self, items: Sequence[MissionItem]) -> list[int] | None:
-        """Return the seqs of changed items; None if the vehicle's items are unknown, or there are more or fewer."""
+        """Return the seqs of changed items; None if the vehicle's items are unknown, or their number differs."""
         vehicle_items = self._cache.items
         if vehicle_items is None or len(vehicle_items) != len(items):
             return None
@@ -378,7 +381,10 @@ class PlanTransfer(Generic[PlanT]):
         return not parts or len(changed_seqs) + PART_OVERHEAD_ITEMS * len(parts) < count
 
     async def _has_checksum_of(self, items: Sequence[MissionItem]) -> bool:
-        """Wait for the checksum of these items if that is faster than reading them back; return True if it arrives."""
+        """Return True if the vehicle reports the checksum of these items.
+
+        Returns False at once if reading the items back takes less time than waiting for a report.
+        """
         autopilot = self._context.autopilot
         round_trip_s = self._context.transfers.round_trip.smoothed_s or 0.0
         reading_takes_s = len(items) / autopilot.mission_download_window * round_trip_s
@@ -399,7 +405,7 @@ class PlanTransfer(Generic[PlanT]):
         is_single_precision = self._channel.is_single_precision
         for seq in sorted(sent.keys() & received.keys()):
             if seq >= self._offset:
-                # Targets of jumps are compared and shown as the program numbers them.
+                # Compare and show jump targets with the item numbers of the program, which do not count home.
                 item, vehicle_item = shift_jumps([sent[seq], received[seq]], -self._offset)
                 texts = item_differences(item, vehicle_item, self._storage, single_precision=is_single_precision)
                 differences += [f"item {seq - self._offset} ({item.name}): {text}" for text in texts]

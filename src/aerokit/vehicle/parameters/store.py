@@ -65,7 +65,7 @@ class ParameterStore:
         return name in self._known
 
     def mark_replaced(self, name: str, value: float) -> None:
-        """Ignore messages with this previous value for ``IN_FLIGHT_S``, because a write has just replaced it.
+        """Ignore messages with this previous value for ``IN_FLIGHT_S`` seconds, because a write has just replaced it.
 
         ArduPilot answers PARAM_SET at once, but sends the answer to PARAM_REQUEST_READ up to 0.1 s after it read the
         value. An answer with the previous value may therefore arrive after the confirmation of the write.
@@ -77,7 +77,7 @@ class ParameterStore:
         self._replaced.pop(name, None)
 
     def replaced_value(self, name: str) -> int | float | None:
-        """Return the value marked by `mark_replaced`, while messages with it are ignored."""
+        """Return the value that was marked by `mark_replaced`, as long as messages with this value are ignored."""
         if name not in self._replaced:
             return None
         value, ignored_until = self._replaced[name]
@@ -94,7 +94,10 @@ class ParameterStore:
         self._table, self.is_complete, self.count = None, False, None
 
     def replace(self, table: ParameterTable, *, since: int) -> None:
-        """Replace all parameters by a list requested when ``updates`` was ``since``. Newer messages take precedence."""
+        """Replace all parameters by a downloaded list.
+
+        ``since`` is the value of ``updates`` when the list was requested. Messages since then take precedence.
+        """
         newer_names = {name for name, updated_at in self._updated_at.items() if updated_at > since}
         old, self._known = self._known, {}
         for name, parameter in table.items():
