@@ -23,7 +23,7 @@ from aerokit.missions.item import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-MAX_ITEMS = 65_535  # MISSION_COUNT has 16 bits
+MAX_ITEMS = 65_535  # The number of items in MISSION_COUNT has 16 bits.
 
 _FRAMES = frozenset(int(frame) for frame in MavFrame)
 _FRAME_TEXT = "a global frame (0, 3, 10, or 5, 6, 11) or a local one (1, 4, 7, 20, 21)"
@@ -61,7 +61,10 @@ def check_count(count: int, *, home_is_item_0: bool = False) -> None:
 
 
 def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) -> None:
-    """Raise :class:`InvalidArgument` if MISSION_ITEM_INT cannot carry the item. Its text begins with ``where``."""
+    """Raise :class:`InvalidArgument` if MISSION_ITEM_INT cannot carry the item.
+
+    The error text begins with ``where``.
+    """
     if not isinstance(item, MissionItem):
         raise InvalidArgument(f"{where} = {item!r} is not a MissionItem")
     _check_integer(where, "command", item.command, 0xFFFF)

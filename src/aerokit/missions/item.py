@@ -228,7 +228,7 @@ class MissionItem(Snapshot):
 
     def _key(self) -> tuple[Any, ...]:
         values: tuple[Any, ...] = self._values(self)
-        # NaN, the only value that differs from itself, is replaced, so that items with NaN can be equal.
+        # Replace NaN, the only value that differs from itself, so that items with NaN can be equal.
         return tuple("NaN" if value != value else value for value in values)
 
     def __eq__(self, other: object) -> bool:
@@ -251,9 +251,10 @@ def place_item(
     *parameters: float,
     is_needed: bool = False,
 ) -> MissionItem:
-    """Create an item at a place. One of ``altitudes`` (relative to home, to mean sea level and to terrain) is given.
+    """Create an item at a place.
 
-    A Position supplies latitude and longitude, and also the altitude if none is given. Home supplies no altitude. If no
+    One of the three ``altitudes`` is given: above home, above mean sea level or above the terrain. A Position supplies
+    latitude and longitude, and also the altitude if none is given. Home supplies no altitude. If no
     place is given and ``is_needed`` is False, the item has 0°, 0°, which ArduPilot takes for the current position.
     """
     if isinstance(latitude_deg, (Position, Home)):
@@ -286,7 +287,7 @@ def _altitudes_of(position: Position) -> Altitudes:
 def altitude_and_frame(
     relative_m: float | None, amsl_m: float | None, terrain_m: float | None
 ) -> tuple[float, MavFrame]:
-    """Return the altitude that is given, which must be exactly one, and its frame."""
+    """Return the altitude that is given and its frame. Exactly one altitude must be given."""
     candidates = (
         ("altitude_relative_m", relative_m, MavFrame.GLOBAL_RELATIVE_ALT),
         ("altitude_amsl_m", amsl_m, MavFrame.GLOBAL),

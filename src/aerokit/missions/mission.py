@@ -136,8 +136,8 @@ class FenceCircle(Snapshot):
 
 
 class Fence(Snapshot):
-    """A geofence: ``Fence(polygons=[FencePolygon([...])], circles=[FenceCircle(home, 300.0)])``. ``Fence()`` is no
-    fence.
+    """A geofence: ``Fence(polygons=[FencePolygon([...])], circles=[FenceCircle(home, 300.0)])``. ``Fence()`` is an
+    empty fence.
 
     ``return_point`` is the destination after a breach (Plane, and PX4 if configured). Both sequences are converted to
     tuples.

@@ -34,7 +34,8 @@ def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
     command = LANDING_PATTERNS[pattern["complexItemType"].value]
     is_relative = pattern["altitudesAreRelative"].boolean()
     frame = MavFrame.GLOBAL_RELATIVE_ALT if is_relative else MavFrame.GLOBAL
-    approach = pattern.child("landingApproachCoordinate") or pattern["loiterCoordinate"]  # The latter in older files.
+    # Older files have a loiterCoordinate instead of the landingApproachCoordinate.
+    approach = pattern.child("landingApproachCoordinate") or pattern["loiterCoordinate"]
     heading = 0.0 if command == MavCmd.NAV_LAND else math.nan  # as QGroundControl sends it
     return (
         MissionItem(MavCmd.DO_LAND_START, MavFrame.MISSION),
@@ -202,7 +203,7 @@ def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
         params[5].number(-180, 180, null=True)
     if command == MavCmd.DO_JUMP:
         numbers[0] = _jump_target(params[0], ids)
-    if math.isnan(numbers[6]) and has_place(command):  # `params` has no altitude.
+    if math.isnan(numbers[6]) and has_place(command):  # The file has no altitude in `params`.
         frame, numbers[6] = _planned_altitude(value, frame)
     param1, param2, param3, param4, latitude, longitude, z = numbers
     x, y = (from_degrees(number, command, frame) for number in (latitude, longitude))
@@ -217,7 +218,7 @@ def _jump_target(param: JsonValue, ids: dict[int, int]) -> float:
 
 
 def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
-    """Return frame and altitude according to the fields for display."""
+    """Return the frame and the altitude of the fields for display (AltitudeMode, Altitude, AMSLAltAboveTerrain)."""
     mode_member = value.child("AltitudeMode")
     mode = 0 if mode_member is None else mode_member.integer(0, 0xFF)
     # Mode 3 is an altitude above the terrain, which the planner has converted to one above mean sea level.
@@ -264,7 +265,7 @@ def _no_constant(text: str) -> None:
 
 
 class JsonValue:
-    """A value in a JSON document. Its methods raise :class:`FileFormatError` if it has another type."""
+    """A value in a JSON document. Its methods raise :class:`FileFormatError` if the value has another type."""
 
     __slots__ = ("name", "path", "value")
 
@@ -301,7 +302,7 @@ class JsonValue:
         return self.value
 
     def elements(self, *sizes: int) -> list[JsonValue]:
-        """Return the elements of an array. If ``sizes`` are given, the array must have one of them."""
+        """Return the elements of an array. If ``sizes`` are given, the array must have one of these lengths."""
         if not isinstance(self.value, list):
             raise self.error("an array")
         if sizes and len(self.value) not in sizes:

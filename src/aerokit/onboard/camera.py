@@ -244,6 +244,7 @@ class CameraAdapter(CameraDevice):
         return storage is None or (storage.is_ready and storage.available_mib > 0)
 
     def expose(self, done: Callable[[Shot | None], None]) -> None:
+        """Take a photo in a task, then call ``done`` with the result, or with None after an error."""
         time_boot_ms, unix_time = self._host.time_boot_ms, self._host.connection.unix_time()
 
         async def take() -> None:

@@ -272,6 +272,7 @@ def _check_option(
 
 
 def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
+    """Return the value in the setting's type; raise InvalidArgument if it is out of range or between two steps."""
     number = checked_setting(setting.name, value, setting.wire_type)
     if isinstance(number, (str, bytes)):
         return number
@@ -415,6 +416,7 @@ class _Reader:
                 )
 
     def _ranges(self, nodes: Iterable[Element]) -> Iterator[SettingRange]:
+        """Yield the valid restrictions that an option imposes on other settings."""
         for node in nodes:
             setting = node.get("parameter", "")
             wire_type = self._types.get(setting)

@@ -216,7 +216,7 @@ def _add_value(values: dict[str, int | float], place: str, name: str, text: str,
         raise FileFormatError(f"{place}: {error}") from None
     if name in values:
         raise FileFormatError(f"{place}: {name} appears a second time")
-    values[name] = checked if kind.is_integer else number
+    values[name] = checked if kind.is_integer else number  # A float keeps all its digits, as in the file.
 
 
 def _directive_hint(fields: list[str]) -> str:

@@ -169,6 +169,7 @@ _BITS = range(64)
 
 
 def _parse(data: bytes) -> list[ParameterMetadata]:
+    """Parse a file of either autopilot, XML or JSON."""
     if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
         root = DefusedXml.fromstring(data, forbid_dtd=True)
         if root.tag == "paramfile":

@@ -193,7 +193,7 @@ class CalibrationRun:
                 await self.session.wait_for_heartbeat(self._cancel_sent_at)
                 is_taken_over = self._sent_cancel is not None and bool(self._sent_cancel.end)
                 if self._has_rebooted or is_taken_over:
-                    return
+                    return  # A reboot has ended the calibration, or another party must not be disturbed.
                 if self.context.arbiter.is_state_recent:
                     self._send_cancel(*self._cancel_command)
             logger.warning("%s: the vehicle did not confirm the cancellation", self.call_name)

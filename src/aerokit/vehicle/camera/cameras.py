@@ -243,9 +243,9 @@ class Cameras:
         # `at` may have created another object for the same camera. Only one of the two publishes its events.
         self._first_link.is_muted = number in self._cameras
 
-    def _on_capture(self, message: Any, device: int) -> None:
+    def _on_capture(self, message: Any, device_id: int) -> None:
         """Create the camera object if needed, so that its capture log also gets this first capture."""
-        number = self._record(message, device)
+        number = self._record(message, device_id)
         if number in (0, self._first_link.number, *self._cameras):
             return  # The sender is not a camera, or the camera's object receives this message itself.
         if self._first_link.number is None:
@@ -263,16 +263,16 @@ class Cameras:
         for number, message in early:
             self.at(number)._log.record(message)
 
-    def _record(self, message: Any, device: int) -> int:
+    def _record(self, message: Any, device_id: int) -> int:
         """Add the camera to the state value `cell`; return its number, or 0 if the message is not from a camera.
 
-        The number is ``device`` in a message of the autopilot, otherwise the component id of the sender.
+        The number is ``device_id`` if the autopilot is the sender, otherwise the component id of the sender.
         """
         frame = message.received_frame
         if frame is None:
             return 0
         is_from_autopilot = frame.component_id == self._session.component_id
-        number = device if is_from_autopilot else frame.component_id
+        number = device_id if is_from_autopilot else frame.component_id
         # Cameras of the autopilot have the numbers 1 to 6; all other cameras have their component ids.
         if (number in AUTOPILOT_CAMERA_IDS) != is_from_autopilot or number == 0:
             return 0

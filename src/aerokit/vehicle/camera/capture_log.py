@@ -138,7 +138,7 @@ class CaptureLog:
                     timeout=REQUEST_TIMEOUT_S,
                 )
                 return False
-            newest = await request(
+            newest = await request(  # The autopilot stores only its newest capture.
                 m.CameraFeedback,
                 where=lambda message: message.cam_idx + 1 == self._link.number,
                 timeout=REQUEST_TIMEOUT_S,
@@ -198,7 +198,7 @@ class CaptureLog:
         ``previous`` is the stored entry with the same index.
         """
         if previous is not None and previous.capture.success is not False:
-            return not entry.reports_same_picture(previous)
+            return not entry.reports_same_picture(previous)  # Only a failed picture's index may be used again.
         index, highest = entry.capture.index, self._highest
         if highest is None or index >= highest.capture.index or index in self._requested:
             return False

@@ -64,7 +64,7 @@ class ComponentSession:
             session.connection,
             session.system_id,
             component_id,
-            autopilot=Autopilot(session.vehicle_type),
+            autopilot=Autopilot(session.vehicle_type),  # The autopilot's special rules do not apply to a component.
             version=version,
             background=session.background,
             describe=self.describe_link,

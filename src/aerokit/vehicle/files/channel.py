@@ -173,6 +173,7 @@ class FileChannel:
     def _session_request(
         self, opcode: MavFtpOpcode, path: str, session: int, idle_timeout_s: float, *, is_sent: bool = False
     ) -> FtpRequest:
+        """Create a request that opens or closes the session of a file."""
         return FtpRequest(
             self.client,
             opcode,
@@ -262,6 +263,7 @@ class LogChannel:
         timeout: float | None,
         on_progress: OnProgress,
     ) -> None:
+        """Request ``size`` bytes of a log as one operation, and write them to ``into``."""
         transfers = self._transfers
         exchange = LogDownload(
             transfers.system_id,

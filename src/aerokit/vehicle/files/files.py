@@ -271,7 +271,8 @@ class Files:
         offset: int = 0,
         data: bytes | None = None,
     ) -> FtpMessage:
-        path_bytes(path)
+        """Send a request with a single reply, as one operation."""
+        path_bytes(path)  # Raises InvalidArgument before anything is sent.
         async with self._channel.operation(path, timeout=timeout, idle_timeout_s=idle_timeout_s):
             return await self._channel.request(opcode, path, idle_timeout_s=idle_timeout_s, offset=offset, data=data)
 

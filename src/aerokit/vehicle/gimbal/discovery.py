@@ -150,7 +150,7 @@ class GimbalRegistry:
         if all(map(math.isfinite, message.q)):
             attitude = from_device(message, self._heading())
         device.set_attitude(message, attitude)
-        if device is self.reporting:
+        if device is self.reporting:  # This is the first gimbal that reports its attitude.
             self.placeholder.update_flags(message)
             self.placeholder.set_attitude(message, attitude)
 

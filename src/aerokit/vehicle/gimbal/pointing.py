@@ -118,8 +118,8 @@ async def wait_until_there(
     """Wait until an attitude newer than ``since`` shows that the target is reached; errors as for `Gimbal.point`."""
     session, checked_at = orders.session, since
     deadline, reboots = session.connection.now() + timeout, orders.public_device.reboots
-    cells = (orders.public_device.attitude, orders.attitude_source.attitude, orders.device.controllers)
-    with orders.device.in_use(), ChangeSignal(session, *cells, every_arrival=True) as changes:
+    watched = (orders.public_device.attitude, orders.attitude_source.attitude, orders.device.controllers)
+    with orders.device.in_use(), ChangeSignal(session, *watched, every_arrival=True) as changes:
         while True:
             source = orders.attitude_source
             session.connection.raise_if_ended()
@@ -144,12 +144,12 @@ async def wait_until_there(
 
 def _describe_state(orders: GimbalOrders, since: float) -> str:
     source, device = orders.attitude_source, orders.device
-    cell = source.attitude
-    if not cell.is_known:
-        return f"the gimbal does not report its attitude (no {cell.waits_for})"
-    text = f"it points to {_format_angles(_angles_of(cell.value))}"
-    if cell.updated_at <= since:
-        text += f", reported {cell.age:.1f} s ago, before the order"
+    attitude = source.attitude
+    if not attitude.is_known:
+        return f"the gimbal does not report its attitude (no {attitude.waits_for})"
+    text = f"it points to {_format_angles(_angles_of(attitude.value))}"
+    if attitude.updated_at <= since:
+        text += f", reported {attitude.age:.1f} s ago, before the order"
     if device.failures:
         text += f", it reports {device.describe_failures()}"
     if device.manager_information is not None:
@@ -189,9 +189,9 @@ def ordered_angles(pitch: float, yaw: float, roll: float | None, *, from_nose: b
 
 def direction_to(context: VehicleContext, target: Position) -> Angles | None:
     """Return the direction from the vehicle to a position; None while the vehicle's position or height is unknown."""
-    cell = context.session.telemetry.position
-    here = cell.latest
-    if here is None or cell.age > POSITION_MAX_AGE_S:
+    position = context.session.telemetry.position
+    here = position.latest
+    if here is None or position.age > POSITION_MAX_AGE_S:
         return None
     height_m = _height_above(here, target)
     if height_m is None:
@@ -338,7 +338,7 @@ class PointingMixin(GimbalMixin):
         with attitude_stream(orders):
             since = self._now()
             await send()
-            target = RestTarget(flag, or_ahead=flag == NEUTRAL)
+            target = RestTarget(flag, or_ahead=flag == NEUTRAL)  # The neutral position is usually straight ahead.
             await wait_until_there(orders, order, f"{orders.name}: {action}", target, since=since, timeout=timeout)
 
     def _check_limits(self, pitch: float, roll: float, yaw: float | None) -> None:

@@ -259,6 +259,7 @@ class PlanTransfer(Generic[PlanT]):
             self._raise_mismatch((f"the vehicle still has items: {remaining}",))
 
     async def _read(self, method: str) -> tuple[MissionItem, ...]:
+        """Read the plan into the cache, as a file if possible."""
         if await self._uses_file(method):
             try:
                 items = await self._channel.read_file()

@@ -181,9 +181,10 @@ class ParameterCache:
                 return None
             return ParameterTable(_parameter(row, i) for i, row in enumerate(content["parameters"]))
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
-            return None
+            return None  # The file is missing, unreadable or damaged.
 
     def save(self, vehicle: str, hash_: int, table: ParameterTable) -> None:
+        """Replace the cached list of a vehicle atomically. Errors of the disk are ignored."""
         rows = [[param.name, param.value, int(param.type), param.default] for param in table.values()]
         content = {"format": CACHE_FORMAT, "vehicle": vehicle, "hash": hash_, "parameters": rows}
         path = self._path(vehicle)

@@ -358,9 +358,9 @@ class NtripClient:
 
 def gga_sentence(session: VehicleSession) -> bytes | None:
     """Return the vehicle's position as ``$GPGGA,…`` (NMEA); None while no recent position is known."""
-    cell = session.telemetry.position
-    place = cell.latest
-    if place is None or cell.age > POSITION_MAX_AGE_S or place.altitude_amsl_m is None:
+    position = session.telemetry.position
+    place = position.latest
+    if place is None or position.age > POSITION_MAX_AGE_S or place.altitude_amsl_m is None:
         return None
     receivers = session.telemetry.cells["gps"].latest
     quality, satellites = 1, 4  # A position needs four satellites at least.

@@ -133,6 +133,7 @@ class Rtk:
         return NtripClient(self._session, self._send, Caster.parse(url), send_position, timeout)
 
     def _send(self, message: bytes) -> None:
+        """Send one RTCM message and update the statistics."""
         if self._session.is_closed:
             raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
         send_rtcm(self._session.connection, message, self)
