@@ -174,6 +174,7 @@ def _convert(letter: str, value: float) -> Iterator[float]:
 
 
 def _convert_special(letter: str, value: float) -> Iterator[float]:
+    """Yield a finite value in the form that ``letter`` stands for, other than an integer with a range."""
     whole = math.trunc(value)
     if letter == "f":  # 32-bit float
         yield struct.unpack("<f", struct.pack("<f", value))[0]

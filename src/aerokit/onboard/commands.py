@@ -229,6 +229,7 @@ class ComponentCommands:
         self._tasks.start(run, f"aerokit {command_name(command.command)}")
 
     async def _finish(self, running: RunningCommand, function: Callable[..., Any], answer: Awaitable[Any]) -> None:
+        """Wait for the result of a handler, and acknowledge the command."""
         try:
             outcome = outcome_of(await answer)
         except asyncio.CancelledError:

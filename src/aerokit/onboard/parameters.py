@@ -99,7 +99,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         """
         check_name(name)
         if self._is_excluded:
-            raise InvalidArgument("a component has either parameters or the settings of a camera definition")
+            raise InvalidArgument("a component cannot have both parameters and the settings of a camera definition")
         if name in self._rows:
             raise InvalidArgument(f"this component already has a parameter {name}")
         if len(self._rows) >= MAX_COMPONENT_PARAMETERS:
@@ -138,7 +138,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
     def _forbid_parameters(self) -> None:
         """Accept no parameters from now on, because the settings of a camera definition use PARAM_EXT."""
         if self._rows:
-            raise InvalidArgument("a component has either parameters or the settings of a camera definition")
+            raise InvalidArgument("a component cannot have both parameters and the settings of a camera definition")
         self._is_excluded = True
 
     def set(self, name: str, value: int | float | str) -> None:

@@ -188,5 +188,5 @@ def _centimetres(distance_m: float | None, nothing_in_range: int) -> int:
     if distance_m is None or math.isnan(distance_m):
         return _NOT_MEASURED
     if distance_m < 0:
-        raise InvalidArgument(f"distances_m contains {distance_m}; allowed: 0 or more, or None")
+        raise InvalidArgument(f"distances_m contains {distance_m}, but each distance must be 0 or more, or None")
     return nothing_in_range if math.isinf(distance_m) else min(nothing_in_range, round(distance_m * 100))

@@ -37,7 +37,7 @@ DUPLICATE_WINDOW_S = 10.0
 REORDER_WINDOW_MS = 5000
 # If an index exceeds the reported count by more than this, the camera's count does not follow the standard.
 MAX_COUNT_LEAD = 100
-# A larger jump of the index counts as corrupt until a second picture confirms it.
+# If the index rises by more than this, it counts as corrupt until the next picture confirms it.
 MAX_INDEX_GAP = 1000
 # If an index is lower than the previous one by more than this, the 16-bit counter of CAMERA_FEEDBACK has wrapped.
 HALF_RANGE = FEEDBACK_INDEX_RANGE // 2
@@ -198,7 +198,8 @@ class CaptureLog:
         ``previous`` is the stored entry with the same index.
         """
         if previous is not None and previous.capture.success is not False:
-            return not entry.reports_same_picture(previous)  # Only a failed picture's index may be used again.
+            return not entry.reports_same_picture(previous)  # Two successful pictures cannot have the same index.
+        # A lower index shows a reset, unless the capture was requested or arrived late.
         index, highest = entry.capture.index, self._highest
         if highest is None or index >= highest.capture.index or index in self._requested:
             return False

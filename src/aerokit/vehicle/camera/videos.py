@@ -195,9 +195,9 @@ class VideoMixin(CameraMixin):
             stream: number of the stream, 1 to 255.
         """
         check_range("stream", stream, 1, 255)
-        for available in await self.load_streams():
-            if available.number != stream and available.is_running:
-                await self.stop_streaming(available.number)
+        for camera_stream in await self.load_streams():
+            if camera_stream.number != stream and camera_stream.is_running:
+                await self.stop_streaming(camera_stream.number)
         await self.start_streaming(stream)
 
     async def _send_stream_command(self, action: str, command: int, stream: int) -> None:

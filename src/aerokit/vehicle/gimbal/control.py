@@ -99,6 +99,7 @@ class ReleaseCommand:
         self._session.commands.send_unconfirmed(self._command, *self._params, component_id=self._target)
 
     async def _confirm(self) -> None:
+        """Wait for the acknowledgement of the command that was just sent; retry it while it is still due."""
         with self._orders.context.arbiter.auxiliary_order() as order:
             await self._orders.context.sender.send_long(
                 order,
@@ -159,7 +160,7 @@ class GimbalControl:
         self._orders, self._session = orders, orders.session
         self._is_primary = is_primary
         self._device: GimbalDevice | None = None
-        self._control_request = ControlRequest(0, 0, is_primary=is_primary)
+        self._control_request = ControlRequest(0, 0, is_primary=is_primary)  # replaced on entry
         self._taken: GimbalTaken | None = None
         self._loss_was_raised = self._was_entered = self._is_ended = False
         self._lost = asyncio.Event()

@@ -169,10 +169,8 @@ class GimbalDevice:
         self.attitude: StateCell[GimbalAttitude] = context.session.connection.new_cell(
             f"{name}.attitude", ATTITUDE_MESSAGES
         )
-        if component_id in (
-            0,
-            context.session.component_id,
-        ):  # All other gimbals send their attitude without a request.
+        # All other gimbals send their attitude without a request.
+        if component_id in (0, context.session.component_id):
             self.attitude._feed_from(WatchedStream(self.attitude, partial(self._request_attitude, context.session)))
         self.controllers: StateCell[GimbalControllers] = context.session.connection.new_cell(
             f"{name}.controllers", "GIMBAL_MANAGER_STATUS"

@@ -113,6 +113,7 @@ class GimbalRegistry:
             self._session.at_close(bus.attach(message_type, callback, system_id=self._session.system_id))
 
     def _record_received(self, message: Message) -> None:
+        """Record when the sender was last received, and when the autopilot's last silence ended."""
         frame = message.received_frame
         if frame is None:
             return

@@ -315,9 +315,8 @@ class Gimbals:
         session = self._context.session
         deadline = session.connection.now() + timeout
         with anyio.move_on_after(timeout):
-            with suppress(
-                CommandRejected, CommandTimeout
-            ):  # One component may refuse, although others send the message.
+            # One component may refuse, although others send the message.
+            with suppress(CommandRejected, CommandTimeout):
                 await session.commands.send_long(
                     MavCmd.REQUEST_MESSAGE,
                     GimbalManagerInformation.ID,

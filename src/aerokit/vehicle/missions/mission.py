@@ -72,7 +72,7 @@ class MissionEndDetector:
     def has_ended(self) -> bool:
         """Return True if the mission has ended. If the vehicle is on the ground, it must have landed, not fallen."""
         is_reported, is_on_ground = self._is_end_reported(), self._is_on_ground
-        # The check must see every call, because it watches the velocity.
+        # `confirms` must be called each time, because it watches the velocity.
         has_landed = self.ground.confirms(is_reported and is_on_ground)
         return has_landed if is_on_ground else is_reported
 

@@ -75,7 +75,7 @@ class PlanChannel:
         except MissionRejected:
             if exchange.was_started:
                 raise
-            return None
+            return None  # The vehicle refused the partial upload itself, not an item.
         self._has_changed = True
         return result
 

@@ -59,10 +59,10 @@ class ParameterAccess:
         self.store: ParameterStore = ParameterStore(transfers)
         self._downloading = asyncio.Lock()
         self._writing = asyncio.Lock()
-        self._has_pack: bool | None = None
+        self._has_pack: bool | None = None  # True if the vehicle offers all parameters in one file; None until tried
         self._answer_round_trip: RoundTrip | None = None
         self._boosts = 0  # number of running operations that need a raised rate of answers
-        self._written_at: dict[str, float] = {}
+        self._written_at: dict[str, float] = {}  # maps each name to the time of its last write
         # Last value of each parameter that this program has written and the vehicle has confirmed.
         self.written: dict[str, int | float] = {}
 

@@ -41,9 +41,9 @@ class ParameterStore:
         self.updates = 0
         # Number of parameters according to the last message. ArduPilot may show and hide parameters at any time.
         self.count: int | None = None
-        # Value of `updates` at the last message with this parameter.
+        # Maps each name to the value of `updates` at the last message with this parameter.
         self._updated_at: dict[str, int] = {}
-        # Previous value of a written parameter, and the time until which messages with it are ignored.
+        # Maps each written name to the previous value, and the time until which messages with this value are ignored.
         self._replaced: dict[str, tuple[int | float, float]] = {}
 
     @property

@@ -152,12 +152,12 @@ class TemporaryParameters(_Block):
     ) -> None:
         super().__init__(registry, access, writing, idle_timeout_s)
         self._values = dict(values)
-        self._is_open = False
+        self._was_entered = False
 
     async def __aenter__(self) -> dict[str, ParameterWrite]:
-        if self._is_open:
+        if self._was_entered:
             raise InvalidArgument("this block was entered already: call temporarily() again")
-        self._is_open = True
+        self._was_entered = True
         try:
             results = await self._write(self._values)
             _raise_first_error(results)
