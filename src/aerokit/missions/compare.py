@@ -309,7 +309,7 @@ def _same_place(
     value, actual_value = getattr(expected, field), getattr(actual, field)
     scale = xy_scale(expected.command, expected.frame)
     if scale != 1:
-        tolerance = 1.0
+        tolerance = 1.0  # for rounding, in units of x and y
         if single_precision:
             tolerance += _float_step(value / scale) * scale
         return bool(abs(value - actual_value) <= tolerance)

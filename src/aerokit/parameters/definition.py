@@ -278,7 +278,7 @@ def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
         return number
     if setting.type == "bool":
         if number not in (0, 1):
-            raise InvalidArgument(f"{setting.name} = {short_repr(value)} is not allowed: True or False")
+            raise InvalidArgument(f"{setting.name} = {short_repr(value)} is not allowed: it must be True or False")
         return bool(number)
     low, high, step = setting.minimum, setting.maximum, setting.step
     # A value that equals a limit as a 32-bit float is allowed.

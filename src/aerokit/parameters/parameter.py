@@ -253,7 +253,7 @@ def checked_setting(name: str, value: object, type: int) -> SettingValue:  # noq
             f"{name} = {short_repr(value)} has {len(data)} bytes; at most {MAX_VALUE_SIZE} fit into the message"
         )
     if data.endswith(b"\0"):
-        raise InvalidArgument(f"{name} = {short_repr(value)}: zeros at its end would be lost")
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: zeros at its end would be lost")
     return setting_value(data, type)
 
 

@@ -282,7 +282,7 @@ def geotag_file(path: str | os.PathLike[str], capture: Capture, *, to: str | os.
 def _split(jpeg: bytes) -> tuple[list[bytes], bytes]:
     """Return the segments in front of the image data, and the image data."""
     if jpeg[:3] != bytes((0xFF, START, 0xFF)):
-        raise FileFormatError("not a JPEG: the bytes do not begin with its marker (FF D8 FF)")
+        raise FileFormatError("the picture is not a JPEG: its bytes do not begin with FF D8 FF")
     segments = list(_segments(jpeg))
     return segments, jpeg[2 + sum(map(len, segments)) :]
 
@@ -297,7 +297,7 @@ def _segments(jpeg: bytes) -> Iterator[bytes]:
         length = int.from_bytes(jpeg[start + 2 : start + 4], "big")
         segment = jpeg[start : start + 2 + length]
         if segment[:1] != b"\xff" or length < 2 or len(segment) < 2 + length:
-            raise FileFormatError("incomplete JPEG: it ends before the image data")
+            raise FileFormatError("the JPEG is incomplete: it ends before the image data")
         yield segment
         start += len(segment)
 

@@ -365,7 +365,7 @@ class StorageMixin(CameraMixin):
         """
         check_range("number", number, 1, 255)
         await self._link.identify()
-        # The second 1 also resets the image log of the camera.
+        # param2 = 1 formats the medium, param3 = 1 also resets the image log of the camera.
         await self._link.command(
             MavCmd.STORAGE_FORMAT, number, 1, 1, attempts=1, progress_timeout=timeout, on_progress=on_progress
         )

@@ -87,7 +87,7 @@ class RestTarget:
         return any(abs(turn) > STILL_DEG for turn in turns)
 
     def describe(self) -> str:
-        return "it has not reported that it rests there"
+        return "and has not reported that it rests in this position"
 
 
 @contextmanager
@@ -147,11 +147,11 @@ def _describe_state(orders: GimbalOrders, since: float) -> str:
     attitude = source.attitude
     if not attitude.is_known:
         return f"the gimbal does not report its attitude (no {attitude.waits_for})"
-    text = f"it points to {_format_angles(_angles_of(attitude.value))}"
+    text = f"the gimbal points to {_format_angles(_angles_of(attitude.value))}"
     if attitude.updated_at <= since:
         text += f", reported {attitude.age:.1f} s ago, before the order"
     if device.failures:
-        text += f", it reports {device.describe_failures()}"
+        text += f", its failures are {device.describe_failures()}"
     if device.manager_information is not None:
         limits = information_of(device.device_id, orders.manager_id, device.manager_information, device=None)
         text += f", its limits are pitch {_format_limits(limits.pitch_deg)}, yaw {_format_limits(limits.yaw_deg)}"

@@ -51,15 +51,15 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     def __init__(
         self,
         orders: GimbalOrders,
-        first: tuple[float, float],
+        first_rates: tuple[float, float],
         is_from_north: bool,
         rate_hz: float,
         valid_for_s: float,
         max_lag_s: float,
     ) -> None:
         check_range("rate_hz", rate_hz, 2, MAX_RATE_HZ)
-        super().__init__(orders.context, self._encode_rates, first, rate_hz, valid_for_s, max_lag_s)
-        _check(*first)
+        super().__init__(orders.context, self._encode_rates, first_rates, rate_hz, valid_for_s, max_lag_s)
+        _check(*first_rates)
         self._orders, self._flags = orders, int(LOCKED if is_from_north else LEVEL)
         self._began_at = -math.inf
         self._order: Order | None = None

@@ -91,6 +91,7 @@ class MissionEndDetector:
         progress = self._tracker.progress.latest
         reports_state = progress is not None and progress.state != MissionState.UNKNOWN
         last = self._tracker.last_item
+        # Without a mission state, the last item that was reached shows the end.
         return not reports_state and last is not None and self._tracker.reached == last
 
     def failure(self, order: Order | None, *, is_paused: bool) -> str | None:

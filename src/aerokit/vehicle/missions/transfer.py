@@ -184,7 +184,7 @@ class PlanChannel:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
         if is_overwritten and self._has_changed and refused_item:
             new_items = "only item 0 is new" if refused_item == 1 else f"items 0 to {refused_item - 1} are new"
-            return f"; on the vehicle {new_items} now, and later items, if it has any, are old: upload again, or clear"
+            return f"; on the vehicle, {new_items} now, and all later items are old: upload again, or clear"
         if is_overwritten and self._has_changed:
             return "; the vehicle now has some new and some old items: upload again, or clear"
         if is_overwritten and is_silent:
@@ -311,6 +311,7 @@ class PlanTransfer(Generic[PlanT]):
             ) from None
 
     async def _send_file(self, items: Sequence[MissionItem], method: str) -> None:
+        """Send the plan as a file and read it back. With "auto", send the items if that fails."""
         try:
             await self._channel.write_file(items)
         except (FileError, FileTimeout) as error:
@@ -357,6 +358,7 @@ class PlanTransfer(Generic[PlanT]):
         return True
 
     async def _send_part(self, items: Sequence[MissionItem], first: int, *, verify: bool) -> bool:
+        """Send consecutive items; return False if the vehicle does not support partial uploads."""
         result = await self._channel.send_part(items, first)
         if result is None:
             return False

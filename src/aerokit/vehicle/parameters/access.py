@@ -122,6 +122,7 @@ class ParameterAccess:
             except (FileError, FileTimeout, NotSupported, RemoteProtocolError) as error:
                 if method == "ftp":
                     raise
+                # A damaged file, or a vehicle with another open file, may be different next time.
                 is_temporary = isinstance(error, RemoteProtocolError) or (
                     isinstance(error, FileError) and error.code == MavFtpErr.NOSESSIONSAVAILABLE
                 )

@@ -243,7 +243,7 @@ class NtripClient:
                     self._reconnects += 1
                     logger.info("%s: connected again", self._name)
                     if await self._forward(response):
-                        pause_s = MIN_RETRY_S
+                        pause_s = MIN_RETRY_S  # The caster sent corrections, so the next attempt may follow soon.
         except (ConnectionClosed, LinkLost) as error:
             self._problem = f"the vehicle's connection has ended: {error}"
         finally:
