@@ -40,13 +40,13 @@ class ItemStorage(Enum):
     """Form in which items are stored. Comparisons tolerate the loss of precision that this form causes."""
 
     WIRE = "wire"
-    """Only MISSION_ITEM_INT: 32-bit floats, equivalent frames."""
+    """Only changes made by MISSION_ITEM_INT: rounding to 32-bit floats, and equivalent frames."""
     ARDUPILOT = "ardupilot"
-    """MISSION_ITEM_INT, and ArduPilot's storage of 15 bytes for each item."""
+    """Changes made by MISSION_ITEM_INT, and by ArduPilot's storage of 15 bytes for each item."""
     PX4 = "px4"
-    """MISSION_ITEM_INT, and PX4's item structure."""
+    """Changes made by MISSION_ITEM_INT, and by PX4's item structure."""
     ANY = "any"
-    """Any of the other three."""
+    """Changes made by any of the other three."""
 
 
 _ARDUPILOT: dict[int, tuple[str, ...]] = {

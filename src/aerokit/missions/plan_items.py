@@ -179,7 +179,7 @@ def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
 def _jump_ids(
     entries: Sequence[JsonValue], groups: Sequence[Sequence[JsonValue] | None], sizes: Sequence[int]
 ) -> dict[int, int]:
-    """Map doJumpId to index. Simple items take precedence over those inside surveys."""
+    """Map each doJumpId to the index of its item. Simple items take precedence over those inside surveys."""
     ids_of_simple_items: dict[int, int] = {}
     ids_in_surveys: dict[int, int] = {}
     first = 0
@@ -276,7 +276,7 @@ class JsonValue:
         self.path: str = path
 
     def error(self, expected: str) -> FileFormatError:
-        """Create an error for a value that is not as expected."""
+        """Create an error that says what was expected instead of this value."""
         # Encode only the beginning of the value, because a large value would take long and is shortened anyway.
         text = "".join(islice(json.JSONEncoder().iterencode(self.value), 41))
         if len(text) > 40:

@@ -50,12 +50,12 @@ class Rename(Snapshot):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All names, newest first."""
+        """All names of the parameter, newest first."""
         return (self.new, *self.other_new, *self.old_names)
 
     @property
     def old_names(self) -> tuple[str, ...]:
-        """All names in old units."""
+        """All names whose values are in old units."""
         return (self.old, *self.other_old)
 
     @property

@@ -1243,7 +1243,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
             yaw_deg_s: the first rate in degrees per second, −720 to 720; positive is to the right.
-            frame: ``"earth"``: the gimbal keeps its yaw relative to north; ``"vehicle"``: it turns with the vehicle.
+            frame: ``"earth"``: the yaw stays relative to north; ``"vehicle"``: the gimbal turns with the vehicle.
             rate_hz: how often the latest rates are sent, 2 to 100.
             valid_for_s: stop the gimbal if no new rates are set for this many seconds.
             max_lag_s: stop the gimbal if the event loop is blocked for this many seconds.
@@ -2141,7 +2141,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         return self.aio.table
 
     def known(self, name: str) -> Parameter | None:
-        """Return the last known parameter of this name on the vehicle; ``table.get(name)`` without building a table."""
+        """Return the last known parameter with this name, like ``table.get(name)`` but without building a table."""
         return self.aio.known(name)
 
     @property
@@ -2923,7 +2923,7 @@ class Rtk(TwinOf["AsyncRtk"]):
 
     @cached_property
     def corrections(self) -> StateCell[Corrections]:
-        """Number, bytes and bandwidth of the corrections sent. Its ``age`` is the time since the last message."""
+        """Number, bytes and bandwidth of the corrections sent; their ``age`` is the time since the last message."""
         return StateCell(self._loop, self.aio.corrections)
 
     def send(self, rtcm: bytes) -> None:

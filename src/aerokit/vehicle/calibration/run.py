@@ -46,7 +46,7 @@ CONFIRM_POLL_INTERVAL_S = 0.1
 
 
 class CalibrationRun:
-    """One calibration. It counts as running from its first command until ``finish`` or a confirmed cancellation."""
+    """One calibration, which counts as running from its first command until ``finish`` or a confirmed cancellation."""
 
     def __init__(
         self, context: VehicleContext, sensor: str, runs: list[CalibrationRun], parameters: Callable[[], Parameters]

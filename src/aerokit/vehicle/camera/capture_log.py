@@ -288,7 +288,7 @@ class CaptureQueue:
         return self._queue.popleft() if self._queue else None
 
     async def wait(self, seconds: float) -> bool:
-        """Wait for a capture; False if none arrives in time."""
+        """Wait for a capture; return False if none arrives in time."""
         with anyio.move_on_after(seconds):
             while not self._queue:
                 self._cell._raise_if_closed()

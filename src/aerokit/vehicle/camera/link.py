@@ -132,7 +132,7 @@ class CameraLink(CameraOrders):
             self._attach(message_type, callback)
 
     def start_polling(self) -> None:
-        """Start polling state values in the background. Call it on the event loop's thread."""
+        """Start polling state values in the background. Must be called on the event loop's thread."""
         if not self._is_polling:
             self._is_polling = True
             self._session.background.start(self.requests.run, "aerokit camera")

@@ -321,7 +321,7 @@ class Settings:
         return not was_read and not setting.write_only
 
     def _with_definition(self, setting: Setting) -> Setting:
-        """Return the setting with its value converted to the type in the definition, if the definition has it."""
+        """Return the setting with its value converted to the type in the definition, if there is one."""
         defined = None if self._definition is None else self._definition.settings.get(setting.name)
         return setting if defined is None else setting.replace(value=defined.convert(setting.value))
 

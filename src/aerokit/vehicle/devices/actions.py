@@ -38,7 +38,7 @@ INJECT_FAILURE = SimpleOrder(
     (Argument("unit", 0, 255), Argument("kind", 0, 255), Argument("instance", 0, 16)),
 )
 TUNE = re.compile(r"[A-Ga-gLlMmNnOoPpSsTt0-9#+.<>\- ]+")
-"""Characters of QBASIC 1.1's PLAY statement, whose notes ArduPilot and PX4 can play."""
+"""Characters allowed in a tune: those of QBASIC 1.1's PLAY statement, which ArduPilot and PX4 understand."""
 TUNE_PART, MAX_TUNE = 30, 230
 MAX_TEXT_BYTES = 1000
 

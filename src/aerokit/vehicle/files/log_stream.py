@@ -27,7 +27,7 @@ NO_MESSAGE_START = 255
 MAX_WAITING = 8192
 """Maximum number of messages that wait for the reader; they need about 2 MB."""
 DROPOUT = b"\x02\x00O"
-"""Head of the ULog message that marks a gap; the duration in ms follows (2 bytes)."""
+"""Beginning of the ULog message that marks a gap; the duration in ms follows (2 bytes)."""
 
 
 class UlogAssembler:

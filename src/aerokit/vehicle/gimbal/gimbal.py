@@ -245,7 +245,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
             yaw_deg_s: the first rate in degrees per second, −720 to 720; positive is to the right.
-            frame: ``"earth"``: the gimbal keeps its yaw relative to north; ``"vehicle"``: it turns with the vehicle.
+            frame: ``"earth"``: the yaw stays relative to north; ``"vehicle"``: the gimbal turns with the vehicle.
             rate_hz: how often the latest rates are sent, 2 to 100.
             valid_for_s: stop the gimbal if no new rates are set for this many seconds.
             max_lag_s: stop the gimbal if the event loop is blocked for this many seconds.

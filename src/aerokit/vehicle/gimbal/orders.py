@@ -268,7 +268,10 @@ class GimbalOrders:
             await self.send(order, CONFIGURE, *self._primary_params((RELEASE, RELEASE)))
 
     def _primary_params(self, controller: tuple[int, int]) -> tuple[float, ...]:
-        """Parameters that set the primary controller. All others are 0 for the first gimbal of an autopilot."""
+        """Return the parameters that set the primary controller.
+
+        For the first gimbal of an autopilot, only two are returned, so that all others are sent as 0.
+        """
         if self.gimbal_id_param == 0:
             return controller
         return (*controller, UNCHANGED, UNCHANGED, 0, 0, self.gimbal_id_param)

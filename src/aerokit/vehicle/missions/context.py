@@ -109,7 +109,7 @@ class PlanContext:
         return (current.mission_id, current.fence_id, current.rally_points_id)[mission_type]
 
     async def wait_for_plan_id(self, mission_type: int, opaque_id: int) -> bool:
-        """Wait for a MISSION_CURRENT with this plan id; False if none arrives in time."""
+        """Wait for a MISSION_CURRENT with this plan id; return False if none arrives in time."""
         received, started_at = asyncio.Event(), self.now()
 
         def check(_: MissionCurrent) -> None:

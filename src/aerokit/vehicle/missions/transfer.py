@@ -287,7 +287,7 @@ class PlanTransfer(Generic[PlanT]):
         return has_ftp and self._cache.has_file is not False and not is_flying  # `has_file` is None until tried.
 
     def _on_file_error(self, error: Exception, method: str) -> None:
-        """Transfer no files from now on. Raise the error if the caller chose files, or if they have worked before."""
+        """Transfer no files from now on. Raise the error if the caller chose files, or if files have worked."""
         if method == "ftp" or (self._cache.has_file and not isinstance(error, FileError)):
             raise error
         self._cache.has_file = False

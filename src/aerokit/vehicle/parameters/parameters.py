@@ -73,7 +73,7 @@ class Parameters(ReadOnly):
         return self._access.store.table
 
     def known(self, name: str) -> Parameter | None:
-        """Return the last known parameter of this name on the vehicle; ``table.get(name)`` without building a table."""
+        """Return the last known parameter with this name, like ``table.get(name)`` but without building a table."""
         return self._access.store.get(name)
 
     @property

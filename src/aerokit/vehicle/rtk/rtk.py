@@ -96,7 +96,7 @@ class Rtk:
 
     @property
     def corrections(self) -> StateCell[Corrections]:
-        """Number, bytes and bandwidth of the corrections sent. Its ``age`` is the time since the last message."""
+        """Number, bytes and bandwidth of the corrections sent; their ``age`` is the time since the last message."""
         return self._corrections
 
     def send(self, rtcm: bytes) -> None:
