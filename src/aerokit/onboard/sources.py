@@ -118,7 +118,7 @@ class ComponentSources:
             if value is not None:
                 flags |= flag
         if len(callsign) > 8:
-            raise InvalidArgument(f"callsign = {callsign!r} is not allowed: at most 8 characters")
+            raise InvalidArgument(f"callsign = {callsign!r} is not allowed: it must have at most 8 characters")
         self._send(
             m.AdsbVehicle(
                 icao,

@@ -199,7 +199,9 @@ class CameraDefinition(Snapshot):
             raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: it can only be read")
         reasons = self.excluded_by(name, values)
         if reasons:
-            raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed now: excluded by {', '.join(reasons)}")
+            raise InvalidArgument(
+                f"{name} = {short_repr(value)} is not allowed now: the setting is excluded by {', '.join(reasons)}"
+            )
         options, restricted_by = self._options(name, values)
         if options or restricted_by:
             return _check_option(setting, value, options, restricted_by)

@@ -283,7 +283,7 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
             "no RC_CHANNELS was received: is a receiver connected?",
         )
         if not _pulses(channels.latest):
-            raise run.failure("the receiver reports no channels: is the transmitter on? nothing was sent")
+            raise run.failure("the receiver reports no channels; switch the transmitter on; nothing was sent")
         await run.begin(CANCEL_ALL)
         await run.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 1, accepts=RESULTS_OF_RC_COMMAND)
 

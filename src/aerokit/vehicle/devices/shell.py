@@ -80,7 +80,7 @@ class Shell(ReadOnly):
         data = line.encode()
         if len(data) > MAX_LINE or "\n" in line or "\r" in line:
             raise InvalidArgument(
-                f"line of {len(data)} bytes is not allowed: at most {MAX_LINE} bytes, without a line break"
+                f"line of {len(data)} bytes is not allowed: it must have at most {MAX_LINE} bytes, and no line break"
             )
         if not self._is_open:
             raise InvalidArgument("the shell is not open: write to it inside its `async with` block")

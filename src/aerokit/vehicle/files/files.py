@@ -183,7 +183,7 @@ class Files:
         path_bytes(path)
         data = bytes(data)
         if len(data) > MAX_FILE_SIZE:
-            raise InvalidArgument(f"data of {len(data)} bytes is not allowed: at most {MAX_FILE_SIZE}")
+            raise InvalidArgument(f"data of {len(data)} bytes is not allowed: it must have at most {MAX_FILE_SIZE}")
         channel = self._channel
         async with channel.operation(
             f"write {path}",
