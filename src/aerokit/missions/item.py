@@ -15,7 +15,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.position import Home, Position, travel_target
 
-DEFAULT_XY = 0x7FFFFFFF  # this value of x or y means "not given", like NaN in the other parameters
+DEFAULT_XY = 0x7FFFFFFF  # In x or y, this value means "not given", like NaN in the other parameters.
 
 FENCE_COMMANDS = frozenset(
     {

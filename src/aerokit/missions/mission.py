@@ -299,7 +299,7 @@ class Plan(Snapshot):
     source: str = ""
 
     def _key(self) -> tuple[Any, ...]:
-        return tuple(self.to_dict().values())[:-1]  # without the last field, `source`
+        return tuple(self.to_dict().values())[:-1]  # Leave out the last field, `source`.
 
     def __eq__(self, other: object) -> bool:
         return self._key() == other._key() if isinstance(other, Plan) else NotImplemented

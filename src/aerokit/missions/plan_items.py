@@ -36,7 +36,7 @@ def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
     frame = MavFrame.GLOBAL_RELATIVE_ALT if is_relative else MavFrame.GLOBAL
     # Older files have a loiterCoordinate instead of the landingApproachCoordinate.
     approach = pattern.child("landingApproachCoordinate") or pattern["loiterCoordinate"]
-    heading = 0.0 if command == MavCmd.NAV_LAND else math.nan  # as QGroundControl sends it
+    heading = 0.0 if command == MavCmd.NAV_LAND else math.nan  # QGroundControl sends these values.
     return (
         MissionItem(MavCmd.DO_LAND_START, MavFrame.MISSION),
         *_reset_items(pattern),

@@ -243,7 +243,7 @@ class ComponentCommands:
     def _fail(self, running: RunningCommand, function: Callable[..., Any], error: Exception) -> None:
         """Answer with the result for an error, and explain it in a status text."""
         name = getattr(function, "__name__", "run")
-        if name == "run":  # aerokit's own wrapper, whose name tells the sender nothing
+        if name == "run":  # The name of aerokit's own wrapper tells the sender nothing.
             name = command_name(running.command.command)
         self._host.report_error(name, error)
         self._running.finish(running, Outcome(result_of(error)))

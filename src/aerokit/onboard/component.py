@@ -150,7 +150,7 @@ class OnboardComponent:
             raise InvalidArgument(f"state = {state} is not allowed: it must be a MAV_STATE (0 to 8)")
         old = self._heartbeat
         heartbeat = m.Heartbeat(old.type, old.autopilot, base_mode, custom_mode, state, MAVLINK_VERSION)
-        heartbeat.encode()  # raises InvalidArgument before the old heartbeat is replaced
+        heartbeat.encode()  # Raises InvalidArgument before the old heartbeat is replaced.
         self._heartbeat = heartbeat
         self._host.send(heartbeat)
 

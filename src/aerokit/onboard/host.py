@@ -98,7 +98,7 @@ class ComponentHost:
         data = "".join(char if char.isprintable() else " " for char in text)
         data = data.encode("ascii", "replace").decode()[:MAX_TEXT_SIZE]
         if len(data) <= TEXT_SIZE:
-            self.send(m.Statustext(severity, data, id=0, chunk_seq=0))  # id 0: the text has only one chunk.
+            self.send(m.Statustext(severity, data, id=0, chunk_seq=0))  # id 0 means that the text has only one chunk.
             return
         self._text_id = self._text_id % 0xFFFF + 1
         for number, start in enumerate(range(0, len(data), TEXT_SIZE)):

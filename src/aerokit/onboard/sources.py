@@ -161,7 +161,7 @@ class ComponentSources:
         angles = (math.radians(right_deg), math.radians(down_deg))
         kind = LandingTargetType.LIGHT_BEACON
         frame = MavFrame.BODY_FRD
-        size = (0.0, 0.0)  # unknown
+        size = (0.0, 0.0)  # The size of the target is unknown.
         self._send(m.LandingTarget(self._time_us(), target_number, frame, *angles, distance_m, *size, type=kind))
 
     def send_corrections(self, rtcm: bytes) -> None:

@@ -211,7 +211,7 @@ def _ardupilot_xml(root: Element) -> Iterator[ParameterMetadata]:
 
 def _ardupilot_json(content: Mapping[str, Any]) -> Iterator[ParameterMetadata]:
     for group, parameters in content.items():
-        if group == "json":  # the format version
+        if group == "json":  # This entry is the version of the format.
             continue
         for name, fields in parameters.items():
             limits = fields.get("Range", {})

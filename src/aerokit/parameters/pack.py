@@ -153,7 +153,7 @@ def pack_for_download(
         unsplit_size = _CODES[code][1].size * (len(values) if whole_defaults else 1)
         size_in_next_block = (len(file) + len(entry)) % block_size
         if 0 < size_in_next_block < unsplit_size:
-            file += bytes(unsplit_size - size_in_next_block)  # padding
+            file += bytes(unsplit_size - size_in_next_block)  # These zeros move the value into the next block.
         file += entry
         previous_name = name
     return bytes(file)

@@ -166,8 +166,8 @@ async def _read_parameter(run: CalibrationRun, name: str) -> float:
 async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
     """ArduPilot: yield the progress of all compasses, and accept the result if all have succeeded."""
     await run.begin((MavCmd.DO_CANCEL_MAG_CAL, 0))
-    percents: dict[int, int] = {}  # progress by compass
-    reports: dict[int, MagCalReport] = {}  # result by compass
+    percents: dict[int, int] = {}  # progress in percent by number of the compass
+    reports: dict[int, MagCalReport] = {}  # final report by number of the compass
     has_changed = False
     compass_mask = 0  # Bit i is set if compass i is being calibrated.
 
@@ -236,8 +236,8 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
 
     with ExitStack() as cleanup:
         await run.start(*params)
-        # The handler is attached only now: until this calibration starts, ArduPilot broadcasts the result of an earlier
-        # one.
+        # Attach the handler only now, because ArduPilot broadcasts the result of an earlier calibration until this one
+        # starts.
         cleanup.callback(run.session.connection.bus.attach(CommandLong, on_request, system_id=run.session.system_id))
         while True:
             await run.wait(lambda: requests)

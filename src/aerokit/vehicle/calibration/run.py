@@ -55,7 +55,7 @@ class CalibrationRun:
         self.session: VehicleSession = context.session
         self.sensor: str = sensor
         self.parameters: Callable[[], Parameters] = parameters
-        self.call_name: str = f"calibrate.{sensor}"  # for error texts
+        self.call_name: str = f"calibrate.{sensor}"  # how error texts name the call
         self._runs = runs  # all runs of this vehicle that may be in progress
         self.step: partial[CalibrationStep] = partial(CalibrationStep, sensor)
         self._cancel_command: tuple[float, ...] | None = None  # MAV_CMD and its parameters

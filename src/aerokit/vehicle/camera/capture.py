@@ -240,7 +240,7 @@ def geotagged(jpeg: bytes, capture: Capture) -> bytes:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # Pillow only warns when it drops tags that it cannot parse.
-            exif.load(old_exif[4:])  # without the marker and the length
+            exif.load(old_exif[4:])  # The marker and the length (4 bytes) are left out.
             exif.get_ifd(EXIF_IFD).update(_exif_tags(capture))
             exif.get_ifd(GPS_IFD).update(_gps_tags(capture))
             body: bytes = exif.tobytes()

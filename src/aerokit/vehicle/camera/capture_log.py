@@ -179,7 +179,7 @@ class CaptureLog:
     def _on_status(self, message: m.CameraCaptureStatus) -> None:
         boot_ms, count = message.time_boot_ms, message.image_count
         if 0 < self._count_boot_ms - boot_ms < REORDER_WINDOW_MS:
-            return  # an older status that arrived late
+            return  # This status is older than the newest one, and arrived late.
         self._count_boot_ms = boot_ms
         if count < self._count:  # The camera counts from 0 again.
             self._reset()

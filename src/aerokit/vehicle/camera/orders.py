@@ -297,7 +297,7 @@ class MessageRequests:
         try:
             answer = await self._request_legacy(message_type, params, where, timeout)
         except CommandRejected as error:
-            raise refusal or error from None  # preferably the refusal of the standard request
+            raise refusal or error from None  # Prefer the refusal of the standard request.
         self._legacy_types.add(message_type)
         return answer
 

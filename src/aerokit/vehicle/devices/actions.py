@@ -128,8 +128,8 @@ class DeviceActions(VehicleBase):
         data = text.encode()
         if not 1 <= len(data) <= MAX_TEXT_BYTES:
             raise InvalidArgument(f"text has {len(data)} bytes; 1 to {MAX_TEXT_BYTES} are allowed")
-        self._last_text_id = self._last_text_id % 0xFFFF + 1  # 1 to 65535
-        text_id = 0 if len(data) <= CHUNK_LENGTH else self._last_text_id  # 0: the text has only one chunk.
+        self._last_text_id = self._last_text_id % 0xFFFF + 1  # a number from 1 to 65535
+        text_id = 0 if len(data) <= CHUNK_LENGTH else self._last_text_id  # 0 means that the text has only one chunk.
         for chunk_number, chunk in enumerate(_chunks(text)):
             self._session.send(Statustext(MavSeverity[severity.upper()], chunk, text_id, chunk_number))
 

@@ -47,7 +47,7 @@ class UlogAssembler:
     def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
         """Add a message of the stream; return the next data of the file, up to the last complete ULog message."""
         gap = 0 if self._next is None else (message.sequence - self._next) % 0x10000
-        if gap >= 0x8000:  # an earlier message, repeated because its acknowledgement was lost
+        if gap >= 0x8000:  # PX4 repeats an earlier message, whose acknowledgement was lost.
             return b""
         data, first_offset = bytes(message.data[: message.length]), message.first_message_offset
         prefix = b""  # the header of the file, or a ULog message that marks a gap

@@ -104,7 +104,7 @@ class GimbalRegistry:
         if device is None and len(self.devices) < MAX_GIMBALS:
             device = self.devices[key] = GimbalDevice(self._context, *key)
             if component_id == self._session.component_id and number == 1:
-                device.topic = ROI  # the vehicle's region of interest moves this gimbal
+                device.topic = ROI  # The vehicle's region of interest moves this gimbal.
         return device
 
     def _listen(self, message_type: type[Message], callback: Callable[[Any], None]) -> None:

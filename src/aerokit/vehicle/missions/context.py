@@ -198,7 +198,7 @@ class MissionTracker:
         """Set the state values from MISSION_CURRENT, with the item numbers of the program, which do not count home."""
         before = self.current.latest
         current = None if reported.current is None else reported.current - self._offset
-        if current is not None and current < 0:  # item 0 of ArduPilot, which is home
+        if current is not None and current < 0:  # The current item is ArduPilot's item 0, which is home.
             current = None
         if reported.total is None and reported.state == MissionState.NO_MISSION:
             current = None

@@ -384,7 +384,7 @@ class _CachedList:
     async def load_if_current(self, refresh: bool) -> bool:
         """Load the cached list into the store if its hash is the vehicle's; return True if it was loaded."""
         key, store, since = await self._key(), self._access.store, self._access.store.updates
-        self._hash = await self._read_hash()  # also with `refresh`, because `save` needs it
+        self._hash = await self._read_hash()  # With `refresh` too, because `save` needs the hash.
         if refresh or self._hash is None:
             return False
         table = self._cache.load(key, self._hash)

@@ -123,7 +123,7 @@ class ParameterStore:
             return
         replaced_value = self.replaced_value(name)
         if old is not None and replaced_value is not None and same_value(received.value, replaced_value):
-            return  # a late message, from before the last write
+            return  # This message is from before the last write.
         new = received if old is None else merge_update(old, received, self.bytewise)
         self._known[name], self._table = new, None
         self.updates += 1

@@ -294,7 +294,7 @@ class ParameterWriter:
     ) -> tuple[list[_PlannedWrite], dict[str, AerokitError]]:
         """Return the planned writes and the errors. In the first round, an invalid value raises InvalidArgument."""
         plans: list[_PlannedWrite] = []
-        first_plans: dict[str, _PlannedWrite] = {}  # by the vehicle's name: two requested names may mean one parameter
+        first_plans: dict[str, _PlannedWrite] = {}  # the first plan for each name on the vehicle
         errors: dict[str, AerokitError] = {}
         for name, answer in answers.items():
             if not isinstance(answer, ResolvedParameter):
@@ -302,6 +302,7 @@ class ParameterWriter:
                 continue
             try:
                 plan = _plan_write(answer, values[name])
+                # Two requested names may mean the same parameter.
                 _check_same_value(plan, first_plans.setdefault(plan.to_send.name, plan))
                 plans.append(plan)
             except InvalidArgument as error:

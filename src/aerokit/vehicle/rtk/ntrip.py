@@ -138,7 +138,7 @@ class _Response:
             if not 0 < size <= MAX_CHUNK_SIZE:
                 return
             yield await self._reader.readexactly(size)
-            await self._reader.readline()  # the line break after the chunk
+            await self._reader.readline()  # Skip the line break after the chunk.
 
 
 class NtripClient:
@@ -267,7 +267,7 @@ class NtripClient:
                         self._oversized += 1
         except asyncio.TimeoutError:
             reason = f"no data for {MAX_SILENCE_S:g} s"
-        except StopAsyncIteration:  # the end of the body
+        except StopAsyncIteration:  # The body has ended.
             pass
         except (OSError, ValueError, EOFError) as error:
             reason = f"the connection failed ({type(error).__name__})"
