@@ -40,8 +40,7 @@ REFUSAL_TEXT_DELAY_S = 0.3
 class PlanChannel:
     """Transfers plans of one MAV_MISSION_TYPE. Items are numbered as the vehicle numbers them.
 
-    Errors use the item numbers of the program. They contain the vehicle's status texts, and tell which items the
-    vehicle has now.
+    Errors use the item numbers of the program, and contain the vehicle's status texts and which items it has now.
     """
 
     def __init__(
@@ -51,10 +50,8 @@ class PlanChannel:
         self._context = context
         self._options: dict[str, Any] = {"idle_timeout_s": idle_timeout_s, "on_progress": on_progress}
         self._path = PACKED_PATHS[mission_type]
-        # True if the vehicle may have received some of our items.
-        self._has_changed = False
-        # True if positions are sent as 32-bit floats, because the vehicle does not support MISSION_ITEM_INT.
-        self.is_single_precision: bool = False
+        self._has_changed = False  # True if the vehicle may have received some of our items
+        self.is_single_precision: bool = False  # True if positions are sent as 32-bit floats (MISSION_ITEM)
 
     async def send(self, items: Sequence[MissionItem]) -> UploadResult:
         """Send all items. If a refusal does not identify the refused item, send the items again one at a time."""
@@ -328,10 +325,7 @@ class PlanTransfer(Generic[PlanT]):
         await self._send_items(items, method, verify=True)
 
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:
-        """Send only the differences.
-
-        Returns False if the whole plan must be sent, because the vehicle's plan is unknown or differs in many items.
-        """
+        """Send only the differences. Returns False if the vehicle's plan is unknown or differs in too many items."""
         autopilot = self._context.autopilot
         if autopilot.reports_mission_checksum:
             reported = self._context.plan_id(self._type, self._cache.updated_at)
@@ -384,10 +378,7 @@ class PlanTransfer(Generic[PlanT]):
         return not parts or len(changed_seqs) + PART_OVERHEAD_ITEMS * len(parts) < count
 
     async def _has_checksum_of(self, items: Sequence[MissionItem]) -> bool:
-        """Return True if the vehicle reports the checksum of these items.
-
-        Returns False at once if reading the items back takes less time than waiting for a report.
-        """
+        """Wait for the checksum of these items if that is faster than reading them back; return True if it arrives."""
         autopilot = self._context.autopilot
         round_trip_s = self._context.transfers.round_trip.smoothed_s or 0.0
         reading_takes_s = len(items) / autopilot.mission_download_window * round_trip_s
