@@ -259,15 +259,10 @@ def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
     motion = px4.motion
     yaw = motion.yaw
     if not px4.is_armed:
-        position_and_velocity, acceleration = (math.nan,) * 6, (0.0, 0.0, 100.0)
+        unknown, acceleration = (math.nan, math.nan, math.nan), (0.0, 0.0, 100.0)
+        mask = _IGNORE_POSITION_AND_VELOCITY
         return m.PositionTargetLocalNed(
-            px4.time_boot_ms,
-            MavFrame.LOCAL_NED,
-            _IGNORE_POSITION_AND_VELOCITY,
-            *position_and_velocity,
-            *acceleration,
-            yaw,
-            0.0,
+            px4.time_boot_ms, MavFrame.LOCAL_NED, mask, *unknown, *unknown, *acceleration, yaw, 0.0
         )
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     acceleration = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down)
