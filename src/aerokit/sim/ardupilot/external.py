@@ -59,7 +59,7 @@ class ArduPilotExternal:
     def _on_navigation(self, message: Message, _: Channel) -> None:
         if not self._vehicle.parameters.get("VISO_TYPE", 0.0):
             return
-        frames = (MavFrame.LOCAL_FRD, MavFrame.BODY_FRD)
+        frames = (MavFrame.LOCAL_FRD, MavFrame.BODY_FRD)  # The firmware ignores ODOMETRY in other frames.
         if isinstance(message, m.Odometry) and (message.frame_id, message.child_frame_id) != frames:
             return
         self.latest[type(message)] = message

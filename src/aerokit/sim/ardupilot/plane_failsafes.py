@@ -84,7 +84,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         bad_for = self._radio_bad.seconds(is_bad, plane.now)
         if not is_bad:
             self._set_radio_lost(is_lost=False)
-        elif plane.parameters["THR_FAILSAFE"] == 1 and bad_for >= _COUNT_S - 1e-6:
+        elif plane.parameters["THR_FAILSAFE"] == 1 and bad_for >= _COUNT_S - 1e-6:  # tolerates rounding errors
             self._set_radio_lost(is_lost=True)
 
     def _set_radio_lost(self, *, is_lost: bool) -> None:

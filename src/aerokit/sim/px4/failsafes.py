@@ -363,7 +363,7 @@ class Px4Failsafes:
             px4.arming.terminate()
         elif action in _MODES:
             px4.switch_to(_MODES[action])
-        elif previous > Action.WARN:
+        elif previous > Action.WARN:  # The failsafe has ended.
             px4.switch_to(px4.intended_mode)
 
     def _report(self, action: FailsafeAction) -> None:
