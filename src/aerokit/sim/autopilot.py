@@ -59,7 +59,7 @@ class VehicleSigning:
             timestamp=(self.timestamp + self.AHEAD) & LAST_TIMESTAMP,
             allow_unsigned=self.unsigned_on(link_id),
         )
-        signing.streams = self._streams
+        signing.streams = self._streams  # The last time stamps of all senders, which the ports share.
         channel.sign_with(signing)
 
     def is_for(self, link_id: int) -> bool:
@@ -84,7 +84,8 @@ class VehicleSigning:
     def _on_setup(self, message: SetupSigning, _channel: Channel) -> None:
         if not self.may_change():
             return
-        self.key = SigningKey(message.secret_key) if any(message.secret_key) else None
+        has_key = any(message.secret_key)  # A key of zero bytes turns signing off.
+        self.key = SigningKey(message.secret_key) if has_key else None
         # The field has 64 bits, but the time stamp of a frame has only 48 bits.
         self.timestamp = message.initial_timestamp & LAST_TIMESTAMP
         self.load()
@@ -119,11 +120,12 @@ class ReceivedCorrections:
 
     def _on_fragment(self, message: GpsRtcmData) -> None:
         data = bytes(message.data[: message.len])
+        # The flags contain, from the lowest bit: is_fragmented (1 bit), fragment_id (2 bits), sequence (5 bits).
         is_fragmented, fragment_id, sequence = message.flags & 1, message.flags >> 1 & 3, message.flags >> 3
         if not is_fragmented:
             self._add(data)
             return
-        if sequence != self._sequence or fragment_id in self._fragments:
+        if sequence != self._sequence or fragment_id in self._fragments:  # A new message begins.
             self._fragments.clear()
         self._sequence, self._fragments[fragment_id] = sequence, data
         # Only the last fragment is shorter than FRAGMENT_SIZE. A message that fills all MAX_FRAGMENTS fragments has no

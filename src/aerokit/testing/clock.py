@@ -47,8 +47,7 @@ T = TypeVar("T")
 
 # The selector is polled once in this many steps. A step is an iteration of the loop or the run of an event source.
 _POLL_EVERY = 64
-# With more timers than this, if most of them are cancelled, asyncio's own iteration runs once to discard the cancelled
-# timers.
+# With more timers than this, cancelled timers are discarded if they are more than half of the timers.
 _MANY_TIMERS = 100
 
 DEADLOCK_TIMEOUT_S = 10.0
@@ -101,7 +100,9 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         if not needs_poll and not ready:
             has_event = self._run_sources() or self._next_timer() != math.inf
             needs_poll = not has_event  # Without an event, only a signal or another thread can wake the loop.
-        if needs_poll or _MANY_TIMERS < len(timers) < 2 * self._timer_cancelled_count:  # type: ignore[attr-defined]
+        cancelled_count = self._timer_cancelled_count  # type: ignore[attr-defined]
+        has_mostly_cancelled_timers = _MANY_TIMERS < len(timers) < 2 * cancelled_count
+        if needs_poll or has_mostly_cancelled_timers:  # asyncio's own iteration polls, and discards cancelled timers.
             self._iterations = 0
             super()._run_once()  # type: ignore[misc]
             return
@@ -242,7 +243,7 @@ def run_virtual(coroutine: Coroutine[Any, Any, T]) -> T:
 
 
 VIRTUAL_BACKEND: tuple[str, dict[str, object]] = ("asyncio", {"loop_factory": VirtualClockLoop})
-"""Return value of a fixture ``anyio_backend`` that runs a module's tests on virtual time."""
+"""Value to return from a module's fixture ``anyio_backend``, so that its tests run on virtual time."""
 
 
 class _JumpingSelector(selectors.DefaultSelector):

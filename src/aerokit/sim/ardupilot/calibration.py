@@ -59,7 +59,8 @@ class AccelerometerCalibration:
     def _on_sample(self, run_number: int, position: int) -> None:
         if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
-        if self.is_held_wrong and position > AccelcalVehiclePos.LEVEL:
+        is_first_position = position == AccelcalVehiclePos.LEVEL
+        if self.is_held_wrong and not is_first_position:
             self._end("Calibration FAILED", AccelcalVehiclePos.FAILED)
         elif position == _LAST:
             self._end("Calibration successful", AccelcalVehiclePos.SUCCESS)
@@ -134,7 +135,8 @@ class CompassCalibration:
             return MavResult.FAILED
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
-        self._compass_mask = whole(command.param1) & _ALL_COMPASSES or _ALL_COMPASSES
+        requested = whole(command.param1) & _ALL_COMPASSES  # Bits of compasses that are not fitted are ignored.
+        self._compass_mask = _ALL_COMPASSES if requested == 0 else requested
         self._started_at, self._saves_at_once = self._vehicle.now, command.param3 != 0.0
         return MavResult.ACCEPTED
 
@@ -184,7 +186,7 @@ class CompassCalibration:
 _GYROS_S, _TRIM_S, _ACCELEROMETERS_S = 0.5, 1.0, 1.0
 _MIN_ACCELEROMETERS_INTERVAL_S = 5.0
 # This param value accepts the present calibration (GCS_Common.cpp, _handle_command_preflight_calibration).
-_FORCED = 76
+_ACCEPTS_PRESENT_CALIBRATION = 76
 _Accelerometers = PreflightCalibrationAccelerometer
 
 
@@ -222,10 +224,11 @@ class Calibrations:
         if vehicle.motors.is_armed:
             vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow calibration")
             return MavResult.FAILED
-        if command.param1 == 1.0:
+        is_gyro_requested, is_barometer_requested = command.param1 == 1.0, command.param3 == 1.0
+        if is_gyro_requested:
             vehicle.info("Initialising ArduPilot")
-            return CommandProgress(percents=(), interval_s=_GYROS_S)
-        if command.param3 == 1.0:
+            return CommandProgress(percents=(), interval_s=_GYROS_S)  # Without percentages, only the result is sent.
+        if is_barometer_requested:
             vehicle.info("Updating barometer calibration")
             vehicle.info("Barometer calibration complete")
             return MavResult.ACCEPTED
@@ -246,5 +249,5 @@ class Calibrations:
             self._simple_calibration_at = vehicle.now
             vehicle.info("Initialising ArduPilot")
             return CommandProgress(percents=(), interval_s=_ACCELEROMETERS_S)
-        is_forced = _FORCED in (command.x, command.param2)
-        return MavResult.ACCEPTED if is_forced else MavResult.UNSUPPORTED
+        accepts_present = _ACCEPTS_PRESENT_CALIBRATION in (command.x, command.param2)  # accelerometers, compasses
+        return MavResult.ACCEPTED if accepts_present else MavResult.UNSUPPORTED

@@ -85,7 +85,7 @@ class ArduPilotCamera:
         if self.remaining:
             is_due = self._vehicle.now - self._taken_at > self.interval_s
             is_taken = is_due and self.take()
-            if is_taken and self.remaining > 0:
+            if is_taken and self.remaining > 0:  # An unlimited series (-1) is not counted.
                 self.remaining -= 1
         elif self.trigger_distance_m > 0.0:
             self._check_distance()
@@ -101,14 +101,17 @@ class ArduPilotCamera:
 
     def run(self, item: MissionItem) -> None:
         """Execute a camera command of a mission. Other commands are ignored."""
-        if item.command == MavCmd.DO_DIGICAM_CONTROL and item.x == 1:
-            self.take()
+        if item.command == MavCmd.DO_DIGICAM_CONTROL:
+            takes_image = item.x == 1  # Param 5 of the command.
+            if takes_image:
+                self.take()
         elif item.command == MavCmd.DO_SET_CAM_TRIGG_DIST:
             self.trigger_by_distance(item.param1)
             if item.param3 == 1.0:
                 self.take()
         elif item.command == MavCmd.IMAGE_START_CAPTURE:
-            self._start(item.param2, item.param3)
+            interval_s, image_count = item.param2, item.param3
+            self._start(interval_s, image_count)
         elif item.command == MavCmd.IMAGE_STOP_CAPTURE:
             self.stop()
 

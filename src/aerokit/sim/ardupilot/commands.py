@@ -104,7 +104,8 @@ def commanded_heading(command: ReceivedCommand, yaw: float) -> float | None:
     angle = math.radians(angle_deg)
     if relative_flag == 0.0:
         return angle
-    return yaw + math.copysign(angle, command.param3 or 1.0)
+    direction = command.param3 or 1.0  # Without a direction, the vehicle turns clockwise.
+    return yaw + math.copysign(angle, direction)
 
 
 class _CommonCommands:
@@ -223,7 +224,7 @@ class _CommonCommands:
                 return Result.DENIED
             if command.place() == (0, 0) and command.z == 0:
                 point = None
-        self._vehicle.look_at(point)
+        self._vehicle.look_at(point)  # None clears the region.
         return Result.ACCEPTED
 
     def look_at_vehicle(self, command: ReceivedCommand) -> int:
@@ -256,7 +257,8 @@ class HomeAndOrigin:
 
     def _set_home(self, command: ReceivedCommand) -> int:
         vehicle, nav = self._vehicle, self._vehicle.navigation
-        if command.param1 == 1.0 or command.place() == (0, 0):
+        uses_current_place = command.param1 == 1.0 or command.place() == (0, 0)
+        if uses_current_place:
             return self._make_home(vehicle.motion.place) if nav.has_position else Result.FAILED
         if command.param1 != 0.0:
             return Result.FAILED

@@ -69,6 +69,7 @@ class MotorTest:
         elif throttle_type == MotorTestThrottleType.THROTTLE_PWM:
             is_valid = _MIN_PWM <= throttle <= _MAX_PWM
         else:
+            # A compass calibration during the test also has its throttle in percent (motor_test.cpp).
             in_percent = (MotorTestThrottleType.THROTTLE_PERCENT, MotorTestThrottleType.COMPASS_CAL)
             is_valid = throttle_type in in_percent and throttle <= 100.0
         if not is_valid:
@@ -281,8 +282,9 @@ class SimulatedCopter(CopterHost):
         heading = commanded_heading(command, self.motion.yaw)
         if heading is None:
             return MavResult.FAILED
-        # `commanded_heading` has already applied the direction to a relative angle (param 4 is 1).
-        direction = 0 if command.param4 else int(command.param3)
+        is_relative = command.param4 == 1.0
+        # `commanded_heading` has already applied the direction to a relative angle. 0 is the shorter way.
+        direction = 0 if is_relative else int(command.param3)
         self.yaw.turn_to(heading, math.radians(command.param2), direction)
         return MavResult.ACCEPTED
 

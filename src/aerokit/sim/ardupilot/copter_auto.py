@@ -17,6 +17,7 @@ from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.messages import MissionItemReached
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterRtl, CopterTakeOff
+from aerokit.sim.ardupilot.host import RC_THROTTLE
 from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance, set_home_from
 from aerokit.sim.motion import Ned, wrap_pi
 
@@ -50,6 +51,9 @@ class _FlyLeg:
         self.is_complete = self.is_complete or math.dist(self.destination, motion.place) <= self._radius
 
 
+_TURN_SHARE_OF_ACCELERATION = 0.7
+
+
 class _CircleLeg:
     """Flight to the nearest point of a circle, and then around the circle. A negative radius is anticlockwise."""
 
@@ -78,19 +82,23 @@ class _CircleLeg:
                 self._approach = None
             return
         motion = self._copter.motion
-        # The turn may use 70 % of the acceleration limit. The remaining 30 % correct the distance from the circle.
-        max_rate = math.sqrt(0.7 * motion.limits.acceleration_m_s2 / max(0.5, self._radius))
+        # The rest of the acceleration limit corrects the distance from the circle.
+        max_acceleration = _TURN_SHARE_OF_ACCELERATION * motion.limits.acceleration_m_s2
+        max_rate = math.sqrt(max_acceleration / max(0.5, self._radius))
         rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)
-        self._report_new_turn()
+        self._report_new_turn()  # The first turn is reported before the copter moves.
         self._angle += rate * dt
         self._turned_rad += abs(rate) * dt
         self._report_new_turn()
-        point, speed = self._point(), rate * self._radius
-        # Follow a point on the circle: command its velocity, plus 1 m/s for each metre between copter and point.
+        # Follow a point that moves along the circle: command its velocity, plus 1 m/s for each metre between the copter
+        # and the point.
+        north, east, down = self._point()
+        speed = rate * self._radius
+        point_velocity_north, point_velocity_east = -speed * math.sin(self._angle), speed * math.cos(self._angle)
         motion.seek_velocity(
-            point[0] - motion.north - speed * math.sin(self._angle),
-            point[1] - motion.east + speed * math.cos(self._angle),
-            point[2] - motion.down,
+            north - motion.north + point_velocity_north,
+            east - motion.east + point_velocity_east,
+            down - motion.down,
         )
 
     def _point(self) -> Ned:
@@ -118,7 +126,7 @@ class _ClimbLeg:
     def update(self, dt: float) -> None:
         copter, auto = self._copter, self._auto
         options = int(copter.parameters["AUTO_OPTIONS"])
-        if copter.rc[2] > _RAISED_THROTTLE or options & _TAKE_OFF_WITHOUT_THROTTLE:
+        if copter.rc[RC_THROTTLE] > _RAISED_THROTTLE or options & _TAKE_OFF_WITHOUT_THROTTLE:
             auto.may_lift_off = True
         if not copter.is_landed or auto.may_lift_off:
             self._take_off.update(auto.climb)
@@ -144,6 +152,7 @@ class _DescendLeg:
 
 _ALLOW_ARMING, _CONTINUE_AFTER_LAND = 1, 4  # bits of AUTO_OPTIONS and of MIS_OPTIONS
 _HEADING_REACHED_RAD, _MIN_TAKE_OFF_M = math.radians(2.0), 1.0
+_CHECKED_COMMANDS = 3  # An upload that changes one of this many next commands restarts the current command.
 # The copter does not stop at a waypoint without delay if one of these commands follows.
 _PASSED_BEFORE = frozenset(
     {Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_PAYLOAD_PLACE}
@@ -244,11 +253,12 @@ class CopterAuto(MissionMode):
     def update(self, dt: float) -> None:
         self.start_if_waiting()
         if not self.is_waiting:
-            if self._check_upcoming() and isinstance(self._leg, _FlyLeg):
+            has_upload_changed_mission = self._check_upcoming()
+            if has_upload_changed_mission and isinstance(self._leg, _FlyLeg):
                 self._restart_command()
             self.vehicle.mission.update()
             self._check_upcoming()  # `mission.update` may have started the next command
-        if self.vehicle.mode is not self:
+        if self.vehicle.mode is not self:  # The mission has changed the mode.
             return
         is_stopped = self.is_paused and isinstance(self._leg, _FlyLeg)
         if self._leg is None or is_stopped:
@@ -259,12 +269,15 @@ class CopterAuto(MissionMode):
             self.vehicle.yaw.update()
 
     def _check_upcoming(self) -> bool:
-        """Record the next three commands. Return True if an upload, instead of the progress, has changed them."""
+        """Record the current and the next commands. Return True if an upload has changed them.
+
+        A change because the mission has advanced to another command does not count (False).
+        """
         run, commands = self.vehicle.mission, self.vehicle.missions.commands
         has_same_index = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
         if commands.version == self._list_version and has_same_index:
             return False
-        upcoming = tuple(islice(run.navigation_from(max(1, run.nav_index)), 3))
+        upcoming = tuple(islice(run.navigation_from(max(1, run.nav_index)), _CHECKED_COMMANDS))
         has_changed = upcoming != self._upcoming
         self._list_version, self._upcoming = commands.version, upcoming
         return has_changed and has_same_index
@@ -309,7 +322,7 @@ class CopterAuto(MissionMode):
         if command == Cmd.NAV_LOITER_UNLIM:
             return False
         if command == Cmd.NAV_GUIDED_ENABLE:
-            return item.param1 == 0
+            return item.param1 == 0  # 0 ends the control by a companion computer, 1 starts it.
         if command == Cmd.NAV_DELAY:
             return now > self._delay_until
         if command == Cmd.CONDITION_DELAY:
@@ -322,9 +335,11 @@ class CopterAuto(MissionMode):
         return True
 
     def _has_stayed(self, index: int, seconds: float) -> bool:
+        """Return True if the copter has reached a waypoint and has waited there for ``seconds``."""
         if not self._is_leg_complete:
             return False
-        self._reached_at = self._reached_at or self.vehicle.now
+        if self._reached_at == 0.0:  # The copter has just reached the waypoint.
+            self._reached_at = self.vehicle.now
         # The firmware counts whole seconds (mode_auto.cpp, verify_nav_wp).
         if math.floor(self.vehicle.now - self._reached_at) < seconds:
             return False
@@ -414,14 +429,15 @@ class CopterAuto(MissionMode):
         self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)
 
     def _change_speed(self, item: MissionItem) -> None:
-        if item.param2 <= 0:
+        speed_type, speed = item.param1, item.param2
+        if speed <= 0:  # A value of -1 means no change.
             return
-        if item.param1 == SpeedType.CLIMB_SPEED:
-            self.climb = item.param2
-        elif item.param1 == SpeedType.DESCENT_SPEED:
-            self.descent = item.param2
+        if speed_type == SpeedType.CLIMB_SPEED:
+            self.climb = speed
+        elif speed_type == SpeedType.DESCENT_SPEED:
+            self.descent = speed
         else:
-            self.speed: float = item.param2
+            self.speed: float = speed
 
     def _look_at(self, item: MissionItem) -> None:
         is_none = (item.x, item.y, item.z) == (0, 0, 0)

@@ -10,7 +10,7 @@ from aerokit.mavlink.enums import CopterMode, FenceMitigate, MavSeverity
 from aerokit.sim.ardupilot.copter_modes import CopterHost
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
-from aerokit.sim.ardupilot.host import ArduPilotMode, ConditionTimer
+from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ConditionTimer
 
 _STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 
@@ -55,7 +55,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
         if not mode.can_arm:
             return [f"{mode.name} mode not armable"]
         max_throttle = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
-        if not mode.arms_with_raised_throttle and self.vehicle.rc[2] > max_throttle:
+        if not mode.arms_with_raised_throttle and self.vehicle.rc[RC_THROTTLE] > max_throttle:
             return ["Throttle too high"]
         return []
 
@@ -125,7 +125,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         if not parameters["FS_THR_ENABLE"]:
             self._set_radio_lost(is_lost=False)
             return
-        is_throttle_low = copter.rc[2] < parameters["FS_THR_VALUE"]
+        is_throttle_low = copter.rc[RC_THROTTLE] < parameters["FS_THR_VALUE"]
         if is_receiving and not is_throttle_low:
             if math.isnan(self._radio_good_at):
                 self._radio_good_at = copter.now
@@ -182,6 +182,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         if self._disarm_if_landed(name):
             return _NONE
         if mode.is_landing:
+            # A smaller priority is more severe: landing, or the termination that is worse.
             is_landing_for_battery = self.battery.priority <= self.BATTERY_PRIORITIES.index(_LAND)
             if self.battery_is_low and is_landing_for_battery:
                 return self._report_continuation(f"{name} + Battery", "Continuing Landing", _LAND)
@@ -248,7 +249,8 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
     def _disarm_if_landed(self, name: str) -> bool:
         """Disarm a landed vehicle and return True. A vehicle in the air, or about to take off, stays armed (False)."""
         copter = self.vehicle
-        if not copter.is_landed or (copter.mode.needs_mission and not copter.motors.is_idle):
+        is_about_to_take_off = copter.mode.needs_mission and not copter.motors.is_idle
+        if not copter.is_landed or is_about_to_take_off:
             return False
         if name == "Radio":  # The firmware reports this failsafe before disarming, all others after it.
             self.warn("Radio Failsafe - Disarming")
@@ -265,9 +267,11 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             self.warn("Mode change to AUTO RTL failed: No return path or landing sequence found")
             self.warn("Trying RTL Mode")
         for attempt, mode in enumerate(_MODES.get(action, ())):
-            if attempt == 1 and action in _FALLBACK_TEXTS:
+            was_first_mode_refused = attempt == 1
+            if was_first_mode_refused and action in _FALLBACK_TEXTS:
                 self.warn(_FALLBACK_TEXTS[action])
-            if self.vehicle.set_mode(mode):
+            is_accepted = self.vehicle.set_mode(mode)
+            if is_accepted:
                 return
 
 

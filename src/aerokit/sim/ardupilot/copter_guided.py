@@ -160,17 +160,18 @@ class CopterGuided(CopterModeBase):
 
     def _run_attitude(self, dt: float) -> None:
         copter = self.vehicle
-        if self._body_rates is not None and not copter.is_landed:
+        if self._body_rates is not None and not copter.is_landed:  # Rates turn the attitude that was set last.
             roll, pitch = (angle + rate * dt for angle, rate in zip(self._attitude, self._body_rates, strict=True))
             self._attitude = (roll, pitch)
         (roll, pitch), climb = self._attitude, self._attitude_climb
-        if self._is_stale:
+        if self._is_stale:  # The firmware levels the copter after GUID_TIMEOUT.
             roll = pitch = climb = 0.0
         copter.motors.spool_up_requested = not copter.is_landed or climb > 0
         if copter.is_landed:
-            copter.is_landed = not (climb > 0 and copter.motors.can_lift)
+            lifts_off = climb > 0 and copter.motors.can_lift
+            copter.is_landed = not lifts_off
             return
-        copter.motion.seek_attitude(roll, pitch, -climb)
+        copter.motion.seek_attitude(roll, pitch, -climb)  # The motion model takes a velocity down.
 
     def _run_target(self) -> None:
         motion = self.vehicle.motion
@@ -236,9 +237,10 @@ class CopterSetpoints:
         if not self._is_guided:
             return
         point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
-        is_invalid = point is None and Setpoint.of(target).has_position
+        is_position_missing = point is None and Setpoint.of(target).has_position
         # `_follow` does not read the point if the set-point has no position.
-        if is_invalid or not self._follow(target, point or _ZERO, rotate=False):
+        is_followed = not is_position_missing and self._follow(target, point or _ZERO, rotate=False)
+        if not is_followed:
             self._guided.enter(force=False)  # An invalid message stops the vehicle.
 
     def _follow(self, target: PositionTarget, point: Ned, *, rotate: bool) -> bool:
@@ -256,7 +258,7 @@ class CopterSetpoints:
         if not self._guided.set_target(position, velocity, acceleration):
             return False
         if setpoint.yaw is not None:
-            yaw.turn_to(setpoint.yaw + (motion.yaw if rotate else 0.0))
+            yaw.turn_to(setpoint.yaw + (motion.yaw if rotate else 0.0))  # In a body frame, yaw is relative to the nose.
         elif setpoint.yaw_rate is not None:
             yaw.turn(setpoint.yaw_rate)
         else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from aerokit.sim.ardupilot.host import ArduPilotMode
+from aerokit.sim.ardupilot.host import RC_PITCH, RC_ROLL, RC_THROTTLE, RC_YAW, ArduPilotMode
 from aerokit.sim.ardupilot.navigation import SmartPath, best_return_place
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.commands import rotated
@@ -51,7 +51,7 @@ class AutoYaw:
         self._heading, self._control = wrap_pi(heading), self._go_to_heading
         self._rate = 0.0
         offset = wrap_pi(self._heading - motion.yaw)
-        is_longer_way = direction and math.copysign(1, offset) != direction
+        is_longer_way = direction != 0 and math.copysign(1, offset) != direction
         # `Motion.face` turns the shorter way, so the longer way needs a turn rate.
         if is_longer_way and abs(offset) > _HEADING_TOLERANCE_RAD:
             self._rate = direction * (rate or motion.limits.turn_rate_rad_s)
@@ -171,7 +171,9 @@ class CopterModeBase(ArduPilotMode):
     vehicle: CopterHost
 
 
-_REACHED_M, _AT_REST_M_S, _DRIFT_CORRECTION_M_S = 0.1, 0.2, 2.0
+_REACHED_M, _AT_REST_M_S = 0.1, 0.2
+# Maximum speeds towards the target of a take-off: horizontally, and downwards after the copter has risen too high.
+_DRIFT_CORRECTION_M_S, _OVERSHOOT_CORRECTION_M_S = 2.0, 1.0
 
 
 class CopterTakeOff:
@@ -189,7 +191,9 @@ class CopterTakeOff:
         if copter.is_landed:
             copter.is_landed = not copter.motors.can_lift
             return
-        motion.seek_position(*self.target, speed=_DRIFT_CORRECTION_M_S, climb=climb_m_s, descent=1.0)
+        motion.seek_position(
+            *self.target, speed=_DRIFT_CORRECTION_M_S, climb=climb_m_s, descent=_OVERSHOOT_CORRECTION_M_S
+        )
         if abs(motion.down - self.target[2]) < _REACHED_M and abs(motion.velocity_down) < _AT_REST_M_S:
             self.is_complete = True
 
@@ -220,7 +224,7 @@ class CopterPilotedMode(CopterModeBase):
 
     def climb_from_stick(self) -> float:
         """Return the climb rate in m/s that the throttle stick commands. The middle holds the altitude."""
-        stick = self.vehicle.rc[2] - _MID_STICK
+        stick = self.vehicle.rc[RC_THROTTLE] - _MID_STICK
         if abs(stick) <= _THROTTLE_DEADZONE:
             return 0.0
         share = (abs(stick) - _THROTTLE_DEADZONE) / (_STICK_RANGE - _THROTTLE_DEADZONE)
@@ -239,7 +243,7 @@ class CopterPilotedMode(CopterModeBase):
             copter.is_landed = False
         if copter.is_landed:
             return
-        roll, pitch, _, yaw = ((copter.rc[i] - _MID_STICK) / _STICK_RANGE for i in range(4))
+        roll, pitch, yaw = ((copter.rc[channel] - _MID_STICK) / _STICK_RANGE for channel in (RC_ROLL, RC_PITCH, RC_YAW))
         self.fly(roll, pitch, climb)
         copter.motion.turn(yaw * _FULL_STICK_TURN_RAD_S)
 
@@ -265,7 +269,7 @@ class CopterStabilize(CopterPilotedMode):
 
     def climb_from_stick(self) -> float:
         # In this mode the stick sets the throttle instead of a climb rate. The middle position hovers.
-        throttle = self.vehicle.rc[2]
+        throttle = self.vehicle.rc[RC_THROTTLE]
         if self.vehicle.is_landed and throttle <= _MID_STICK:
             return 0.0
         return _STABILIZE_CLIMB_M_S * (throttle - _MID_STICK) / _STICK_RANGE
@@ -321,6 +325,7 @@ class CopterRtl(CopterModeBase):
         self._place = best_return_place(copter, home, is_allowed=copter.fence.contains)
         north, east, down = self._place
         distance = math.hypot(north - copter.motion.north, east - copter.motion.east)
+        # A smaller down coordinate is higher. The copter returns at the altitude of the place if that is higher.
         self._return_down = min(down, home[2] - self._return_altitude(distance))
         copter.yaw.apply_default(returning=True)
         return True
@@ -331,9 +336,10 @@ class CopterRtl(CopterModeBase):
         current = self.vehicle.navigation.altitude_above_home
         after_min_climb = current + parameters["RTL_CLIMB_MIN"] / 100.0
         target = max(after_min_climb, parameters["RTL_ALT"] / 100.0, _RTL_MIN_ALTITUDE_M)
-        if parameters["RTL_CONE_SLOPE"] > 0:
-            target = min(target, max(distance * parameters["RTL_CONE_SLOPE"], _RTL_MIN_ALTITUDE_M, current))
-        return max(target, current)
+        if parameters["RTL_CONE_SLOPE"] > 0:  # A short return needs less altitude.
+            altitude_of_cone = distance * parameters["RTL_CONE_SLOPE"]
+            target = min(target, max(altitude_of_cone, _RTL_MIN_ALTITUDE_M))
+        return max(target, current)  # A return never begins with a descent.
 
     @property
     def destination(self) -> Ned | None:
@@ -350,12 +356,14 @@ class CopterRtl(CopterModeBase):
         elif copter.is_landed:  # Let the motors idle; the copter then disarms after DISARM_DELAY.
             copter.motors.spool_up_requested = False
         elif target is not None:
-            self._next_phase(copter.fly_to(target, self.speed))
+            distance = copter.fly_to(target, self.speed)
+            self._update_phase(has_arrived=distance < _ARRIVED_M)
 
-    def _next_phase(self, distance: float) -> None:
-        if self._phase == "climb" and distance < _ARRIVED_M:
+    def _update_phase(self, *, has_arrived: bool) -> None:
+        """Start the next phase once the present phase is over: climb, return, wait above the place, land."""
+        if self._phase == "climb" and has_arrived:
             self._phase = "return"
-        elif self._phase == "return" and distance < _ARRIVED_M:
+        elif self._phase == "return" and has_arrived:
             self._phase, self._waiting_since = "wait", self.vehicle.now
         elif self._phase == "wait":
             waited = self.vehicle.now - self._waiting_since
@@ -403,6 +411,9 @@ class CopterSmartRtl(CopterModeBase):
             self.is_landing: bool = True
             copter.land()
             return
-        radius = _ARRIVED_M if len(self._way_back) == 1 else copter.parameters["WPNAV_RADIUS"] / 100
-        if copter.fly_to(self._way_back[0], copter.speed_limit("WPNAV_SPEED")) < radius:
+        next_point, is_last = self._way_back[0], len(self._way_back) == 1
+        distance = copter.fly_to(next_point, copter.speed_limit("WPNAV_SPEED"))
+        # The copter stops only at the last point, where it lands.
+        max_distance = _ARRIVED_M if is_last else copter.parameters["WPNAV_RADIUS"] / 100
+        if distance < max_distance:
             del self._way_back[0]

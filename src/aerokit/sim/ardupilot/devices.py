@@ -38,14 +38,14 @@ class ArduPilotDevices:
         if not self._is_set("GRIP_ENABLE") or not is_known:
             return Result.FAILED
         is_grab = command.param2 == GripperActions.GRAB
-        moves = is_grab is not self.is_gripped
-        if moves:
+        has_to_move = is_grab is not self.is_gripped
+        if has_to_move:
             self._vehicle.info(f"Gripper load {'grabbing' if is_grab else 'releasing'}")
 
         def finish() -> None:
             self._vehicle.info(f"Gripper load {'grabbed' if is_grab else 'released'}")
 
-        self._vehicle.call_later(_GRIP_S if moves else 0.0, finish)
+        self._vehicle.call_later(_GRIP_S if has_to_move else 0.0, finish)
         self.is_gripped = is_grab
         return Result.ACCEPTED
 
@@ -58,6 +58,7 @@ class ArduPilotDevices:
         return Result.ACCEPTED
 
     def handle_chute(self, command: ReceivedCommand) -> int:
+        """Enable, disable or release the parachute. Like the firmware, accept even a release that has no effect."""
         vehicle = self._vehicle
         if command.param1 in (ParachuteAction.DISABLE, ParachuteAction.ENABLE):
             if "CHUTE_ENABLED" in vehicle.parameters:
@@ -87,7 +88,7 @@ class ArduPilotDevices:
         elif action == WinchActions.RELATIVE_LENGTH_CONTROL:
             self._goal_m = self.line_m + command.param3
             self.line_rate_m_s = _WINCH_RATE_M_S if command.param3 > 0 else -_WINCH_RATE_M_S
-        if not was_moving and self.line_rate_m_s:
+        if not was_moving and self.line_rate_m_s:  # A winch that moves already has a scheduled step.
             self._vehicle.call_later(_WINCH_STEP_S, self._run)
         return Result.ACCEPTED
 

@@ -74,6 +74,7 @@ class ArduPilotExternal:
         if not is_enabled or target.frame not in (MavFrame.BODY_FRD, MavFrame.LOCAL_FRD):
             return
         self.latest[type(target)] = target
+        # The offset of the target is relative to the vehicle, and turned with its heading.
         north, east, _down = rotated((target.x, target.y, target.z), motion.yaw)
         self._target, self._target_at = (motion.north + north, motion.east + east), self._vehicle.now
 

@@ -8,9 +8,10 @@ from enum import IntFlag
 from typing import ClassVar, Generic
 
 from aerokit.mavlink.enums import GpsFixType, MavSeverity
-from aerokit.sim.ardupilot.host import ArduPilotHost, ConditionTimer, HostT
+from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotHost, ConditionTimer, HostT
 
 _OK, _LOW, _CRITICAL = 0, 1, 2
+# The levels in names of parameters, and in texts.
 _NAMES = {_LOW: "LOW", _CRITICAL: "CRT"}
 _WORDS = {_LOW: "low", _CRITICAL: "critical"}
 _PERIOD_S = 0.1
@@ -45,7 +46,8 @@ class BatteryFailsafe:
         self._vehicle.send_text(MavSeverity.WARNING, f"Battery 1 is {_WORDS[level]} {used}")
         action = int(self._vehicle.parameters[f"BATT_FS_{_NAMES[level]}_ACT"])
         priority = self._priorities.index(action) if action in self._priorities else len(self._priorities)
-        if priority <= self.priority:
+        is_as_severe = priority <= self.priority  # The most severe action has the index 0.
+        if is_as_severe:
             self.priority = priority
             self._act(action)
 
@@ -235,7 +237,7 @@ class ArduPilotArming(Generic[HostT]):
             return []
         sticks = () if options & _SKIP_STICKS else _CENTRED_STICKS
         if options & _CHECK_THROTTLE:
-            sticks = (*sticks, ("Throttle", 3))
+            sticks = (*sticks, ("Throttle", RC_THROTTLE + 1))  # The numbers of RC channels count from 1.
         return [f"{name} (RC{number}) is not neutral" for name, number in sticks if self._is_moved(number)]
 
     def _is_moved(self, number: int) -> bool:

@@ -120,6 +120,7 @@ _ALL = _MAX_ALT | _CIRCLE | _POLYGON | _MIN_ALT
 _BACKUP_M = 20.0
 _RECOVERY_S = 10.0
 _STATUS_INTERVAL_S = 1.0
+_LOWEST_ALT_MIN_M = -100.0
 _UNION, _NO_MODE_CHANGE = 2, 1
 _WHEN_ARMED = 3
 _DEFAULTS = {"FENCE_ALT_MAX": 100.0, "FENCE_ALT_MIN": -10.0, "FENCE_AUTOENABLE": 0.0}
@@ -272,8 +273,8 @@ class ArduPilotFence(Generic[HostT]):
 
         A breach of a circle or an altitude limit that has grown by the backup distance counts as new.
         """
-        is_inside = beyond_m < 0.0 or (kind == _POLYGON and beyond_m == 0.0)
-        if is_inside:
+        is_on_border_of_polygon = kind == _POLYGON and beyond_m == 0.0  # The border is still allowed.
+        if beyond_m < 0.0 or is_on_border_of_polygon:
             self._clear(kind)
             return False
         has_grown = kind != _POLYGON and beyond_m >= self._new_breach_m.get(kind, math.inf)
@@ -313,9 +314,9 @@ class ArduPilotFence(Generic[HostT]):
     def _record_breach(self, kind: int) -> None:
         vehicle = self.vehicle
         self.breach_count += 1
-        is_first = not self.breached
+        was_any_breached = self.breached != 0
         self.breached |= kind
-        if not is_first:
+        if was_any_breached:  # The time and FENCE_STATUS are those of the first breach.
             return
         self.breach_time_ms = vehicle.time_boot_ms
         if vehicle.now - self._reported_at > _STATUS_INTERVAL_S:
@@ -391,7 +392,7 @@ class ArduPilotFence(Generic[HostT]):
             (radius < 0.0, "Invalid Circle FENCE_RADIUS value"),
             (radius < margin, "Circle FENCE_MARGIN is greater than FENCE_RADIUS"),
             (high < 0.0, "Invalid FENCE_ALT_MAX value"),
-            (low < -100.0, "Invalid FENCE_ALT_MIN value"),
+            (low < _LOWEST_ALT_MIN_M, "Invalid FENCE_ALT_MIN value"),
             (bool(breached), breached),
             (margin < 0.0, "Invalid FENCE_MARGIN value"),
             (high < low, "FENCE_ALT_MAX < FENCE_ALT_MIN"),

@@ -110,9 +110,10 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         """Return the answer with the offset and the data that the firmware sends for this opcode."""
         is_acknowledged = answer.opcode == Op.ACK
         is_transfer = request.opcode in (Op.READFILE, Op.WRITEFILE) and is_acknowledged
+        # The firmware sends 0 as the offset of other replies.
         offset = request.offset if is_transfer or request.opcode == Op.LISTDIRECTORY else 0
         if is_acknowledged and request.opcode in _WITHOUT_DATA:
-            answer = request.acknowledge()
+            answer = request.acknowledge()  # an acknowledgement without data
         return answer.replace(offset=offset)
 
     def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
@@ -162,11 +163,13 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
 
     def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         is_reading = request.opcode == Op.OPENFILERO
-        if is_reading and self._host.now - self._sent_at > _SESSION_TIMEOUT_S:
+        is_idle = self._host.now - self._sent_at > _SESSION_TIMEOUT_S
+        if is_reading and is_idle:  # The client may have missed the reply to its previous request to open a file.
             self._close_all(peer)
         if peer.sessions:
             raise Refused(MavFtpErr.FAIL)
         answer = super()._open(peer, request)
+        # The banner follows a download of the parameters, as in the older protocol (GCS_FTP.cpp).
         self._is_banner_due = is_reading and self._path(request).startswith("@PARAM/param.pck")
         return answer
 

@@ -134,7 +134,8 @@ class ArduPilotGimbal:
         if place is not None and self._vehicle.navigation.has_position:
             north, east, down = place[0] - motion.north, place[1] - motion.east, place[2] - motion.down
             pitch = math.degrees(math.atan2(-down, math.hypot(north, east)))
-            self._target = MountTarget(0.0, pitch, math.degrees(math.atan2(east, north)), True)
+            yaw = math.degrees(math.atan2(east, north))
+            self._target = MountTarget(0.0, pitch, yaw, is_from_north=True)
         return self._target
 
     def _from_nose(self, target: MountTarget) -> float:
@@ -193,7 +194,8 @@ class ArduPilotGimbal:
 
     def set_control(self, sender: tuple[int, int], system: int, component: int) -> bool:
         """Handle MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Return False for invalid ids."""
-        if not (-3 <= system <= 255 and -3 <= component <= 255):
+        are_ids_valid = all(_RELEASE_CONTROL <= number <= 255 for number in (system, component))
+        if not are_ids_valid:
             return False
         previous = self.in_control
         if system == _TAKE_CONTROL:
@@ -203,7 +205,7 @@ class ArduPilotGimbal:
         elif system != _KEEP_CONTROL:
             self.in_control = (system, component)
         if self.in_control != previous:
-            self._vehicle.call_later(0.0, self._send_status)
+            self._vehicle.call_later(0.0, self._send_status)  # later, after the acknowledgement
         return True
 
     def _send_status(self) -> None:

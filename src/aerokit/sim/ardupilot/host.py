@@ -21,6 +21,9 @@ from aerokit.sim.missions import MissionStore
 from aerokit.sim.motion import GRAVITY_M_S2, GlobalPoint, LocalFrame, Ned
 from aerokit.sim.parameters import SimParameters
 
+RC_ROLL, RC_PITCH, RC_THROTTLE, RC_YAW = range(4)
+"""Indices of the RC channels of the sticks, in ArduPilot's default RCMAP."""
+
 HostT = TypeVar("HostT", bound="ArduPilotHost")
 
 

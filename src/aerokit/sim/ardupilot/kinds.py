@@ -51,7 +51,7 @@ class BootTimeline:
     gps_fix: float = 9.94
     origin_set: float = 19.93
     healthy: float = 22.40
-    """The attitude estimate is healthy. A second later, the vehicle can be armed in modes without GPS."""
+    """The attitude estimate is healthy. About a second after this time, modes without GPS can be armed."""
     position_good: float = 41.55
     """The estimator uses GPS, so that modes that need a position become available."""
     estimator_leads_early: bool = True

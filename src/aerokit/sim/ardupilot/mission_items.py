@@ -19,6 +19,7 @@ from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.missions import float32
 
 _MAX_ALTITUDE_M = 83000.0
+_NOT_STORED = "-"  # Storage type of a param that a download returns as 0.
 _DOWNLOADED_FRAMES: dict[int, int] = {
     MavFrame.MISSION: MavFrame.GLOBAL,
     MavFrame.GLOBAL: MavFrame.GLOBAL,
@@ -101,6 +102,7 @@ def stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
     # The storage format reserves the command ids 0 and 1 (AP_Mission.cpp).
     if result == MavMissionResult.ACCEPTED and item.command in (0, 1):
         result = MavMissionResult.INVALID
+    # One letter for each stored param; empty for an unsupported command.
     layout = STORED_COMMANDS.get(item.command, _UNKNOWN).parameters
     if kind == "plane":
         layout = _PLANE_PARAMETERS.get(item.command, layout)
@@ -109,11 +111,12 @@ def stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
     if result != MavMissionResult.ACCEPTED:
         return result
     values = (item.param1, item.param2, item.param3, item.param4, float(item.x), float(item.y), item.z)
-    stored_values = [_CONVERSIONS[type_](value) for type_, value in zip(layout.ljust(7, "-"), values, strict=True)]
+    types = layout.ljust(len(values), _NOT_STORED)
+    stored_values = [_CONVERSIONS[type_](value) for type_, value in zip(types, values, strict=True)]
     if item.command == Cmd.NAV_LOITER_TURNS:
         stored_values[:4] = _stored_turns(item)
     p1, p2, p3, p4, x, y, z = stored_values
-    frame: int = MavFrame.GLOBAL
+    frame: int = MavFrame.GLOBAL  # The frame that a download reports for an item without a position.
     if has_location(item.command):
         place_or_result = _stored_place(item)
         if isinstance(place_or_result, int):
@@ -140,6 +143,7 @@ def _stored_place(item: MissionItem) -> tuple[float, float, float, int] | int:
     frame = altitude_frame(item.frame)
     if frame is None:
         return MavMissionResult.UNSUPPORTED_FRAME
+    # The firmware stores whole centimetres, and calculates in single precision.
     centimetres = int(float32(float32(item.z) * 100.0))
     return item.x, item.y, float32(centimetres * float32(0.01)), frame
 
@@ -151,7 +155,7 @@ def _stored_turns(item: MissionItem) -> tuple[float, float, float, float]:
     """
     turns, radius = item.param1, abs(item.param3)
     turn_unit = 1 / 256 if 0 < turns < 1 else 1
-    turn_byte = int(min(255.0, turns / turn_unit)) & 0xFF
+    turn_byte = int(min(255.0, turns / turn_unit)) & 0xFF  # A negative number keeps only its lowest byte.
     radius_unit = 1 if radius <= 255 else 10
     radius_byte = int(min(255.0, radius / radius_unit))
     sign = -1.0 if item.param3 < 0 else 1.0
@@ -182,7 +186,7 @@ def _signed(value: int, bits: int) -> float:
 
 # Functions that return a value as it is after it was stored and read again, by storage type.
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
-    "-": lambda _: 0.0,
+    _NOT_STORED: lambda _: 0.0,
     "f": float32,
     "e": _half,
     "B": lambda value: float(whole(value) & 0xFF),

@@ -17,6 +17,7 @@ from aerokit.sim.ardupilot.mission_items import altitude_frame, check_place, sto
 from aerokit.sim.missions import float32
 
 _MIN_RALLY_M, _MAX_RALLY_M = -32768, 32767
+_HOME_SEQ = 0
 
 
 class ItemList:
@@ -121,9 +122,9 @@ class CommandList(ItemList):
         if seq > count or max(seq, 1) >= self.capacity:
             return MavMissionResult.ERROR
         if seq == count:
-            self.add_home()
+            self.add_home()  # The first uploaded item follows the placeholder for home.
             self._commands.append(stored_item)
-        elif seq > 0:
+        elif seq != _HOME_SEQ:
             self._commands[seq] = stored_item
         self.version += 1
         return MavMissionResult.ACCEPTED
@@ -191,7 +192,7 @@ def _stored_rally_point(item: MissionItem) -> MissionItem | int:
     result = check_place(item.x, item.y)
     if result != MavMissionResult.ACCEPTED:
         return result
-    if not _MIN_RALLY_M <= item.z <= _MAX_RALLY_M:
+    if not _MIN_RALLY_M <= item.z <= _MAX_RALLY_M:  # The altitude is stored in whole metres, as an int16.
         return MavMissionResult.INVALID_PARAM7
     frame = altitude_frame(item.frame)
     if frame is None or item.frame == MavFrame.MISSION:
@@ -293,7 +294,7 @@ def _stored_fence_item(item: MissionItem) -> MissionItem | int:
     if item.command in _POLYGONS:
         if item.param1 > _MAX_VERTICES:
             return MavMissionResult.INVALID_PARAM1
-        size = float(whole(item.param1) & 0xFF)
+        size = float(whole(item.param1) & 0xFF)  # The number of vertices is stored in one byte.
     elif item.command in _CIRCLES:
         size = float32(item.param1)
     elif item.command != Cmd.NAV_FENCE_RETURN_POINT:

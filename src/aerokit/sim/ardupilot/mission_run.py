@@ -18,7 +18,7 @@ from aerokit.sim.ardupilot.mission_items import command_name
 from aerokit.sim.motion import Ned
 
 _FIRST = 1
-_MAX_JUMPS, _MAX_STEPS = 64, 255
+_MAX_JUMPS, _MAX_STEPS, _MAX_LOOK_AHEAD = 64, 255, 16
 _UNLIMITED = -1
 _WITH_TARGET = frozenset({Cmd.DO_JUMP, Cmd.JUMP_TAG, Cmd.DO_JUMP_TAG})
 _TAKE_OFFS = frozenset({Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF})
@@ -159,8 +159,8 @@ class MissionRun:
         return False
 
     def navigation_from(self, index: int) -> Iterator[tuple[int, MissionItem]]:
-        """Yield the next navigation commands in the order of execution (with jumps), at most sixteen."""
-        for _ in range(16):
+        """Yield the next navigation commands in the order of execution (with jumps), at most `_MAX_LOOK_AHEAD`."""
+        for _ in range(_MAX_LOOK_AHEAD):  # Jumps may form an endless loop.
             navigation = self._next_navigation(index)
             if navigation is None:
                 return
@@ -265,7 +265,8 @@ class MissionRun:
 
         ``start`` is the index to search from; 0 searches after the current navigation command.
         """
-        index = start or (self.nav_index + 1 if self.nav_index else _FIRST)
+        index_after_current = self.nav_index + 1 if self.nav_index else _FIRST
+        index = start or index_after_current
         self._running_do, self._last_do_index = None, 0
         for _ in range(_MAX_STEPS):
             command = self._next(index, count_jumps=True)
@@ -275,7 +276,8 @@ class MissionRun:
             index = command_index + 1
             if is_navigation(item):
                 self.nav_index = command_index
-                if self._begin(command_index, item):  # An unsupported command is skipped.
+                is_supported = self._begin(command_index, item)
+                if is_supported:  # An unsupported command is skipped.
                     self._running_nav = item
                     return True
             elif self._running_do is None:
@@ -321,11 +323,13 @@ class MissionRun:
             if item.command not in (Cmd.DO_JUMP, Cmd.DO_JUMP_TAG):
                 return index, item
             target = self._jump_target(item)
+            # Without counting, a jump that is met again would be followed for ever.
             is_endless = not count_jumps and first_jump == index
             if self._list.command(target) is None or is_endless:
                 return None
             first_jump = first_jump or index
-            index = target if self._jumps_now(index, int(item.param2), count_jumps=count_jumps) else index + 1
+            has_jumps_left = self._use_jump(index, times=int(item.param2), count_jumps=count_jumps)
+            index = target if has_jumps_left else index + 1
         return None
 
     def _jump_target(self, item: MissionItem) -> int:
@@ -338,8 +342,11 @@ class MissionRun:
                 return index
         return 0
 
-    def _jumps_now(self, index: int, times: int, *, count_jumps: bool) -> bool:
-        """Return True if the jump command at ``index``, which jumps ``times`` times, has repetitions left."""
+    def _use_jump(self, index: int, *, times: int, count_jumps: bool) -> bool:
+        """Return True if the jump command at ``index``, which jumps ``times`` times, has repetitions left.
+
+        With ``count_jumps``, use up one of the repetitions.
+        """
         jumps_done = self._jumps.get(index, 0)
         if times != _UNLIMITED and jumps_done >= times:
             if count_jumps:

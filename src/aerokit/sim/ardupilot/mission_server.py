@@ -151,6 +151,7 @@ class ArduPilotMissionServer(MissionServer):
             return item_message_int(item, request.seq, client, kind, current=current)
         place: tuple[float, float] = (item.x, item.y)
         if has_location(item.command):
+            # Degrees. Like the firmware, convert them in single precision.
             place = (float32(item.x * float32(1e-7)), float32(item.y * float32(1e-7)))
         self._warn_once(request, "got MISSION_REQUEST; use MISSION_REQUEST_INT!")
         return item_message_float(item, place, request.seq, client, kind, int(current))

@@ -46,6 +46,7 @@ class ArduPilotNavigation:
     def start(self) -> None:
         """Schedule the events of the boot timeline."""
         timeline, call_later = self._vehicle.timeline, self._vehicle.call_later
+        # The estimator reports its flags as uninitialised for the second half of its start.
         unaligned_at = timeline.ready + 0.5 * (timeline.estimator_active - timeline.ready)
         call_later(unaligned_at, lambda: self._set_flags(int(Ekf.UNINITIALIZED)))
         call_later(timeline.estimator_active, self._activate)
@@ -343,14 +344,18 @@ class SmartPath:
 
 
 def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
-    """Return the path without those points that are within ``tolerance`` metres of the simplified path."""
+    """Return the path without those points that are within ``tolerance`` metres of the simplified path.
+
+    This is the algorithm of Ramer, Douglas and Peucker.
+    """
     if len(path) < 3:
         return list(path)
     distances = [_distance_to_line(point, path[0], path[-1]) for point in path[1:-1]]
     farthest = max(range(len(distances)), key=distances.__getitem__)
     if distances[farthest] <= tolerance:
         return [path[0], path[-1]]
-    middle = farthest + 1
+    middle = farthest + 1  # Index in `path`. The first point of `path` has no distance.
+    # Both halves contain the middle point, which is used once.
     return simplify(path[: middle + 1], tolerance)[:-1] + simplify(path[middle:], tolerance)
 
 
@@ -362,7 +367,7 @@ def prune(path: Sequence[Ned], tolerance: float) -> list[Ned]:
     points = list(path)
     first = 0
     while first < len(points) - 3:
-        for last in range(len(points) - 2, first + 1, -1):
+        for last in range(len(points) - 2, first + 1, -1):  # The longest loop comes first.
             approach = _closest_approach(points[first], points[first + 1], points[last], points[last + 1])
             if approach is None:
                 continue

@@ -165,7 +165,9 @@ class SimulatedPlane(PlaneHost):
         wing.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
         if wing.is_on_ground and not was_on_ground:
             self.info(f"SIM Hit ground at {wing.impact_speed_m_s:f} m/s")
-        if self.rest_timer.seconds(wing.is_at_rest and wing.throttle <= 0, self.now) >= _REST_S:
+        is_resting = wing.is_at_rest and wing.throttle <= 0
+        rested_for_s = self.rest_timer.seconds(is_resting, self.now)
+        if rested_for_s >= _REST_S:
             self.is_landed: bool = True
             wing.settle()
 
@@ -192,9 +194,10 @@ class SimulatedPlane(PlaneHost):
         if not self.set_mode(PlaneMode.GUIDED):
             return MavResult.FAILED
         self.guided.go_to(point)
-        if command.param3 > 0:
+        radius = command.param3
+        if radius > 0:  # Otherwise the radius is WP_LOITER_RAD.
             is_anticlockwise = not math.isnan(command.param4) and command.param4 != 0
-            self.guided.radius = -command.param3 if is_anticlockwise else command.param3
+            self.guided.radius = -radius if is_anticlockwise else radius
         return MavResult.ACCEPTED
 
     def _change_speed(self, command: ReceivedCommand) -> int:
@@ -206,4 +209,4 @@ class SimulatedPlane(PlaneHost):
             mode.speed = command.param2
             return MavResult.ACCEPTED
         is_ground_speed = command.param1 == SpeedType.GROUNDSPEED
-        return MavResult.ACCEPTED if is_ground_speed else MavResult.FAILED
+        return MavResult.ACCEPTED if is_ground_speed else MavResult.FAILED  # An invalid airspeed fails, too.

@@ -70,6 +70,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             return True  # Arming enters the current mode again, which must not restart the mission.
         super().enter(force=force)
         self._manoeuvre = _LOITER
+        # Later, because the mission or RTL may change the mode again, and this change must be complete before.
         plane.call_later(0.0, self._begin if plane.mission.is_present else self._return_at_once)
         return True
 
@@ -102,7 +103,8 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if self._place is None:
             return
         bearing = math.atan2(wing.east - self._place[1], wing.north - self._place[0])
-        if not math.isnan(self._on_circle_since):
+        was_on_circle = not math.isnan(self._on_circle_since)
+        if was_on_circle:
             self._turned_rad += abs(wrap_pi(bearing - self._last_bearing))
         elif self._is_on_circle:
             self._on_circle_since = self.vehicle.now
@@ -133,12 +135,14 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         plane, command = self.vehicle, item.command
         if command == Cmd.NAV_TAKEOFF:
             assert self._place is not None
-            is_high = plane.wing.down <= self._place[2]
-            return self._report_if(is_high, f"Takeoff complete at {plane.altitude_m:.2f}m")
+            is_altitude_reached = plane.wing.down <= self._place[2]
+            return self._report_if(is_altitude_reached, f"Takeoff complete at {plane.altitude_m:.2f}m")
         if command in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT):
             return self._has_passed(index)
         if command == Cmd.NAV_LOITER_TIME:
-            return self._report_if(plane.now - self._on_circle_since >= item.param1, "Loiter time complete")
+            # Before the plane has reached the circle, the time is NaN, and the comparison is false.
+            time_on_circle_s = plane.now - self._on_circle_since
+            return self._report_if(time_on_circle_s >= item.param1, "Loiter time complete")
         if command == Cmd.NAV_LOITER_TURNS:
             return self._report_if(self._turned_rad >= 2 * math.pi * item.param1, "Loiter orbits complete")
         if command == Cmd.NAV_LOITER_TO_ALT:
@@ -265,6 +269,8 @@ class PlaneGuided(PlaneNavigatingMode):
         """
         mask, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
+        # Without rates, the attitude has all angles. Otherwise, the bits of the rates select angles (the firmware reads
+        # them in this way, see GCS_MAVLink_Plane.cpp).
         selects_all_angles = not mask & Mask.ATTITUDE_IGNORE and mask & _RATES == _RATES
         if selects_all_angles or not mask & Mask.BODY_ROLL_RATE_IGNORE:
             self._bank = _TimedValue(roll, now)
@@ -280,13 +286,14 @@ class PlaneGuided(PlaneNavigatingMode):
         )
         has_target = has_bank or has_pitch or has_throttle or self._course is not None
         if self.vehicle.is_landed or not has_target:
-            super().update(dt)
+            super().update(dt)  # circles the target
             return
         limits = wing.wing_limits
+        # Half throttle flies at cruise speed.
         speed = 2.0 * self._throttle.value * self.vehicle.cruise_m_s if has_throttle else self.airspeed
-        climb = wing.climb_to(wing.down if self._place is None else self._place[2])
-        climb = max(-self._climb_limit, min(self._climb_limit, climb))
-        if has_pitch:
+        target_down = wing.down if self._place is None else self._place[2]
+        climb = max(-self._climb_limit, min(self._climb_limit, wing.climb_to(target_down)))
+        if has_pitch:  # A commanded pitch replaces the altitude.
             climb = max(-limits.sink_m_s, min(limits.climb_m_s, speed * math.sin(self._pitch.value)))
         if not has_bank and self._course is not None:
             wing.head(self._course, speed, climb)

@@ -8,7 +8,7 @@ from typing import ClassVar
 from aerokit.mavlink.enums import MavCmd, MavMissionType, MavSeverity, PlaneMode
 from aerokit.sim.ardupilot.failsafes import ArduPilotFailsafes
 from aerokit.sim.ardupilot.fence import ArduPilotFence
-from aerokit.sim.ardupilot.host import ArduPilotMode, ConditionTimer
+from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ConditionTimer
 from aerokit.sim.ardupilot.navigation import best_return_place
 from aerokit.sim.ardupilot.plane_modes import PlaneHost
 from aerokit.sim.motion import Ned
@@ -73,7 +73,8 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def _is_radio_bad(self) -> bool:
         plane = self.vehicle
-        is_throttle_low = plane.parameters["THR_FAILSAFE"] != 0 and plane.rc[2] <= plane.parameters["THR_FS_VALUE"]
+        checks_throttle = plane.parameters["THR_FAILSAFE"] != 0
+        is_throttle_low = checks_throttle and plane.rc[RC_THROTTLE] <= plane.parameters["THR_FS_VALUE"]
         return is_throttle_low or plane.now - self.radio_received_at > _SILENT_S
 
     def _check_radio(self) -> None:
@@ -107,7 +108,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         if mode in _PILOTED or (mode in _NAVIGATING and action != _SHORT_BEST_GUESS):
             plane.set_mode(_SHORT_MODES.get(action, PlaneMode.CIRCLE))  # Every other action circles.
         self._mode_after = plane.mode.number
-        if self._mode_after != self._mode_before:
+        if self._mode_after != self._mode_before:  # Some modes continue, and a mode change may be refused.
             self.warn(f"RC Short Failsafe: switched to {plane.mode.name}")
         else:
             self.warn("RC Short Failsafe On")
@@ -127,6 +128,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         plane = self.vehicle
         if plane.mode.is_landing:
             return
+        # The long failsafe counts from the start of the short one.
         lost_since = self._short_since if self.state == _SHORT else self.radio_received_at
         timeout = plane.parameters["FS_LONG_TIMEOUT"]
         gcs_option = int(plane.parameters["FS_GCS_ENABL"])
@@ -156,6 +158,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     def _start_long(self, state: int) -> None:
         """Execute FS_LONG_ACTN. Its effect depends on the mode: a piloted mode, RTL, or AUTO and GUIDED."""
         plane = self.vehicle
+        # The ground station may hang, so the radio takes over from its overrides (events.cpp).
         plane.rc.release_overrides()
         self.state = state
         mode = plane.mode.number
@@ -163,7 +166,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         if mode in _LONG_AS_PILOTED:
             acts_in_take_off = action in (_LONG_GLIDE, _LONG_PARACHUTE)
             if self._is_in_take_off and not acts_in_take_off:
-                self._is_long_pending = True
+                self._is_long_pending = True  # The action follows after the initial climb.
             else:  # In these modes, action 0 returns to launch; only in AUTO and GUIDED it continues.
                 self.change_to(*_LONG_MODES.get(action or _LONG_RTL, ()))
         elif mode == PlaneMode.RTL:
@@ -186,7 +189,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def act_on_battery(self, action: int) -> None:
         is_landing = self.vehicle.mode.is_landing
-        lands = action in (_LAND, _QLAND, _LOITER_QLAND)
+        lands = action in (_LAND, _QLAND, _LOITER_QLAND)  # A plane without lifting rotors treats all three alike.
         if action == _TERMINATE:
             self.refuse_termination()
         elif not is_landing and (lands or action in (_BATTERY_RTL, _AUTOLAND_OR_RTL)):
@@ -243,7 +246,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
 
     def act(self, new_breaches: int) -> None:
         plane = self.vehicle
-        if self.caused_mode:
+        if self.caused_mode:  # The plane already returns from an earlier breach.
             return
         self.report("breached", new_breaches)
         mode = plane.mode.number
@@ -275,7 +278,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             for item in plane.missions.items(MavMissionType.FENCE)
             if item.command == MavCmd.NAV_FENCE_RETURN_POINT
         )
-        north, east = next(points, home[:2])
+        north, east = next(points, home[:2])  # a fence has at most one return point
         return (north, east, home[2] - height)
 
     def on_cleared(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from aerokit.mavlink.enums import MavModeFlag, MavSeverity
-from aerokit.sim.ardupilot.host import ArduPilotMode, ConditionTimer
+from aerokit.sim.ardupilot.host import RC_PITCH, RC_ROLL, RC_THROTTLE, ArduPilotMode, ConditionTimer
 from aerokit.sim.ardupilot.navigation import best_return_place
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.motion import Motion, Ned, SimulatedWind
@@ -114,9 +114,11 @@ class PlaneLanding:
         # point), and across that line.
         remaining = (north - wing.north) * cos_course + (east - wing.east) * sin_course
         aside = (east - wing.east) * cos_course - (north - wing.north) * sin_course
-        flare_time = wing.velocity_down * plane.parameters["LAND_FLARE_SEC"]
-        if down - wing.down < max(plane.parameters["LAND_FLARE_ALT"], flare_time):
-            self._flare(down - wing.down, remaining)
+        # The flare starts below LAND_FLARE_ALT, or when the plane would touch down within LAND_FLARE_SEC.
+        height, sink_rate = down - wing.down, wing.velocity_down
+        flare_height = max(plane.parameters["LAND_FLARE_ALT"], sink_rate * plane.parameters["LAND_FLARE_SEC"])
+        if height < flare_height:
+            self._flare(height, remaining)
         if self._is_flaring:
             climb, speed = -_FLARE_SINK_M_S, wing.wing_limits.airspeed_min_m_s
         else:
@@ -124,6 +126,7 @@ class PlaneLanding:
             down_on_slope = down + (self._approach_start[2] - down) * max(0.0, remaining) / length
             slope_sink = (down - self._approach_start[2]) * wing.ground_speed_m_s / length
             climb, speed = -slope_sink + wing.climb_to(down_on_slope), _APPROACH_SHARE * plane.cruise_m_s
+        # The course points to the approach line, more directly the farther the plane is from it.
         wing.head(course + math.atan2(aside, _CORRECTION_LENGTH_M), speed, climb)
 
     def _flare(self, height: float, remaining: float) -> None:
@@ -150,7 +153,9 @@ class PlaneLanding:
 
 
 _MID_STICK, _STICK_RANGE, _LOW_THROTTLE = 1500, 500, 1100
+_CENTRED_STICK = 0.05  # A stick deflection of up to this share counts as centred.
 _CIRCLE_BANK_SHARE = 1 / 3
+# The climb of a take-off ends this many metres below the altitude of the take-off.
 _TAKE_OFF_DONE_M = 5.0
 _NAVIGATES = MavModeFlag.GUIDED_ENABLED | MavModeFlag.STABILIZE_ENABLED
 
@@ -175,16 +180,18 @@ class PlanePilotedMode(PlaneModeBase):
 
     def update(self, dt: float) -> None:
         plane, wing = self.vehicle, self.vehicle.wing
-        throttle = max(0.0, min(1.0, (plane.rc[2] - 1000) / 1000))
-        if plane.is_landed and plane.rc[2] <= _LOW_THROTTLE:
+        throttle_pulse, limits = plane.rc[RC_THROTTLE], wing.wing_limits
+        is_idle = throttle_pulse <= _LOW_THROTTLE
+        if plane.is_landed and is_idle:
             wing.roll_out()
             return
         plane.lift_off()
-        climb = self.stick(1) * wing.wing_limits.climb_m_s  # A pulled stick has a positive value, and climbs.
-        if plane.rc[2] <= _LOW_THROTTLE:
-            climb = min(climb, 0.0) - wing.wing_limits.glide_sink_m_s
-        speed = max(0.0, throttle * 2 * plane.cruise_m_s)  # Half throttle flies at cruise speed.
-        wing.bank_and_climb(speed, self.stick(0) * wing.wing_limits.bank_rad, climb)
+        climb = self.stick(RC_PITCH) * limits.climb_m_s  # A pulled stick has a positive value, and climbs.
+        if is_idle:  # Without thrust, the plane glides, and a pulled stick has no effect.
+            climb = min(climb, 0.0) - limits.glide_sink_m_s
+        throttle = max(0.0, min(1.0, (throttle_pulse - 1000) / 1000))
+        speed = throttle * 2 * plane.cruise_m_s  # Half throttle flies at cruise speed.
+        wing.bank_and_climb(speed, self.stick(RC_ROLL) * limits.bank_rad, climb)
 
 
 class PlaneAltitudeMode(PlaneModeBase):
@@ -208,12 +215,12 @@ class PlaneAltitudeMode(PlaneModeBase):
 
     def climb_rate(self) -> float:
         """Return the rate at which the altitude changes, in m/s."""
-        return self.stick(1) * self.vehicle.parameters["FBWB_CLIMB_RATE"]
+        return self.stick(RC_PITCH) * self.vehicle.parameters["FBWB_CLIMB_RATE"]
 
     def steer(self, climb: float) -> None:
         """Bank as the roll stick commands, and climb at ``climb`` m/s."""
         wing = self.vehicle.wing
-        wing.bank_and_climb(self.vehicle.cruise_m_s, self.stick(0) * wing.wing_limits.bank_rad, climb)
+        wing.bank_and_climb(self.vehicle.cruise_m_s, self.stick(RC_ROLL) * wing.wing_limits.bank_rad, climb)
 
 
 class PlaneCruise(PlaneAltitudeMode):
@@ -225,12 +232,12 @@ class PlaneCruise(PlaneAltitudeMode):
 
     def steer(self, climb: float) -> None:
         wing = self.vehicle.wing
-        if abs(self.stick(0)) > 0.05:
+        if abs(self.stick(RC_ROLL)) > _CENTRED_STICK:  # The pilot turns, so the present course is not held.
             self._course = None
             super().steer(climb)
             return
         if self._course is None:
-            self._course = math.atan2(wing.velocity_east, wing.velocity_north)
+            self._course = math.atan2(wing.velocity_east, wing.velocity_north)  # Hold the present course over ground.
         wing.head(self._course, self.vehicle.cruise_m_s, climb)
 
 
@@ -290,7 +297,8 @@ class PlaneRtl(PlaneNavigatingMode):
         plane = self.vehicle
         home, height = plane.home_or_ground, plane.parameters["RTL_ALTITUDE"]
         self.radius: float = plane.parameters["RTL_RADIUS"]
-        down = plane.wing.down if height < 0 else home[2] - height
+        keeps_altitude = height < 0
+        down = plane.wing.down if keeps_altitude else home[2] - height
         self._place = best_return_place(plane, (home[0], home[1], down))
         return True
 
@@ -301,32 +309,36 @@ class PlaneTakeOff(PlaneNavigatingMode):
     def enter(self, *, force: bool) -> bool:
         super().enter(force=force)
         self._place = None
-        self._climbs = False
+        self._is_climbing = False
         return True
 
     @property
     def is_taking_off(self) -> bool:  # type: ignore[override]
-        return self._climbs
+        return self._is_climbing
 
     def update(self, dt: float) -> None:
-        plane, wing = self.vehicle, self.vehicle.wing
+        plane = self.vehicle
         if self._place is None:
             self._start()
-        assert self._place is not None
-        if self._climbs:
+        if self._is_climbing:
             plane.climb_out()
-            self._climbs = wing.down > self._place[2] + _TAKE_OFF_DONE_M
+            self._is_climbing = self._missing_height_m() > _TAKE_OFF_DONE_M
         else:
             super().update(dt)
 
+    def _missing_height_m(self) -> float:
+        assert self._place is not None
+        return self.vehicle.wing.down - self._place[2]
+
     def _start(self) -> None:
+        """Set the place to circle: TKOFF_DIST metres ahead of the nose, and TKOFF_ALT metres above home."""
         plane, wing = self.vehicle, self.vehicle.wing
         height, distance = plane.parameters["TKOFF_ALT"], plane.parameters["TKOFF_DIST"]
         north, east = wing.north + distance * math.cos(wing.yaw), wing.east + distance * math.sin(wing.yaw)
         self._place = (north, east, plane.home_or_ground[2] - height)
-        self._climbs = wing.down > self._place[2] + _TAKE_OFF_DONE_M
+        self._is_climbing = self._missing_height_m() > _TAKE_OFF_DONE_M
         heading = math.degrees(wing.yaw) % 360.0
-        text = "Climbing to TKOFF alt then loitering" if self._climbs else "Above TKOFF alt - loitering"
+        text = "Climbing to TKOFF alt then loitering" if self._is_climbing else "Above TKOFF alt - loitering"
         if plane.is_landed:
             text = f"Takeoff to {height:.0f}m for {distance:.1f}m heading {heading:.1f} deg"
         plane.info(text)
@@ -353,6 +365,7 @@ class PlaneAutoland(PlaneNavigatingMode):
         home = plane.home_or_ground
         distance, height = plane.parameters["AUTOLAND_WP_DIST"], plane.parameters["AUTOLAND_WP_ALT"]
         north, east = math.cos(plane.take_off_yaw), math.sin(plane.take_off_yaw)
+        # The landing has the direction of the take-off, so the approach starts on the other side of home.
         start = (home[0] - distance * north, home[1] - distance * east, home[2] - height)
         self._place, self._landing = home, PlaneLanding(plane, home, start)
         return True

@@ -21,6 +21,7 @@ _LOW_THROTTLE_PWM = 950
 # Special values of channels in RC_CHANNELS_OVERRIDE. `_RELEASE_UPPER` releases one of the channels 9 to 18.
 _UNCHANGED, _RELEASE_UPPER = 0xFFFF, 0xFFFE
 _ROLL, _PITCH, _THROTTLE, _YAW, _FORWARD, _LATERAL = range(6)
+_SUB_PITCH, _SUB_ROLL = 0, 1
 
 
 class ArduPilotRadio:
@@ -42,7 +43,7 @@ class ArduPilotRadio:
             value, since = self._overrides[index]  # The value 0 means that the channel is released.
             if value and self._vehicle.now - since < self._override_time():
                 return value
-        if index == _THROTTLE and self._failure == _LOW_THROTTLE:
+        if index == _THROTTLE and self._failure == _LOW_THROTTLE:  # SIM_RC_FAIL simulates a receiver without signal.
             return _LOW_THROTTLE_PWM
         return self._sticks[index] if index < len(self._sticks) else 0
 
@@ -96,11 +97,12 @@ class ArduPilotRadio:
             return
         vehicle.failsafes.ground_station_seen_at = vehicle.now
         for index in range(_OVERRIDABLE):
-            value, is_upper = getattr(override, f"chan{index + 1}_raw"), index >= len(self._sticks)
+            value = getattr(override, f"chan{index + 1}_raw")
+            is_upper = index >= len(self._sticks)  # one of the channels 9 to 16
             if value == _UNCHANGED or (value == 0 and is_upper):  # In an upper channel, 0 also means unchanged.
                 continue
             if value == _RELEASE_UPPER and is_upper:
-                value = 0
+                value = 0  # The stored value 0 releases a channel.
             self._overrides[index] = (value, vehicle.now)
 
 
@@ -168,11 +170,13 @@ class SubJoystick(ArduPilotJoystick):
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
         gain = max(0.1, min(1.0, self.setting("JS_GAIN_DEFAULT", 0.5)))
-        throttle_scale = 2 * _SUB_SCALE * gain * self.setting("JS_THR_GAIN", 1.0)
-        throttle = axes.z * throttle_scale + _CENTRE - 500 * throttle_scale
+        scale = _SUB_SCALE * gain
+        throttle_scale = 2 * scale * self.setting("JS_THR_GAIN", 1.0)
+        throttle = axes.z * throttle_scale + _CENTRE - 500 * throttle_scale  # 500 is the middle of the axis z.
+        # Like the firmware, do not scale pitch and roll (joystick.cpp).
         offsets = {
-            _ROLL: axes.s, _PITCH: axes.t, _YAW: axes.r * _SUB_SCALE * gain,
-            _FORWARD: axes.x * _SUB_SCALE * gain, _LATERAL: axes.y * _SUB_SCALE * gain,
+            _SUB_PITCH: axes.s, _SUB_ROLL: axes.t, _YAW: axes.r * scale, _FORWARD: axes.x * scale,
+            _LATERAL: axes.y * scale,
         }  # fmt: skip
         pulses = {channel: _CENTRE + offset for channel, offset in offsets.items()} | {_THROTTLE: throttle}
         return {channel: int(max(_SUB_MIN_PWM, min(_SUB_MAX_PWM, pulse))) for channel, pulse in pulses.items()}

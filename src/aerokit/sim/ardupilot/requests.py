@@ -38,6 +38,7 @@ _SUPPORTED_MESSAGES: dict[Kind, frozenset[int]] = {
 
 # A stream may have at most 80 % of the rate of the main loop, which is 400 Hz (GCS_Common.cpp, cap_message_interval).
 _MIN_INTERVAL_S, _MAX_INTERVAL_S = 0.0025 / 0.8, 60.0
+_MODES_MONITOR_INTERVAL_S = 5.0
 _MESSAGE_INTERVAL_IDS = 1 << 16  # The 16-bit message id in MESSAGE_INTERVAL is below this number.
 _MIN_TERRAIN_REQUEST_INTERVAL_S = 2.0
 
@@ -118,7 +119,9 @@ class ArduPilotMessageRequests:
 
         def send() -> None:
             message = self._vehicle.build(message_id)
-            if message is not None and (message_id != m.RcChannelsRaw.ID or channel.version == 1):
+            # The firmware sends RC_CHANNELS_RAW only on MAVLink 1 ports.
+            is_allowed = message_id != m.RcChannelsRaw.ID or channel.version == 1
+            if message is not None and is_allowed:
                 self._vehicle.send(message, channel)
 
         self._vehicle.call_later(0.0, send)
@@ -130,9 +133,10 @@ class ArduPilotMessageRequests:
         """
         vehicle = self._vehicle
         modes = vehicle.available_modes()
-        for message in modes if index == 0 else modes[index - 1 : index]:
+        requested_modes = modes if index == 0 else modes[index - 1 : index]  # empty if there is no such mode
+        for message in requested_modes:
             vehicle.call_later(0.0, partial(vehicle.send, message, channel))
-        channel.streams.set_interval(m.AvailableModesMonitor.ID, 5.0, vehicle.now)
+        channel.streams.set_interval(m.AvailableModesMonitor.ID, _MODES_MONITOR_INTERVAL_S, vehicle.now)
 
     def _on_group(self, request: m.RequestDataStream, channel: Channel) -> None:
         if request.start_stop not in (0, 1):

@@ -19,7 +19,7 @@ from aerokit.mavlink.enums import (
 from aerokit.mavlink.messages import SetAttitudeTarget
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes, ArmingCheck
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
-from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors, ConditionTimer
+from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ArduPilotMotors, ConditionTimer
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.radio import ArduPilotJoystick, RoverJoystick
 from aerokit.sim.ardupilot.rover_modes import ROVER_MODES, RoverGuided, RoverHost
@@ -130,7 +130,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         if not parameters["FS_THR_ENABLE"]:
             self.is_radio_lost = False
             return
-        is_throttle_low = rover.rc[2] < parameters["FS_THR_VALUE"]
+        is_throttle_low = rover.rc[RC_THROTTLE] < parameters["FS_THR_VALUE"]
         self.is_radio_lost: bool = is_throttle_low or rover.now - self.radio_received_at > _SILENT_S
         self._update_link(_RADIO, is_lost=self.is_radio_lost)
 
@@ -149,7 +149,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self._lost_since = rover.now
         if self._triggered and not self._lost:
             self.warn(f"{name} Failsafe Cleared", MavSeverity.INFO)
-        self._triggered &= self._lost
+        self._triggered &= self._lost  # A failsafe is over for each link that has returned.
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
         if not self._lost or self._triggered or is_waiting or not self._may_act():
             return
@@ -198,8 +198,9 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     def _check_wheels(self) -> None:
         """Detect that the rover does not move although its mode drives (FS_CRASH_CHECK)."""
         rover, action = self.vehicle, int(self.vehicle.parameters["FS_CRASH_CHECK"])
-        tries_to_drive = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
-        is_stuck = bool(action) and tries_to_drive and rover.motion.ground_speed_m_s < _STUCK_M_S
+        # In the simulation, only a failed motor keeps the rover from driving.
+        is_blocked = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
+        is_stuck = bool(action) and is_blocked and rover.motion.ground_speed_m_s < _STUCK_M_S
         if self._stuck.seconds(is_stuck, rover.now) >= _STUCK_S:
             self._stuck.reset()
             self.warn("Crash: Going to HOLD", MavSeverity.EMERGENCY)
@@ -260,7 +261,8 @@ class RoverSetpoints(GuidedSetpoints):
         if message.type_mask & AttitudeMask.THROTTLE_IGNORE:
             return
         speed = self.vehicle.waypoint_speed * max(-1.0, min(1.0, message.thrust))
-        heading = euler_from_quaternion(*message.q)[2]
+        _, _, heading = euler_from_quaternion(*message.q)
+        # The velocity has the direction of the heading. A negative speed is expressed by `backwards`.
         velocity = (abs(speed) * math.cos(heading), abs(speed) * math.sin(heading), 0.0)
         backwards = speed < 0
         if message.type_mask & AttitudeMask.BODY_YAW_RATE_IGNORE:

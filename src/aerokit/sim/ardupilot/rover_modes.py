@@ -46,7 +46,8 @@ class RoverHost(RoverSubVehicle):
         motion = self.motion
         north, east = place[0] - motion.north, place[1] - motion.east
         distance = math.hypot(north, east)
-        is_behind = abs(wrap_pi(math.atan2(east, north) - motion.yaw)) > math.pi / 2
+        bearing_from_nose = wrap_pi(math.atan2(east, north) - motion.yaw)
+        is_behind = abs(bearing_from_nose) > math.pi / 2
         is_moving = motion.ground_speed_m_s > _STANDING_M_S
         has_just_passed = is_behind and is_moving and distance <= self.parameters["WP_RADIUS"] / 2.0
         return distance <= _ARRIVED_M or has_just_passed
@@ -225,7 +226,7 @@ class RoverGuided(_Mode):
         rover = self.vehicle
         if not self._has_arrived and rover.has_arrived(place):
             self._has_arrived = True
-            rover.send(MissionItemReached(0))
+            rover.send(MissionItemReached(0))  # ArduRover reports the arrival at a guided target in this way.
         if self._has_arrived:
             rover.motion.stop()
         else:
@@ -242,8 +243,9 @@ class RoverGuided(_Mode):
         elif speed == 0.0:
             motion.stop()
         else:
-            course = math.atan2(east, north) + (math.pi if target.backwards else 0.0)
-            motion.head(speed, course if target.yaw is None else target.yaw)
+            # Backwards, the nose points away from the direction of travel.
+            heading = math.atan2(east, north) + (math.pi if target.backwards else 0.0)
+            motion.head(speed, heading if target.yaw is None else target.yaw)
 
 
 ROVER_MODES: tuple[Callable[[RoverHost], ArduPilotMode], ...] = (

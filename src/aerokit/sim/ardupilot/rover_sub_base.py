@@ -110,6 +110,7 @@ class GuidedSetpoints:
             yaw, yaw_rate = setpoint.yaw, setpoint.yaw_rate
         if yaw is not None and frame in self.RELATIVE_YAW_FRAMES:
             yaw += self.vehicle.motion.yaw
+        # Without a yaw or a yaw rate, the vehicle turns to the direction of travel, and never moves backwards.
         backwards = message.vx < 0 and (yaw is not None or yaw_rate is not None)
         if velocity is not None and frame in self.BODY_FRAMES:
             velocity = rotated(velocity, self.vehicle.motion.yaw)
@@ -257,6 +258,7 @@ class RoverSubAuto(MissionMode):
     def _is_done(self, index: int, item: MissionItem) -> bool:
         command, now = item.command, self.vehicle.now
         if command in _WAYPOINTS:
+            # NAV_LOITER_UNLIM never ends, but its arrival is reported.
             return self._has_stayed(index, item) and command != Cmd.NAV_LOITER_UNLIM
         if command == Cmd.NAV_RETURN_TO_LAUNCH:
             return self._place is None or self.has_arrived(self._place)
@@ -274,7 +276,8 @@ class RoverSubAuto(MissionMode):
         if self._reached_at is None:
             self._reached_at = now
             self.vehicle.info(self.reached_text(index, item.param1))
-        return now - self._reached_at >= max(0.0, item.param1)
+        delay_s = max(0.0, item.param1)
+        return now - self._reached_at >= delay_s
 
     def _go(self, item: MissionItem) -> None:
         vehicle = self.vehicle
@@ -289,7 +292,8 @@ class RoverSubAuto(MissionMode):
         self._place = (north, east, current[2] if item.z == 0 else point[2])
         following = next(vehicle.mission.navigation_from(vehicle.mission.nav_index + 1), None)
         is_waypoint_next = following is not None and following[1].command in _WAYPOINTS
-        self._stops = item.param1 > 0 or not is_waypoint_next
+        has_delay = item.param1 > 0
+        self._stops = has_delay or not is_waypoint_next
 
     def _wait(self, item: MissionItem) -> None:
         self._wait_until = self.vehicle.now + max(0.0, item.param1)

@@ -21,7 +21,7 @@ from aerokit.mavlink.enums import (
 from aerokit.mavlink.messages import SetAttitudeTarget
 from aerokit.sim.ardupilot.commands import commanded_heading
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
-from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors
+from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ArduPilotMotors
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.radio import ArduPilotJoystick, SubJoystick
 from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
@@ -110,7 +110,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         is_receiving = sub.rc.is_receiving
         if is_receiving:
             self.radio_received_at: float = sub.now
-        is_throttle_low = is_receiving and sub.rc[2] < sub.parameters["FS_THR_VALUE"]
+        is_throttle_low = is_receiving and sub.rc[RC_THROTTLE] < sub.parameters["FS_THR_VALUE"]
         is_lost = is_throttle_low or sub.now - self.radio_received_at >= _SILENT_S
         if not enabled:
             is_lost = False
@@ -126,14 +126,15 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
     def _check_pilot(self) -> None:
         sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_PILOT_INPUT"])
         silence = sub.now - self.radio_received_at
-        if not enabled or not silence >= sub.parameters["FS_PILOT_TIMEOUT"]:
+        is_silent = silence >= sub.parameters["FS_PILOT_TIMEOUT"]  # false for a pilot that was never received (NaN)
+        if not enabled or not is_silent:
             self.is_pilot_lost = False
             return
         if self.is_pilot_lost:
             return
         self.is_pilot_lost = True
         self.warn("Lost manual control", MavSeverity.CRITICAL)
-        for index in range(_STICKS):
+        for index in range(_STICKS):  # Otherwise the last stick positions would still control the vehicle.
             sub.rc[index] = _STICK_MIDDLE
         if enabled == _PILOT_DISARM:
             sub.arming.disarm()
@@ -153,7 +154,8 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         if self.is_ground_station_lost or not sub.is_armed:
             return
         self.is_ground_station_lost: bool = True
-        if action == _FAILSAFE_DISARM or (action in _GCS_MODES and not sub.set_mode(_GCS_MODES[action])):
+        is_mode_refused = action in _GCS_MODES and not sub.set_mode(_GCS_MODES[action])
+        if action == _FAILSAFE_DISARM or is_mode_refused:
             sub.arming.disarm()
 
     def act_on_battery(self, action: int) -> None:
@@ -215,7 +217,7 @@ class SubSetpoints(GuidedSetpoints):
         """Follow the yaw and the thrust for one second. The message must have both an attitude and a thrust."""
         if message.type_mask & (AttitudeMask.ATTITUDE_IGNORE | AttitudeMask.THROTTLE_IGNORE):
             return
-        climb_share = 2.0 * (max(0.0, min(1.0, message.thrust)) - 0.5)
+        climb_share = 2.0 * (max(0.0, min(1.0, message.thrust)) - 0.5)  # A thrust of 0.5 holds the depth.
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * self.vehicle.parameters[max_climb_parameter] / 100.0
         _, _, yaw = euler_from_quaternion(*message.q)

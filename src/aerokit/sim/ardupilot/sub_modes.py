@@ -13,7 +13,7 @@ from aerokit.sim.commands import rotated
 from aerokit.sim.motion import Ned, wrap_pi
 from aerokit.sim.vehicle_motion import UnderwaterMotion
 
-_MIN_LOOK_AHEAD_M = 1.0
+_MIN_LOOK_AHEAD_M, _MIN_TRAVEL_M_S = 1.0, 0.05
 _DEADZONE = 0.06
 _FULL_STICK_M_S = 1.0
 _FULL_STICK_TURN_RAD_S = math.radians(90.0)
@@ -48,8 +48,10 @@ class SubHost(RoverSubVehicle):
             motion.face(math.atan2(east - motion.east, north - motion.north))
         # The horizontal and the vertical speed have the ratio of the distances, so that the path is straight.
         depth_difference = abs(down - motion.down)
-        horizontal = max(speed * min(1.0, distance / max(depth_difference, 1e-3)), 0.05)
+        # The longer of the two distances is covered at full speed. The limit of 1 mm avoids a division by zero.
+        horizontal = speed * min(1.0, distance / max(depth_difference, 1e-3))
         vertical = speed * min(1.0, depth_difference / max(distance, 1e-3))
+        horizontal = max(horizontal, _MIN_TRAVEL_M_S)
         climb, descent = min(max_climb, vertical), min(max_descent, vertical)
         motion.seek_position(north, east, down, speed=horizontal, climb=climb, descent=descent)
 

@@ -23,6 +23,7 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 from aerokit.mavlink.message import Message
+from aerokit.sim.ardupilot.host import RC_PITCH, RC_ROLL, RC_THROTTLE, RC_YAW
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.plane_modes import PlaneHost
 from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
@@ -118,6 +119,7 @@ def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
     if nav.is_healthy:
         enabled |= _AHRS
         health |= _AHRS if vehicle.timeline.estimator_leads_early or nav.has_position else 0
+    # The firmware continues its log for some seconds after disarming.
     if vehicle.motors.is_armed or vehicle.now - vehicle.motors.disarmed_at < _LOG_AFTER_DISARMING_S:
         enabled |= _LOGGING
     if vehicle.rangefinder_reach_m > 0.0:
@@ -214,6 +216,9 @@ def _vibration(vehicle: ArduPilotVehicle) -> m.Vibration:
     return m.Vibration(vehicle.time_boot_us, x, y, z, 0, 0, 0)
 
 
+_FULL_THROTTLE_RPM, _ESC_PACKETS_PER_S, _ESC_TEMPERATURE_C = 15000, 100, 32
+
+
 def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
     has_motor = [index in _MOTORS[vehicle.KIND] for index in range(4)]
 
@@ -221,10 +226,12 @@ def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
         return [value if fitted else 0 for fitted in has_motor]
 
     voltages = per_motor(round(vehicle.battery.voltage_v * 100))
-    currents = per_motor(round(vehicle.battery.current_a * 25))  # A quarter of the battery current, in 0.01 A.
-    rpms = per_motor(round(vehicle.motors.throttle * 15000))  # Full throttle is 15,000 rpm.
-    counts = per_motor(int(vehicle.uptime * 100) & 0xFFFF)
-    temperatures = bytes(per_motor(32))
+    # Each motor takes a quarter of the battery current, in units of 0.01 A.
+    currents = per_motor(round(vehicle.battery.current_a / 4 * 100))
+    rpms = per_motor(round(vehicle.motors.throttle * _FULL_THROTTLE_RPM))
+    # Number of received telemetry packets. The field has 16 bits.
+    counts = per_motor(int(vehicle.uptime * _ESC_PACKETS_PER_S) & 0xFFFF)
+    temperatures = bytes(per_motor(_ESC_TEMPERATURE_C))
     return m.EscTelemetry1To4(temperatures, voltages, currents, (0,) * 4, rpms, counts)
 
 
@@ -270,7 +277,8 @@ _SURFACE_RANGE = 400
 _ROVER_DEADZONE = 30
 _OUTPUTS = 16
 _FULL_ROLL_RATE, _FULL_PITCH_RATE = 1.5, 0.5
-_SUB_ROLL, _SUB_YAW, _SUB_FORWARD, _SUB_LATERAL = 1, 3, 4, 5
+# Indices of the RC channels of ArduSub that have another meaning than in other firmwares.
+_SUB_ROLL, _SUB_FORWARD, _SUB_LATERAL = 1, 4, 5
 
 
 def _copter_outputs(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
@@ -282,19 +290,20 @@ def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
     wing, is_armed = plane.wing, plane.motors.is_armed
     throttle = 1000 + (round(1000 * plane.motors.throttle) if is_armed else 0)
     if plane.mode.number == PlaneMode.MANUAL:
-        aileron, elevator, rudder = (_surface(_stick(plane.rc[index])) for index in (0, 1, 3))
-        throttle = max(1000, min(2000, plane.rc[2])) if is_armed else 1000
+        aileron, elevator, rudder = (_pulse(_stick(plane.rc[channel])) for channel in (RC_ROLL, RC_PITCH, RC_YAW))
+        throttle = max(1000, min(2000, plane.rc[RC_THROTTLE])) if is_armed else 1000
     else:
-        aileron = _surface(wing.roll_rate / _FULL_ROLL_RATE)
-        elevator = _surface(-wing.pitch_rate / _FULL_PITCH_RATE)
-        rudder = _surface(wing.roll_rate / _FULL_ROLL_RATE / 2.0)
+        # The motion model has no surfaces. The deflections are derived from the rates of the plane.
+        roll_share = wing.roll_rate / _FULL_ROLL_RATE
+        aileron, rudder = _pulse(roll_share), _pulse(0.5 * roll_share)
+        elevator = _pulse(-wing.pitch_rate / _FULL_PITCH_RATE)  # A pulse below the middle raises the nose.
     return _servo_outputs(plane, aileron, elevator, throttle, rudder)
 
 
 def _rover_outputs(rover: RoverHost) -> m.ServoOutputRaw:
     """Build SERVO_OUTPUT_RAW with the steering on output 1, even while disarmed, and the motor on output 3."""
     if rover.mode.has_manual_throttle:
-        deflection = rover.rc[0] - _MIDDLE
+        deflection = rover.rc[RC_ROLL] - _MIDDLE  # The roll stick steers.
         beyond_deadzone = max(0, abs(deflection) - _ROVER_DEADZONE)
         size = min(_STICK_RANGE, int(beyond_deadzone * _STICK_RANGE / (_STICK_RANGE - _ROVER_DEADZONE)))
         steering = size if deflection > 0 else -size
@@ -309,14 +318,16 @@ def _sub_outputs(sub: SubHost) -> m.ServoOutputRaw:
     thrusters = [_MIDDLE] * 6
     if sub.motors.is_armed:
         yaw, forward, lateral, roll = (
-            _stick(sub.rc[index]) for index in (_SUB_YAW, _SUB_FORWARD, _SUB_LATERAL, _SUB_ROLL)
+            _stick(sub.rc[channel]) for channel in (RC_YAW, _SUB_FORWARD, _SUB_LATERAL, _SUB_ROLL)
         )
-        vertical = 1.0 - 2.0 * sub.motors.throttle
-        shares = (
+        # The signs are the motor factors of the frame VECTORED (AP_Motors6DOF.cpp). The vertical thrusters have the
+        # throttle factor -1: their pulses fall below the middle for a throttle above one half.
+        vertical = -(2.0 * sub.motors.throttle - 1.0)
+        thrusts = (
             yaw - forward + lateral, -yaw - forward - lateral, -yaw + forward + lateral, yaw + forward - lateral,
             vertical + roll, vertical - roll,
         )  # fmt: skip
-        thrusters = [_surface(share) for share in shares]
+        thrusters = [_pulse(thrust) for thrust in thrusts]
     return _servo_outputs(sub, *thrusters, 0, _MIDDLE, 0, _MIDDLE)
 
 
@@ -332,7 +343,8 @@ def _stick(pwm: int) -> float:
     return (pwm - _MIDDLE) / _STICK_RANGE
 
 
-def _surface(share: float) -> int:
+def _pulse(share: float) -> int:
+    """Return the pulse in µs of a control surface or a thruster, for a share from -1 to 1 of the full range."""
     return _MIDDLE + round(_SURFACE_RANGE * max(-1.0, min(1.0, share)))
 
 

@@ -158,7 +158,8 @@ def _local_position(vehicle: ArduPilotVehicle) -> m.LocalPositionNed | None:
 def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
     motion, nav = vehicle.motion, vehicle.navigation
     if not nav.is_gps_detected:
-        return m.GpsRawInt(0, GpsFixType.NO_GPS, 0, 0, 0, eph=65535, epv=65535, vel=0, cog=0, satellites_visible=0)
+        unknown = 65535  # dilution of precision
+        return m.GpsRawInt(0, GpsFixType.NO_GPS, 0, 0, 0, eph=unknown, epv=unknown, vel=0, cog=0, satellites_visible=0)
     if nav.fix_type < GpsFixType.TYPE_3D_FIX:
         return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, eph=9999, epv=9999, vel=0, cog=0, satellites_visible=3)
     place = nav.frame.to_global(*motion.place)
@@ -204,7 +205,7 @@ def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | Non
         return None
     place = vehicle.navigation.frame.to_global(*target)
     position = (place.latitude_e7, place.longitude_e7, place.altitude_m)
-    mask = _POSITION_ONLY | _LAST_BYTE
+    mask = _POSITION_ONLY | _LAST_BYTE  # The firmware also sets the four unused bits.
     return m.PositionTargetGlobalInt(vehicle.time_boot_ms, MavFrame.GLOBAL, mask, *position, *(0.0,) * 8)
 
 

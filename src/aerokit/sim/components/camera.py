@@ -32,7 +32,8 @@ class CameraParameters(ExtendedParameters):
         values, camera = self.values, self._camera
         if MODE in values:
             values[MODE] = int(camera.mode)
-        if values.get(EXPOSURE) == AUTO and {ISO, SHUTTER} <= values.keys():
+        has_iso_and_shutter = {ISO, SHUTTER} <= values.keys()
+        if values.get(EXPOSURE) == AUTO and has_iso_and_shutter:
             values[ISO], values[SHUTTER] = AUTO_ISO, AUTO_SHUTTER_S
         iso = values.get(ISO)
         if camera.mode == CameraMode.VIDEO and isinstance(iso, int) and iso > MAX_VIDEO_ISO:
@@ -74,8 +75,8 @@ def _at_once(handler: AsyncHandler) -> CommandHandler:
 
     def execute(command: ReceivedCommand) -> int:
         try:
-            handler(command).send(None)
-        except StopIteration as end:
+            handler(command).send(None)  # runs the coroutine until it waits or returns
+        except StopIteration as end:  # A coroutine returns its value by this exception.
             return int(end.value)
         raise AssertionError("a command handler of the simulated camera must not wait, but it did")
 

@@ -131,7 +131,8 @@ class Lens:
         elif kind == CameraZoomType.RANGE and 0.0 <= value <= 100.0:
             self.zoom.set(value)
         elif kind == CameraZoomType.FOCAL_LENGTH and 1.0 <= value / FOCAL_LENGTH_MM <= _ZOOM_FACTOR:
-            self.zoom.set((value / FOCAL_LENGTH_MM - 1.0) / (_ZOOM_FACTOR - 1.0) * 100.0)
+            zoom_factor = value / FOCAL_LENGTH_MM
+            self.zoom.set((zoom_factor - 1.0) / (_ZOOM_FACTOR - 1.0) * 100.0)
         else:
             return False
         return True
@@ -145,7 +146,7 @@ class Lens:
         elif kind == SetFocusType.RANGE and 0.0 <= value <= 100.0:
             self.focus.set(value)
         elif kind == SetFocusType.METERS and value > 0.0:
-            self.focus.set(100.0 * value / (value + _HALF_RANGE_FOCUS_M))
+            self.focus.set(100.0 * value / (value + _HALF_RANGE_FOCUS_M))  # 100 % is infinity.
         elif kind in _AUTO:
             self.focus.set(_SHARP_PERCENT)
         else:

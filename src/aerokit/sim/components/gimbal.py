@@ -133,7 +133,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         target = self._target if self.region is None else self._angles_to(self.region)
         seconds = self.now - self._since
         roll, pitch, yaw = (angle + rate * seconds for angle, rate in zip(target, self._rates, strict=True))
-        if self.is_yaw_locked:
+        if self.is_yaw_locked:  # The target is relative to north, the result to the nose.
             yaw = math.remainder(yaw - self.heading(), math.tau)
         return (self._limited(0, roll), self._limited(1, pitch), self._limited(2, yaw))
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from datetime import datetime, timezone
 from functools import partial
 
-from aerokit.mavlink.enums import MavCmd, MavComponent, MavResult, MavSeverity
+from aerokit.mavlink.enums import MavCmd, MavComponent, MavResult, MavSeverity, ParachuteAction
 from aerokit.mavlink.messages import CommandLong
 from aerokit.sim.commands import ReceivedCommand
 from aerokit.sim.px4 import modes
@@ -28,7 +28,7 @@ _PERCENT_PER_SIDE = 17
 
 def _side_texts(sensor: str, sides_done: int) -> list[str]:
     """Return the texts before the measurement of a side, after ``sides_done`` sides (calibration_routines.cpp)."""
-    side = _SIDES[-1 - sides_done]
+    side = _SIDES[-1 - sides_done]  # The simulated user measures the sides from the last to the first.
     return [
         f"pending: {' '.join(_SIDES[: len(_SIDES) - sides_done])}",
         "hold vehicle still on a pending side",
@@ -64,7 +64,8 @@ class Px4Calibration:
             return MavResult.TEMPORARILY_REJECTED
         if self.is_running:
             self._cancel()
-            return MavResult.ACCEPTED if sensor == "" else MavResult.TEMPORARILY_REJECTED
+            is_cancellation = sensor == ""  # A command without a sensor cancels the calibration.
+            return MavResult.ACCEPTED if is_cancellation else MavResult.TEMPORARILY_REJECTED
         if sensor in _AUTOMATIC_CALIBRATIONS:
             self._start(sensor)
             self._measure(*_AUTOMATIC_CALIBRATIONS[sensor])
@@ -195,8 +196,9 @@ class Px4Arming:
         px4 = self._px4
         if px4.is_armed:
             return True
-        if not px4.is_ready and not px4.faults.prearm_failures:
-            return False  # During the boot, PX4 refuses without a text.
+        is_booting = not px4.is_ready and not px4.faults.prearm_failures
+        if is_booting:
+            return False  # PX4 refuses without a text.
         if self._calibration.is_running:
             px4.send_text(MavSeverity.CRITICAL, "Arming denied: calibrating")
             return False
@@ -244,7 +246,8 @@ class Px4Arming:
         px4.is_in_failsafe = True
         px4.send_text(MavSeverity.CRITICAL, "Failsafe activated")
         px4.send_text(MavSeverity.CRITICAL, "Preflight Fail: Flight termination active")
-        px4.send(CommandLong(px4.system_id, MavComponent.PARACHUTE, MavCmd.DO_PARACHUTE, 0, 2.0, *(0.0,) * 6))
+        release = float(ParachuteAction.RELEASE)
+        px4.send(CommandLong(px4.system_id, MavComponent.PARACHUTE, MavCmd.DO_PARACHUTE, 0, release, *(0.0,) * 6))
 
     def start_first_log(self) -> None:
         """Start a log at the boot. This log also records the first flight."""

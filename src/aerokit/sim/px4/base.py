@@ -295,7 +295,10 @@ class Px4Vehicle(Px4Host):
         return True
 
     def can_run(self, mode: Px4Mode) -> bool:
-        """Return True if the requirements of the mode are met: sticks, mission, set-points or position."""
+        """Return True if everything the mode needs is available.
+
+        Depending on the mode, these are stick input, a valid mission, set-points, and a position estimate.
+        """
         traits = modes.MODES.get(mode)
         if traits is None or self.arming.is_terminated:
             return False

@@ -8,6 +8,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
     FailureType,
     FailureUnit,
+    MavDoRepositionFlags,
     MavFrame,
     MavModeFlag,
     MavResult,
@@ -101,6 +102,7 @@ def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
 
 
 _FORCE_MAGIC = 21196.0
+_REBOOT_DELAY_S = 0.2
 _ALIASES: dict[Px4Mode, Px4Mode] = {(modes.AUTO, 0): modes.MISSION, modes.ORBIT: modes.POSITION}
 # `_NAN_AS_INT` is the upper half of a NaN of type double.
 _INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
@@ -242,7 +244,7 @@ class _Flight:
 
         A latitude or longitude that is NaN or INT32_MAX keeps the place, and an altitude that is NaN keeps the height.
         """
-        if whole(command.param2) != 1:  # The flag CHANGE_MODE is required.
+        if whole(command.param2) != MavDoRepositionFlags.CHANGE_MODE:  # PX4 requires this flag, and no other flag.
             return MavResult.UNSUPPORTED
         result = self._change(modes.HOLD)
         if result != MavResult.ACCEPTED:
@@ -294,7 +296,7 @@ class _Flight:
             self._tuning_since = math.nan
         elif math.isnan(self._tuning_since):
             self._tuning_since = px4.now
-        steps = (px4.now - self._tuning_since) / _TUNING_STEP_S
+        steps = (px4.now - self._tuning_since) / _TUNING_STEP_S  # NaN while disarmed
         progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), len(_TUNING_PROGRESS) - 1)]
         answer = m.CommandAck(command.command, MavResult.IN_PROGRESS, progress, 0, *command.sender)
         px4.send(answer, command.channel)
@@ -334,7 +336,8 @@ class _Flight:
 
     def set_home(self, command: ReceivedCommand) -> int:
         px4, motion = self._px4, self._px4.motion
-        if command.param1 > 0.5:
+        uses_current_place = command.param1 > 0.5
+        if uses_current_place:
             px4.home = motion.place
         elif not math.isfinite(command.x + command.y + command.z):
             return MavResult.DENIED
@@ -354,7 +357,7 @@ class _Flight:
         if self._px4.is_armed or command.param1 not in (1.0, 2.0):
             return MavResult.DENIED
         action = self._px4.restart if command.param1 == 1.0 else self._px4.shut_down
-        self._px4.call_later(0.2, action)  # later, so that the acknowledgement is still sent
+        self._px4.call_later(_REBOOT_DELAY_S, action)  # later, so that the acknowledgement is still sent
         return MavResult.ACCEPTED
 
 

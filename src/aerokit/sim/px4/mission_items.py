@@ -94,6 +94,7 @@ def _as_fence_point(item: MissionItem) -> MissionItem:
 
 
 def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
+    """Return an item of a global frame as PX4 stores it, or the MAV_MISSION_RESULT of a refusal."""
     layout = _PLACES.get(item.command)
     if layout is None:
         return MavMissionResult.UNSUPPORTED
@@ -101,25 +102,27 @@ def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
     if command in _ROI_COMMANDS:
         if _whole(item.param1) not in _ROI_WITH_PLACE:
             return MavMissionResult.INVALID_PARAM1
-        command = Cmd.DO_SET_ROI
+        command = Cmd.DO_SET_ROI  # PX4 stores both commands as DO_SET_ROI (mavlink_mission.cpp).
     params = (item.param1, item.param2, item.param3, item.param4)
     p1, p2, p3, p4 = (_CONVERSIONS[type_](param) for type_, param in zip(layout, params, strict=True))
     return item.replace(command=command, frame=frame, param1=p1, param2=p2, param3=p3, param4=p4)
 
 
 def _without_place(item: MissionItem) -> MissionItem | int:
+    """Return an item of MAV_FRAME_MISSION as PX4 stores it, or the MAV_MISSION_RESULT of a refusal."""
     if item.command not in _WITHOUT_PLACE:
         return MavMissionResult.UNSUPPORTED
     p1, p2, command = item.param1, item.param2, item.command
     if command == Cmd.DO_JUMP:  # PX4 stores the target as int16 and the number of repetitions as uint16.
         target = _whole(p1) & 0xFFFF
-        if target & 0x8000:
+        if target & 0x8000:  # The highest bit of an int16 is its sign.
             target -= 0x10000
         p1, p2 = float(target), float(_whole(p2) & 0xFFFF)
     if command in _ROI_COMMANDS:
         if _whole(p1) not in _ROI_WITHOUT_PLACE:
             return MavMissionResult.INVALID_PARAM1
-        command = Cmd.DO_SET_ROI
+        command = Cmd.DO_SET_ROI  # PX4 stores both commands as DO_SET_ROI (mavlink_mission.cpp).
+    # PX4 stores x and y as floats, and rounds them to integers for a download (mavlink_mission.cpp).
     x, y = _rounded(float32(item.x)), _rounded(float32(item.y))
     return item.replace(command=command, frame=Frame.MISSION, param1=p1, param2=p2, x=x, y=y)
 
