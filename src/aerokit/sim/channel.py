@@ -68,7 +68,7 @@ class MessageReader:
         """Return the messages whose last bytes are in ``data``, each with its ``received_frame``."""
         framer = self._framers.get(peer)
         if framer is None:
-            if len(self._framers) >= MAX_PEERS:
+            if len(self._framers) >= MAX_PEERS:  # The first key is the oldest peer.
                 del self._framers[next(iter(self._framers))]
             framer = self._framers[peer] = Framer()
             framer.wanted = self._wanted
@@ -196,7 +196,7 @@ class Channel:
 
     def encode(self, message: Message, sender: tuple[int, int] | None = None) -> bytes:
         """Return a frame with the next sequence number. It is empty if a MAVLink 1 port cannot send the message."""
-        if self.version == 1 and message.ID > 255:
+        if self.version == 1 and message.ID > 255:  # The id of a MAVLink 1 message has one byte.
             return b""
         sender = self._own_ids if sender is None else sender
         encoder = self._encoders.get(sender)

@@ -220,7 +220,7 @@ class Motion:
         offset_north, offset_east, offset_down = north - self.north, east - self.east, down - self.down
         distance = math.hypot(offset_north, offset_east)
         scale = 0.0
-        if distance > 1e-6:
+        if distance > 1e-6:  # At the point, the direction is undefined.
             deceleration = BRAKING_SHARE * self.limits.acceleration_m_s2
             scale = min(speed, approach_speed(distance, 1.0, deceleration)) / distance
         vertical = approach_speed(abs(offset_down), 1.0, BRAKING_SHARE * self.limits.vertical_acceleration_m_s2)
@@ -312,10 +312,9 @@ class Motion:
 
     def _acceleration_from_lean(self, roll: float, pitch: float) -> tuple[float, float]:
         max_lean = self.limits.lean_rad
-        forward, right = (
-            -GRAVITY_M_S2 * math.tan(_clamp(pitch, max_lean)),
-            GRAVITY_M_S2 * math.tan(_clamp(roll, max_lean)),
-        )
+        # A positive pitch raises the nose, which pushes the copter backwards. A positive roll pushes it to the right.
+        forward = -GRAVITY_M_S2 * math.tan(_clamp(pitch, max_lean))
+        right = GRAVITY_M_S2 * math.tan(_clamp(roll, max_lean))
         cos_yaw, sin_yaw = math.cos(self.yaw), math.sin(self.yaw)
         drag_north, drag_east = self._drag()
         return (
@@ -351,13 +350,14 @@ class Motion:
     def _lean(self, north: float, east: float, dt: float, *, powered: bool) -> None:
         roll = pitch = 0.0
         if powered and not self.is_on_ground:
+            # The copter also leans against its drag.
             drag_north, drag_east = self._drag()
             north, east = north + drag_north, east + drag_east
             cos_yaw, sin_yaw = math.cos(self.yaw), math.sin(self.yaw)
             limit = self.limits.lean_rad
             pitch = _clamp(-math.atan2(north * cos_yaw + east * sin_yaw, GRAVITY_M_S2), limit)
             roll = _clamp(math.atan2(east * cos_yaw - north * sin_yaw, GRAVITY_M_S2), limit)
-        share = 1.0 - _LEAN_KEPT_PER_S**dt
+        share = 1.0 - _LEAN_KEPT_PER_S**dt  # The lean approaches its target exponentially.
         roll_step, pitch_step = (roll - self.roll) * share, (pitch - self.pitch) * share
         self.roll += roll_step
         self.pitch += pitch_step

@@ -190,7 +190,7 @@ class Px4ParameterServer(ParameterServer):
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
         name, parameters = request.param_id, self._parameters
-        if name == HASH_NAME:
+        if name == HASH_NAME:  # The client knows the parameters already, so the running list is not needed.
             self.stop_list(channel)
         code = self._error_for(name, request.param_type)
         if code is not None:
@@ -202,6 +202,7 @@ class Px4ParameterServer(ParameterServer):
             parameters[name] = self.clamped(name, value)
         self.send(name, parameters.index(name), channel)
         if parameters[name] != previous and not math.isnan(value):
+            # PX4 also broadcasts every changed parameter (mavlink_parameters.cpp).
             self._vehicle.call_later(_SECOND_ECHO_S, lambda: self.send(name, parameters.index(name), None))
 
     def _error_for(self, name: str, type_: int) -> int | None:

@@ -238,7 +238,7 @@ class _Reader(FileHandle):
         self._with_defaults = query.get("withdefaults", 0)
         if self._with_defaults > 1 or max(self._start, self._count) >= 0xFFFF:
             raise FileFault(EINVAL)
-        self._block = block or 0
+        self._block = block or 0  # The block size; 0 means that the first read determines the size.
         # PX4, which is recognised by its fixed block size, keeps a value and its default in one block.
         self._whole_defaults = block is not None
         self._content: bytes | None = None
@@ -301,7 +301,7 @@ class _Writer(UploadedFile):
         position, previous_name = HEADER.size, b""
         for _ in range(count):
             entry = read_entry(content, position, previous_name) if position < len(content) else None
-            if entry is None or entry.default is not None:
+            if entry is None or entry.default is not None:  # An upload must not contain default values.
                 raise FileFault(EINVAL)
             name = entry.name.decode("ascii", "replace")
             if name in self._parameters:

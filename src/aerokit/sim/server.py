@@ -139,7 +139,7 @@ class SimulatorServer:
         if self._cancels_owner and owner is not None and owner is asyncio.current_task():
             _uncancel(owner)
         if self.failure is not None and self.failure is not error:
-            raise self.failure from self.failure.__cause__
+            raise self.failure from self.failure.__cause__  # "from" keeps the cause that the exception has already.
 
     def wake(self) -> None:
         """Run all events that are due. Call this method after a change of a fault or of a value of a vehicle.
@@ -230,13 +230,13 @@ class SimulatorServer:
 
     def _schedule(self) -> None:
         loop = self._loop
-        if loop is None or self._end_source is not None:
+        if loop is None or self._end_source is not None:  # An event source needs no timer.
             return
         due = min(self._dues, default=math.inf)
         if due == math.inf:
             return
         if self._timer is not None:
-            if self._timer_due == due:
+            if self._timer_due == due:  # The present timer is still right.
                 return
             self._timer.cancel()
         when = self._loop_time(due)
@@ -247,13 +247,14 @@ class SimulatorServer:
 
     def _skip_lateness(self) -> None:
         """Skip the time by which the timer is late beyond ``_MAX_CATCH_UP_S``. In real time, skip nothing."""
-        if self._loop is None or self._speedup == 1.0 or (self._timer is None and self._end_source is None):
+        has_nothing_scheduled = self._timer is None and self._end_source is None
+        if self._loop is None or self._speedup == 1.0 or has_nothing_scheduled:
             return
         due_at = self._next_loop_time() if self._timer is None else self._timer_at
-        late = self._loop.time() - due_at - _MAX_CATCH_UP_S / self._speedup
-        if late > 0:
-            self._started_at += late
-            self._timer_at += late
+        skipped_s = self._loop.time() - due_at - _MAX_CATCH_UP_S / self._speedup
+        if skipped_s > 0:  # A later start of the simulation makes its present time earlier.
+            self._started_at += skipped_s
+            self._timer_at += skipped_s
 
     def _loop_time(self, due: float) -> float:
         """Convert simulated time to loop time."""
@@ -284,7 +285,8 @@ class _Port:
         active = [channel for channel in self.channels if channel.has_output]
         if not active:
             return []
-        if together and len(self.channels) > _BATCH_THRESHOLD:
+        is_fleet = len(self.channels) > _BATCH_THRESHOLD
+        if together and is_fleet:
             return datagrams(piece for channel in active for piece in channel.take_pieces())
         return [datagram for channel in active for datagram in channel.take_datagrams()]
 

@@ -167,7 +167,7 @@ class SimulatedVehicle:
     @property
     def next_due(self) -> float:
         """Time of the next event; infinity if there is none."""
-        if not self._is_on and math.isnan(self.booted_at):
+        if not self._is_on and math.isnan(self.booted_at):  # The power-on, which `step` does, is due at once.
             return self.now
         if self.faults.frozen:
             return self.now + TICK_S  # `step` must be called even if nothing happens, because it advances the time.
@@ -355,7 +355,7 @@ class SimulatedVehicle:
             self._record_text(severity, text)
             self.send_parts([Statustext(severity, text, 0, 0)])
             return
-        self._text_id = self._text_id % 0xFFFF + 1
+        self._text_id = self._text_id % 0xFFFF + 1  # 1 to 65535, because the id 0 means a text of one chunk.
         self.send_chunks(severity, text, self._text_id)
 
     def send_chunks(self, severity: int, text: str, text_id: int) -> None:

@@ -79,7 +79,8 @@ class FixedWing(Motion):
         wind_correction = math.asin(max(-0.9, min(0.9, crosswind / speed)))
         heading = course - wind_correction
         heading_rate = turn_rate + _TURN_GAIN_PER_S * wrap_pi(heading - self.yaw)
-        self.bank_and_climb(airspeed, math.atan(speed * heading_rate / GRAVITY_M_S2), climb)
+        bank = math.atan(speed * heading_rate / GRAVITY_M_S2)  # In a level turn, tan(bank) = speed * rate / gravity.
+        self.bank_and_climb(airspeed, bank, climb)
 
     def fly_to(self, north: float, east: float, down: float, *, airspeed: float) -> None:
         """Fly towards a point and over it."""
@@ -95,7 +96,8 @@ class FixedWing(Motion):
         # course is a mixture of both.
         share_to_centre = max(-1.0, min(1.0, (distance - radius) / radius))
         course = course_to_centre - turn_sign * (math.pi / 2) * (1.0 - share_to_centre)
-        turn_rate = turn_sign * self.ground_speed_m_s / radius if distance < 1.5 * radius else 0.0
+        is_near_circle = distance < 1.5 * radius
+        turn_rate = turn_sign * self.ground_speed_m_s / radius if is_near_circle else 0.0
         self.head(course, airspeed, self.climb_to(down), turn_rate=turn_rate)
 
     def roll_out(self) -> None:
@@ -261,7 +263,7 @@ class GroundMotion(Motion):
             speed = min(speed, approach_speed(distance, 1.0, self.wheels.acceleration_m_s2))
         course = math.atan2(offset_east, offset_north)
         if backwards:
-            self.head(-speed, course + math.pi)
+            self.head(-speed, course + math.pi)  # The nose points away from the point.
             return
         if abs(wrap_pi(course - self.yaw)) > _SLOW_TURN_ERROR_RAD:  # Drive slowly until the rover has turned.
             speed = min(speed, _SLOW_M_S)
@@ -276,7 +278,7 @@ class GroundMotion(Motion):
         """Advance by ``dt`` seconds. A rover without power rolls to a stop."""
         rate = self._turn_rate()
         self._accelerate(self._curve_speed(rate) if powered else 0.0, dt)
-        mean_yaw = self.yaw + 0.5 * rate * dt
+        mean_yaw = self.yaw + 0.5 * rate * dt  # The mean during this step, so that long steps stay on the curve.
         self.yaw: float = wrap_pi(self.yaw + rate * dt)
         self.yaw_rate: float = rate
         north, east = self.speed_m_s * math.cos(mean_yaw), self.speed_m_s * math.sin(mean_yaw)
@@ -364,6 +366,7 @@ class UnderwaterMotion(Motion):
 
     def step(self, dt: float, *, powered: bool = True) -> None:
         """Advance by ``dt`` seconds. A submarine without power rises."""
+        # Acceleration without thrust: buoyancy is upwards, and the drag is against the velocity.
         floating_down = -self.buoyancy_m_s2 - _DRAG_PER_S * self.velocity_down
         if powered:
             north, east, commanded_down = self._commanded_acceleration()

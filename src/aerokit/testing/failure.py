@@ -48,7 +48,7 @@ def _describe(flight: Flight | ServedFlight) -> list[str]:
 
 def _describe_flight(flight: Flight | ServedFlight) -> list[str]:
     track, texts = flight.track, flight.journal.texts
-    if not track:
+    if not track:  # The track has no points.
         return [f"{track.name}: not switched on"]
     lines = [
         f"{track.name}: {' → '.join(track.modes)}, armed for {track.armed_s:.1f} s,"
@@ -86,7 +86,8 @@ def _recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: 
         recording = group[0].recording
         if recording is None:
             continue
-        path = _path(test, directory, f"-{number + 1}.tlog" if number else ".tlog")
+        is_first = number == 0  # Only further recordings have a number in their names.
+        path = _path(test, directory, ".tlog" if is_first else f"-{number + 1}.tlog")
         try:
             path.write_bytes(recording.to_bytes())
             lines.append(f"recording in {path}")
@@ -100,7 +101,8 @@ def _report(path: Path, flight: Flight | ServedFlight, count: int) -> str:
     from aerokit.logs.report import write_report
 
     system_id = flight.simulated.system_id
-    target = path.with_suffix(f".{system_id}.html" if count > 1 else ".html")
+    shares_recording = count > 1
+    target = path.with_suffix(f".{system_id}.html" if shares_recording else ".html")
     try:
         write_report(path, target, system_id=system_id, force=True)
     except ModuleNotFoundError:

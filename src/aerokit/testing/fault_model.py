@@ -127,7 +127,7 @@ class FaultyPath:
         if is_reordered:
             self.reordered += 1
             due += model.overtaken_s
-        else:
+        else:  # Jitter alone must not change the order.
             due = self._latest_due = max(due, self._latest_due)
         self.duplicated += is_duplicated
         return [(due, frame)] * (2 if is_duplicated else 1)
@@ -136,7 +136,7 @@ class FaultyPath:
         """Return the time at which the last byte of a frame is sent; None if the queue is full."""
         model, air = self.model, self._air
         begin = max(now, air.busy_until)
-        if math.isinf(model.bandwidth):
+        if math.isinf(model.bandwidth):  # Sending takes no time.
             return begin
         queued_bytes = (begin - now) * model.bandwidth
         # An empty queue accepts every frame, even if the frame is larger than the queue.
@@ -166,7 +166,9 @@ def split_frames(data: bytes) -> Sequence[bytes]:
     pieces: list[bytes] = []
     begin, size = 0, len(data)
     while begin < size:
-        end = min(_end_of_frame(data, begin) or size, size)
+        end_of_frame = _end_of_frame(data, begin)
+        # Bytes that begin no frame, and an incomplete frame, extend to the end of the data.
+        end = size if end_of_frame is None else min(end_of_frame, size)
         pieces.append(data[begin:end])
         begin = end
     return pieces or [data]
@@ -178,8 +180,9 @@ def _end_of_frame(data: bytes, begin: int) -> int | None:
         return None
     magic, payload_length, flags = data[begin : begin + 3]
     if magic == MAGIC_V1:
-        return begin + payload_length + 8  # 6 bytes of header and 2 bytes of checksum
-    return begin + payload_length + 12 + (SIGNATURE_LENGTH if flags & SIGNED else 0)
+        return begin + 6 + payload_length + 2  # 6 bytes of header and 2 bytes of checksum
+    signature_length = SIGNATURE_LENGTH if flags & SIGNED else 0
+    return begin + 10 + payload_length + 2 + signature_length  # 10 bytes of header and 2 bytes of checksum
 
 
 def _check_number(name: str, value: float, low: float, high: float) -> None:

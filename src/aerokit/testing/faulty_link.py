@@ -99,7 +99,8 @@ class StalledQueue:
             dropped=self._on_drop,
             stalled=partial(self._on_peer_stalled, peer),
         )
-        if self._is_stalled and not self._system_limit:
+        accepts_no_bytes = self._system_limit == 0
+        if self._is_stalled and accepts_no_bytes:
             outbox.pause()
         return outbox
 
@@ -214,7 +215,7 @@ class FaultyLink(Link):
         self.incoming.start(loop.time())
         try:
             await self.link.open(self._incoming_path)
-        except BaseException:
+        except BaseException:  # Also after a cancellation, the link can be opened again.
             self._incoming_path.close()
             self._in_flight.clear()
             self._incoming_path = self._in_flight = None
@@ -279,7 +280,7 @@ class FaultyLink(Link):
     def _on_stalled(self, is_stalled: bool) -> None:
         now, stalled_at = asyncio.get_running_loop().time(), self._stalled_at
         was_stalled = stalled_at is not None
-        if self._incoming_path is None or is_stalled == was_stalled:
+        if self._incoming_path is None or is_stalled == was_stalled:  # Report only a change, and only while open.
             return
         self._stalled_at = now if is_stalled else None
         if stalled_at is None:

@@ -186,7 +186,7 @@ class SimulatedFleet(Sequence[Flight]):
             self._server = await stack.enter_async_context(SimulatorServer([self._scheduler, *self._vehicles], far_end))
             if self.recording is not None:
                 self.recording.attach(self._server)
-            stack.callback(self._close)
+            stack.callback(self._close)  # This runs before the server ends, so that the tracks get their last points.
             self._scheduler.refresh_with(self._refresh)
             if self._connect:
                 await self._connect_all(near_end, stack)
@@ -236,7 +236,7 @@ def _side_by_side(
     for number, kind in enumerate(kinds):
         if vehicles:
             frame = vehicles[0].frame
-            home = frame.to_global(0.0, number * spacing_m, 0.0)
+            home = frame.to_global(0.0, number * spacing_m, 0.0)  # north, east, down
             options["home"] = home.latitude_e7 / 1e7, home.longitude_e7 / 1e7, frame.origin.altitude_m
         vehicles.append(simulated(kind, system_id=system_id + number, seed=seed + number, **options))
     return vehicles

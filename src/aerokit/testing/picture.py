@@ -152,6 +152,10 @@ def _shapes(tracks: Sequence[Drawable]) -> list[_Shape]:
     return _map(drawn) + _profile(drawn) + _legend(drawn) if drawn else []
 
 
+_MAX_X_TICKS, _MAX_Y_TICKS, _MAX_Y_TICKS_OF_LOW_CHART = 6, 5, 3
+_LOW_CHART = 200  # A chart of up to this many pixels is low.
+
+
 class _Axes:
     """Maps the values of two axes to positions in a rectangle of the picture, with a margin."""
 
@@ -171,24 +175,27 @@ class _Axes:
     def grid(self, x_unit: str, y_unit: str) -> list[_Shape]:
         shapes: list[_Shape] = []
         bottom, right = self.top + self.height, self.left + self.width
-        for value in _ticks(self.x_range, 6):
+        for value in _ticks(self.x_range, _MAX_X_TICKS):
             x, _ = self.place(value, 0.0)
             shapes.append(_GridLine((x, self.top), (x, bottom)))
-            shapes.append(_Text(x, bottom + 15, f"{value:g} {x_unit}", "middle"))
-        for value in _ticks(self.y_range, 5 if self.height > 200 else 3):
+            shapes.append(_Text(x, bottom + 15, f"{value:g} {x_unit}", "middle"))  # 15 pixels below the axis
+        max_y_ticks = _MAX_Y_TICKS if self.height > _LOW_CHART else _MAX_Y_TICKS_OF_LOW_CHART
+        for value in _ticks(self.y_range, max_y_ticks):
             _, y = self.place(0.0, value)
             shapes.append(_GridLine((self.left, y), (right, y)))
+            # The text is 5 pixels left of the axis, and its baseline 4 pixels lower, so that it is centred on the line.
             shapes.append(_Text(self.left - 5, y + 4, f"{value:g} {y_unit}", "end"))
         return shapes
 
 
 def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
+    # All tracks are drawn relative to the first home: east to the right, north upwards.
     paths = [[(east, north) for north, east, _ in track.local(tracks[0].home)] for track in tracks]
     outlines = [outline for track in tracks for outline in _outlines(track, tracks[0].home)]
     easts, norths = zip(*(place for path in paths + outlines for place in path), strict=True)
-    axes = _Axes(easts, norths, 30, _MAP_HEIGHT - 60, square=True)
+    axes = _Axes(easts, norths, top=30, height=_MAP_HEIGHT - 60, square=True)
     shapes = axes.grid("m", "m")
-    shapes += [_Line([axes.place(*corner) for corner in outline], _FAILED, True) for outline in outlines]
+    shapes += [_Line([axes.place(*corner) for corner in outline], _FAILED, is_dashed=True) for outline in outlines]
     labels = _Labels()
     for track, path, colour in zip(tracks, paths, _colours(len(paths)), strict=True):
         places = [axes.place(east, north) for east, north in path]
@@ -211,7 +218,8 @@ def _outlines(track: Drawable, origin: Position) -> list[list[tuple[float, float
         outlines.append([(east + radius * math.sin(angle), north + radius * math.cos(angle)) for angle in angles])
     if failure.polygon:
         corners = [offset_of(corner) for corner in failure.polygon]
-        outlines.append([(east, north) for north, east in (*corners, corners[0])])
+        closed = (*corners, corners[0])  # The last line leads back to the first corner.
+        outlines.append([(east, north) for north, east in closed])
     return outlines
 
 
@@ -220,11 +228,13 @@ def _failed_point(track: Drawable, places: Sequence[tuple[float, float]]) -> lis
     if track.failure is None:
         return []
     x, y = places[_index_of(track, track.failure.point)]
+    size = 7  # Pixels from the middle of the cross to its ends.
     strokes = [
-        _Line([(x - 7, y - 7), (x + 7, y + 7)], _FAILED),
-        _Line([(x - 7, y + 7), (x + 7, y - 7)], _FAILED),
+        _Line([(x - size, y - size), (x + size, y + size)], _FAILED),
+        _Line([(x - size, y + size), (x + size, y - size)], _FAILED),
     ]
-    return [*strokes, _Text(x, y + 22, "failed here", "middle", _FAILED)]
+    label_y = y + size + 15
+    return [*strokes, _Text(x, label_y, "failed here", "middle", _FAILED)]
 
 
 def _index_of(track: Drawable, point: TrackPoint) -> int:
@@ -249,6 +259,7 @@ class _Labels:
                 continue
             previous_mode = point.mode
             shapes.append(_Dot(x, y, colour, 2.5))
+            # Place the label above the point or, if another label is there, up to three lines higher.
             label_levels = (y - above - step * _LABEL_HEIGHT for step in range(4))
             label_y = next((level for level in label_levels if self._is_free(x, level)), None)
             if label_y is not None and len(self._places) < _MAX_LABELS:
@@ -267,16 +278,18 @@ def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
     limits = [track.failure.altitude_m for track in tracks if track.failure is not None]
     limit = next((altitude for altitude in limits if altitude is not None), None)
     times, heights = zip(*(place for path in paths for place in path), strict=True)
-    drawn_heights = heights if limit is None else (*heights, limit)
-    axes = _Axes(times, drawn_heights, _MAP_HEIGHT, _PROFILE_HEIGHT - 40, square=False)
+    shown_heights = heights if limit is None else (*heights, limit)  # The chart also shows the line of the limit.
+    axes = _Axes(times, shown_heights, top=_MAP_HEIGHT, height=_PROFILE_HEIGHT - 40, square=False)
     shapes = axes.grid("s", "m up")
     if limit is not None:
-        shapes.append(_Line([axes.place(min(times), limit), axes.place(max(times), limit)], _FAILED, True))
+        limit_line = [axes.place(min(times), limit), axes.place(max(times), limit)]
+        shapes.append(_Line(limit_line, _FAILED, is_dashed=True))
     labels = _Labels()
     for track, path, colour in zip(tracks, paths, _colours(len(paths)), strict=True):
         places = [axes.place(time, height) for time, height in path]
         shapes.append(_Line(places, colour))
-        shapes += labels.modes(track, places, colour) if len(tracks) == 1 else []
+        if len(tracks) == 1:  # The labels of several tracks would overlap.
+            shapes += labels.modes(track, places, colour)
         if track.failure is not None:
             shapes.append(_Dot(*places[_index_of(track, track.failure.point)], _FAILED))
     return shapes

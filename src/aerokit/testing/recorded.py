@@ -49,6 +49,7 @@ class RecordedParameters(ParameterProtocolServer):
         for time, value in vehicle.recording.parameters:
             self._recorded.setdefault(value.param_id, []).append((time, value))
         values = [value for _, value in vehicle.recording.parameters]
+        # Only values of a list have an index. Values of reads and writes have UNKNOWN_INDEX.
         indices = {value.param_id: value.param_index for value in values if value.param_index != UNKNOWN_INDEX}
         without_index = [name for name in self._recorded if name not in indices]
         is_complete = bool(indices) and len(indices) == max(value.param_count for value in values)
@@ -85,6 +86,7 @@ class RecordedParameters(ParameterProtocolServer):
         if name not in self.names:
             self._refuse(request, -1, channel)
             return
+        # Without a successful write in the recording, the vehicle answers with the present value.
         if name in self._vehicle.recording.settable:
             self._written[name] = request.param_value
         self.send(name, self.names.index(name), None)
@@ -116,8 +118,9 @@ class RecordedMissions(MissionServer):
         if mission_type in self._written:
             return self._written[mission_type]
         position_s, items = self._vehicle.position_s, None
-        for plan in self._vehicle.recording.plans:
-            if plan.mission_type == mission_type and (items is None or plan.since <= position_s):
+        for plan in self._vehicle.recording.plans:  # The plans are in the order of their times.
+            is_first = items is None
+            if plan.mission_type == mission_type and (is_first or plan.since <= position_s):
                 items = plan.items
         return items
 
@@ -275,9 +278,9 @@ class RecordedVehicle(SimulatedVehicle):
 
     def _play(self) -> None:
         stream = self.recording.stream
-        time = stream[self._next][0]
-        while self._next < len(stream) and stream[self._next][0] <= time:
-            frame = stream[self._next][1]
+        due_at = stream[self._next][0]
+        while self._next < len(stream) and stream[self._next][0] <= due_at:  # Frames may have the same time.
+            _, frame = stream[self._next]
             self.send(STANDARD.decode(frame), sender=(frame.system_id, frame.component_id))
             self._next += 1
         self._schedule_next()
@@ -293,9 +296,10 @@ class RecordedVehicle(SimulatedVehicle):
         if answer is None:
             return MavResult.UNSUPPORTED
         for delay, ack in answer.acks:
+            # The recorded acknowledgement is addressed to the recorded client.
             readdressed = m.CommandAck(ack.command, ack.result, ack.progress, ack.result_param2, *command.sender)
             self.call_later(delay, lambda ack=readdressed: self.send(ack, command.channel))  # type: ignore[misc]
-        return None
+        return None  # The acknowledgements were recorded, so no further one is sent.
 
     def _answer_to(self, command: ReceivedCommand) -> RecordedAnswer | None:
         """Return the recorded answer to a command. Equal commands get successive answers. The last answer repeats."""
@@ -310,8 +314,10 @@ class RecordedVehicle(SimulatedVehicle):
             candidates = answers
         if not candidates:
             return None
-        count = self._answered_counts.get(id(candidates[0]), 0)
-        self._answered_counts[id(candidates[0])] = count + 1
+        # Count per list of candidates, which its first answer identifies.
+        list_id = id(candidates[0])
+        count = self._answered_counts.get(list_id, 0)
+        self._answered_counts[list_id] = count + 1
         return candidates[min(count, len(candidates) - 1)]
 
     def _on_request_message(self, command: ReceivedCommand) -> int | None:
@@ -326,7 +332,8 @@ class RecordedVehicle(SimulatedVehicle):
         """Return the latest played message with this id, or else the first recorded one, or None."""
         stream = self.recording.stream
         own = (self.system_id, self.component_id)
-        for _, frame in (*reversed(stream[: self._next]), *stream[self._next :]):
+        played, not_yet_played = stream[: self._next], stream[self._next :]
+        for _, frame in (*reversed(played), *not_yet_played):
             if frame.message_id == message_id and (frame.system_id, frame.component_id) == own:
                 return STANDARD.decode(frame)
         return None

@@ -140,12 +140,12 @@ def hosted_flight(
                 yield server
 
     with start_blocking_portal() as portal:
-        serving = portal.wrap_async_context_manager(serve())
+        serving = portal.wrap_async_context_manager(serve())  # runs on the thread of the portal
         flight = ServedFlight(portal, serving.__enter__(), scheduler, vehicle, interruption, recording)
         try:
             yield flight
         finally:
-            portal.call(scheduler.record)
+            portal.call(scheduler.record)  # Append the final points, because the tracks are not refreshed any more.
             scheduler.refresh_with(None)
             with flight._raising_once():
                 serving.__exit__(None, None, None)

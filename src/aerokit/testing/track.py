@@ -273,6 +273,7 @@ class Track(Sequence[TrackPoint]):
         for point in self:
             up = 0.0 if altitude is None else point.altitude_m - altitude
             offset = (*offset_of(point), up)
+            # The vehicle also was between two points. The offsets have their origin at the given position.
             distance = _distance_of_origin(offset if previous_offset is None else previous_offset, offset)
             if distance < min_distance:
                 min_distance, nearest = distance, point
@@ -336,9 +337,10 @@ def min_distance_m(first: Track, second: Track) -> tuple[float, float]:
     second_times = [time for time, _ in second_path]
     closest = math.inf, 0.0
     for point, (north, east, up) in zip(first, first.local(), strict=True):
-        index = bisect_right(second_times, point.time_s)
-        second_did_not_run = index == 0 or (index == len(second_path) and second_times[-1] < point.time_s)
-        if second_did_not_run:
+        index = bisect_right(second_times, point.time_s)  # Number of points of the second track up to this time.
+        has_not_started = index == 0
+        has_ended = index == len(second_path) and second_times[-1] < point.time_s
+        if has_not_started or has_ended:
             continue
         first_place = (north, east, up + first_home_m)
         second_place = _interpolated(

@@ -55,6 +55,7 @@ def metres_from(origin: Position) -> Callable[[Position | TrackPoint], tuple[flo
     The metres are measured on the tangent plane of the earth's ellipsoid at ``origin``.
     """
     latitude, longitude = origin.latitude_deg, origin.longitude_deg
+    # Metres per degree, from the length of a hundredth of a degree around the origin.
     per_latitude = geo.distance_m(latitude - 0.005, longitude, latitude + 0.005, longitude) * 100
     per_longitude = geo.distance_m(latitude, longitude - 0.005, latitude, longitude + 0.005) * 100
 

@@ -33,7 +33,8 @@ class Px4Shell:
             return
         self.is_open = bool(message.flags & SerialControlFlag.RESPOND)
         self._line += bytes(message.data[: message.count])
-        if not self.is_open or not self._line.endswith(b"\n"):
+        is_complete = self._line.endswith(b"\n")
+        if not self.is_open or not is_complete:
             return
         line, self._line = self._line, b""
         output = line + self._output(line.decode(errors="replace").strip()) + b"pxh> "
@@ -65,7 +66,8 @@ class Px4LogStream:
     def start(self, command: ReceivedCommand) -> int:
         if self._station is not None:
             return MavResult.TEMPORARILY_REJECTED
-        if command.param1:
+        log_format = command.param1
+        if log_format:  # PX4 supports only ULog (0).
             return MavResult.UNSUPPORTED
         self._station, self._channel = command.sender, command.channel
         self._sequence = self._tries = self._acknowledged = 0
@@ -97,7 +99,7 @@ class Px4LogStream:
         sequence, first_message_offset, padded = self._sequence & 0xFFFF, len(header), data.ljust(_DATA, b"\0")
         block = message_class(*self._station, sequence, len(data), first_message_offset, padded)
         self._px4.send(block, self._channel)
-        if not self._sends_definitions:
+        if not self._sends_definitions:  # A definition block keeps its number until it is acknowledged.
             self._sequence += 1
         self._px4.call_later(_STEP_S, self._run)
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _SENSORS = (m.ObstacleDistance, m.DistanceSensor, m.OpticalFlowRad)
 _VISION_TIMEOUT_S = 5.0
+_MIN_TOLERANCE_M = 0.05
 _HORIZONTAL, _GPS_POSITION = 1, 1
 
 
@@ -109,7 +110,8 @@ class PrecisionLanding:
             return
         self._search_began_at = None
         north, east = target[0] - motion.north, target[1] - motion.east
-        is_above = math.hypot(north, east) <= max(limits["PLD_HACC_RAD"], 0.05)
+        # The model needs a tolerance, even if the parameter is 0.
+        is_above = math.hypot(north, east) <= max(limits["PLD_HACC_RAD"], _MIN_TOLERANCE_M)
         descent = px4.flight.descent_speed_m_s if is_above else 0.0
         motion.seek_velocity(*velocity_to_landing_target(north, east), descent)
 
@@ -122,4 +124,5 @@ class PrecisionLanding:
             px4.flight.descend()
             return
         search_down = px4.home[2] - limits["PLD_SRCH_ALT"]
+        # Search from above: hold the place, and climb to the search altitude.
         motion.seek_position(motion.north, motion.east, search_down, speed=1.0, climb=2.0, descent=1.0)

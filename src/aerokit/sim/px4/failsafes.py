@@ -25,6 +25,7 @@ from aerokit.sim.px4.modes import AUTO, HOLD, LAND, MISSION, OFFBOARD, ORBIT, RT
 _POLYGONS = {Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: True, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False}
 _CIRCLES = {Cmd.NAV_FENCE_CIRCLE_INCLUSION: True, Cmd.NAV_FENCE_CIRCLE_EXCLUSION: False}
 _NO_ACTION, _WARNING = 0, 1
+_BATTERY_LAND, _BATTERY_RETURN = 2, 3
 
 
 class Px4Fence:
@@ -90,7 +91,7 @@ class Px4Fence:
         while index < len(items):
             item = items[index]
             if item.command in _POLYGONS:
-                count = max(1, int(item.param1))
+                count = max(1, int(item.param1))  # The number of corners, which every corner contains.
                 corners = [self._place(item) for item in items[index : index + count]]
                 yield _POLYGONS[Cmd(item.command)], _is_in_polygon(corners, north, east)
                 index += count
@@ -221,11 +222,12 @@ class Px4Failsafes:
         state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
         if state == MavBatteryChargeState.OK:
             return Action.NONE
-        is_known_at_arming = state <= self._battery_at_arming
-        if state == MavBatteryChargeState.LOW or is_known_at_arming or action not in (2, 3):
+        is_known_at_arming = state <= self._battery_at_arming  # A state that arming has accepted causes no action.
+        has_action = action in (_BATTERY_LAND, _BATTERY_RETURN)
+        if state == MavBatteryChargeState.LOW or is_known_at_arming or not has_action:
             return Action.WARN
-        lands = action == 2 or state == MavBatteryChargeState.EMERGENCY
-        return Action.LAND if lands else Action.RETURN
+        must_land = action == _BATTERY_LAND or state == MavBatteryChargeState.EMERGENCY
+        return Action.LAND if must_land else Action.RETURN
 
     def arming_reasons(self) -> list[str]:
         """Return the texts of the failures that prevent arming."""
@@ -341,11 +343,13 @@ class Px4Failsafes:
         """
         worst = max(self._active.values(), default=Action.NONE)
         intended = self._px4.intended_mode
-        if self._is_overridden and worst < Action.DISARM:
+        if self._is_overridden and worst < Action.DISARM:  # The user cannot override disarming and termination.
             return min(worst, Action.WARN)
-        if worst == Action.RETURN and intended in (LAND, RTL):
+        is_returning_already = intended in (LAND, RTL)
+        if worst == Action.RETURN and is_returning_already:
             return Action.WARN
-        if worst in (Action.RETURN, Action.LAND) and self.action <= Action.HOLD and self._px4.now < self._holds_until:
+        is_delay_running = self.action <= Action.HOLD and self._px4.now < self._holds_until
+        if worst in (Action.RETURN, Action.LAND) and is_delay_running:
             return Action.HOLD
         return worst
 

@@ -14,6 +14,7 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.manual import Px4ManualFlight
 from aerokit.sim.px4.modes import Px4Mode
 
+_MIN_CLIMB_SHARE = 0.05
 _RADII_M = (1.0, 100.0)
 _BACK_TO_CIRCLE_PER_S = 0.5
 
@@ -46,6 +47,7 @@ class Px4Orbit:
         turn_sign = math.copysign(1.0, self.radius_m)
         tangent = angle + turn_sign * math.pi / 2
         speed = self.speed_m_s
+        # The velocity away from the middle, which leads back to the circle. It is negative outside the circle.
         outwards = max(-speed, min(speed, _BACK_TO_CIRCLE_PER_S * (abs(self.radius_m) - distance)))
         motion.seek_velocity(
             speed * math.cos(tangent) + outwards * math.cos(angle),
@@ -175,7 +177,8 @@ class Px4Flight:
     def _take_off(self) -> None:
         vehicle = self._vehicle
         ramp = (vehicle.now - self._ramp_began_at) / max(0.1, vehicle.parameters["MPC_TKO_RAMP_T"])
-        climb = vehicle.parameters["MPC_TKO_SPEED"] * max(0.05, min(1.0, ramp))
+        climb_share = max(_MIN_CLIMB_SHARE, min(1.0, ramp))  # Without a minimum, the copter would not leave the ground.
+        climb = vehicle.parameters["MPC_TKO_SPEED"] * climb_share
         vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=climb, descent=1.0)
         if abs(vehicle.motion.down - self.target[2]) < _ARRIVED_M:
             target = self.target
@@ -187,6 +190,7 @@ class Px4Flight:
         vehicle, motion = self._vehicle, self._vehicle.motion
         self._is_default_height = down is None
         if down is None:
+            # A smaller down coordinate is higher.
             down = min(vehicle.home[2] - vehicle.parameters["MIS_TAKEOFF_ALT"], motion.down)
         self.target = (motion.north, motion.east, down)
         if vehicle.is_armed:
@@ -233,6 +237,7 @@ class Px4Flight:
         height = max(vehicle.parameters["RTL_RETURN_ALT"], current_height)
         if distance < vehicle.parameters["RTL_MIN_DIST"]:
             height = max(vehicle.parameters["RTL_DESCEND_ALT"], current_height)
+        # A smaller down coordinate is higher. The return first climbs at its present place, and never descends.
         self.target = (north, east, min(down, self.destination[2] - height))
         amsl = vehicle.frame.origin.altitude_m - self.target[2]
         text = f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)"

@@ -23,6 +23,8 @@ from aerokit.sim.px4.host import Px4Host
 
 _INITIAL_SEQUENCE = 65526
 _INFO_LEVELS = 102
+# Numbers of the reasons in the events.
+_OTHER_REASON = 0
 _ARMED_BY = {"external command": 4, "mission start": 5}
 _DISARMED_BY = {"external command": 4, "landing": 6, "auto preflight disarming": 7}
 _EVENT_IDS = {
@@ -61,9 +63,11 @@ def _event_of(text: str) -> tuple[int, bytes] | None:
     if text in _EVENT_IDS:
         return _EVENT_IDS[text], b""
     if text.startswith("Armed by "):
-        return _ARMED, bytes([_ARMED_BY.get(text.removeprefix("Armed by "), 0)])
+        reason = _ARMED_BY.get(text.removeprefix("Armed by "), _OTHER_REASON)
+        return _ARMED, bytes([reason])
     if text.startswith("Disarmed by "):
-        return _DISARMED, bytes([_DISARMED_BY.get(text.removeprefix("Disarmed by "), 0)])
+        reason = _DISARMED_BY.get(text.removeprefix("Disarmed by "), _OTHER_REASON)
+        return _DISARMED, bytes([reason])
     return_text = _RETURN_TEXT.fullmatch(text)
     if return_text is None:
         return None
@@ -161,7 +165,7 @@ class Px4StreamRates:
 
     def start(self, channel: Channel, number: int, first: float) -> None:
         """Start the streams of link ``number`` at time ``first``."""
-        mode = self._modes[min(number, len(self._modes) - 1)]
+        mode = self._modes[min(number, len(self._modes) - 1)]  # Further links have the last mode.
         self._mode_of[channel] = mode
         intervals_us = self._intervals_us[channel] = {}
         for message_id, rate in self._rates_at_start(mode).items():
@@ -193,7 +197,7 @@ class Px4StreamRates:
         new_us = _interval_us(rates[message_id]) if requested_us == 0 else max(_OFF, requested_us)
         self._intervals_us[channel][message_id] = new_us
         if self._is_built(message_id):
-            channel.streams.set_interval(message_id, max(0, new_us) / 1e6, now)
+            channel.streams.set_interval(message_id, max(0, new_us) / 1e6, now)  # 0 stops the stream.
         return MavResult.ACCEPTED
 
     def on_requested(self, channel: Channel, message_id: int) -> None:

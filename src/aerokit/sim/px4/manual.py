@@ -134,7 +134,8 @@ class Px4ManualFlight:
             return
         down = self._height_velocity() if px4.mode in _HOLDS_HEIGHT else self._velocity_of_thrust()
         tilt = math.radians(px4.parameters["MPC_MAN_TILT_MAX"])
-        px4.motion.seek_attitude(tilt * sticks.roll, -tilt * sticks.pitch, down)
+        pitch = -tilt * sticks.pitch  # A stick pushed forward (positive) lowers the nose (negative).
+        px4.motion.seek_attitude(tilt * sticks.roll, pitch, down)
 
     def _fly_velocity(self) -> None:
         px4, sticks, motion = self._px4, self._px4.sticks, self._px4.motion
@@ -150,13 +151,13 @@ class Px4ManualFlight:
 
     def _hold_position(self, down: float) -> None:
         motion = self._px4.motion
-        if self._place is None:
+        if self._place is None:  # After a movement, the vehicle first stops, and then holds the place of its stop.
             if motion.ground_speed_m_s > _AT_REST_M_S:
                 motion.seek_velocity(0.0, 0.0, down)
                 return
             self._place = (motion.north, motion.east)
         offset_north, offset_east = self._place[0] - motion.north, self._place[1] - motion.east
-        motion.seek_velocity(offset_north, offset_east, down)
+        motion.seek_velocity(offset_north, offset_east, down)  # 1 m/s for each metre of distance
 
     def _height_velocity(self) -> float:
         """Return the vertical velocity (m/s down) that the throttle stick commands. The centre holds the height."""
@@ -169,10 +170,10 @@ class Px4ManualFlight:
             self._down = None
             return -throttle * px4.parameters["MPC_Z_VEL_MAX_DN"]
         if self._down is None:
-            if abs(motion.velocity_down) > _AT_REST_M_S:
+            if abs(motion.velocity_down) > _AT_REST_M_S:  # First stop, then hold the height of the stop.
                 return 0.0
             self._down = motion.down
-        return self._down - motion.down
+        return self._down - motion.down  # 1 m/s for each metre of distance
 
     @property
     def _thrust(self) -> float:

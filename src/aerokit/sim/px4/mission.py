@@ -266,11 +266,12 @@ class Px4Mission:
         """Return the index of the item after a DO_JUMP. PX4 counts its jumps, and sends the item to the last client."""
         jumps_done, index = self._jumps.get(self.current, 0), self.current
         if jumps_done >= item.param2:
-            self._jumps.pop(index, None)
+            self._jumps.pop(index, None)  # The next execution of this DO_JUMP counts again from 0.
             return index + 1
         self._jumps[index] = jumps_done + 1
         self._px4.missions.on_item_changed(index)
-        return int(item.param1) if 0 <= item.param1 < self.count else index + 1
+        is_target_valid = 0 <= item.param1 < self.count
+        return int(item.param1) if is_target_valid else index + 1
 
     def _aim(self, item: MissionItem) -> None:
         px4, motion = self._px4, self._px4.motion
@@ -369,7 +370,7 @@ class Px4Mission:
     def _finish(self) -> None:
         px4 = self._px4
         self.is_finished = True
-        self.current = max(0, min(self.current, self.count - 1))
+        self.current = max(0, min(self.current, self.count - 1))  # The last item stays current.
         if px4.is_landed:
             px4.info("Mission finished, landed")
             return

@@ -26,6 +26,9 @@ _NAN3: Ned = (math.nan, math.nan, math.nan)
 # The simulated ground is level, so altitudes above terrain are treated as altitudes above home.
 _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFrame.GLOBAL_TERRAIN_ALT_INT)
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
+_VERSION_1_14 = 1 << 24 | 14 << 16  # One byte each for the major and the minor version.
+_FLIGHT_CONTROL_GROUP = 0
+_MAX_TICK_S = 0.1
 
 
 def _vector(components: Iterable[float]) -> Ned:
@@ -86,7 +89,7 @@ class Px4Offboard:
         local_frame = self._vehicle.frame
         north, east = local_frame.to_local(target.lat_int, target.lon_int)
         down = local_frame.origin.altitude_m - target.alt
-        if target.coordinate_frame != MavFrame.GLOBAL_INT:
+        if target.coordinate_frame != MavFrame.GLOBAL_INT:  # In the other frames, the altitude is relative to home.
             down = self._vehicle.home[2] - target.alt
         self._store(target, (north, east, down), is_body=False)
 
@@ -111,7 +114,7 @@ class Px4Offboard:
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
         motion = self._vehicle.motion
         if target.type_mask & AttitudeTargetTypemask.ATTITUDE_IGNORE:
-            if self._attitude is None or self._body_rates is None:
+            if self._attitude is None or self._body_rates is None:  # The first rates turn the present attitude.
                 self._attitude = (motion.roll, motion.pitch, motion.yaw)
             self._body_rates = (target.body_roll_rate, target.body_pitch_rate, target.body_yaw_rate)
         elif all(map(math.isfinite, target.q)):
@@ -122,12 +125,12 @@ class Px4Offboard:
 
     def _on_actuators(self, target: SetActuatorControlTarget, _: Channel) -> None:
         """Apply the thrust of actuator group 0. PX4 1.14 and later ignore the message."""
-        if self._vehicle.version_number >= 1 << 24 | 14 << 16:  # version 1.14
+        if self._vehicle.version_number >= _VERSION_1_14:
             return
         motion = self._vehicle.motion
         self._attitude, self._body_rates = (motion.roll, motion.pitch, motion.yaw), None
-        if target.group_mlx == 0:
-            self._thrust = target.controls[3]
+        if target.group_mlx == _FLIGHT_CONTROL_GROUP:
+            _roll, _pitch, _yaw, self._thrust, *_ = target.controls
         self.updated_at = self._vehicle.now
 
     def watch(self) -> None:
@@ -146,7 +149,7 @@ class Px4Offboard:
     def fly(self) -> None:
         motion = self._vehicle.motion
         # After another mode, the last call may be long ago, so the elapsed time is limited to that of a tick.
-        elapsed, self._flown_at = min(0.1, self._vehicle.now - self._flown_at), self._vehicle.now
+        elapsed, self._flown_at = min(_MAX_TICK_S, self._vehicle.now - self._flown_at), self._vehicle.now
         if self._attitude is not None:
             self._fly_attitude(self._attitude, elapsed)
             return
@@ -165,8 +168,10 @@ class Px4Offboard:
             angles_and_rates = zip(attitude, self._body_rates, strict=True)
             attitude = self._attitude = _vector(angle + rate * elapsed for angle, rate in angles_and_rates)
         roll, pitch, yaw = attitude
-        climb = (max(0.0, min(1.0, self._thrust)) - 0.5) * 2.0 * _CLIMB_AT_FULL_THRUST_M_S
-        motion.seek_attitude(roll, pitch, -climb)
+        climb_share = (
+            max(0.0, min(1.0, self._thrust)) - 0.5
+        ) * 2.0  # In the simulation, a thrust of 0.5 holds the height.
+        motion.seek_attitude(roll, pitch, -climb_share * _CLIMB_AT_FULL_THRUST_M_S)  # a velocity down
         motion.face(yaw)
 
     def _wanted_velocity(self) -> Ned:

@@ -100,7 +100,8 @@ class Px4Gimbal:
         north, east = place_north - motion.north, place_east - motion.east
         own_altitude_m = self._px4.frame.to_global(*motion.place).altitude_m
         pitch = math.atan2(altitude_m - own_altitude_m, math.hypot(north, east))
-        return (0.0, max(math.radians(_LIMITS[1][0]), pitch), math.atan2(east, north))
+        (min_pitch_deg, _max_pitch_deg) = _LIMITS[1]
+        return (0.0, max(math.radians(min_pitch_deg), pitch), math.atan2(east, north))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
         """Turn to angles (NaN: stay), then turn on at rates. The flag RETRACT is accepted, but has no effect."""
@@ -278,7 +279,8 @@ class Px4CameraTrigger:
             return None
         if self._px4.now - self._last_at < _MIN_INTERVAL_S:
             return MavResult.TEMPORARILY_REJECTED
-        if command.x == 1:
+        takes_image = command.x == 1
+        if takes_image:
             self.shoot()
         return MavResult.ACCEPTED
 

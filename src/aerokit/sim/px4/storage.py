@@ -85,7 +85,7 @@ class _Writer(FileHandle):
         raise FileFault(EINVAL)
 
     def write(self, offset: int, data: bytes) -> None:
-        new_bytes = data[max(0, self._written - offset) :]
+        new_bytes = data[max(0, self._written - offset) :]  # A repeated write contains bytes that were received before.
         has_gap = offset > self._written
         if self._is_rejected or has_gap:
             self._raise_rejected()
@@ -117,7 +117,7 @@ class _Writer(FileHandle):
 
     def _parse_row(self) -> bool:
         """Apply the next entry. Return False if not all of its bytes were received yet."""
-        pending = self._pending = self._pending.lstrip(b"\0")
+        pending = self._pending = self._pending.lstrip(b"\0")  # Zero bytes between two entries are padding.
         try:
             entry = read_entry(pending, 0, self._previous_name) if pending else None
         except RemoteProtocolError:

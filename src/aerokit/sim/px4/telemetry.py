@@ -122,9 +122,9 @@ def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
         id=0,
         battery_function=MavBatteryFunction.ALL,
         type=MavBatteryType.LIPO,
-        temperature=32767,  # The temperature is unknown. Current and energy are not measured either.
+        temperature=32767,  # unknown
         voltages=voltages,
-        current_battery=-100,
+        current_battery=-100,  # In 0.01 A; PX4 sends -1 A for a current that is not measured.
         current_consumed=0,
         energy_consumed=-1,
         battery_remaining=int(battery.percent),
@@ -236,6 +236,7 @@ def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
         return None
     place = px4.frame.to_global(*px4.home)
     altitude = round(place.altitude_m * 1000)
+    # A home that a client has set has no attitude.
     quaternion = (math.nan,) * 4 if px4.home_is_set_by_client else (1.0, 0.0, 0.0, 0.0)
     return m.HomePosition(
         place.latitude_e7, place.longitude_e7, altitude, *px4.home, quaternion, 0.0, 0.0, 0.0, px4.time_boot_us
@@ -259,6 +260,7 @@ def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
     motion = px4.motion
     yaw = motion.yaw
     if not px4.is_armed:
+        # PX4 makes sure in this way that there is no thrust (MulticopterPositionControl.cpp).
         unknown, acceleration = (math.nan, math.nan, math.nan), (0.0, 0.0, 100.0)
         mask = _IGNORE_POSITION_AND_VELOCITY
         return m.PositionTargetLocalNed(
@@ -267,7 +269,7 @@ def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     acceleration = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down)
     return m.PositionTargetLocalNed(
-        px4.time_boot_ms, 1, 0, *px4.flight.target, *velocity, *acceleration, yaw, motion.yaw_rate
+        px4.time_boot_ms, MavFrame.LOCAL_NED, 0, *px4.flight.target, *velocity, *acceleration, yaw, motion.yaw_rate
     )
 
 

@@ -227,7 +227,7 @@ def _rc_channels(px4: Px4Vehicle) -> m.RcChannels | None:
     if not px4.sticks.has_channels:
         return None
     channels = px4.sticks.channels
-    used_count = len(channels) if any(channels[8:]) else 8
+    used_count = len(channels) if any(channels[8:]) else 8  # Many clients send only the first eight channels.
     used = {f"chan{number}_raw": pulse for number, pulse in enumerate(channels[:used_count], start=1)}
     unused = {f"chan{number}_raw": _UNUSED_CHANNEL for number in range(used_count + 1, len(channels) + 1)}
     return m.RcChannels(time_boot_ms=px4.time_boot_ms, chancount=used_count, rssi=100, **used, **unused)
@@ -251,7 +251,8 @@ def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None
     place, motion = px4.frame.to_global(*px4.flight.target), px4.motion
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     rates = (motion.yaw, motion.yaw_rate)
-    return m.PositionTargetGlobalInt(px4.time_boot_ms, 5, 0, *place, *velocity, 0.0, 0.0, 0.0, *rates)
+    frame = MavFrame.GLOBAL_INT
+    return m.PositionTargetGlobalInt(px4.time_boot_ms, frame, 0, *place, *velocity, 0.0, 0.0, 0.0, *rates)
 
 
 def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:

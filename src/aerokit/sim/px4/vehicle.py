@@ -134,7 +134,8 @@ class Px4PlaneFlight(Px4Flight):
         sticks, parameters = self._plane.sticks, self._plane.parameters
         climb = -sticks.pitch * parameters["FW_T_CLMB_MAX" if sticks.pitch < 0 else "FW_T_SINK_MAX"]
         min_speed, max_speed = parameters["FW_AIRSPD_MIN"], parameters["FW_AIRSPD_MAX"]
-        speed = min_speed + (sticks.throttle + 1.0) / 2 * (max_speed - min_speed)
+        throttle = (sticks.throttle + 1.0) / 2  # from 0 to 1
+        speed = min_speed + throttle * (max_speed - min_speed)
         self._motion.bank_and_climb(speed, math.radians(parameters["FW_R_LIM"]) * sticks.roll, climb)
         self.stay_here()
 
