@@ -23,6 +23,8 @@ from aerokit.sim.motion import Ned, wrap_pi
 
 _STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
 _TAKE_OFF_WITHOUT_THROTTLE, _RAISED_THROTTLE = 2, 1100  # A bit of AUTO_OPTIONS, and a pulse in µs.
+# A turn on a circle uses at most this share of the acceleration limit. The rest corrects the distance from the circle.
+_TURN_SHARE_OF_ACCELERATION = 0.7
 
 
 class _Leg(Protocol):
@@ -49,9 +51,6 @@ class _FlyLeg:
             return
         motion.seek_position(*self.destination, speed=limits.speed, climb=limits.climb, descent=limits.descent)
         self.is_complete = self.is_complete or math.dist(self.destination, motion.place) <= self._radius
-
-
-_TURN_SHARE_OF_ACCELERATION = 0.7
 
 
 class _CircleLeg:
@@ -82,7 +81,6 @@ class _CircleLeg:
                 self._approach = None
             return
         motion = self._copter.motion
-        # The rest of the acceleration limit corrects the distance from the circle.
         max_acceleration = _TURN_SHARE_OF_ACCELERATION * motion.limits.acceleration_m_s2
         max_rate = math.sqrt(max_acceleration / max(0.5, self._radius))
         rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)
@@ -90,15 +88,12 @@ class _CircleLeg:
         self._angle += rate * dt
         self._turned_rad += abs(rate) * dt
         self._report_new_turn()
-        # Follow a point that moves along the circle: command its velocity, plus 1 m/s for each metre between the copter
-        # and the point.
+        # Follow a point that moves along the circle: command its velocity, plus 1 m/s for each metre of distance.
         north, east, down = self._point()
         speed = rate * self._radius
-        point_velocity_north, point_velocity_east = -speed * math.sin(self._angle), speed * math.cos(self._angle)
+        velocity_north, velocity_east = -speed * math.sin(self._angle), speed * math.cos(self._angle)
         motion.seek_velocity(
-            north - motion.north + point_velocity_north,
-            east - motion.east + point_velocity_east,
-            down - motion.down,
+            north - motion.north + velocity_north, east - motion.east + velocity_east, down - motion.down
         )
 
     def _point(self) -> Ned:
@@ -269,10 +264,7 @@ class CopterAuto(MissionMode):
             self.vehicle.yaw.update()
 
     def _check_upcoming(self) -> bool:
-        """Record the current and the next commands. Return True if an upload has changed them.
-
-        A change because the mission has advanced to another command does not count (False).
-        """
+        """Record the current and the next commands. Return True if an upload, not the progress, has changed them."""
         run, commands = self.vehicle.mission, self.vehicle.missions.commands
         has_same_index = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
         if commands.version == self._list_version and has_same_index:

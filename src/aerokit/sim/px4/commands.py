@@ -16,9 +16,7 @@ from aerokit.mavlink.enums import (
     MavType,
     MavVtolState,
 )
-from aerokit.mavlink.enums import (
-    MavCmd as Cmd,
-)
+from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, whole
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle

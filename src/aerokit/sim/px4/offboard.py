@@ -27,7 +27,7 @@ _NAN3: Ned = (math.nan, math.nan, math.nan)
 _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFrame.GLOBAL_TERRAIN_ALT_INT)
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
 _VERSION_1_14 = 1 << 24 | 14 << 16  # One byte each for the major and the minor version.
-_FLIGHT_CONTROL_GROUP = 0
+_FLIGHT_CONTROL_GROUP, _THRUST_CONTROL = 0, 3
 _MAX_TICK_S = 0.1
 
 
@@ -130,7 +130,7 @@ class Px4Offboard:
         motion = self._vehicle.motion
         self._attitude, self._body_rates = (motion.roll, motion.pitch, motion.yaw), None
         if target.group_mlx == _FLIGHT_CONTROL_GROUP:
-            _roll, _pitch, _yaw, self._thrust, *_ = target.controls
+            self._thrust = target.controls[_THRUST_CONTROL]
         self.updated_at = self._vehicle.now
 
     def watch(self) -> None:
@@ -168,9 +168,8 @@ class Px4Offboard:
             angles_and_rates = zip(attitude, self._body_rates, strict=True)
             attitude = self._attitude = _vector(angle + rate * elapsed for angle, rate in angles_and_rates)
         roll, pitch, yaw = attitude
-        climb_share = (
-            max(0.0, min(1.0, self._thrust)) - 0.5
-        ) * 2.0  # In the simulation, a thrust of 0.5 holds the height.
+        # In the simulation, a thrust of 0.5 holds the height.
+        climb_share = (max(0.0, min(1.0, self._thrust)) - 0.5) * 2.0
         motion.seek_attitude(roll, pitch, -climb_share * _CLIMB_AT_FULL_THRUST_M_S)  # a velocity down
         motion.face(yaw)
 
