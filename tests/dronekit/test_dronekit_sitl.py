@@ -124,7 +124,7 @@ def test_sim_option_serves_vehicle(
     ("arguments", "text"),
     [
         (["--sim", "--vehicle", "coptr"], "did you mean 'copter'"),
-        (["--sim", "--home", "x"], "is not LAT,LON,ALT"),
+        (["--sim", "--home", "x"], "it must be LAT,LON,ALT"),
         (["-m", "no_such_module"], "No module named no_such_module"),
     ],
 )

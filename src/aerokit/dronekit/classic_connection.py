@@ -28,9 +28,10 @@ logger: logging.Logger = logging.getLogger("dronekit.mavlink")
 
 vehicle_logger: logging.Logger = logging.getLogger("dronekit")
 
-CLOSE_TIMEOUT_S = 2.0  # maximum time for which close() waits for the answers to recent orders
+CLOSE_TIMEOUT_S = 2.0  # maximum time that close() waits for the answers to recent orders
 
-SHARED_KINDS = {"disarm": "arm"}  # an order replaces the previous one of its kind; disarming also replaces arming
+# A new call replaces the previous call of its kind. Disarming also replaces arming, and vice versa.
+SHARED_KINDS = {"disarm": "arm"}
 
 CoroutineFunction = Callable[..., Awaitable[object]]
 
@@ -59,7 +60,7 @@ class ClassicConnection:
         self.supports_mavlink_2 = False
         """True once the vehicle has reported that it supports MAVLink 2, even if it still sends version 1."""
         self.note_sent: Callable[[Message], None] = lambda message: None
-        """Called on the loop with each sent message, because it may overrule earlier orders."""
+        """Called on the loop with each sent message, because a message may overrule earlier orders."""
         self.vehicle: Any = None
         self._is_closed = threading.Event()
         self._closing = threading.Lock()
@@ -71,11 +72,11 @@ class ClassicConnection:
         )
 
     def send(self, message: Message, *, to: int | None = None) -> None:
-        """Send a message, in the order of the calls, from any thread, without blocking.
+        """Send a message without blocking, from any thread. Messages are sent in the order of the calls.
 
         Raises InvalidArgument if a field is out of range, and APIException if the connection is closed.
         """
-        message.encode()  # errors are raised here, in the caller, rather than on the loop
+        message.encode()  # so that the caller gets the error of an invalid field, which would be logged on the loop
         with classic_errors():
             self.connection.raise_if_ended()
             self.calls.post(self._send, message, to)
@@ -122,7 +123,7 @@ class ClassicConnection:
         return self._is_closed.is_set()
 
     def is_of_another_vehicle(self, system_id: int) -> bool:
-        """Return True if this system has an autopilot and is not the connected vehicle."""
+        """Return True if the system with this id has an autopilot but is not the connected vehicle."""
         return system_id != self.target_system and any(
             source[0] == system_id and is_autopilot(heartbeat)
             for source, heartbeat in self.connection.heartbeats.items()
@@ -143,7 +144,7 @@ def _on_dropped(
     listener_thread: ListenerThread,
     close_callbacks: list[Callable[[], object]],
 ) -> None:
-    """Clean up after a connection was garbage collected. Runs on the loop, which ends afterwards."""
+    """Clean up after the program dropped a connection without closing it. Runs on the loop, which ends afterwards."""
     vehicle_logger.warning("the connection to %s was closed: the program dropped it without close()", address)
     atexit.unregister(exit_callback)
     listener_thread.stop()
@@ -175,7 +176,7 @@ class BackgroundCalls:
         """Describes the vehicle's state in the warning about a rejected command."""
 
     def start(self, kind: str, function: CoroutineFunction, *args: Any, **kwargs: Any) -> BackgroundCall:
-        """Start a call, from any thread, without blocking. First messages are sent in the order of these calls.
+        """Start a call without blocking, from any thread. Calls send their first messages in the order of their start.
 
         Raises ConnectionClosed if the connection was closed.
         """
@@ -190,12 +191,12 @@ class BackgroundCalls:
         return order
 
     def cancel(self, order: BackgroundCall) -> None:
-        """Cancel a call, so that it sends nothing more. From any thread, without blocking."""
+        """Cancel a call without blocking, from any thread. The call then sends nothing more."""
         with contextlib.suppress(ConnectionClosed):
             self._loop.call_soon(self._cancel, order)
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
-        """Call a function on the loop that neither blocks nor raises, in order with other calls."""
+        """Call a function on the loop after all earlier calls. The function must neither block nor raise."""
         if self._loop.is_current:
             function(*args)
         else:
@@ -210,7 +211,7 @@ class BackgroundCalls:
     def _begin(self, order: BackgroundCall, function: CoroutineFunction) -> None:
         kind = SHARED_KINDS.get(order.kind, order.kind)
         if kind in self._newest:
-            self._cancel(self._newest[kind])
+            self._cancel(self._newest[kind])  # the new call replaces it
         if order.set_running_or_notify_cancel():
             name = f"dronekit {order.kind}"
             order.task = asyncio.get_running_loop().create_task(self._run(order, function), name=name)
@@ -224,7 +225,7 @@ class BackgroundCalls:
     def _end(self, kind: str, order: BackgroundCall) -> None:
         if self._newest.get(kind) is order:
             del self._newest[kind]
-        if not order.done():  # its task was cancelled
+        if not order.done():  # the task of this call was cancelled
             reason = "a newer order replaced it, it was cancelled, or the connection was closed"
             order.set_exception(ConnectionClosed(f"{order.kind}: {reason}"))
 
@@ -233,9 +234,9 @@ class BackgroundCalls:
             await function()
         except Exception as error:
             if not isinstance(error, ConnectionClosed):
-                text = str(error)  # the exception itself would keep stack frames, and thus the vehicle, alive
+                text = str(error)  # a logged exception would keep its stack frames, and thus the vehicle, alive
                 if isinstance(error, CommandRejected) and self.describe is not None:
-                    text += f" ({self.describe()})"  # a rejection rarely names its cause
+                    text += f" ({self.describe()})"  # the vehicle's answer rarely names the cause of a rejection
                 vehicle_logger.warning("%s: %s", order.kind, text)
             order.set_exception(error)
         else:
@@ -243,7 +244,7 @@ class BackgroundCalls:
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
-    # Tasks that earlier calls have just created send their first messages before `function` is called.
+    # One iteration later, so that tasks which earlier calls have just created send their first messages before.
     asyncio.get_running_loop().call_soon(function, *args)
 
 
@@ -262,16 +263,16 @@ def weak_callback(method: Callable[..., object]) -> Callable[..., None]:
 
 IGNORE = 0xFFFF
 RELEASE = 0
-RELEASE_UPPER = 0xFFFE  # releases a channel above 8, for which 0 means "ignore"
+RELEASE_UPPER = 0xFFFE  # releases a channel above 8; 0 leaves such a channel unchanged
 
 CHANNELS_OF_MAVLINK_1 = 8
 CHANNELS = 18
 
-RELEASE_COPIES = 3  # because the message is not acknowledged, and a frame may be lost
+RELEASE_COPIES = 3  # sent several times, because the message is not acknowledged and a frame may be lost
 
 
 class OverrideRelease:
-    """The channels that this connection overrides, by target; releases them when the connection ends.
+    """Records the RC channels that this connection overrides, and releases them when the connection ends.
 
     https://mavlink.io/en/messages/common.html#RC_CHANNELS_OVERRIDE
     """
@@ -283,7 +284,7 @@ class OverrideRelease:
         self._overridden: dict[tuple[int, int], set[int]] = {}
 
     def note_sent(self, message: Message) -> None:
-        """Record the channels of a sent RC_CHANNELS_OVERRIDE; ignores other messages."""
+        """Record which channels a sent RC_CHANNELS_OVERRIDE overrides or releases; ignore other messages."""
         if not isinstance(message, RcChannelsOverride):
             return
         target = message.target_system, message.target_component
@@ -293,16 +294,16 @@ class OverrideRelease:
             is_upper = channel > CHANNELS_OF_MAVLINK_1
             if value == (RELEASE_UPPER if is_upper else RELEASE):
                 overridden.discard(channel)
-            elif value not in (IGNORE, RELEASE):  # above channel 8, 0 means "ignore", too
+            elif value not in (IGNORE, RELEASE):  # above channel 8, RELEASE (0) leaves the channel unchanged, too
                 overridden.add(channel)
 
     def send(self, connection: Connection) -> None:
-        """Release overridden channels, unless ``is_enabled`` is False (loop thread). Never raises."""
+        """Send the release of all overridden channels, unless ``is_enabled`` is False (loop thread). Never raises."""
         for (system, component), channels in self._overridden.items():
             if self.is_enabled and channels:
                 values = [_release_value(channel, channel in channels) for channel in range(1, CHANNELS + 1)]
                 message = RcChannelsOverride(system, component, *values)
-                with contextlib.suppress(AerokitError):  # the link may be closed
+                with contextlib.suppress(AerokitError):  # the link may already be closed
                     for _ in range(RELEASE_COPIES):
                         connection.send(message)
 
