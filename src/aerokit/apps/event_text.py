@@ -1,4 +1,4 @@
-"""Text for events, for the terminal monitor and ``aerokit events``."""
+"""Texts of events for the terminal monitor and ``aerokit events``."""
 
 from __future__ import annotations
 
