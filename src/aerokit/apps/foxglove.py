@@ -218,6 +218,7 @@ class _TopicChannels:
                 continue
             if self._needs_sending(name, cell.updated_at, partial(topics.state_topic, system_id, state, value)):
                 self._send(name, cell.updated_at, topics.state_fields(value))
+        # The link's statistics change with every frame, so they are sent at an interval.
         name, now = topics.vehicle_topic(system_id, "link"), self._connection.now()
         if now - self._sent_at.get(name, -_LINK_INTERVAL_S) >= _LINK_INTERVAL_S:
             link = overview(vehicle)["link"]

@@ -50,7 +50,7 @@ class ClassicConnection:
         self.target_system = target_system
         """System id of the vehicle, 0 until it is found."""
         self.listener_thread: ListenerThread = ListenerThread()
-        self.listener_thread.on_called = loop.activity.feed
+        self.listener_thread.on_called = loop.activity.feed  # a callback that returns shows that the program is running
         self.loop = loop
         self._context = context
         self.connection: Connection = context.value

@@ -313,7 +313,8 @@ class FlightMethods(VehicleAttributes):
             if altitude is None:
                 return False
             start = altitude if start is None else start
-            return abs(altitude - alt) <= epsilon or (start < alt <= altitude) or (altitude <= alt < start)
+            has_passed = start < alt <= altitude or altitude <= alt < start  # on the way up, or down
+            return abs(altitude - alt) <= epsilon or has_passed
 
         return has_reached
 

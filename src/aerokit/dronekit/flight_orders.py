@@ -236,7 +236,7 @@ class CurrentCommand:
             return
         if aio.heartbeat_age > MODE_MAX_AGE_S:
             raise APIException(f"the vehicle is silent; it may or may not have set the next command to {seq}")
-        if seq == 0:
+        if seq == 0:  # home, which mission.set_current() cannot set, because it counts the items after home
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:
             await aio.mission.set_current(seq - 1)

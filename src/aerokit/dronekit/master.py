@@ -99,6 +99,7 @@ class Master:
         _, heartbeat = self._autopilot()
         is_px4 = heartbeat is not None and heartbeat.autopilot == MavAutopilot.PX4
         vehicle = self._connection.vehicle
+        # Vehicle.mode accepts names and ArduPilot's numbers, but not PX4's three numbers.
         if vehicle is not None and (isinstance(mode, str) or not is_px4):
             vehicle.mode = mode
             return
@@ -222,7 +223,7 @@ class Master:
         ``alt`` is in metres above home with ``relative_alt``, otherwise above sea level.
         """
         gps = self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
-        hud = self.recv_match(type="VFR_HUD", blocking=True)
+        hud = self.recv_match(type="VFR_HUD", blocking=True)  # like pymavlink, which takes the altitude from it
         position = self.recv_match(type="GLOBAL_POSITION_INT", blocking=True)
         alt = position.relative_alt * 1e-3 if relative_alt else hud.alt
         return mavutil.location(gps.lat * 1e-7, gps.lon * 1e-7, alt, hud.heading)
@@ -281,7 +282,7 @@ class Inbox(Mapping[str, Any]):
         message_id = _id_of(name)
         while (frame := self._latest.get(message_id)) is None and self._may_wait():
             with self._frame_arrived:
-                self._frame_arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)
+                self._frame_arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)  # short, so that _may_wait() ends in time
         if frame is None:
             raise KeyError(name)
         return message_of(frame)

@@ -206,11 +206,11 @@ class _Parser(argparse.ArgumentParser):
 
 def _split_at_program(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
     """Split a command line after the program: return the arguments up to it, and the program's own arguments."""
-    is_value = False
+    is_option_value = False
     for count, argument in enumerate(arguments, 1):
-        if not is_value and not argument.startswith("-"):
+        if not is_option_value and not argument.startswith("-"):
             return arguments[:count], arguments[count:]
-        is_value = not is_value and argument in OPTIONS_WITH_VALUE
+        is_option_value = not is_option_value and argument in OPTIONS_WITH_VALUE
     return arguments, []
 
 
@@ -313,6 +313,7 @@ def _print_program_traceback(kind: type[BaseException], error: BaseException, tr
 
 def _without_our_frames(traceback: TracebackType | None) -> TracebackType | None:
     entry = traceback
+    # Skip our frames up to the one that runs the program, then those of runpy.
     while entry is not None and entry.tb_frame.f_code not in (_run_file.__code__, _run_module.__code__):
         entry = entry.tb_next
     if entry is None:  # the error did not happen in the program, so all frames are of interest

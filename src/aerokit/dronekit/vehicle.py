@@ -215,7 +215,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
             APIException: no vehicle was found in time; the text describes what was received instead.
         """
         with self._dk_initializing:
-            if self._dk.aio_or_none is not None:
+            if self._dk.aio_or_none is not None:  # already connected by an earlier call
                 self._dk_wait_until_booted(timeout=max(heartbeat_timeout or 0.0, 0.0) or CONNECT_TIMEOUT_S)
                 return
             self._dk.heartbeat_limit_s = max(heartbeat_timeout or 0.0, 0.0)
@@ -308,6 +308,7 @@ async def _connected(
         tasks = BackgroundTasks(connection.fail)
         try:
             begin(aio, tasks)
+            # DroneKit accepts a rate of 0 or less, but aio.streams() does not; 1 Hz is requested instead.
             with nullcontext() if rate is None else aio.streams(min(rate, MAX_STREAM_RATE_HZ) if rate > 0 else 1.0):
                 yield aio
         finally:

@@ -144,7 +144,7 @@ class FleetAction:
         assert task is not None
         self._tasks[member.name] = task
         try:
-            if member.name in self._stopped:
+            if member.name in self._stopped:  # by the policy, before this task began
                 return
             if delay_s:
                 await anyio.sleep(delay_s)

@@ -157,7 +157,7 @@ class Member:
         elif state is not None and is_worse_failsafe(state, self._ignored_failsafe):
             return f"it is in a failsafe (MAV_STATE {MavState(state).name})"
         uses_missions = "mission" in vars(vehicle)  # vehicle.mission is created at its first use
-        if uses_missions and vehicle.mission.explains_mode:
+        if uses_missions and vehicle.mission.explains_mode:  # the mode changed because the mission has ended
             return ""
         if self._current_control() == self._control_when_reclaimed:
             return ""

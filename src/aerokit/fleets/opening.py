@@ -161,7 +161,7 @@ def _members_of_vehicles(sources_by_name: Mapping[str, Source], networks: dict[s
             if network is None:
                 network = name
                 networks[name] = source.connection
-            is_named_by_program = not name.isdecimal()
+            is_named_by_program = not name.isdecimal()  # _named_sources() numbers the other sources
             member_name = name if is_named_by_program else f"{network}/{source.system_id}"
             members.append(Member(member_name, network, source))
     return members

@@ -110,6 +110,7 @@ def separate_by_altitude(
         return Deconfliction("refused", reason, min_distance_m, conflicts)
     lowest_m = max(max(route.start[2], route.target[2]) for route in routes)
     layers: dict[str, int] = {}
+    # Each route gets the lowest layer that no crossing route uses and no stationary vehicle blocks.
     for route in routes:
         used_layers = {
             layers[earlier.name]
@@ -171,6 +172,7 @@ def _conflicts(
     routes: Sequence[Route], stationary: Mapping[str, LocalPoint], min_distance_m: float
 ) -> tuple[Conflict, ...]:
     _check_distance(min_distance_m)
+    # Times are ignored here, so the paths can have any speed.
     paths = [Path.straight(route.name, route.start, route.target, 1.0) for route in routes]
     conflicts = list(find_conflicts(paths, min_distance_m))
     for path in paths:

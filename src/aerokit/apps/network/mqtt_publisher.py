@@ -225,6 +225,7 @@ class MqttLink(BaseLink):
         if self._timer is not None:
             self._timer.cancel()
         if client is not None and client.socket() is not None:
+            # Without a DISCONNECT, the broker itself publishes "offline" (will_set).
             if client.is_connected() and not client.want_write():
                 client.publish(self._alive_topic, b"offline", retain=True)
                 client.disconnect()
