@@ -180,20 +180,20 @@ class BackgroundCalls:
 
         Raises ConnectionClosed if the connection was closed.
         """
-        order = BackgroundCall(kind)
-        self._pending.add(order)
-        order.add_done_callback(self._pending.discard)
+        call = BackgroundCall(kind)
+        self._pending.add(call)
+        call.add_done_callback(self._pending.discard)
         try:
-            self._loop.call_soon(self._begin, order, functools.partial(function, *args, **kwargs))
+            self._loop.call_soon(self._begin, call, functools.partial(function, *args, **kwargs))
         except ConnectionClosed:
-            order.cancel()
+            call.cancel()
             raise
-        return order
+        return call
 
-    def cancel(self, order: BackgroundCall) -> None:
+    def cancel(self, call: BackgroundCall) -> None:
         """Cancel a call without blocking, from any thread. The call then sends nothing more."""
         with contextlib.suppress(ConnectionClosed):
-            self._loop.call_soon(self._cancel, order)
+            self._loop.call_soon(self._cancel, call)
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
         """Call a function on the loop after all earlier calls. The function must neither block nor raise."""
@@ -208,28 +208,28 @@ class BackgroundCalls:
         if pending and not self._loop.is_current:
             concurrent.futures.wait(pending, timeout)
 
-    def _begin(self, order: BackgroundCall, function: CoroutineFunction) -> None:
-        kind = SHARED_KINDS.get(order.kind, order.kind)
+    def _begin(self, call: BackgroundCall, function: CoroutineFunction) -> None:
+        kind = SHARED_KINDS.get(call.kind, call.kind)
         if kind in self._newest:
             self._cancel(self._newest[kind])  # the new call replaces it
-        if order.set_running_or_notify_cancel():
-            name = f"dronekit {order.kind}"
-            order.task = asyncio.get_running_loop().create_task(self._run(order, function), name=name)
-            order.task.add_done_callback(lambda _: self._end(kind, order))
-            self._newest[kind] = order
+        if call.set_running_or_notify_cancel():
+            name = f"dronekit {call.kind}"
+            call.task = asyncio.get_running_loop().create_task(self._run(call, function), name=name)
+            call.task.add_done_callback(lambda _: self._end(kind, call))
+            self._newest[kind] = call
 
-    def _cancel(self, order: BackgroundCall) -> None:
-        if order.task is not None and order in self._newest.values():
-            order.task.cancel()
+    def _cancel(self, call: BackgroundCall) -> None:
+        if call.task is not None and call in self._newest.values():
+            call.task.cancel()
 
-    def _end(self, kind: str, order: BackgroundCall) -> None:
-        if self._newest.get(kind) is order:
+    def _end(self, kind: str, call: BackgroundCall) -> None:
+        if self._newest.get(kind) is call:
             del self._newest[kind]
-        if not order.done():  # the task of this call was cancelled
-            reason = "a newer order replaced it, it was cancelled, or the connection was closed"
-            order.set_exception(ConnectionClosed(f"{order.kind}: {reason}"))
+        if not call.done():  # the task was cancelled before it had a result
+            reason = "the order was cancelled or replaced by a newer one, or the connection was closed"
+            call.set_exception(ConnectionClosed(f"{call.kind}: {reason}"))
 
-    async def _run(self, order: BackgroundCall, function: CoroutineFunction) -> None:
+    async def _run(self, call: BackgroundCall, function: CoroutineFunction) -> None:
         try:
             await function()
         except Exception as error:
@@ -237,10 +237,10 @@ class BackgroundCalls:
                 text = str(error)  # a logged exception would keep its stack frames, and thus the vehicle, alive
                 if isinstance(error, CommandRejected) and self.describe is not None:
                     text += f" ({self.describe()})"  # the vehicle's answer rarely names the cause of a rejection
-                vehicle_logger.warning("%s: %s", order.kind, text)
-            order.set_exception(error)
+                vehicle_logger.warning("%s: %s", call.kind, text)
+            call.set_exception(error)
         else:
-            order.set_result(None)
+            call.set_result(None)
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:

@@ -183,7 +183,7 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
     # on the border of the polygon.
     inside = _closest_inside(start_difference, vector, other_vector)
     if inside is not None and abs(time_difference(*inside)) <= slack_s:
-        corners = [inside]
+        corners = [inside]  # a polygon that is a single point
     else:
         corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
         if slack_s < math.inf:
@@ -213,7 +213,7 @@ def _closest_inside(
     """
     aa, bb, ab = _dot(vector, vector), _dot(other_vector, other_vector), _dot(vector, other_vector)
     determinant = aa * bb - ab * ab
-    if determinant <= TOLERANCE * max(aa * bb, TOLERANCE):
+    if determinant <= TOLERANCE * max(aa * bb, TOLERANCE):  # the lines are parallel, or a leg has no length
         return None
     da, db = _dot(start_difference, vector), _dot(start_difference, other_vector)
     s, t = (ab * db - bb * da) / determinant, (aa * db - ab * da) / determinant
