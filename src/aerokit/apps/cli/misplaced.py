@@ -1,4 +1,4 @@
-"""Recognises an address or a file given in place of another argument, before anything is opened."""
+"""Recognises an address or a file that was given in place of another argument, before anything is opened."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _COMMANDS_BY_SUFFIX = {
 
 
 def is_address(word: str) -> bool:
-    """Return True for an address of a link that is unlikely to be anything else."""
+    """Return True if a word is certainly the address of a link and not another argument."""
     return _ADDRESS_PATTERN.fullmatch(word) is not None
 
 
@@ -37,7 +37,7 @@ def misplaced_file(word: str) -> str | None:
     path = Path(word)
     suffix = path.suffix.lower()
     advice = _COMMANDS_BY_SUFFIX.get(suffix)
-    is_other_file = path.is_file() and suffix != ".tlog"  # a recording is an address: it is replayed
+    is_other_file = path.is_file() and suffix != ".tlog"  # a recording can be an address: it is replayed
     if advice is None and not is_other_file:
         return None
     text = f"{word!r} is a file; an address is expected, such as udpin:0.0.0.0:14550"
@@ -72,7 +72,7 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
 
 
 def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) -> str:
-    """Return the error text for ``aerokit params udpin:… list``."""
+    """Return the error text if an address is before the action, as in ``aerokit params udpin:… list``."""
     address, action, *arguments = [*words, "ACTION"] if len(words) == 1 else words
     actions = next(item.choices for item in parser._actions if isinstance(item, argparse._SubParsersAction))
     action_parser = actions.get(action) or next(iter(actions.values()))

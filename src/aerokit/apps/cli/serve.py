@@ -152,9 +152,9 @@ async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> in
     with on_interrupt(stop):
         try:
             await server.serve()
-        except SystemExit:  # uvicorn exits when it cannot listen
+        except SystemExit:  # uvicorn exits if it cannot listen
             raise LinkOpenError(
-                f"cannot listen on {options.host} port {options.port}: it may be in use; choose another with --port"
+                f"cannot listen on {options.host}, port {options.port}: it may be in use; choose another with --port"
             ) from None
     if not server.started:
         return FAILED
@@ -166,7 +166,7 @@ def _server_class(uvicorn: Any) -> Any:
     class Server(uvicorn.Server):  # type: ignore[misc]
         @contextmanager
         def capture_signals(self) -> Iterator[None]:
-            yield  # the command handles signals
+            yield  # uvicorn's signal handlers are not installed, because the command handles signals
 
         async def startup(self, sockets: Any = None) -> None:
             await super().startup(sockets=sockets)
@@ -177,7 +177,7 @@ def _server_class(uvicorn: Any) -> Any:
 
 
 def _emit_serving(options: argparse.Namespace, app: ServeApp, port: int) -> None:
-    host: str = {"0.0.0.0": _LOOPBACK, "::": "::1"}.get(options.host, options.host)  # a browser cannot open the former
+    host: str = {"0.0.0.0": _LOOPBACK, "::": "::1"}.get(options.host, options.host)  # browsers cannot open 0.0.0.0
     url = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
     # Browsers do not send the part after the #, so that the token never reaches a server log.
     page = url if options.read_only and _is_loopback(options.host) else f"{url}#token={app.token}"
