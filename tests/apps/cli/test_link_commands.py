@@ -242,7 +242,7 @@ def test_record_without_frames_fails(capsys: pytest.CaptureFixture[str]) -> None
     [
         (
             ["udpin:127.0.0.1:0"],
-            "argument FILE: 'udpin:127.0.0.1:0' is an address; the recording must follow the address",
+            "'udpin:127.0.0.1:0' is an address; the recording must follow the address",
         ),
         (["a.tlog", "--seconds", "1", "b.tlog"], "aerokit record: error: unrecognized arguments: b.tlog"),
         (
