@@ -287,7 +287,7 @@ class CommandSequence:
         self._store_download(number, mission)
 
     def _store_download(self, number: int, mission: Mission) -> None:
-        """Store a downloaded mission (loop thread)."""
+        """Store a downloaded mission. Runs on the loop thread."""
         home, connection = mission.home, self._core.aio.connection
         own_ids = connection.source_system, connection.source_component
         home_command, *items = _commands_of(mission, own_ids)

@@ -290,7 +290,7 @@ class FlightMethods(VehicleAttributes):
             self._handler.wait_closed(min(interval, max(deadline - time.monotonic(), 0.0)))
 
     def wait_for_armable(self, timeout: float | None = None) -> None:
-        """Wait until :attr:`is_armable`. Raises TimeoutError after ``timeout`` seconds."""
+        """Wait until :attr:`is_armable` is true. Raises TimeoutError after ``timeout`` seconds."""
         self.wait_for(lambda: self.is_armable, timeout, errmsg="the vehicle did not become armable")
 
     def wait_for_alt(self, alt: float, epsilon: float = 0.1, rel: bool = True, timeout: float | None = None) -> None:

@@ -153,7 +153,7 @@ def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
 
 
 async def reject(reason: str) -> None:
-    """Fail with a reason, which is logged like a rejection by the vehicle."""
+    """Raise APIException with a reason, which is then logged like a rejection by the vehicle."""
     raise APIException(reason)
 
 
@@ -222,8 +222,7 @@ class CurrentCommand:
     async def _choose(self, seq: int) -> None:
         """Set the current command on the vehicle.
 
-        ArduPilot first gets one MISSION_SET_CURRENT, like from DroneKit. Without confirmation, a command with retries
-        follows.
+        Like DroneKit, sends ArduPilot one MISSION_SET_CURRENT. If that is not confirmed, sends a command with retries.
         """
         aio = self._core.aio
         if not aio.autopilot.home_is_item_0:

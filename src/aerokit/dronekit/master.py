@@ -45,7 +45,7 @@ class Master:
         own_ids = connection.connection
         self.source_system: int = own_ids.source_system
         self.source_component: int = own_ids.source_component
-        """Own component id."""
+        """Component id of this program."""
         self.mav: MessageFactory = MessageFactory(self._send, self.source_system, self.source_component)
         """Object with a method for each message, which creates and sends it."""
         self.messages: Inbox = Inbox(connection)

@@ -128,7 +128,7 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
             if other_leg[0].t_s - slack_s > leg[1].t_s or other_leg[1].t_s + slack_s < leg[0].t_s:
                 continue  # the vehicles never fly these legs at the same time
             if _lower_bound(leg, other_leg) >= min(best.distance_m, below_m):
-                # `below_m` is then the distance, unless later legs are closer.
+                # These legs are at least `below_m` apart, which is the result unless other legs are closer.
                 if best.distance_m == math.inf:
                     best = Approach(below_m, leg[0].t_s, other_leg[0].t_s)
                 continue

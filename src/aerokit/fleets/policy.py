@@ -1,4 +1,4 @@
-"""Failure policies: orders to the other members when one member fails. Without IO."""
+"""Failure policies: which orders the other members get when a member fails. Without IO."""
 
 from __future__ import annotations
 

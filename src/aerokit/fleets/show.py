@@ -106,7 +106,7 @@ class Show(Snapshot):
         """Parse a show in CSV, in the format that the module describes.
 
         Raises:
-            InvalidArgument: the text is not in this format; the error names the line.
+            InvalidArgument: the text is not in this format. The error names the line.
         """
         rows = csv.reader(io.StringIO(text))
         if [cell.strip() for cell in next(rows, [])] != COLUMNS:
@@ -128,7 +128,7 @@ class Show(Snapshot):
         """Parse a show in JSON, in the format that the module describes.
 
         Raises:
-            InvalidArgument: the text is not in this format; the error names the track.
+            InvalidArgument: the text is not in this format. The error names the track.
         """
         try:
             data = json.loads(text)

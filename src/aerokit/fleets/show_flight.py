@@ -48,7 +48,8 @@ __all__ = [
 # Speed of the correction towards the track, per metre of deviation, in 1/s.
 TRACK_GAIN = 0.8
 
-# A vehicle may fly at CATCH_UP_FACTOR times the track's speed, at least CATCH_UP_M_S, plus CATCH_UP_M_S in any case.
+# Speed limit of a vehicle: CATCH_UP_FACTOR times the track's speed or CATCH_UP_M_S, whichever is larger, plus
+# CATCH_UP_M_S.
 CATCH_UP_FACTOR, CATCH_UP_M_S = 1.5, 1.0
 
 CONFLICT_SLACK_S = 0.5

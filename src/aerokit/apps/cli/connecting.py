@@ -242,7 +242,7 @@ async def connect_to(
 
 
 def add_link(command: argparse.ArgumentParser, *, default: str | None = None) -> None:
-    """Add the address with ``--baud``, ``--signing-key`` and ``--json``; ``default`` as in :func:`add_address`."""
+    """Add the address with ``--baud``, ``--signing-key`` and ``--json``; ``default`` is as in :func:`add_address`."""
     add_address(command, default=default)
     add_signing_key(command, f"signing key of the vehicles (${SIGNING_KEY_VARIABLE})")
     add_json(command)

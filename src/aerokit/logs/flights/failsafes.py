@@ -32,7 +32,7 @@ class Failsafe(Snapshot):
 
     time_s: float
     kind: str
-    """A key of `KINDS`."""
+    """The kind of failsafe, a key of `KINDS`."""
     acted: bool
     """True if the autopilot reacted: it changed the mode, disarmed, or reported an action."""
     evidence: tuple[FailsafeEvidence, ...]

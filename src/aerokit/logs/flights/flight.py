@@ -166,7 +166,7 @@ class Waypoint(Snapshot):
 
     number: int
     command: int
-    """MAV_CMD."""
+    """Number of the command (MAV_CMD)."""
     latitude_deg: float
     """NaN for items without a position."""
     longitude_deg: float
@@ -199,7 +199,7 @@ class FlightLog:
     begins_at: float = 0.0
     """UTC of the first entry, in seconds since 1970. If the value is less than a year, the clock was not set."""
     ends_at: float = 0.0
-    """UTC of the last entry."""
+    """UTC of the last entry, in seconds since 1970."""
     speed: float = 1.0
     """Simulated seconds for each recorded second: not 1 only in a ``.tlog`` of a simulation that is not in real time.
     All times of the flight are then in simulated seconds.

@@ -107,7 +107,7 @@ def _column_kind(value: object) -> str:
 
 
 def _position(latitude: float, longitude: float, amsl_m: float, relative_m: float | None) -> Position | None:
-    """Create a position. Return None for impossible values, with which an estimator has diverged or not started yet."""
+    """Create a position. Return None for impossible values, which a diverged or not yet started estimator reports."""
     try:
         check_place(latitude, longitude)
         position = Position(latitude, longitude, float(amsl_m), relative_m)

@@ -41,7 +41,7 @@ _INDEXING_SHARE = 0.3  # part of the progress that indexing the rows counts for
 
 
 def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Fill a flight from its file.
+    """Read the file of a flight, and fill the flight with its content.
 
     Raises:
         FileFormatError: the file is not an ArduPilot log, or was written before 2015.

@@ -76,7 +76,7 @@ _BUFFER = 1 << 20
 
 
 def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Fill a flight from its file.
+    """Read the file of a flight, and fill the flight with its content.
 
     Raises:
         FileFormatError: the file is not a PX4 log.
@@ -179,7 +179,7 @@ class _Reader:
         return max((int(time_us) - self._began_us) / 1e6, 0.0)
 
     def _topics(self, *names: str) -> list[tuple[int, _Topic]]:
-        """Return the instances, with their numbers, of the first of these topics that exists."""
+        """Return all instances of the first of these topics that the log has, each with its number."""
         for name in names:
             instances = [data for data in self._data if data.name == name]
             if instances:
