@@ -229,7 +229,8 @@ class VehicleAttributes(VehicleCore):
         if aio is not None and aio.autopilot.prearm_depends_on_mode:  # PX4
             status = self._dk_sys_status.message
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
-        gps = self._dk_gps.message  # the rule of DroneKit follows
+        # Like DroneKit: any fix (2D or better), and a predicted position of the estimator.
+        gps = self._dk_gps.message
         return gps is not None and gps.fix_type > 1 and bool((self._dk_ekf_flags or 0) & PRED_POS_HORIZ_ABS)
 
     @property

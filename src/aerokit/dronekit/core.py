@@ -239,7 +239,7 @@ class Core:
             aio.connection.bus.attach_lazily(message_type, weak_callback(latest.on_frame), system_id=aio.system_id)
 
     def watch_link(self) -> None:
-        """Report the age of the last heartbeat to listeners 20 times a second; log when silence begins and ends."""
+        """Report the age of the last heartbeat to its listeners 20 times a second; log when silence begins and ends."""
         aio = self.aio
         if not aio.connection.is_open:
             return

@@ -227,7 +227,7 @@ class CurrentCommand:
         aio = self._core.aio
         if not aio.autopilot.home_is_item_0:
             await aio.mission.set_current(max(seq - 1, 0))
-            self._chosen = seq - 1
+            self._chosen = seq - 1  # -1 is the index of no item
             return
         aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))
         with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):

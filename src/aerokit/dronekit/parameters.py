@@ -177,7 +177,7 @@ class ParameterValues:
         """Store a parameter; return True if it is new or changed."""
         name, previous = parameter.name, self._parameters.get(parameter.name)
         if previous is None and len(self._parameters) >= MAX_PARAMETERS:
-            return False
+            return False  # limits memory, because a sender can make up names
         if previous is None and name != name.upper():
             self._spelling_of_upper[name.upper()] = name
         self._parameters[name] = parameter

@@ -147,7 +147,7 @@ class Fleet(Selection):
         def attach(sink: Sink) -> list[Detach]:
             detach: list[Detach] = []
             for event_type in event_types:
-                if event_type is MemberEvent:
+                if event_type is MemberEvent:  # all events of vehicles
                     detach += self._attach_member_events(Event, sink)
                 elif not issubclass(event_type, FleetEvent):
                     detach += self._attach_member_events(event_type, sink)

@@ -158,7 +158,7 @@ class Show(Snapshot):
         write_atomically(path, self.to_json() if str(path).lower().endswith(".json") else self.to_csv())
 
     def _check(self) -> None:
-        object.__setattr__(self, "tracks", dict(self.tracks))
+        object.__setattr__(self, "tracks", dict(self.tracks))  # a copy; this object is immutable otherwise
         if not self.tracks:
             raise InvalidArgument("tracks is empty: a show needs at least one track")
         for name, track in self.tracks.items():

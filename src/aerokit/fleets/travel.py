@@ -366,6 +366,7 @@ class Missions(SelectionBase):
         paths: list[Path | None] = []
         if members:
             first_member = next(iter(members.values()))
+            # A position of any age will do, because it is only the origin of the coordinates.
             origin = LocalOrigin(position_of(first_member, math.inf))
             paths = [_mission_path(origin, members[name], mission) for name, mission in missions.items()]
         conflicts = find_conflicts([path for path in paths if path is not None], min_m)

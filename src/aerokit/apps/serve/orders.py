@@ -351,7 +351,7 @@ class OrderRunner:
                 "disarm: force is allowed only after the server has seen the vehicle hit the ground and stay there;"
                 " nothing was sent",
             )
-        if order_type.is_safe:
+        if order_type.is_safe:  # may be sent to a silent vehicle, and in any number
             return
         if vehicle.link_state.latest is not LinkState.CONNECTED:
             raise HeartbeatTimeout(

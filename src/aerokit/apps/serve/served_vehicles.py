@@ -253,21 +253,24 @@ def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
 
 
 def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
-    """Return why ``arm`` would be refused, from the state received so far; empty if no reason is known.
+    """Return the known reasons why the order ``arm`` would be refused; empty if none is known. Sends nothing.
 
-    ``missing`` are the conditions missing for flight. ArduPilot arms without most of them, in modes without position.
+    ``missing`` are the missing conditions for flight. In modes without a position, ArduPilot arms without most of them.
     """
     autopilot, unarmable = vehicle.autopilot, _unarmable_mode(vehicle)
     if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False:
         return []
-    if unarmable is not None and unarmable["arms_in"] is None:
+    if unarmable is not None and unarmable["arms_in"] is None:  # `arm` cannot change to a mode that allows arming
         unless = f" unless {unarmable['unless']} allows it" if unarmable["unless"] else ""
         return [f"{autopilot.firmware} cannot arm in {unarmable['mode']}{unless}", *missing]
     sensors, estimator = vehicle.sensors.latest, vehicle.estimator.latest
     if missing and sensors is not None and sensors.prearm_checks_pass is False:
+        # The general reason is omitted if there are specific reasons.
         return [reason for reason in missing if len(missing) == 1 or reason != _CHECKS_FAIL]
     mode = vehicle.mode.latest
-    arms_in = unarmable["arms_in"] if unarmable is not None else None if mode is None else mode.name
+    arms_in = None if mode is None else mode.name
+    if unarmable is not None:  # `arm` would change the mode before
+        arms_in = unarmable["arms_in"]
     needs_position = bool(autopilot.modes_without_position) and arms_in not in (None, *autopilot.modes_without_position)
     if needs_position and estimator is not None and estimator.missing:
         change = "" if unarmable is None else ", to which Arm would change the mode"
@@ -287,7 +290,11 @@ def _is_flying_mission(vehicle: Vehicle) -> bool:
 
 
 def _unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
-    """Return the current mode if ``arm`` would leave it, the mode to arm in, and the parameter that permits arming."""
+    """Return data about the current mode if the vehicle cannot arm in it; None if it can.
+
+    ``arms_in`` is the mode to which ``arm`` would change, or None. ``unless`` is the parameter that permits arming in
+    the current mode.
+    """
     autopilot, mode = vehicle.autopilot, vehicle.mode.latest
     if mode is None or mode.name not in autopilot.unarmable_modes.union(autopilot.armable_by_option):
         return None

@@ -52,7 +52,7 @@ LOG_READERS: dict[str, Callable[[FlightLog, int | None, Callable[[int], object]]
     ".ulg": read_ulog_flight,
 }
 """Maps the suffix of a log to the function that reads it."""
-# Below this height above home, the vehicle may be on the ground. Slower sinking is noise.
+# A vehicle below this height above home may be on the ground. Sinking more slowly than this is noise.
 _FLYING_HEIGHT_M, _SINKING_M_S = 1.0, 0.3
 _SAME_ALTITUDE_M = 5.0  # both logged altitudes count as the same value if they differ by less than this
 
@@ -118,7 +118,7 @@ def _armed_at_end(flight: FlightLog) -> str:
     """Return a note that the log ends while the vehicle is armed, and on what is unknown for that reason."""
     note = "the log ends while the vehicle is armed"
     height_m = flight.track.at("altitude_relative_m", flight.duration_s, not_older_s=math.inf)
-    if height_m < _FLYING_HEIGHT_M:
+    if height_m < _FLYING_HEIGHT_M:  # False if the height is unknown (NaN)
         return note
     where = "" if math.isnan(height_m) else f", {height_m:.1f} m above home"
     sink_m_s = flight.velocity.at("down_m_s", flight.duration_s, not_older_s=math.inf)
@@ -145,6 +145,7 @@ def _complete_altitudes(flight: FlightLog) -> None:
             amsl_m = amsl[row]
             if math.isnan(relative_m):
                 relative[row] = amsl_m - home_amsl_m
+            # If home is near sea level, both altitudes are nearly the same anyway.
             elif abs(home_amsl_m) > _SAME_ALTITUDE_M and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
                 # The value is the altitude above sea level if it is closer to that of home than to 0; otherwise it is
                 # the altitude above home.

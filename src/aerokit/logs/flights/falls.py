@@ -121,4 +121,4 @@ def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
     ]
     texts = [text for text in flight.texts if begin_s - 3 <= text.time_s <= end_s + 5]
     crash_texts = dict.fromkeys(item.text for item in evidence_in_texts(texts) if item.kind in CRASH_KINDS)
-    return reasons + list(crash_texts)[:3]
+    return reasons + list(crash_texts)[:3]  # three texts are enough

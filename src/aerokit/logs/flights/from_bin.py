@@ -126,6 +126,7 @@ class _Tables:
                 continue
             row_format = reader.formats[number]
             index = row_format.columns.index("TimeUS")
+            # "Q" is a 64-bit integer. A row at the end of the file may be incomplete.
             if row_format.format[index] == "Q" and offsets[0] + row_format.len <= len(reader.data_map):
                 pattern = _struct_pattern(row_format, [index])
                 (time_us,) = struct.unpack_from(pattern, reader.data_map, offsets[0] + _HEADER_SIZE)
