@@ -226,6 +226,7 @@ class _TopicChannels:
                 self._send(name, now, link)
 
     def _publish_pose(self, system_id: int, vehicle: Vehicle) -> None:
+        """Send the location, and the pose in the map frame, which combines position and attitude."""
         position, attitude = vehicle.position.latest, vehicle.attitude.latest
         if position is None:
             return

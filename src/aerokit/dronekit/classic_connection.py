@@ -230,6 +230,7 @@ class BackgroundCalls:
             call.set_exception(ConnectionClosed(f"{call.kind}: {reason}"))
 
     async def _run(self, call: BackgroundCall, function: CoroutineFunction) -> None:
+        """Await the function, log its failure, and set the result of the call."""
         try:
             await function()
         except Exception as error:

@@ -106,6 +106,7 @@ class FlightMethods(VehicleAttributes):
         self._dk_change_armed(False, wait, timeout, "failed to disarm vehicle")
 
     def _dk_change_armed(self, value: bool, wait: bool, timeout: float | None, failure_text: str) -> None:
+        """Arm or disarm, unless the vehicle already reports the value and no opposite order is pending."""
         is_overruling = self._dk_is_changing_to(not value)
         if self._armed == value and not is_overruling:
             self._dk.check_link()

@@ -82,7 +82,7 @@ class ServedVehicle:
         try:
             self._loop.run_until_complete(self._serve())
         except Exception as error:
-            if self._startup_ended.is_set():
+            if self._startup_ended.is_set():  # otherwise __init__ raises the error
                 errprinter(f"the simulated vehicle failed: {error!r}")
             self._error = error
         finally:
@@ -195,7 +195,7 @@ class SITL:
 def start_default(lat: float | None = None, lon: float | None = None) -> SITL:
     """Start a copter near Canberra or at this position; InvalidArgument if only one coordinate is given."""
     if (lat is None) != (lon is None):
-        raise InvalidArgument("dronekit_sitl.start_default: give both lat and lon, or neither")
+        raise InvalidArgument("dronekit_sitl.start_default needs either both lat and lon or neither")
     sitl = SITL()
     heading_deg = 353  # required by the format of SITL's --home, but ignored
     sitl.launch([] if lat is None else [f"--home={lat:f},{lon:f},{HOME[2]},{heading_deg}"])

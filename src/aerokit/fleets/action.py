@@ -140,6 +140,7 @@ class FleetAction:
     # --------------------------------------------------------------------------------- one member
 
     async def _run_member(self, member: Member, delay_s: float) -> None:
+        """Execute the action with one member after a delay, and record its outcome."""
         task = asyncio.current_task()
         assert task is not None
         self._tasks[member.name] = task
@@ -178,7 +179,8 @@ class FleetAction:
             return
         self._failed[member.name] = self._outcomes[member.name] = error
         member.record_failure(self.name, error)
-        if self._is_safe or self._failed_first is not None or self._is_applying_policy or self._context.is_closed:
+        is_policy_applied = self._failed_first is not None or self._is_applying_policy
+        if self._is_safe or is_policy_applied or self._context.is_closed:
             return
         # _apply_policy() refreshes the other members, which may call _fail() for them, too. Only the first failure
         # applies the policy.
@@ -191,6 +193,7 @@ class FleetAction:
     # ------------------------------------------------------------------------------ other members
 
     def _apply_policy(self, failed: Member, error: Exception) -> None:
+        """Ask the policy about a failure, send its orders, and cancel the running actions of the ordered members."""
         for member in self._members:
             member.refresh()
         others = [member for member in self._members if member.name not in self._failed]
@@ -256,7 +259,7 @@ class FleetAction:
                 await member.vehicle.hold()
         except AerokitError as error:
             self._order_errors[member.name] = str(error)
-            member.refresh()
+            member.refresh()  # the order may have failed because of a lost link or a takeover
         finally:
             self._pending_orders -= 1
             if not self._pending_orders:

@@ -128,6 +128,7 @@ class DistanceMonitor:
         return positions
 
     def _on_too_close(self, first: Member, second: Member, distance_m: float) -> None:
+        """Order both members to hold, if this program flies them, and publish the event."""
         pair = (first, second)
         for member in pair:
             member.refresh()

@@ -385,6 +385,7 @@ class Formations(Travel):
         return Following(self._context, member, followers, formation, rate_hz, max_speed_m_s)
 
     def _leader_and_followers(self, formation: Formation, leader: str) -> tuple[Member, list[Member]]:
+        """Check a formation and its leader; return the leader and the followers."""
         for name in (leader, *formation.offsets):
             if name not in self.members:
                 raise InvalidArgument(

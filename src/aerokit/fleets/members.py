@@ -148,6 +148,7 @@ class Member:
     # --------------------------------------------------------------------------------- private
 
     def _takeover_reason(self) -> str:
+        """Return why the member counts as taken over; an empty string if it does not."""
         vehicle = self.vehicle
         if vehicle.is_confirmed_disarmed:  # a disarmed vehicle does not fly, so there is no control to take over
             return ""

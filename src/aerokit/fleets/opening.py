@@ -137,6 +137,7 @@ async def fleet(
 
 
 def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[str, Source]:
+    """Return all sources by name. Sources outside of mappings are named by their number."""
     sources_by_name: dict[str, Source] = {}
     for number, source in enumerate(sources, 1):
         entries = source if isinstance(source, Mapping) else {str(number): source}
@@ -170,6 +171,7 @@ def _members_of_vehicles(sources_by_name: Mapping[str, Source], networks: dict[s
 def _requested_ids(
     system_ids: Iterable[int] | Mapping[str, Iterable[int]] | None, networks: list[str]
 ) -> dict[str, list[int] | None]:
+    """Return the requested system ids of each network; None for a network: all that are found."""
     ids: dict[str, list[int] | None] = {name: None for name in networks}  # noqa: C420 - of a wider type
     by_network: dict[str, Iterable[int]] = {}
     if isinstance(system_ids, Mapping):

@@ -205,11 +205,9 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
 def _closest_inside(
     start_difference: Sequence[float], vector: Sequence[float], other_vector: Sequence[float]
 ) -> tuple[float, float] | None:
-    """Return s and t of the closest points of two lines.
+    """Return s and t of the closest points of two lines; None if a point is outside of its leg, or they are parallel.
 
-    None if a closest point is outside of its leg, or if the lines are parallel.
-
-    At these points, the derivatives of the squared distance with respect to s and t are 0.
+    At the closest points, the derivatives of the squared distance with respect to s and t are 0.
     """
     aa, bb, ab = _dot(vector, vector), _dot(other_vector, other_vector), _dot(vector, other_vector)
     determinant = aa * bb - ab * ab

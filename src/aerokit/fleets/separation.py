@@ -171,6 +171,7 @@ def separate_by_time(
 def _conflicts(
     routes: Sequence[Route], stationary: Mapping[str, LocalPoint], min_distance_m: float
 ) -> tuple[Conflict, ...]:
+    """Return the conflicts of routes with each other and with stationary vehicles, regardless of time."""
     _check_distance(min_distance_m)
     # Times are ignored here, so the paths can have any speed.
     paths = [Path.straight(route.name, route.start, route.target, 1.0) for route in routes]

@@ -48,8 +48,7 @@ __all__ = [
 # Speed of the correction towards the track, per metre of deviation, in 1/s.
 TRACK_GAIN = 0.8
 
-# Speed limit of a vehicle: CATCH_UP_FACTOR times the track's speed or CATCH_UP_M_S, whichever is larger, plus
-# CATCH_UP_M_S.
+# Speed limit: CATCH_UP_FACTOR times the track's speed or CATCH_UP_M_S (the larger), plus CATCH_UP_M_S.
 CATCH_UP_FACTOR, CATCH_UP_M_S = 1.5, 1.0
 
 CONFLICT_SLACK_S = 0.5
@@ -201,6 +200,7 @@ def max_relative_error(
 
 
 def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> LocalPoint | None:
+    """Return the position at a time, interpolated between samples; None outside of their times."""
     for (start_s, start), (end_s, end) in pairwise(samples):
         if start_s <= at_s <= end_s:
             fraction = 0.0 if end_s == start_s else (at_s - start_s) / (end_s - start_s)
@@ -218,8 +218,7 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
 class TrackRecorder:
     """Records the positions of a vehicle (GLOBAL_POSITION_INT) in its ``with`` block: seconds of the show, and metres.
 
-    The times are those of the vehicle's own clock (``time_boot_ms``), converted with the measured offset. If the result
-    is implausible, the time of arrival is used.
+    Times are from the vehicle's clock (``time_boot_ms``), or those of arrival if the measured offset does not fit it.
     """
 
     def __init__(

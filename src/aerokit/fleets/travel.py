@@ -142,6 +142,7 @@ class Travel(SelectionBase):
         names: tuple[str, ...] = (),
         max_distance_m: float = MAX_DISTANCE_M,
     ) -> FleetResult:
+        """Fly members to their targets, directly or with the planned separation."""
         if separation is None and self._context.min_distance_m is not None:
             separation = self.plan_separation(targets, speed_m_s=speed_m_s)
         if separation is None or separation.decision == "clear":
@@ -156,6 +157,7 @@ class Travel(SelectionBase):
     def _resolve_targets(
         self, targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home]
     ) -> dict[str, Position]:
+        """Return the targets by member name. A function of targets is called for available members only."""
         for member in self:
             member.refresh()
         if callable(targets):

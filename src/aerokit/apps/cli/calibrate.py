@@ -93,7 +93,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 async def _run(options: argparse.Namespace) -> int:
     if options.sensor == "escs" and not options.propellers_removed:
-        raise InvalidArgument("escs: the motors get full throttle: remove the propellers and add --propellers-removed")
+        raise InvalidArgument("escs: the motors get full throttle; remove the propellers and add --propellers-removed")
     async with connect_to(
         options,
         options.address,

@@ -267,6 +267,7 @@ class Monitor(App[None]):
         return size.width, size.height
 
     def _show_map(self, widget: Panel) -> None:
+        """Draw the map again if its size, a marker or a track has changed."""
         model, size = self._model, widget.content_size
         homes = []
         for vehicle in model.vehicles.values():  # a home is shown only together with a track

@@ -220,6 +220,7 @@ class MqttLink(BaseLink):
             self._connect_result.set_result(text)
 
     def _release(self) -> None:
+        """Close the connection, and publish "offline" if that is possible without waiting."""
         client, self._client = self._client, None
         self._unsent.clear()
         if self._timer is not None:

@@ -86,6 +86,7 @@ class Publishing:
         return now - self._sent.get(name, (-math.inf, None))[0] >= REPEAT_INTERVAL_S
 
     def _publish(self, name: str, value: object, age_s: float, now: float) -> None:
+        """Publish a state, unless its value is unchanged and a repetition is not due."""
         if name in self._sent and self._sent[name][1] == value and not self._is_repeat_due(name, now):
             return
         self._sent[name] = (now, value)

@@ -139,7 +139,7 @@ def _refuse_constant(constant: str) -> NoReturn:
 def _object_without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) < len(pairs):
-        raise ValueError("an object has a duplicate name")
+        raise ValueError("an object contains the same name twice")
     return result
 
 

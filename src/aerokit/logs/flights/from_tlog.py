@@ -272,6 +272,7 @@ class _Reader:
         self._system_status = status
 
     def _count_other_heartbeat(self, time_s: float, system_id: int, raw: bytes) -> None:
+        """Record a ground station's heartbeat, or that the log contains another vehicle."""
         vehicle_type = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]  # empty if the frame is too short
         if vehicle_type == bytes((MavType.GCS,)):
             self._flight.gcs_heartbeats.append(time_s)
@@ -390,6 +391,7 @@ class _Reader:
         self._add_velocity_target(time_s, message)
 
     def _on_local_target(self, time_s: float, message: m.PositionTargetLocalNed) -> None:
+        """Add a local set-point, converted with the newest local and global positions of the vehicle."""
         if message.type_mask & _NO_POSITION != _NO_POSITION:
             local_north, local_east, local_down = self._local_position
             north, east, down = message.x - local_north, message.y - local_east, message.z - local_down

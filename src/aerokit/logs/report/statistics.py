@@ -175,6 +175,7 @@ def _max(values: list[float]) -> float | None:
 
 
 def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> float:
+    """Return the length in metres of the track's parts in these rows, without steps that are noise."""
     length_m = 0.0
     counted: tuple[float, float] | None = None  # the point up to which `length_m` counts
     for previous_row, row in pairwise([-2, *rows]):  # -2: the first row has no previous row
