@@ -226,7 +226,7 @@ class VehicleAttributes(VehicleCore):
         if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False
         aio = self._dk.aio_or_none
-        if aio is not None and aio.autopilot.prearm_depends_on_mode:  # PX4
+        if aio is not None and aio.autopilot.prearm_depends_on_mode:  # PX4, whose checks are a bit of SYS_STATUS
             status = self._dk_sys_status.message
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         # Like DroneKit: any fix (2D or better), and a predicted position of the estimator.

@@ -108,7 +108,7 @@ class Channels(_ChannelDict):
 
     # --------------------------------------------------------------------------------- private
 
-    if not TYPE_CHECKING:  # type checkers expect the types that dict has
+    if not TYPE_CHECKING:  # hidden from type checkers, because dict has these methods with other types
         __setitem__, __delitem__, __ior__ = map(_unsupported, ("__setitem__", "__delitem__", "__ior__"))
         clear, pop, popitem = map(_unsupported, ("clear", "pop", "popitem"))
         setdefault, update = map(_unsupported, ("setdefault", "update"))

@@ -245,7 +245,7 @@ class BackgroundCalls:
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
-    # One iteration later, so that tasks which earlier calls have just created send their first messages before.
+    # Called one iteration later, so that tasks of earlier calls, which were just created, send their messages before.
     asyncio.get_running_loop().call_soon(function, *args)
 
 

@@ -38,7 +38,7 @@ PARAM_FIELDS: list[str] = FIELDS[7:11]
 # Fields whose change makes a mission different from the vehicle's mission.
 CONTENT_FIELDS: tuple[str, ...] = ("frame", "command", "autocontinue", *FIELDS[7:])
 AMSL_FRAMES = (0, 5)  # MAV_FRAME_GLOBAL and MAV_FRAME_GLOBAL_INT
-# The first row of a waypoint file counts as home within this distance from home (about ten metres horizontally).
+# The first row of a waypoint file counts as home if it is this close to home; 1e-4 degrees are about ten metres.
 HOME_TOLERANCE_DEG, HOME_TOLERANCE_M = 1e-4, 2.0
 
 

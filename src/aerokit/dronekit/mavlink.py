@@ -257,7 +257,7 @@ def _raise_classic(error: LinkOpenError) -> NoReturn:
         if cause.errno is not None:
             raise type(cause)(cause.errno, str(error)) from error
         raise type(cause)(str(error)) from error
-    if isinstance(cause, ValueError):  # pyserial: unsupported baud rate
+    if isinstance(cause, ValueError):  # raised by pyserial for an unsupported baud rate
         raise ValueError(str(error)) from error
     raise error
 

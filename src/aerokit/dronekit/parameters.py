@@ -40,7 +40,7 @@ READ_TIMEOUT_S = 30.0
 RETRY_DELAY_S = 1.0
 
 # An attempt to set a parameter takes ROUND_TRIPS round trips of the link, at least MIN_ATTEMPT_S. After the last
-# attempt, the answer is awaited for this share of the time of an attempt.
+# attempt, the answer is awaited for LAST_WAIT_SHARE of an attempt's time.
 MIN_ATTEMPT_S, ROUND_TRIPS = 1.0, 3
 LAST_WAIT_SHARE = 0.5
 

@@ -279,7 +279,7 @@ def _run_file(path: str, arguments: Sequence[str]) -> None:
     if os.path.isdir(path) or path.endswith(".pyc") or zipfile.is_zipfile(path):
         runpy.run_path(path, run_name="__main__")
         return
-    # Without runpy, which removes the module `__main__` at the end, although threads of the program may still need it.
+    # Does not use runpy, which removes the module `__main__` at the end, although threads may still need it.
     path = os.path.abspath(path)
     with io.open_code(path) as file:
         source = file.read()

@@ -409,7 +409,7 @@ async def _fly_track(
         async with vehicle.guided.velocity(rate_hz=rate_hz) as stream:
             while (at_s := vehicle.connection.now() - begin_at) < path.ends_at_s:
                 if at_s < 0 and not recorder.has_position:
-                    stream.set(VelocitySetpoint())  # velocity 0, until the first position arrives
+                    stream.set(VelocitySetpoint())  # a velocity of 0, until the first position arrives
                 else:
                     stream.set(_setpoint(path, at_s, lead_s, recorder.extrapolated_position()))
                 await anyio.sleep(period_s)

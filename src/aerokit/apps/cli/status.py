@@ -81,7 +81,7 @@ def _vehicle_lines(vehicle: Vehicle, found: Readiness) -> list[str]:
 
 def _readiness(vehicle: Vehicle, found: Readiness) -> list[str]:
     lines = readiness_lines(vehicle, found)
-    if lines and vehicle.armed.latest:  # arming checks do not apply
+    if lines and vehicle.armed.latest:  # the checks before arming do not matter in flight
         return _aligned("missing", [*found.against_arming, *found.against_flight])
     if lines:
         return _aligned("arming", [text.replace("arm() changes to", "aerokit changes to") for text in lines])

@@ -156,7 +156,7 @@ class MqttLink(BaseLink):
         client.on_socket_close = self._on_socket_close
         loop.add_reader(sock, self._read, client, sock)
         self._poll(client)
-        # Without asyncio.wait_for, which before Python 3.12 could lose a cancellation.
+        # Does not use asyncio.wait_for, which before Python 3.12 could lose a cancellation.
         await asyncio.wait((self._connect_result,), timeout=CONNECT_TIMEOUT_S)
         if self._connect_result.done():
             refusal = self._connect_result.result()

@@ -489,7 +489,7 @@ def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any
 
 
 async def _wait_until_ended(record: OrderRecord, timeout_s: float | None) -> None:
-    # Without asyncio.wait_for, which before Python 3.12 could lose a cancellation.
+    # Does not use asyncio.wait_for, which before Python 3.12 could lose a cancellation.
     waiting = asyncio.ensure_future(record.ended.wait())
     try:
         await asyncio.wait((waiting,), timeout=timeout_s)

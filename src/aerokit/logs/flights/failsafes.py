@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 # Pieces of evidence of the same kind belong to one failsafe if they are at most this time apart.
 _SAME_KIND_GAP_S = 8.0
-# Evidence of the kind "general" belongs to the failsafe of specific evidence if they are at most this time apart.
+# Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart.
 _GENERAL_GAP_S = 3.0
 _REACTION_TIMEOUT_S = 12.0
 # Values measured at most this time before a failsafe are shown with it.
 _BEFORE_S = 10.0
 # A mode change within this time after a failsafe is attributed to the autopilot, even if the log has no cause.
 _AUTOPILOT_REACTION_S = 3.0
-# Kinds of crashes and failures for which autopilots disarm.
+# The kinds of failsafes (crashes and failures) at which autopilots disarm.
 CRASH_KINDS: frozenset[str] = frozenset(("crash", "thrust", "motor", "termination"))
 
 

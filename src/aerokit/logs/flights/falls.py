@@ -13,10 +13,11 @@ if TYPE_CHECKING:
 
     from aerokit.logs.flights.flight import FlightLog
 
-# Autopilots land at 0.5 to 2 m/s, and descend at 1.5 m/s by default (ArduPilot WP_SPD_DN, PX4 MPC_Z_VEL_MAX_DN).
+# Slower descents do not count, and a descent ends below _STOPPED_M_S. Autopilots land at 0.5 to 2 m/s, and descend at
+# 1.5 m/s by default (ArduPilot WP_SPD_DN, PX4 MPC_Z_VEL_MAX_DN).
 _MIN_SINK_M_S, _STOPPED_M_S = 3.0, 1.0
 _MIN_HEIGHT_M = 2.0
-# Free fall reaches this speed after two metres.
+# With a higher sink rate, an impact is a fall, not a hard landing. Free fall reaches this speed after two metres.
 _FALL_SINK_M_S = 6.0
 # An impact on the ground stops a vehicle within this time. Motors need longer to stop a fast descent.
 _IMPACT_S = 0.6

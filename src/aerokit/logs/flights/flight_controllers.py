@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _MAGIC = b"\xa3\x95"
-_MAX_UNREADABLE_TAIL = 4096  # this many bytes at the end are not reported, because power-off may have cut rows off
+_MAX_UNREADABLE_TAIL = 4096  # up to this many bytes at the end are ignored: power-off may cut off rows
 _NO_UTC = "no GNSS time in the log: times count from power-on, which is shown as 1970-01-01"
 _A_YEAR_S = 365 * 86_400.0
 _MAX_UNIX_S = 4_102_444_800.0  # the year 2100; `aerokit.mavlink.tlog` has the same limit

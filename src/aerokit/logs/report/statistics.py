@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 # Shorter steps do not add to the length of the track, because they are noise of a stationary vehicle.
 _MIN_STEP_M = 1.0
 _MAX_LISTED = 5
-# A hovering multicopter needs 20 to 60 % throttle, so more than this in a descent is unusual.
+# A hovering multicopter needs 20 to 60 % throttle, so 90 % in a descent is unusual.
 _HIGH_THROTTLE_PERCENT, _HIGH_ATTITUDE_ERROR_DEG = 90.0, 20.0
 # If the throttle or current in a descent is below this share of the value before, the motors have less power than a
 # controlled descent needs.
