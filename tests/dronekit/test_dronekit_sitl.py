@@ -90,7 +90,7 @@ def test_sitl_port_in_use_raises() -> None:
 def test_sitl_invalid_position_or_system_raises() -> None:
     with pytest.raises(InvalidArgument, match="both lat and lon"):
         start_default(lat=1.0)
-    with pytest.raises(InvalidArgument, match="not one of"):
+    with pytest.raises(InvalidArgument, match="one of copter"):
         SITL().download("boat", "stable")
 
 

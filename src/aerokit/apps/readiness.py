@@ -13,7 +13,7 @@ _OWN_FLIGHT_PURPOSES: tuple[Literal["setpoint", "mission", "return"], ...] = ("s
 
 
 class Readiness(NamedTuple):
-    """Why a disarmed vehicle cannot arm or fly: reasons in two groups, without duplicates."""
+    """Reasons why a disarmed vehicle cannot arm or fly, in two groups without duplicates."""
 
     against_arming: tuple[str, ...]
     """Reasons why the vehicle refuses to arm in its present mode."""

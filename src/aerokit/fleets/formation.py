@@ -176,7 +176,7 @@ class Following:
 
     @property
     def reason(self) -> str:
-        """Why following has stopped early; an empty string if it has not."""
+        """The reason for which following has stopped early; an empty string if it has not."""
         return self._reason
 
     def error_m(self, name: str) -> float:

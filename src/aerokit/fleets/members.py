@@ -53,7 +53,7 @@ class Member:
         self.state: MemberState = MemberState.ACTIVE
         """The member's state in the fleet."""
         self.reason: str = ""
-        """Why the member is in this state; empty in the state ACTIVE."""
+        """The reason for this state; empty in the state ACTIVE."""
         self._lost_at = 0.0
         # The vehicle's newest order and its mode at the time of `reclaim`. The member does not count as taken over as
         # long as both are the same.

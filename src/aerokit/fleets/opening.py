@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("aerokit")
 
 TooCloseAction = Literal["hold", "report"]
-"""What the fleet does if two members come too close to each other in flight."""
+"""The fleet's reaction if two members come too close to each other in flight."""
 Source = str | Link | Connection | Vehicle
 
 DISCOVERY_S = 2.5  # long enough for two heartbeats at 1 Hz, because one may be lost

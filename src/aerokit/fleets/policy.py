@@ -40,7 +40,7 @@ class MemberFailure(Snapshot):
 
 
 PolicyDecision = PolicyName | Mapping[str, PolicyOrder] | None
-"""What a policy function returns: a built-in policy, a mapping of members to orders, or None (the others continue)."""
+"""Result of a policy function: a built-in policy, a mapping of members to orders, or None (the others continue)."""
 
 Policy = PolicyName | Callable[[MemberFailure], PolicyDecision]
 """A built-in policy, or a function. The function is called on the event loop and must not block."""

@@ -29,7 +29,7 @@ from aerokit.position import Home, Position, travel_target
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
 SeparationMethod = Literal["layers", "corridors", "refuse"]
-"""How crossing paths are separated: by altitude (layers), by time (corridors), or not at all (refuse)."""
+"""Method to separate crossing paths: by altitude (layers), by time (corridors), or not at all (refuse)."""
 
 
 @checks_arguments

@@ -64,7 +64,7 @@ class Following(BlockTwin["AsyncFollowing"]):
 
     @property
     def reason(self) -> str:
-        """Why following has stopped early; an empty string if it has not."""
+        """The reason for which following has stopped early; an empty string if it has not."""
         return self.aio.reason
 
     def error_m(self, name: str) -> float:

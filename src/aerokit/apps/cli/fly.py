@@ -53,7 +53,7 @@ class PlanFlight(SupervisedFlight):
         super().__init__(vehicle, report, interrupts, options.on_interrupt)
         self._plan, self._options, self._report = plan, options, report
         self.sent: str = _NOTHING_SENT
-        """What was sent to the vehicle before arming, for the message after Ctrl-C."""
+        """Words for what was sent to the vehicle before arming, for the message after Ctrl-C."""
 
     async def _fly(self) -> int:
         vehicle = self._vehicle

@@ -34,7 +34,7 @@ class Fall(Snapshot):
     begins_s: float
     """Start of the descent."""
     height_m: float
-    """How far the vehicle descended."""
+    """Height that the vehicle lost."""
     sink_m_s: float
     """Sink rate at the end of the descent."""
     is_hard_landing: bool

@@ -127,7 +127,7 @@ class ModeChange(Snapshot):
     time_s: float
     name: str
     reason: str = ""
-    """Why the mode changed, such as ``"battery failsafe"``; empty if the log does not contain the reason."""
+    """Reason for the change, such as ``"battery failsafe"``; empty if the log does not contain the reason."""
     by_autopilot: bool | None = None
     """True if the autopilot itself changed the mode; None if the log does not show who changed it."""
 

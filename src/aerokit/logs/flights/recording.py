@@ -38,7 +38,7 @@ class ClockComparison:
 
     @property
     def speed(self) -> float:
-        """How many seconds the vehicle's clock advances in a recorded second; 1 if the log is too short to compare."""
+        """Seconds by which the vehicle's clock advances in a recorded second; 1 if the log is too short to compare."""
         if min(self._recorded_s, self._vehicle_s) < _MIN_CLOCK_COMPARISON_S:
             return 1.0
         return self._vehicle_s / self._recorded_s

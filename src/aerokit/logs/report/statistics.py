@@ -65,7 +65,7 @@ class FlightStatistics(Snapshot):
     max_hdop: float | None
     max_vibration_m_s2: float | None
     clips: float | None
-    """How often an accelerometer reached its limit."""
+    """Number of times that an accelerometer reached its limit."""
     max_estimator_ratio: float | None
     """Maximum innovation test ratio. Above 1, the estimator rejects a measurement."""
     lost_percent: float | None
