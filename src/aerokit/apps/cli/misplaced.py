@@ -51,6 +51,7 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
     if parser._subparsers is not None:
         return _address_before_action(parser, words) if words and is_address(words[0]) else None
     has_connect = "--connect" in parser._option_string_actions
+    # Some commands take the address as a positional argument, without --connect.
     if not has_connect and any("address" in action.dest or action.dest == "endpoints" for action in parser._actions):
         is_connected = any(word.partition("=")[0] == "--connect" for word in words)
         line = shlex.join([*command, *(word.removeprefix("--connect=") for word in words if word != "--connect")])

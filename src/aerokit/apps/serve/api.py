@@ -166,6 +166,7 @@ def _operation(operation: Operation) -> dict[str, Any]:
         },
     }
     if not operation.is_open:
+        # In OpenAPI, {} means that a request without a token may be allowed, too.
         description["security"] = [{"token": []}] if is_order else [{"token": []}, {}]
     if is_order:
         description["responses"]["202"] = {"description": "running (wait=false)", "content": _json(answer)}

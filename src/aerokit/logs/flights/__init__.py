@@ -102,7 +102,7 @@ def _complete(flight: FlightLog) -> None:
     is_armed_at_end = bool(flight.armed) and math.isinf(flight.armed[-1][1])
     if is_armed_at_end:
         flight.armed[-1] = (flight.armed[-1][0], flight.duration_s)
-    if flight.home is None and len(flight.track):
+    if flight.home is None and len(flight.track):  # use the position at the first arming, or else the first position
         first_armed_row = max(flight.track.index_at(flight.armed[0][0]), 0) if flight.armed else 0
         columns = ("latitude_deg", "longitude_deg", "altitude_amsl_m")
         position = (flight.track[name][first_armed_row] for name in columns)

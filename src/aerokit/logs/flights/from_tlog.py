@@ -259,8 +259,8 @@ class _Reader:
         flight.add_mode(
             time_s,
             self._autopilot.mode_of(message).name,
-            "ordered" if was_commanded else "",
-            False if was_commanded else None,
+            reason="ordered" if was_commanded else "",
+            by_autopilot=False if was_commanded else None,
         )
         armed = is_armed(message.base_mode)
         flight.set_armed(time_s, armed)
