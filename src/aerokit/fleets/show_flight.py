@@ -372,7 +372,7 @@ class Shows(Travel):
                 raise InvalidArgument(f"show: {short_repr(name)} is not a member; members: {', '.join(self.members)}")
         if origin.altitude_amsl_m is not None:
             return LocalOrigin(origin), origin.altitude_amsl_m
-        first_member = self.members[next(iter(show.tracks))]
+        first_member = self.members[next(iter(show.tracks))]  # its home defines the altitude
         above_home = origin.replace(altitude_relative_m=origin.altitude_relative_m or 0.0)
         return LocalOrigin(origin), altitude_amsl(first_member, above_home)
 

@@ -143,6 +143,7 @@ class BinReader(_RowReader):
             fields.pop("mavpackettype", None)
             if table not in ("FMT", "FMTU") and self._is_plausible_time(message._timestamp):
                 self._note_time(message._timestamp)
+                # A .bin contains no system and component id, so both are 1.
                 yield LogRecord(message._timestamp, 1, 1, table, fields, _ardupilot_states(table, fields, reader))
         if not count:
             raise FileFormatError(f"{self.path} is not an ArduPilot log: it contains no message")
