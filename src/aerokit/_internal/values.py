@@ -22,7 +22,7 @@ else:  # typing_extensions takes longer to import than this package
 
 @dataclass_transform(frozen_default=True)
 class _SnapshotType(type):
-    """Turns annotated names into slots and generates ``__init__``. The module must postpone annotations."""
+    """Turns annotated names into slots and generates ``__init__``. Needs ``from __future__ import annotations``."""
 
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> _SnapshotType:
         annotations: dict[str, str] = namespace.get("__annotations__", {})
@@ -34,7 +34,7 @@ class _SnapshotType(type):
         if own_fields:
             type.__setattr__(cls, "__init__", _lazy_init(cls))
         type.__setattr__(cls, "_defaults", defaults)
-        # attrgetter needs a name. Values without fields are all equal, as their class is.
+        # attrgetter needs at least one name. In a class without fields, all values are equal, like their __class__.
         type.__setattr__(cls, "_values", attrgetter(*(fields or ("__class__",))))
         return cls
 
@@ -53,7 +53,7 @@ class _SnapshotType(type):
 
 
 def _lazy_init(cls: Any) -> Callable[..., None]:
-    # A program creates values of few classes, so __init__ is generated at the first call.
+    # __init__ is generated when it is first called, because a program creates values of only a few of these classes.
     def generate_and_call(self: object, *args: Any, **kwargs: Any) -> None:
         init = _generate_init(cls)
         type.__setattr__(cls, "__init__", init)
@@ -119,5 +119,5 @@ class Snapshot(metaclass=_SnapshotType):
 
 
 def _short(value: object) -> str:
-    # Seven decimal places of a degree are a centimetre on earth.
+    # Seven decimal places suffice: 1e-7 degrees are about a centimetre on earth.
     return repr(round(value, 7) if isinstance(value, float) else value)

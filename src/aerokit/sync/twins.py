@@ -795,7 +795,7 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
 
         Raises:
             InvalidArgument: a value is out of range; nothing was sent.
-            SetpointStreamStopped: the block was left or not entered.
+            SetpointStreamStopped: the `async with` block of this stream was left, or not entered.
             ValueUnknownError: PX4's attitude or local position is unknown, which a landing target requires.
             ConnectionClosed: the connection has ended.
         """
@@ -811,14 +811,14 @@ class External(TwinOf["AsyncExternal"]):
     """
 
     def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
-        """Supply pose and velocity (ODOMETRY). ArduPilot needs VISO_TYPE, PX4 EKF2_EV_CTRL."""
+        """Supply pose and velocity (ODOMETRY). Set VISO_TYPE on ArduPilot, EKF2_EV_CTRL on PX4."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.odometry, rate_hz=rate_hz, valid_for_s=valid_for_s),
         )
 
     def vision_position(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
-        """Supply a pose (VISION_POSITION_ESTIMATE). ArduPilot needs VISO_TYPE, PX4 EKF2_EV_CTRL."""
+        """Supply a pose (VISION_POSITION_ESTIMATE). Set VISO_TYPE on ArduPilot, EKF2_EV_CTRL on PX4."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.vision_position, rate_hz=rate_hz, valid_for_s=valid_for_s),
@@ -839,13 +839,13 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def gps(self, *, rate_hz: float = 5.0, valid_for_s: float = 0.5) -> MeasurementStream[GpsMeasurement]:
-        """Supply a satellite position (GPS_INPUT). ArduPilot needs GPS1_TYPE 14; PX4 does not read it."""
+        """Supply a satellite position (GPS_INPUT). Set GPS1_TYPE to 14 on ArduPilot; PX4 does not read GPS_INPUT."""
         return MeasurementStream(self._loop, self._loop.call(self.aio.gps, rate_hz=rate_hz, valid_for_s=valid_for_s))
 
     def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:
         """Supply distances around the vehicle (OBSTACLE_DISTANCE).
 
-        ArduPilot needs PRX1_TYPE 2, PX4 needs CP_DIST above 0.
+        Set PRX1_TYPE to 2 on ArduPilot, CP_DIST above 0 on PX4.
         """
         return MeasurementStream(
             self._loop,
@@ -853,14 +853,14 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def obstacle_points(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstaclePoints]:
-        """Supply positions of obstacles (OBSTACLE_DISTANCE_3D). ArduPilot needs PRX1_TYPE 2; PX4 does not read them."""
+        """Supply positions of obstacles (OBSTACLE_DISTANCE_3D) to ArduPilot. Set PRX1_TYPE to 2. PX4 does not read it."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.obstacle_points, rate_hz=rate_hz, valid_for_s=valid_for_s),
         )
 
     def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
-        """Supply a distance (DISTANCE_SENSOR). ArduPilot needs RNGFND1_TYPE 10 and RNGFND1_ORIENT."""
+        """Supply a distance (DISTANCE_SENSOR). On ArduPilot, set RNGFND1_TYPE to 10, and RNGFND1_ORIENT."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.range_finder, rate_hz=rate_hz, valid_for_s=valid_for_s),
@@ -872,7 +872,7 @@ class External(TwinOf["AsyncExternal"]):
         rate_hz: float = 20.0,
         valid_for_s: float = 0.3,
     ) -> MeasurementStream[TargetMeasurement]:
-        """Supply the position of a landing target (LANDING_TARGET). ArduPilot needs PLND_ENABLED and PLND_TYPE 1.
+        """Supply the position of a landing target (LANDING_TARGET). On ArduPilot, set PLND_ENABLED and PLND_TYPE to 1.
 
         ``vehicle.land_on`` opens this stream itself and lands the vehicle.
         """
@@ -884,7 +884,7 @@ class External(TwinOf["AsyncExternal"]):
     def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
         """Supply optical flow (OPTICAL_FLOW; for PX4 OPTICAL_FLOW_RAD).
 
-        ArduPilot needs FLOW_TYPE 5, PX4 EKF2_OF_CTRL.
+        Set FLOW_TYPE to 5 on ArduPilot, EKF2_OF_CTRL on PX4.
         """
         return MeasurementStream(
             self._loop,
@@ -899,9 +899,10 @@ class External(TwinOf["AsyncExternal"]):
         speed_accuracy_m_s: float = 1.0,
         direction_accuracy_deg: float = 15.0,
     ) -> None:
-        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE); returns at the acknowledgement.
+        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE). Returns when the vehicle acknowledges it.
 
-        No message reports the effect. ArduPilot uses the estimate in its simpler estimator (DCM), PX4 in EKF2.
+        No message reports whether the vehicle uses it. ArduPilot uses the wind in its simpler estimator (DCM), PX4 in
+        EKF2.
 
         Args:
             speed_m_s: horizontal speed, 0 to 100.
@@ -931,7 +932,7 @@ class External(TwinOf["AsyncExternal"]):
 
         Args:
             origin: latitude, longitude and altitude above mean sea level.
-            timeout: seconds until the vehicle reports it.
+            timeout: seconds to wait until the vehicle reports the origin.
 
         Raises:
             InvalidArgument: the origin has no altitude above mean sea level. Nothing was sent.
@@ -3735,7 +3736,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def vtol_state(self) -> StateCell[int]:
-        """MAV_VTOL_STATE: 1 to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
+        """MAV_VTOL_STATE: 1 becomes fixed wing, 2 becomes multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
         return StateCell(self._loop, self.aio.vtol_state)
 
     @cached_property
@@ -3795,7 +3796,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def batteries(self) -> StateCell[tuple[Battery, ...]]:
-        """All batteries (BATTERY_STATUS, else SYS_STATUS)."""
+        """All batteries (BATTERY_STATUS, or SYS_STATUS if that is missing)."""
         return StateCell(self._loop, self.aio.batteries)
 
     @cached_property
@@ -4989,13 +4990,13 @@ class Vehicle(VehicleTwin):
     def camera(self) -> Camera:
         """The first camera found. Cameras attached to the autopilot come after cameras with their own component id.
 
-        A call to this object waits briefly until a camera is found. ``camera_at`` returns any other camera.
+        The calls of this object wait briefly until a camera is found. ``camera_at`` returns any other camera.
         """
         return self._part("camera", Camera)
 
     @property
     def cameras(self) -> StateCell[tuple[int, ...]]:
-        """The numbers of the cameras found so far, for ``camera_at``.
+        """The numbers of the cameras found so far. Pass a number to ``camera_at`` to get the camera.
 
         A number is a component id (100 to 105), or 1 to 6 for a camera attached to the autopilot that has reported a
         picture.
@@ -5036,7 +5037,7 @@ class Vehicle(VehicleTwin):
                 Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
             rate_hz: transmission rate of the latest positions, 2 to 400.
             valid_for_s: seconds for which the latest positions are repeated; the stream stops after that.
-            max_lag_s: maximum delay of the event loop in seconds; the stream stops above it.
+            max_lag_s: the stream stops if the event loop is blocked for more than this many seconds.
 
         Raises:
             InvalidArgument: a rate or a time is out of range, or the autopilot has no such mode.
@@ -5067,7 +5068,7 @@ class Vehicle(VehicleTwin):
         timeout: float | None = 300.0,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> LandingReport:
-        """Land on a target that your program sees; returns on the ground, disarmed, with a report of the landing.
+        """Land on a target that your program sees. Returns a report when the vehicle is on the ground and disarmed.
 
         aerokit streams LANDING_TARGET, and the autopilot's own mode lands: LAND with PLND_ENABLED on ArduCopter,
         PRECLAND on PX4. If the target is lost, the autopilot decides. ArduCopter retries, or lands where it is
@@ -5079,9 +5080,9 @@ class Vehicle(VehicleTwin):
             target: a function or coroutine function that returns a :class:`aerokit.TargetMeasurement`, or None while
                 the target is not visible; or an asynchronous iterable of such results.
             rate_hz: rate at which the function is called, and the highest rate of LANDING_TARGET.
-            acquire_timeout: seconds to wait until the target is visible. The landing is ordered only then.
-            timeout: seconds until the vehicle is on the ground and disarmed; None: no limit.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            acquire_timeout: seconds to wait until the target is visible. Once it is visible, the landing is ordered.
+            timeout: seconds until the vehicle must be on the ground and disarmed; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             InvalidArgument: a rate or a time is out of range, or the target is of another type.
@@ -5169,19 +5170,19 @@ class Vehicle(VehicleTwin):
         return self._loop.run(self.aio.return_altitude)
 
     def set_return_altitude(self, altitude_m: float) -> None:
-        """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
+        """Set the altitude at which the vehicle returns to launch. Returns when the vehicle has confirmed the value.
 
         Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
         higher than this when the return starts keeps its height.
 
         Args:
-            altitude_m: metres above home, above 0, at most 3,000. Q_RTL_ALT holds whole metres only.
+            altitude_m: metres above home, above 0, at most 3,000. The parameter Q_RTL_ALT can hold only whole metres.
 
         Raises:
             InvalidArgument: the altitude is out of range, or has a fraction that the parameter cannot hold.
             NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
             ParameterRejected: the vehicle has no such parameter, or kept the previous value.
-            ParameterTimeout: not confirmed, but it may have been set.
+            ParameterTimeout: the vehicle did not confirm the new value, but may have stored it.
         """
         self._loop.run(self.aio.set_return_altitude, altitude_m)
 

@@ -157,7 +157,7 @@ async def test_block_left_with_stream_in_other_task_holds() -> None:
             stream = await vehicle.guided.velocity().__aenter__()
         with pytest.raises(SetpointStreamStopped, match="the block of its vehicle was left"):
             stream.set(VelocitySetpoint())
-        with pytest.raises(ConnectionClosed, match="the block of this vehicle was left; nothing was sent"):
+        with pytest.raises(ConnectionClosed, match="the async with block of this vehicle was left; nothing was sent"):
             vehicle.send(Heartbeat(6, 8, 0, 0, 4))
         await anyio.sleep(1.0)
         assert copter.mode.number == CopterMode.BRAKE
