@@ -853,7 +853,7 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def obstacle_points(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstaclePoints]:
-        """Supply positions of obstacles (OBSTACLE_DISTANCE_3D) to ArduPilot. Set PRX1_TYPE to 2. PX4 does not read it."""
+        """Supply positions of obstacles (OBSTACLE_DISTANCE_3D). Only ArduPilot reads them: set PRX1_TYPE to 2."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.obstacle_points, rate_hz=rate_hz, valid_for_s=valid_for_s),
@@ -3736,7 +3736,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def vtol_state(self) -> StateCell[int]:
-        """MAV_VTOL_STATE: 1 becomes fixed wing, 2 becomes multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
+        """MAV_VTOL_STATE: 1 changing to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
         return StateCell(self._loop, self.aio.vtol_state)
 
     @cached_property

@@ -81,7 +81,7 @@ class External:
         return self._stream("obstacles", ObstacleSectors, self._encode.obstacles, rate_hz, valid_for_s)
 
     def obstacle_points(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstaclePoints]:
-        """Supply positions of obstacles (OBSTACLE_DISTANCE_3D) to ArduPilot. Set PRX1_TYPE to 2. PX4 does not read it."""
+        """Supply positions of obstacles (OBSTACLE_DISTANCE_3D). Only ArduPilot reads them: set PRX1_TYPE to 2."""
         return self._stream("obstacle_points", ObstaclePoints, self._encode.obstacle_points, rate_hz, valid_for_s)
 
     def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
