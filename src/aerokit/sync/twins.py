@@ -3736,7 +3736,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def vtol_state(self) -> StateCell[int]:
-        """MAV_VTOL_STATE: 1 changing to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
+        """MAV_VTOL_STATE: 1 going to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
         return StateCell(self._loop, self.aio.vtol_state)
 
     @cached_property

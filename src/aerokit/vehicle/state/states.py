@@ -71,7 +71,7 @@ class States:
     vtol_state: StateField[int] = StateField(
         MessageSource("ExtendedSysState", condition.vtol_state, hz=5.0), eager=True
     )
-    """MAV_VTOL_STATE: 1 changing to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
+    """MAV_VTOL_STATE: 1 going to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
 
     landed_state: StateField[int] = StateField(
         MessageSource("ExtendedSysState", condition.landed_state, hz=5.0),
