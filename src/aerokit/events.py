@@ -71,7 +71,7 @@ class Event(Snapshot):
 
 
 class VehicleFound(Event):
-    """The first heartbeat of an autopilot arrived on the connection, even if no `Vehicle` is connected.
+    """The first heartbeat of an autopilot arrived on the connection, whether or not the program has a `Vehicle` for it.
 
     ``vehicle_type`` is the MAV_TYPE, ``autopilot`` the MAV_AUTOPILOT in the heartbeat.
     """
@@ -111,15 +111,15 @@ class VehicleRebooted(Event):
 class DuplicateSender(Event):
     """A second sender uses a system and component id that is already in use. Its messages are ignored.
 
-    The second sender is recognised by its address on the link, or by a second series of sequence numbers from the
-    same address. Published once for each address.
+    The second sender is recognised by its other address, or by a second series of sequence numbers from the same
+    address. Published once for each address.
     """
 
     component_id: int
 
 
 class RouteChanged(Event):
-    """A component moved to another peer of the link. ``before`` and ``after`` are the addresses."""
+    """A component is now received from another peer of the link. ``before`` and ``after`` are the peers' addresses."""
 
     component_id: int
     before: str

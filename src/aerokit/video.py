@@ -214,7 +214,7 @@ class _Reader(threading.Thread):
             raise LinkOpenError(f"the video of {self._uri} cannot be opened: {error}") from None
         with container:
             if not container.streams.video:
-                raise LinkOpenError(f"{self._uri} has no video")
+                raise LinkOpenError(f"the stream {self._uri} contains no video")
             self._call_on_loop(self._stream._on_open)
             try:
                 for picture in container.decode(video=0):

@@ -138,7 +138,7 @@ class _Rules:
 
 
 def _is_time(parameter: inspect.Parameter) -> bool:
-    """Return True if the name denotes seconds, rather than metres or degrees per second."""
+    """Return True if the parameter is a time in seconds, and not a speed, whose name ends in ``_s``, too."""
     name, is_speed = parameter.name, parameter.name.endswith(("m_s", "deg_s"))
     return str(parameter.annotation) in _SECONDS and name.endswith(("timeout", "_s")) and not is_speed
 

@@ -26,7 +26,7 @@ def to_jsonable(value: object) -> Any:
     """
     if value is None or isinstance(value, (bool, str)):
         return value
-    if isinstance(value, Enum):
+    if isinstance(value, Enum):  # Enums come before int, because members of an IntEnum are integers, too.
         return _names(value)
     if isinstance(value, int):
         return int(value)

@@ -93,7 +93,7 @@ class Snapshot(metaclass=_SnapshotType):
         return type(self)(**{**self.to_dict(), **changes})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary, in order."""
+        """Return the fields as a dictionary, in the order of their declaration."""
         return {field: getattr(self, field) for field in self.__match_args__}
 
     def __setattr__(self, name: str, value: object) -> None:

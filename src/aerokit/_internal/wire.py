@@ -50,6 +50,7 @@ class Copyable:
     __slots__ = ()
 
     def __getstate__(self) -> tuple[None, dict[str, Any]]:
+        # Python's own method finds only fields that are declared as __slots__, and compiled fields are not.
         names = (
             name
             for cls in type(self).__mro__

@@ -254,7 +254,7 @@ async def _find_vehicle(connection: Connection, system_id: int | None, timeout: 
             detach()
         search.close()
     raise ConnectFailed(
-        f"no heartbeat of {search.description} within {timeout:g} s on {connection.link.address}:"
+        f"no heartbeat of {search.description} arrived within {timeout:g} s on {connection.link.address}:"
         f" {explain_no_vehicle(connection, system_id)}"
     )
 
@@ -340,13 +340,13 @@ async def vehicles_on(
     """Connect to every vehicle found on a connection, for the duration of the block.
 
     A vehicle that falls silent stays in the mapping; its ``link_state`` and the ages of its cells show the silence.
-    Vehicles that this program is already connected to are left out.
+    Vehicles to which this program is already connected are not in the mapping.
 
     Args:
         connection: the result of :func:`aerokit.open_connection`.
         rates: rates to request from each vehicle, as a mapping of message class to Hz; see :func:`aerokit.connect`.
             ``{}`` requests nothing.
-        on_found: called in the loop with each new vehicle.
+        on_found: called in the event loop with each new vehicle.
 
     Returns:
         Mapping of system id to vehicle, in the order in which they were found; grows while the block lasts.
@@ -363,10 +363,10 @@ async def vehicles_on(
                 vehicles[system_id] = vehicle
                 if on_found is not None:
                     on_found(vehicle)
-                await asyncio.Event().wait()  # until `vehicles_on` ends and cancels this task
+                await asyncio.Event().wait()  # Wait until `vehicles_on` ends and cancels this task.
         except AerokitError as error:
             # The vehicle fell silent again, the program is connected to it already, or the connection has ended.
-            logger.info("system %d was not connected: %s", system_id, error)
+            logger.info("the connection to system %d failed or ended: %s", system_id, error)
 
     async def search() -> None:
         try:

@@ -322,7 +322,7 @@ async def test_px4_without_external_vision_raises() -> None:
     async with open_px4(px4(EKF2_EV_CTRL=3.0)) as flight:
         async with flight.vehicle.external.odometry():
             pass
-        with pytest.raises(OperationRejected, match=r"EKF2_EV_CTRL = 3, so that .* set EKF2_EV_CTRL to 4 or 5"):
+        with pytest.raises(OperationRejected, match=r"EKF2_EV_CTRL = 3, so .* set EKF2_EV_CTRL to 4 or 5"):
             async with flight.vehicle.external.vision_speed():
                 raise AssertionError("entered")
 

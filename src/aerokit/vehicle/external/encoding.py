@@ -188,7 +188,7 @@ class MeasurementEncoder:
         check_range("first_deg", value.first_deg, -360, 360)
         count = len(value.distances_m)
         if not 1 <= count <= MAX_SECTORS:
-            raise InvalidArgument(f"distances_m has {count} distances; allowed: 1 to {MAX_SECTORS}")
+            raise InvalidArgument(f"distances_m has {count} distances, but must have 1 to {MAX_SECTORS}")
         min_cm, max_cm = _centimetres("min_m", value.min_m), _centimetres("max_m", value.max_m)
         distances = [UNKNOWN_DISTANCE] * MAX_SECTORS
         for index, distance_m in enumerate(value.distances_m):
@@ -216,7 +216,8 @@ class MeasurementEncoder:
     def range_finder(self, value: v.RangeMeasurement) -> tuple[Message, ...]:
         """Return DISTANCE_SENSOR."""
         if value.direction not in ORIENTATIONS:
-            raise InvalidArgument(f"direction = {value.direction!r} is not allowed: one of {', '.join(ORIENTATIONS)}")
+            directions = ", ".join(ORIENTATIONS)
+            raise InvalidArgument(f"direction = {value.direction!r} is not allowed: it must be one of {directions}")
         if value.quality is not None:
             check_range("quality", value.quality, 1, 100)
         _check_variance(value.variance_m2)
@@ -279,7 +280,9 @@ class MeasurementEncoder:
         """Return a position in the local frame; ``offset`` is relative to the vehicle, along its body axes."""
         telemetry = self._session.telemetry
         if max(telemetry.attitude.age, telemetry.local_position.age) > POSITION_MAX_AGE_S:
-            raise ValueUnknownError("landing target: the vehicle's attitude or local position is unknown, or too old")
+            raise ValueUnknownError(
+                "the landing target was not sent: the vehicle's attitude or local position is unknown or too old"
+            )
         attitude, own_position = telemetry.attitude.value, telemetry.local_position.value
         if is_level:  # The axes of the offset turn with the vehicle, but do not tilt.
             attitude = Attitude(0.0, 0.0, attitude.yaw_deg)

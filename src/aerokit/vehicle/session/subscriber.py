@@ -145,10 +145,11 @@ class ComponentSubscriber:
 
         def filtered(item: Any) -> None:
             frame = getattr(item, "received_frame", None)
-            # An event without a component id is about the whole system.
-            event_source = getattr(item, "component_id", self._component_id)
-            source = event_source if frame is None else frame.component_id
-            if source == self._component_id:
+            if frame is not None:
+                component_id = frame.component_id
+            else:  # An event without a component id is about the whole system, and thus about this component, too.
+                component_id = getattr(item, "component_id", self._component_id)
+            if component_id == self._component_id:
                 sink(item)
 
         return filtered

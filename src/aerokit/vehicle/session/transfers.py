@@ -44,7 +44,7 @@ class Messaging(Protocol):
 
 
 class Transfers:
-    """Runs exchanges with the autopilot of one vehicle and provides its capabilities."""
+    """Runs exchanges of requests and answers with one component, and provides its capabilities."""
 
     def __init__(
         self,

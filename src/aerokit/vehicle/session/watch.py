@@ -74,6 +74,7 @@ class VehicleWatch:
         self._last_times: dict[str, tuple[int, float]] = {}
         # The first ``time_boot_ms`` after a boot, and when its message was processed.
         self._first_time: tuple[int, float] | None = None
+        # By this clock, the connection recognises a vehicle that returns from a new address.
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
         # For each clock: a decreased time and when it was processed. Later messages may confirm that it shows a reboot.
         self._decreased_times: dict[str, tuple[int, float]] = {}

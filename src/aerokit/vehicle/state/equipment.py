@@ -331,6 +331,7 @@ def from_orientation(message: MountOrientation, heading: float | None) -> Gimbal
 
     ``heading`` is the vehicle's heading in degrees; while it is unknown, ``yaw_deg`` is relative to the nose.
     """
+    # ``yaw_absolute`` is an extension field: 0 may mean that it was not sent.
     if message.yaw_absolute and math.isfinite(message.yaw_absolute):
         yaw = _rounded_to_360(message.yaw_absolute)
     elif heading is not None:

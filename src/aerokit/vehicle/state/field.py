@@ -61,7 +61,7 @@ class MessageSource(Generic[T]):
         watched_hz: float | None = None,
     ) -> None:
         if message not in MESSAGE_IDS:
-            raise ValueError(f"{message} is not a message class")
+            raise ValueError(f"{message} is not the name of a message class")
         self.message: str = message
         self.decode = decode
         self.needs_context: bool = needs_context

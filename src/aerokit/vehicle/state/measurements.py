@@ -77,7 +77,7 @@ class AirPressure(Snapshot):
 
 
 class Altitude(Snapshot):
-    """Altitudes of PX4 in metres; None if unknown. ``monotonic_m`` never jumps, but its zero is arbitrary."""
+    """Altitudes in ALTITUDE (PX4) in metres; None if unknown. ``monotonic_m`` never jumps, but its zero is arbitrary."""
 
     monotonic_m: float | None
     amsl_m: float | None
