@@ -49,7 +49,7 @@ class _SnapshotType(type):
         defining_class = getattr(init, "defining_class", None)
         if defining_class is not None:
             init = _generate_init(defining_class)
-        return signature(init.__get__(object()))  # bound to any object, because a signature has no self
+        return signature(init.__get__(object()))  # Binding the method, to any object, removes self from its signature.
 
 
 def _lazy_init(cls: Any) -> Callable[..., None]:

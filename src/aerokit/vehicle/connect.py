@@ -44,7 +44,7 @@ __all__ = ["connect", "vehicles_on", "warn_if_left_flying"]
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# An older heartbeat does not prove that the vehicle is present now, so the search waits for the next one.
+# A heartbeat older than this (seconds) does not prove that the vehicle is present, so the search waits for a new one.
 HEARTBEAT_MAX_AGE_S = 2.0
 
 # A component other than 1 counts as the autopilot after this many heartbeats, if component 1 has sent none.

@@ -31,7 +31,8 @@ GPS_EPOCH_S, LEAP_SECONDS, SECONDS_PER_WEEK = 315_964_800, 18, 604_800
 GPS_NUMBERS = ("hdop", "vdop", "horizontal_accuracy_m", "vertical_accuracy_m", "speed_accuracy_m_s", "yaw_deg")
 # Maps each direction to its MAV_SENSOR_ORIENTATION.
 ORIENTATIONS: dict[RangeDirection, int] = {"forward": 0, "right": 2, "back": 4, "left": 6, "up": 24, "down": 25}
-# A MAV_ESTIMATOR_TYPE, a MAV_DISTANCE_SENSOR, and the number that means an unknown covariance in DISTANCE_SENSOR.
+# The MAV_ESTIMATOR_TYPE of vision, the MAV_DISTANCE_SENSOR of a laser, and the covariance in DISTANCE_SENSOR that means
+# "unknown".
 VISION, LASER, UNKNOWN_COVARIANCE = 2, 0, 255
 LANDING_TARGET_TYPE_VISION_FIDUCIAL = 2
 # Rotations between the axes of ROS (east, north, up; forward, left, up) and the axes of MAVLink.
@@ -65,7 +66,7 @@ class MeasurementEncoder:
             # The axes of the frame and the axes of the body are both converted.
             to_mavlink = ENU_TO_NED if is_earth_frame else FLU_TO_FRD
             quaternion = multiply(multiply(to_mavlink, quaternion), FLU_TO_FRD)
-            x, y, up = position  # x and y are east and north, or forward and left
+            x, y, up = position  # x and y are east and north in "enu", forward and left in "flu".
             position = (y, x, -up) if is_earth_frame else (x, -y, -up)
             velocity = None if velocity is None else (velocity[0], -velocity[1], -velocity[2])
         frame = self._session.autopilot.external.ned_frame if is_earth_frame else MavFrame.LOCAL_FRD
@@ -197,7 +198,8 @@ class MeasurementEncoder:
             is_free = distance_m > value.max_m  # A sector without an obstacle is sent as max_distance + 1.
             distances[index] = max_cm + 1 if is_free else _centimetres("distances_m", distance_m)
         time_us = self._time_us(value.measured_at)
-        angles = (value.step_deg, value.first_deg)  # increment_f, which replaces the integer increment (0), and offset
+        # The fields increment_f, which the autopilots read instead of the integer field increment, and angle_offset.
+        angles = (value.step_deg, value.first_deg)
         return (m.ObstacleDistance(time_us, LASER, distances, 0, min_cm, max_cm, *angles, MavFrame.BODY_FRD),)
 
     def obstacle_points(self, value: v.ObstaclePoints) -> tuple[Message, ...]:
@@ -245,7 +247,7 @@ class MeasurementEncoder:
         if self._session.autopilot.external.target_is_local:
             frame, offset = MavFrame.LOCAL_NED, self._in_local_frame(offset, is_level=value.is_level)
         time_us, unknown_size = self._time_us(value.measured_at), (0.0, 0.0)
-        # Angles about the camera's axes, from straight down.
+        # Angular offsets of the target from the centre of the picture, for a camera that looks straight down.
         angles = (math.atan2(value.right_m, value.down_m), -math.atan2(value.forward_m, value.down_m))
         no_rotation = (1.0, 0.0, 0.0, 0.0)
         last_fields = (LANDING_TARGET_TYPE_VISION_FIDUCIAL, 1)  # 1: the position is valid
@@ -261,7 +263,7 @@ class MeasurementEncoder:
         check_range("interval_s", value.interval_s, 0, 10, above=True)
         check_range("quality", value.quality, 0, 255)
         time_us = self._time_us(value.measured_at)
-        distance_m = -1.0 if value.distance_m is None else value.distance_m  # a negative distance means "unknown"
+        distance_m = -1.0 if value.distance_m is None else value.distance_m  # A negative distance means "unknown".
         check_finite("distance_m", distance_m)
         if self._session.autopilot.external.flow_in_radians:
             gyro = UNKNOWN_VECTOR if value.gyro_rad is None else value.gyro_rad

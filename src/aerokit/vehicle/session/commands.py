@@ -268,7 +268,7 @@ class CommandSender:
         is_answer = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
         if is_answer and is_final:
             self._results[key] = ack.result
-            # `accepted_at` needs proof, and an ack without a target may be for another ground station.
+            # An ack without a target may be for another ground station, so it does not count for `accepted_at`.
             if ack.result == MavResult.ACCEPTED and ack.target_system == self._connection.source_system:
                 self._accepted_at[key] = self._connection.now()
         if run is not None:

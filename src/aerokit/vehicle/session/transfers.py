@@ -153,7 +153,7 @@ class Transfers:
                 if self._request_version is not None:
                     await self._request_version()
                 await self._version.wait_until(lambda _: True)
-            # Without `request_version` (autopilot), the session requests the version until it arrives, maybe later.
+            # There is no `request_version` for an autopilot, because its session requests the version until it arrives.
             self._is_version_unavailable = self._request_version is not None and not self._version.is_known
         version = self._version.latest
         return None if version is None else version.capabilities

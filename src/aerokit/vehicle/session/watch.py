@@ -39,7 +39,7 @@ REBOOT_CONFIRM_S = 0.2
 # While a reboot is expected, it is detected when the vehicle's clock is behind its expected time by more than this. A
 # boot takes longer than this; messages are delayed by less.
 MIN_REBOOT_STEP_MS = 2000
-# A simulation's clock may be faster than real time. Its speed is computed once its reports cover this many seconds.
+# A simulation's clock may be faster than real time. The speed is computed once the reported times span these seconds.
 CLOCK_SPAN_S = 5.0
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0

@@ -77,7 +77,10 @@ class AirPressure(Snapshot):
 
 
 class Altitude(Snapshot):
-    """Altitudes in ALTITUDE (PX4) in metres; None if unknown. ``monotonic_m`` never jumps, but its zero is arbitrary."""
+    """Altitudes of PX4 in metres (ALTITUDE). An unknown altitude is None.
+
+    ``monotonic_m`` never jumps, but its zero is arbitrary.
+    """
 
     monotonic_m: float | None
     amsl_m: float | None
