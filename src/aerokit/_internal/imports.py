@@ -10,7 +10,7 @@ from importlib import import_module
 # Packages that only the other project called aerokit has: ``aerokit.aero`` and so on.
 _OTHER_PACKAGES = ("aero", "engine", "stability")
 
-# Users often look for the contents of these modules in the package itself: aerokit.LinkLost, not aerokit.errors.LinkLost.
+# Users often look in the package for the contents of these modules: aerokit.LinkLost, not aerokit.errors.LinkLost.
 _NAMED_MODULES = ("aerokit.errors", "aerokit.events")
 
 

@@ -32,7 +32,7 @@ _Key = tuple[int, int]
 
 
 class CommandSender:
-    """The command protocol with one vehicle (https://mavlink.io/en/services/command.html).
+    """Runs the command protocol with one vehicle (https://mavlink.io/en/services/command.html).
 
     COMMAND_ACK has no request id. Commands with the same MAV_CMD to one component are therefore serialized; other
     commands never wait for each other. When an order ends, aerokit aborts the order's running command and does not send

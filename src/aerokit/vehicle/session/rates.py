@@ -35,9 +35,9 @@ WATCH_WINDOW = 5
 SLOW_FACTOR = 0.5
 
 RETRY_INTERVAL_S = 5.0
-"""Seconds after a request without any message, after which the stream is requested again.
+"""If no message of a stream arrives for this many seconds after a request, the stream is requested again.
 
-This interval doubles with each further request of the stream, up to ``MAX_RETRY_INTERVAL_S``.
+The interval doubles with each further request of the stream, up to ``MAX_RETRY_INTERVAL_S``.
 """
 
 MAX_RETRY_INTERVAL_S = 60.0

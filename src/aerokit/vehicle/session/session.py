@@ -63,7 +63,7 @@ EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 
 
 async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
-    """Request version, home and origin until they are known, and again after each reboot; request the modes once.
+    """Request version, home and origin until they are known, and again after each reboot. Request the modes once.
 
     Runs until the link closes.
     """

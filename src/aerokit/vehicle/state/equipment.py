@@ -156,7 +156,7 @@ class Vibration(Snapshot):
 
 
 def distance_sensors(message: messages.DistanceSensor, context: Context) -> tuple[RangeFinder, ...]:
-    """Return all sensors reported so far. The sensor of this message has its new reading."""
+    """Return all sensors reported so far, with the new reading of this message's sensor."""
     quality = message.signal_quality
     is_valid = quality != INVALID_QUALITY
     sensor = RangeFinder(
@@ -171,17 +171,17 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
 
 
 def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
-    """Return all sensors reported so far, with the reading in RANGEFINDER, ArduPilot's older message, as sensor 0."""
+    """Return all sensors reported so far, with the new reading in RANGEFINDER (older ArduPilot) as sensor 0."""
     return _replaced(context.before, RangeFinder(0, finite(message.distance), LOOKING_DOWN), _id_of)
 
 
 def first_gps(message: messages.GpsRawInt, context: Context) -> tuple[GpsReceiver, ...]:
-    """Return all receivers reported so far. The first one has the values of this message."""
+    """Return all receivers reported so far, the first one with the new values of this message."""
     return _replaced(context.before, _gps_receiver(message, 0), _index_of)
 
 
 def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver, ...]:
-    """Return all receivers reported so far. The second one has the values of this message."""
+    """Return all receivers reported so far, the second one with the new values of this message."""
     return _replaced(context.before, _gps_receiver(message, 1), _index_of)
 
 
@@ -210,7 +210,7 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
 
 
 def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Battery, ...]:
-    """Return all batteries reported so far. The battery of this message has its values."""
+    """Return all batteries reported so far, with the new values of this message's battery."""
     cells_mv = [millivolts for millivolts in message.voltages if millivolts != U16]
     # Cells 11 to 14 are an extension of the message, in which an absent cell may be 0 instead of U16.
     cells_mv += [millivolts for millivolts in message.voltages_ext if millivolts not in (0, U16)]
@@ -232,7 +232,7 @@ def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Batter
 
 
 def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery, ...] | None:
-    """Return all batteries reported so far. The first one has the values of SYS_STATUS; None if there are none."""
+    """Return all batteries reported so far, the first with the values of SYS_STATUS; None if SYS_STATUS has none."""
     voltage = None if message.voltage_battery in (0, U16) else message.voltage_battery / 1e3
     remaining = known(message.battery_remaining, unknown=-1)
     if voltage is None and remaining is None:
@@ -265,7 +265,7 @@ def rc_channels(message: messages.RcChannels) -> RcChannels:
 
 
 def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOutputs:
-    """Return all outputs reported so far. The sixteen outputs of this message's port have its values."""
+    """Return all outputs reported so far, with the new values of this message's port, which has 16 outputs."""
     frame = message.received_frame
     # MAVLink 1 has no extension fields, so the message has only the first eight outputs of the port.
     count = 8 if frame is not None and frame.version == 1 else OUTPUTS_PER_PORT

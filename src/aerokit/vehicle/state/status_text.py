@@ -40,7 +40,7 @@ class StatusTextAssembler:
         self._recent: deque[StatusText] = deque(maxlen=MAX_RECENT_TEXTS)
 
     def receive(self, message: Statustext, now: float) -> list[StatusText]:
-        """Process one message. Return the texts that end with it, and incomplete texts whose time is over."""
+        """Process one message. Return the texts that it completes, and truncated texts whose next chunk is overdue."""
         truncated_texts = self.expire(now)
         chunk = _bytes_of(message)
         if message.id == 0:
@@ -67,7 +67,7 @@ class StatusTextAssembler:
         self._recent.clear()
 
     def _add_chunk(self, message: Statustext, chunk: bytes, now: float) -> Iterator[StatusText]:
-        """Add a chunk to its text. Yield the texts that end by this: complete, or truncated by the next text."""
+        """Add a chunk to its text. Yield the text if it is now complete, and an earlier text that remains truncated."""
         key = (_sender(message), message.id)
         text = self._incomplete.get(key)
         if text is not None and message.chunk_seq < text.next_seq:
