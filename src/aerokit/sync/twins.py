@@ -460,9 +460,10 @@ class SetpointStream(StreamTwin[SetpointT]):
     any way makes the vehicle hold.
 
     The stream stops by itself if there is no new set-point for ``valid_for_s``, or if the event loop is late by
-    ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, or stays in place for twelve
-    seconds although it should move. ``set`` and leaving the block then raise :class:`SetpointStreamStopped`. If a pilot
-    or a failsafe changed the mode, nothing more is sent to the vehicle.
+    ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, hits the ground (velocities,
+    positions and trajectories only), or stays in place for twelve seconds although it should move. ``set`` and leaving
+    the block then raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changed the mode, nothing more is sent
+    to the vehicle.
     """
 
     @property
@@ -4750,7 +4751,7 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: there is no such state. Nothing was sent.
             NotSupported: the vehicle is not a VTOL. Nothing was sent.
-            OperationRejected: the mode changed, or the vehicle disarmed, during the transition.
+            OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the transition.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ten seconds.
@@ -4816,7 +4817,7 @@ class Vehicle(VehicleTwin):
                 was sent.
             ValueUnknownError: the vehicle's position or home is needed but unknown.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
-            OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
+            OperationRejected: the mode changed (a pilot, a failsafe), or the vehicle disarmed or hit the ground.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not arrive in time, or does not move.
@@ -4871,7 +4872,7 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: the mode changed or the vehicle disarmed meanwhile.
+            OperationRejected: the mode changed, or the vehicle disarmed meanwhile or hit the ground.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.
         """
@@ -4931,8 +4932,8 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: the vehicle is not armed or is already flying; or its mode changed or it disarmed
-                meanwhile.
+            OperationRejected: the vehicle is not armed or is already flying; or its mode changed, it disarmed
+                meanwhile or hit the ground.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
