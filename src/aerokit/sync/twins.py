@@ -476,7 +476,7 @@ class SetpointStream(StreamTwin[SetpointT]):
 
         Raises:
             InvalidArgument: a value is out of range; the previous set-point remains in force until it expires.
-            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+            SetpointStreamStopped: the stream has ended by itself, or its `async with` block was left.
         """
         self._loop.call(self.aio.set, setpoint)
 
@@ -740,7 +740,7 @@ class StickStream(BlockTwin["AsyncStickStream"]):
 
         Raises:
             InvalidArgument: a position is out of range; the previous positions stay in force until they expire.
-            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+            SetpointStreamStopped: the stream has ended by itself, or its `async with` block was left.
         """
         self._loop.call(self.aio.set, sticks)
 
@@ -1329,7 +1329,8 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
 
         Raises:
-            InvalidArgument: a parameter is not a number or does not fit, or the block was left. Nothing was sent.
+            InvalidArgument: a parameter is not a number or does not fit, or the `with` block was left. Nothing was
+                sent.
             OperationRejected: the order has ended: it was superseded or taken over.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
@@ -1365,7 +1366,8 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             component_id: as for :meth:`command`.
 
         Raises:
-            InvalidArgument: the mode is not one of the modes of the order, or the block was left. Nothing was sent.
+            InvalidArgument: the mode is not one of the modes of the order, or the `with` block was left. Nothing was
+                sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             OperationTimeout: the vehicle accepted the mode but stayed in another mode.
@@ -4134,7 +4136,7 @@ class Vehicle(VehicleTwin):
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
-            ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
+            ConnectionClosed, LinkLost: the connection has ended, or this vehicle's `async with` block was left.
         """
         self._loop.call(self.aio.send, message)
 
@@ -4184,7 +4186,7 @@ class Vehicle(VehicleTwin):
         ``vehicle.component(100).subscribe(...)``.
 
         Raises:
-            InvalidArgument: no type, a rate out of range, or a message that the dialect does not contain.
+            InvalidArgument: no type was given, the rate is out of range, or the dialect does not contain a message.
         """
         return Subscription(
             self._loop,
@@ -4227,9 +4229,7 @@ class Vehicle(VehicleTwin):
 
     @property
     def is_armed(self) -> bool:
-        """True if the last heartbeat reports armed; False before the first one, and after a reboot until the next
-        one.
-        """
+        """True if the last heartbeat reports armed; False while the state is unknown."""
         return self.aio.is_armed
 
     @property
@@ -4262,8 +4262,9 @@ class Vehicle(VehicleTwin):
         return self._loop.call(self.aio.describe_link)
 
     def describe_now(self) -> str:
-        """Return a clause about the reported state: ``holding in BRAKE, still armed, 9 m above home, last heartbeat
-        0.3 s ago``.
+        """Return a clause about the reported state.
+
+        For example: ``holding in BRAKE, still armed, 9 m above home, last heartbeat 0.3 s ago``.
         """
         return self.aio.describe_now()
 
@@ -4412,7 +4413,7 @@ class Vehicle(VehicleTwin):
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
-                texts. If the pre-arm checks fail, the vehicle is asked for its reasons three seconds before the end.
+                texts. Three seconds before this error, a vehicle whose pre-arm checks fail is asked for its reasons.
         """
         self._loop.run(self.aio.wait_ready, timeout=timeout)
 
@@ -4444,7 +4445,7 @@ class Vehicle(VehicleTwin):
                 sent to the vehicle as a STATUSTEXT right before the command, and ArduPilot writes this text into its
                 flight log. PX4 logs only texts that have the vehicle's own system id.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
-            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no such limit.
 
         Raises:
             InvalidArgument: there is no such mode, it does not allow arming, or the reason is too long. Nothing was
@@ -4479,7 +4480,7 @@ class Vehicle(VehicleTwin):
         Args:
             force: also disarm in flight: **the vehicle falls**.
             timeout: seconds for HEARTBEAT to report disarmed after the command was accepted.
-            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no such limit.
 
         Raises:
             CommandRejected: the vehicle refused, usually because it is flying.
@@ -4566,7 +4567,7 @@ class Vehicle(VehicleTwin):
                 autopilot. A fixed wing ignores it.
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             NotSupported: this type of vehicle cannot circle a place. Nothing was sent.
@@ -4618,7 +4619,7 @@ class Vehicle(VehicleTwin):
             clockwise: direction in the first lobe, as seen from above.
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
         """
         self._loop.run(
             self.aio.figure_eight,
@@ -4665,7 +4666,7 @@ class Vehicle(VehicleTwin):
             max_distance_m: a place farther away than this many metres is refused.
             timeout: seconds in total. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle
                 moves.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             InvalidArgument: a value is out of range, or ``turns`` was given without ``radius_m``. Nothing was sent.
@@ -4800,7 +4801,7 @@ class Vehicle(VehicleTwin):
         order was given meanwhile or another party changed the mode. After a silence, aerokit waits for the next
         heartbeat, and orders a hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
-        vehicle that does not support it.
+        vehicle that does not support this command.
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level. The vehicle keeps its
@@ -4810,7 +4811,7 @@ class Vehicle(VehicleTwin):
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
             max_distance_m: a place farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             InvalidArgument: the target is not on earth or too far away, or another argument is out of range. Nothing
@@ -4867,7 +4868,7 @@ class Vehicle(VehicleTwin):
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until the vehicle has the heading.
-            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no such limit.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
@@ -4887,15 +4888,14 @@ class Vehicle(VehicleTwin):
         )
 
     def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
-        """Move the home position, to a place or to the vehicle's present position, and wait until HOME_POSITION
-        reports it.
+        """Move the home position, and wait until HOME_POSITION reports the new place.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
         firmware that does not support this gets a COMMAND_LONG, which has a resolution of about a metre.
 
         Args:
-            place: latitude, longitude and an altitude above mean sea level; None: the present position.
-            timeout: seconds until HOME_POSITION reports it.
+            place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.
+            timeout: seconds until HOME_POSITION reports the new place.
 
         Raises:
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
@@ -4919,7 +4919,7 @@ class Vehicle(VehicleTwin):
         timeout: float = 60.0,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Take off and climb to ``altitude_m`` above home; returns at that altitude.
+        """Take off and climb to ``altitude_m`` above home. Returns when the vehicle is at that altitude.
 
         The vehicle must be armed. If the autopilot requires another mode for a take-off, aerokit changes the mode.
         After a cancellation or a time-out, aerokit orders the vehicle to hold where it is.
@@ -4927,7 +4927,7 @@ class Vehicle(VehicleTwin):
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
             timeout: seconds until the vehicle is at that altitude.
-            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no such limit.
 
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
@@ -4950,7 +4950,7 @@ class Vehicle(VehicleTwin):
 
         Args:
             timeout: seconds until it is on the ground; None: no limit.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             NotSupported: this type of vehicle has no landing mode. Nothing was sent.

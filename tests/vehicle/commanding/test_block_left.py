@@ -155,7 +155,7 @@ async def test_block_left_with_stream_in_other_task_holds() -> None:
             await vehicle.arm()
             await vehicle.take_off(10.0)
             stream = await vehicle.guided.velocity().__aenter__()
-        with pytest.raises(SetpointStreamStopped, match="the block of its vehicle was left"):
+        with pytest.raises(SetpointStreamStopped, match="the async with block of its vehicle was left"):
             stream.set(VelocitySetpoint())
         with pytest.raises(ConnectionClosed, match="the async with block of this vehicle was left; nothing was sent"):
             vehicle.send(Heartbeat(6, 8, 0, 0, 4))

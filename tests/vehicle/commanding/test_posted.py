@@ -391,7 +391,7 @@ async def test_posted_order_errors_say_why(grounded: Flight) -> None:
     grounded.wire.clear()
     with pytest.raises(InvalidArgument, match="requires armed=True or armed=False"), vehicle.posted("arm"):
         pass
-    with pytest.raises(InvalidArgument, match="the block of this order was left"):
+    with pytest.raises(InvalidArgument, match="the `with` block of this order was left"):
         await order.command(ARM, 1)
     assert not grounded.wire.commands(ARM)
 

@@ -324,7 +324,7 @@ async def test_reboot_vehicle_does_not_return_times_out(grounded: Flight) -> Non
             grounded.copter.faults.silent = True
 
         tasks.start_soon(dies)
-        with pytest.raises(OperationTimeout, match=r"reboot: no restart within 8 s; last heartbeat \d"):
+        with pytest.raises(OperationTimeout, match=r"reboot: .* did not restart within 8 s; last heartbeat \d"):
             await grounded.vehicle.reboot(timeout=8.0)
 
 

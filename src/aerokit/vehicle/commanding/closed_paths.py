@@ -69,7 +69,7 @@ class Eight(ClosedPath):
 
 
 class PathFlight:
-    """Moves a set-point straight to the start of a path, stops it there, and moves it along the path to a stop.
+    """Moves a set-point straight to the start of a path, stops it there, and then moves it along the path to its end.
 
     ``start`` is the vehicle's position relative to the centre of the path (north, east, down). ``centre`` is the
     position of the centre in the local frame. ``heading`` returns the heading in degrees for a place relative to the
@@ -98,7 +98,7 @@ class PathFlight:
         return self._phase >= self._last_phase
 
     def advance(self, seconds: float) -> TrajectorySetpoint:
-        """Move the set-point on by this time, and return it."""
+        """Move the set-point on by this many seconds, and return it."""
         return self._advance_on_path(seconds) if self.is_on_path else self._advance_to_path(seconds)
 
     def _advance_to_path(self, seconds: float) -> TrajectorySetpoint:
@@ -158,7 +158,8 @@ class TurnCounter:
     def __init__(self, radius_m: float, *, clockwise: bool) -> None:
         self._radius_m, self._direction = radius_m, 1 if clockwise else -1
         self._tolerance_m = max(MIN_TOLERANCE_M, TOLERANCE_SHARE * radius_m)
-        self._bearing: float | None = None  # from the centre, while the vehicle is near the circle
+        # Bearing from the centre to the vehicle in radians; None while the vehicle is not near the circle.
+        self._bearing: float | None = None
         self.rounds: float = 0.0
         self.is_on_path: bool = False
         """True while the vehicle is near the circle."""
@@ -177,7 +178,7 @@ class LobeCounter:
 
     def __init__(self, major_m: float, axis_deg: float) -> None:
         self._half_m, self._axis = major_m / 2, math.radians(axis_deg)
-        self._lobe = 0  # the last lobe that the vehicle was in: 1 or -1; 0 before the first one
+        self._lobe = 0  # The last lobe that the vehicle was in is 1 or -1; 0 means that it was in none yet.
         self.rounds: float = 0.0
         self.is_on_path: bool = False
         """True while the vehicle is in one of the lobes."""

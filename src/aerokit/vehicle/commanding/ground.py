@@ -57,7 +57,7 @@ class ImpactDetector:
         self._session = session
         self._updated_at = self._sank_fast_at = -math.inf
         self._max_sink_m_s = 0.0
-        # Sink rate before the impact, and height of the place of the impact.
+        # Sink rate before the impact, and height of the vehicle at the impact. Both are None without an impact.
         self._impact_m_s: float | None = None
         self._impact_height_m: float | None = None
         # Height before the descent; None if it is unknown.
@@ -70,27 +70,28 @@ class ImpactDetector:
         velocity = cell.latest
         if velocity is None or cell.updated_at == self._updated_at:
             return
-        # Velocities may arrive less often than the time that an impact takes.
+        # An impact may take less time than passes between two velocities.
         interval_s = min(cell.updated_at - self._updated_at, MAX_INTERVAL_S)
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = cell.updated_at
         height_m = self._current_height()
-        if velocity.down_m_s >= IMPACT_M_S:
+        if velocity.down_m_s >= IMPACT_M_S:  # The vehicle sinks as fast as before an impact.
             is_new_descent = cell.updated_at - self._sank_fast_at > max_stop_s
             self._max_sink_m_s = velocity.down_m_s if is_new_descent else max(self._max_sink_m_s, velocity.down_m_s)
             self._sank_fast_at = cell.updated_at
         elif abs(velocity.down_m_s) < STILL_M_S and cell.updated_at - self._sank_fast_at <= max_stop_s:
+            # The vehicle has suddenly stopped. If it has lost no height, only its reported velocity has jumped.
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
                 self._impact_m_s, self._impact_height_m = self._max_sink_m_s, height_above_home(self._session.telemetry)
         elif _has_changed(self._impact_height_m, height_above_home(self._session.telemetry), IMPACT_HEIGHT_M):
-            self._impact_m_s = self._impact_height_m = None
+            self._impact_m_s = self._impact_height_m = None  # The vehicle flies on, so it did not hit the ground.
         if velocity.down_m_s < STILL_M_S and cell.updated_at - self._sank_fast_at > max_stop_s:
             self._top_m = height_m
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S
         self._has_stopped = self._impact_m_s is not None and (self._has_stopped or is_slow)
 
     def describe(self) -> str:
-        """Return the impact as a clause; empty if there was none, or the vehicle has left the place of the impact."""
+        """Return a clause about the impact; empty if there was none, or if the vehicle has flown on since."""
         if self._impact_m_s is None or not self._has_stopped:
             return ""
         return f"{HIT_GROUND} at {self._impact_m_s:.1f} m/s"
@@ -116,7 +117,7 @@ class GroundCheck:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Process every velocity that arrives within the block, rather than only the last one before each check."""
+        """During a `with` block, process every velocity at its arrival, instead of only the last one at each check."""
         detach = self._session.telemetry.velocity.observe(lambda *_: self._impact.update())
         try:
             yield
@@ -144,7 +145,7 @@ class GroundCheck:
         return self._has_settled(now, velocity.updated_at) and not self._impact.describe()
 
     def failure_reason(self, in_flight: Callable[[], str | None]) -> str | None:
-        """Return a clause if a vehicle that is reported on the ground falls or fell; before that, ``in_flight()``."""
+        """Return a clause if the vehicle falls or fell. Before it is reported on the ground, return ``in_flight()``."""
         return self.fall() if self.is_pending else in_flight()
 
     def fall(self) -> str | None:

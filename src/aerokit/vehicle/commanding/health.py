@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.vehicle.session.session import VehicleSession
 
-# Seconds in which status texts are collected after the vehicle was requested to run its checks.
+# After the vehicle was requested to run its checks, status texts are collected for this many seconds.
 TEXTS_S = 1.0
-# Values older than this do not describe the present state.
+# Values older than this many seconds do not describe the present state.
 HEALTH_MAX_AGE_S = 5.0
 RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
@@ -66,7 +66,7 @@ class Health:
         return [*heartbeats, *too_old, *from_before_silence]
 
     async def why_not_armable(self) -> list[str]:
-        """Return why arming would be refused now. The vehicle is requested to run its checks if it supports that."""
+        """Return why arming would be refused now. A vehicle that can run its checks on request runs them first."""
         if self._telemetry.is_armed:
             return []
         return list(await self.arming_reasons(self._session.connection.now()))
@@ -120,7 +120,7 @@ class Health:
             await self._request_texts(since)
 
     async def _request_texts(self, since: float) -> None:
-        """Request the vehicle to run its pre-arm checks, unless it has sent texts about arming since this time."""
+        """Let the vehicle run its pre-arm checks, unless it has sent texts about arming since this time."""
         if self.arming_texts(since) or not self._autopilot.runs_prearm_checks:
             return
         try:
@@ -134,8 +134,9 @@ class Health:
         return [text for text in self._session.texts_since(since) if self._autopilot.arming_reason(text) is not None]
 
     def _failing(self) -> list[str]:
-        """Return failing sensors, failing pre-arm checks, missing estimates, and a missing GPS fix if it is their
-        cause.
+        """Return failing sensors, failing pre-arm checks and missing estimates.
+
+        If estimates are missing, a missing GPS fix is added, because it may be the cause.
         """
         failing, estimator = self._failing_sensors(), self._telemetry.estimator.latest
         if estimator is None or not estimator.missing:
@@ -155,7 +156,7 @@ class Health:
         """
         failing: list[str] = []
         sensors = self._telemetry.sensors.latest
-        # PX4 then reports the requirements of the present mode, in which it cannot arm.
+        # In a mode that does not allow arming, PX4 reports the requirements of that mode instead of those for arming.
         is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
         if sensors is not None and sensors.prearm_checks_pass is not True and not is_meaningless:
             failing += [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing if self._is_required(name)]

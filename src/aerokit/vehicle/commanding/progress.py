@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 POLL_INTERVAL_S = 0.25
-"""Maximum seconds between two evaluations of the state, as during a silence of the vehicle."""
+"""The state is evaluated at least this often (in seconds), even while the vehicle is silent."""
 
 MAX_SILENCE_S = 10.0
 """Default number of seconds without a heartbeat after which an operation fails."""
@@ -40,10 +40,10 @@ FALL_EVIDENT_S = 0.5
 """After falling for this time, a vehicle sinks faster than ``FALL_SINK_M_S``, even with air resistance."""
 
 HIT_GROUND = "the vehicle hit the ground"
-"""Beginning of the clause about an impact."""
+"""Beginning of each clause about an impact."""
 
 FALL_STOP_S = 1.5
-"""Maximum seconds from a fast descent to a standstill on the ground that together count as a fall."""
+"""A vehicle on the ground has fallen if it stood still at most this many seconds after a fast descent."""
 
 
 async def await_progress(
@@ -166,8 +166,9 @@ class StallDetector:
         return self._place is not None and self._there_since - self._sank_fast_at <= FALL_STOP_S
 
     def __call__(self, timeout_s: float = STALL_TIMEOUT_S) -> str | None:
-        """Return a clause with the time for which the vehicle has not moved; None if it moves or its position is
-        unknown.
+        """Return a clause if the vehicle has not moved for ``timeout_s`` seconds, otherwise None.
+
+        While the position is unknown, the result is None.
         """
         now, cell = self._session.connection.now(), self._session.telemetry.position
         here = cell.latest
@@ -239,9 +240,7 @@ class VehiclePosition:
 
     @property
     def arrival_radius_m(self) -> float:
-        """Distance in metres at which the vehicle counts as arrived. It includes the circle that the vehicle was
-        ordered to fly.
-        """
+        """Distance from the target in metres at which the vehicle counts as arrived, even if it circles the target."""
         return max(self._autopilot.arrival_radius_m, CIRCLE_MARGIN * self._circle_m)
 
     def distance_to(self, target: Position) -> float:
@@ -260,10 +259,10 @@ class VehiclePosition:
     def check_reach(
         self, name: str, places: Iterable[Position | None], max_distance_m: float, *, are_items: bool = False
     ) -> None:
-        """Raise InvalidArgument for a place farther away than the limit; accept all places while the position is
-        unknown.
+        """Raise InvalidArgument for a place farther away than ``max_distance_m``.
 
-        With ``are_items``, ``places`` has one entry for each item of a plan: None for an item without a place.
+        While the vehicle's position is unknown, all places are accepted. With ``are_items``, ``places`` has one entry
+        for each item of a plan: None for an item without a place.
         """
         check_range("max_distance_m", max_distance_m, 0, math.inf, above=True)
         here = self._telemetry.position.latest
@@ -287,8 +286,9 @@ class VehiclePosition:
                 )
 
     def remaining_distance(self, target: Position) -> float:
-        """Return the remaining distance. For ground vehicles it is horizontal, because their altitude has no fixed
-        origin.
+        """Return the remaining distance to ``target`` in metres.
+
+        For ground vehicles this is the horizontal distance, because their altitude has no fixed origin.
         """
         if self._autopilot.is_surface_vehicle:
             return self.distance_to(Position(target.latitude_deg, target.longitude_deg))
@@ -296,7 +296,7 @@ class VehiclePosition:
 
     @staticmethod
     def height_above(here: Position, target: Position) -> float:
-        """Return how many metres ``here`` is above ``target``; 0 if that is unknown."""
+        """Return how many metres ``here`` is above ``target``; 0 if no altitude is known for both."""
         for here_m, target_m in (
             (here.altitude_relative_m, target.altitude_relative_m),
             (here.altitude_amsl_m, target.altitude_amsl_m),

@@ -126,7 +126,7 @@ class RoundFlight:
             refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
             refusal = next(refusals, "")
             if refusal:
-                self._wrong_circle = refusal  # so that the vehicle is ordered to hold
+                self._wrong_circle = refusal  # The vehicle must hold then, too.
             if reason := mode_failure() or refusal:
                 return reason
             if session.connection.now() <= started + CIRCLE_REPORT_S:  # PX4 may still report the previous circle.

@@ -100,7 +100,7 @@ class StickStream(SteeringStream[StickInput]):
 
         Raises:
             InvalidArgument: a position is out of range; the previous positions stay in force until they expire.
-            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+            SetpointStreamStopped: the stream has ended by itself, or its `async with` block was left.
         """
         check_kind("sticks", sticks, StickInput)
         self._set(sticks)

@@ -256,7 +256,7 @@ class SteeringStream(ValueStream[ValueT]):
             raise self._stop_error
 
     async def _leave(self, exc: BaseException | None) -> None:
-        """Leave the block while the stream is running."""
+        """End the running stream when its `async with` block is left: make the vehicle hold."""
         self._end()
         self._stop_error = SetpointStreamStopped(f"the block of this {self._NAME} was left")
         if exc is not None:  # An exception leaves the block at once, without waiting for the confirmation of the hold.
@@ -275,8 +275,9 @@ class SteeringStream(ValueStream[ValueT]):
                 raise
 
     async def _enter(self, mode: Mode, order: Order) -> None:
-        """Change the mode. ArduPilot accepts values once it is in the mode; PX4 enters the mode once it receives
-        values.
+        """Change the mode, and begin to send values.
+
+        ArduPilot accepts values once it is in the mode. PX4 enters the mode only while it receives values.
         """
         if self._needs_stream_before_mode:
             self._begin_sending()
@@ -330,8 +331,9 @@ class TakeoverCheck:
         self._end_of_take_off = (take_off_mode, hold_mode)
 
     def raise_if_changed(self, operation: str) -> None:
-        """Raise OperationRejected if an order was given, or if the mode was changed other than by the end of a
-        take-off.
+        """Raise OperationRejected if an order was given, or if the mode was changed.
+
+        A change from the take-off mode to the hold mode is allowed, because it is the end of a take-off.
         """
         if self._arbiter.latest(STEERING) is not self._order_before:
             raise OperationRejected(f"{operation}: {SUPERSEDED} before anything was ordered")
