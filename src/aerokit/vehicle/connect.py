@@ -230,7 +230,7 @@ async def _attached(
 def warn_if_left_flying(vehicle: Vehicle) -> None:
     """Log a warning if the vehicle may still execute the program's orders when its `async with` block is left."""
     if vehicle._arbiter.may_be_executing and not vehicle.is_confirmed_disarmed:
-        logger.warning("the block of vehicle %d was left: %s", vehicle.system_id, vehicle.describe_now())
+        logger.warning("the async with block of vehicle %d was left: %s", vehicle.system_id, vehicle.describe_now())
 
 
 async def _find_vehicle(connection: Connection, system_id: int | None, timeout: float) -> _Found:

@@ -29,7 +29,7 @@ async def test_block_left_after_cancelled_flight_warns_that_vehicle_holds(
     assert scope.cancelled_caught
     (record,) = [record for record in caplog.records if "was left: " in record.message]
     assert (record.name, record.levelname) == ("aerokit", "WARNING")
-    assert record.message.startswith("the block of vehicle 1 was left: holding in BRAKE, still armed, ")
+    assert record.message.startswith("the async with block of vehicle 1 was left: holding in BRAKE, still armed, ")
 
 
 async def test_block_left_by_exception_in_flight_warns(caplog: pytest.LogCaptureFixture) -> None:

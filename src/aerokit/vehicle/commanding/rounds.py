@@ -59,7 +59,8 @@ class RoundFlight:
         self._operation, self._center, self._counter = operation, center, counter
         self._rounds = math.inf if rounds is None else rounds
         max_distance_m, self._timeout, self._max_silence_s = limits
-        self._wrong_circle = ""
+        # Why the vehicle does not fly the ordered circle; empty if it does. Such a vehicle is ordered to hold.
+        self._circle_problem = ""
         position = context.vehicle_position
         self._place = position.command_place(center)
         position.check_reach("center", [center], max_distance_m)
@@ -105,7 +106,7 @@ class RoundFlight:
             cleanup.hold_in_background(order)
             raise
         except OperationRejected:
-            if self._wrong_circle:
+            if self._circle_problem:
                 cleanup.hold_in_background(order)
             raise
 
@@ -118,7 +119,7 @@ class RoundFlight:
             """Recognise a wrong radius: PX4 accepts a radius above its limit, but then flies another radius."""
             flown_m = abs(status.radius)
             is_wrong = circle_m and abs(flown_m - circle_m) > RADIUS_ERROR_M
-            self._wrong_circle = (
+            self._circle_problem = (
                 f"the vehicle flies a circle of {flown_m:.1f} m instead of {circle_m:g} m" if is_wrong else ""
             )
 
@@ -126,12 +127,12 @@ class RoundFlight:
             refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
             refusal = next(refusals, "")
             if refusal:
-                self._wrong_circle = refusal  # The vehicle must hold then, too.
+                self._circle_problem = refusal
             if reason := mode_failure() or refusal:
                 return reason
             if session.connection.now() <= started + CIRCLE_REPORT_S:  # PX4 may still report the previous circle.
                 return None
-            return self._wrong_circle or None
+            return self._circle_problem or None
 
         def stall_reason() -> str | None:
             is_staying = not self._rounds and self._is_in_place

@@ -258,7 +258,7 @@ class SteeringStream(ValueStream[ValueT]):
     async def _leave(self, exc: BaseException | None) -> None:
         """End the running stream when its `async with` block is left: make the vehicle hold."""
         self._end()
-        self._stop_error = SetpointStreamStopped(f"the block of this {self._NAME} was left")
+        self._stop_error = SetpointStreamStopped(f"the async with block of this {self._NAME} was left")
         if exc is not None:  # An exception leaves the block at once, without waiting for the confirmation of the hold.
             self._hold()
         elif not self._context.arbiter.is_state_recent:
