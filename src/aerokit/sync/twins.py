@@ -2939,7 +2939,7 @@ class Rtk(TwinOf["AsyncRtk"]):
 
         Raises:
             InvalidArgument: ``rtcm`` is empty, or a message is incomplete, damaged or too long. Nothing was sent.
-            ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
+            ConnectionClosed, LinkLost: the connection has ended, or this vehicle's `async with` block was left.
         """
         self._loop.call(self.aio.send, rtcm)
 
@@ -4393,11 +4393,19 @@ class Vehicle(VehicleTwin):
         return self.aio.taken_over
 
     def missing_for_flight(self) -> list[str]:
-        """Return what is still missing before the vehicle can fly, from the state received so far. Sends nothing."""
+        """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
+
+        If its arming checks fail, includes the vehicle's texts about them of the last 35 seconds;
+        :meth:`why_not_armable` requests them. A vehicle may arm all the same: ArduCopter arms in STABILIZE without a
+        position.
+        """
         return self._loop.call(self.aio.missing_for_flight)
 
     def why_not_armable(self) -> list[str]:
-        """Return the reasons why arming would be refused now; an empty list means that none is known.
+        """Return the reasons why arming would be refused now, in the present mode; an empty list means that none is
+        known.
+
+        What only a flight needs is not listed, see :meth:`missing_for_flight`.
 
         Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) if it supports that, and collects its status
         texts. Also reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
@@ -5240,8 +5248,9 @@ def open_connection(
         mavlink_version: version of sent messages, 1 or 2; both are received.
         signing: key that signs sent frames; received frames without its signature are refused (docs/signing.md). None:
             frames are neither signed nor verified.
-        record: ``.tlog`` file for all sent and received frames, unknown messages included. An existing file is replaced
-            when the first frame is received. A full disk ends the recording, not the connection.
+        record: ``.tlog`` file for all sent and received frames, unknown messages included. When the first frame is
+            received, an existing file is renamed to the next free number (``flight.1.tlog``), which logger "aerokit"
+            reports. A full disk ends the recording, not the connection.
         reconnect: True to reopen a lost link (e.g. an unplugged device) until it is back, instead of ending the
             connection; see ``LinkInterrupted`` and ``LinkRestored``. Does not apply to the first opening, or to the end
             of a replay. With several links: True to keep the connection while all of them are lost.
@@ -5317,7 +5326,8 @@ def connect(
         mavlink_version: version of the frames we send, 1 or 2.
         signing: signs everything we send, and rejects frames that are not signed with its key (docs/signing.md).
             None: no signatures.
-        record: a ``.tlog`` file that receives all traffic in both directions; an existing file is replaced.
+        record: a ``.tlog`` file that receives all traffic in both directions; an existing file is kept under a numbered
+            name, ``flight.1.tlog``.
         reconnect: reopen a lost link, with as many attempts as it needs, instead of ending the connection.
         peers: accept datagrams and connections only from these IP addresses and networks: ``"10.0.0.7"``,
             ``["10.0.0.0/24"]``. For links with an open port: udpin, udpbcast, tcpin. None: accept all.
