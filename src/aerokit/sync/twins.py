@@ -777,7 +777,7 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
 
     @property
     def is_open(self) -> bool:
-        """True inside the block."""
+        """True inside the stream's `async with` block."""
         return self.aio.is_open
 
     @property

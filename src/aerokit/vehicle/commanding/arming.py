@@ -263,13 +263,9 @@ class ArmingActions(VehicleBase):
             return arming_mode
         # A set-point stream needs its own mode. A booting vehicle may still change its mode by itself.
         is_booting = self.telemetry.system_status.latest in BOOTING
-        if (
-            self._flight_cleanup.stop_stream is not None
-            or is_booting
-            or not self.telemetry.is_confirmed_disarmed
-            or not self._health.unarmable_mode()
-            or self._is_in_optional_mode()
-        ):
+        must_keep_mode = self._flight_cleanup.stop_stream is not None or is_booting
+        may_arm_in_mode = not self._health.unarmable_mode() or self._is_in_optional_mode()
+        if must_keep_mode or may_arm_in_mode or not self.telemetry.is_confirmed_disarmed:
             return None
         return self.autopilot.mode_to_arm_in()
 

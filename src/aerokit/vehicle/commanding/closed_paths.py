@@ -165,7 +165,7 @@ class TurnCounter:
         """True while the vehicle is near the circle."""
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Process a place relative to the centre."""
+        """Process a reported position of the vehicle, in metres from the centre."""
         self.is_on_path = abs(math.hypot(north_m, east_m) - self._radius_m) <= self._tolerance_m
         bearing_before, self._bearing = self._bearing, math.atan2(east_m, north_m) if self.is_on_path else None
         if bearing_before is not None and self._bearing is not None:
@@ -184,7 +184,7 @@ class LobeCounter:
         """True while the vehicle is in one of the lobes."""
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Process a place relative to the centre."""
+        """Process a reported position of the vehicle, in metres from the centre."""
         along = north_m * math.cos(self._axis) + east_m * math.sin(self._axis)
         self.is_on_path = abs(along) > self._half_m
         lobe = int(math.copysign(1, along)) if self.is_on_path else 0

@@ -41,7 +41,10 @@ IMPACT_HEIGHT_M = 3.0
 """If the height changes by this distance after a sudden stop, the stop was not on the ground."""
 
 MIN_DROP_M = 1.0
-"""A vehicle that falls to ``IMPACT_M_S`` loses 1.8 m. If it lost less than this, its velocity jumped."""
+"""A vehicle that falls until it sinks at ``IMPACT_M_S`` loses 1.8 m of height.
+
+If it has lost less height than this constant, only its reported velocity has jumped.
+"""
 
 MAX_SLIDE_M_S = 8.0
 """A vehicle that is faster than this over ground is not on the ground yet: a fixed wing may have levelled off."""

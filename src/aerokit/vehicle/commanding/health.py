@@ -155,7 +155,7 @@ class Health:
         return [text for text in self._session.texts_since(since) if self._autopilot.arming_reason(text) is not None]
 
     def _failing(self) -> list[str]:
-        """Return failing sensors and missing estimates, and a missing GPS fix if it may be the cause of the latter."""
+        """Return failing sensors and missing estimates. If estimates are missing, also report a missing GPS fix."""
         return [*self._failing_sensors(), *self._missing_estimates()]
 
     def _missing_estimates(self) -> list[str]:

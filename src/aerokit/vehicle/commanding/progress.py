@@ -61,7 +61,7 @@ async def await_progress(
 ) -> None:
     """Return when ``is_done()`` has been true for ``held_for`` seconds.
 
-    All functions are called every ``POLL_INTERVAL_S``, and whenever the mode, the arming or the landed state changes;
+    The functions are called every ``POLL_INTERVAL_S``, and whenever the mode, the arming or the landed state changes;
     with ``at_positions`` also at each new position. ``operation`` is the name for error texts.
 
     Raises:

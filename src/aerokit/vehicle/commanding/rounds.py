@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 # Interval at which set-points are computed; rate at which the latest is sent; seconds for which it may be sent.
 SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
 RADIUS_ERROR_M, CIRCLE_REPORT_S = 0.5, 2.0
-"""Deviation in metres from which a reported radius counts as wrong, and seconds in which PX4 may still report the
-previous circle.
+"""Deviation in metres from which a reported radius counts as wrong.
+
+For CIRCLE_REPORT_S seconds after the command, PX4 may still report the previous circle.
 """
 LAG_ROUNDS = 0.02
 """Fraction of a round by which the count may lag although the vehicle is at the end of its path."""

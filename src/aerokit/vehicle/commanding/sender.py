@@ -245,7 +245,7 @@ class OrderSender:
         return failure_reason
 
     def impact_failure(self, order: Order) -> Callable[[], str]:
-        """Return a function that returns a clause once the vehicle has hit the ground during the newest order."""
+        """Return a function that returns a clause once the vehicle has hit the ground while ``order`` is the newest."""
         detector = ImpactDetector(self._session)
 
         def failure_reason() -> str:

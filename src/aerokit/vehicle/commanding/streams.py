@@ -131,7 +131,7 @@ class ValueStream(Generic[ValueT]):
         except Exception as error:
             self._stop(str(error))
             return
-        due = max(due + self._period_s, self._now())
+        due = max(due + self._period_s, self._now())  # After a delay, ticks that were missed are not made up for.
         self._timer = asyncio.get_running_loop().call_at(due, self._tick, due)
 
     def _send(self) -> None:

@@ -122,7 +122,7 @@ class MeasurementStream(Generic[MeasurementT]):
 
     @property
     def is_open(self) -> bool:
-        """True inside the block."""
+        """True inside the stream's `async with` block."""
         return self._is_open
 
     @property
