@@ -12,7 +12,7 @@ import anyio
 
 from aerokit._internal.arguments import checked
 from aerokit._internal.async_block import async_block
-from aerokit.connection.bus import copy_exception
+from aerokit.connection.bus import EVERY_SYSTEM, copy_exception
 from aerokit.connection.connection import Connection
 from aerokit.connection.heartbeats import OwnHeartbeat, is_autopilot
 from aerokit.connection.opening import explain_no_vehicle, open_connection
@@ -244,7 +244,7 @@ async def _find_vehicle(connection: Connection, system_id: int | None, timeout: 
         if frame is not None and connection.now() - frame.received_at <= HEARTBEAT_MAX_AGE_S:
             search.on_heartbeat(heartbeat)
     detachments = [
-        connection.bus.attach(Heartbeat, search.on_heartbeat, system_id=system_id or 0),
+        connection.bus.attach(Heartbeat, search.on_heartbeat, system_id=system_id or EVERY_SYSTEM),
         connection.on_end(search.abort),
     ]
     try:

@@ -15,15 +15,22 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 SETTLING_S, SETTLED_M_S = 0.5, 2.0
-"""A vehicle on the ground moves up or down slower than this for at least this time, even on a ship. A vehicle whose
-motors stop while it climbs is slower than this for 0.4 s at most."""
+"""A vehicle on the ground moves up or down slower than this speed for at least this time, even on a ship.
+
+A vehicle whose motors stop while it climbs is slower than this speed for 0.4 s at most.
+"""
 
 UNSETTLED_S, UNSETTLED_M = 5.0, 2.0
-"""A vehicle whose height has changed by less than this distance for this time is on the ground, whatever velocity it
-reports."""
+"""A vehicle whose height changes by less than this distance in this time is on the ground.
+
+This applies whatever velocity the vehicle reports, because the velocity may be wrong.
+"""
 
 IMPACT_M_S = 6.0
-"""Sink rate in m/s that no landing has right before touchdown. Autopilots descend at 5 m/s at most, and slow down."""
+"""A vehicle that sinks this fast right before it stops does not land, but falls.
+
+Autopilots descend at 5 m/s at most, and slow down before the touchdown.
+"""
 
 IMPACT_STOP_S = 0.7
 """A descent at ``IMPACT_M_S`` that ends within this time is an impact. Autopilots need longer to brake."""
