@@ -124,13 +124,14 @@ class PathFlight:
         self._phase = min(self._phase + self._present_speed_m_s * seconds / metres_per_radian, self._last_phase)
         if self.is_complete:
             self._present_speed_m_s = 0.0
-        place, tangent, curvature = self._path.at(self._phase)
+        place, tangent, second_derivative = self._path.at(self._phase)
         phase_rate = self._present_speed_m_s / math.hypot(*tangent)
         # The part of the second derivative that is parallel to the path would change the speed, so it is subtracted.
-        parallel = (curvature[0] * tangent[0] + curvature[1] * tangent[1]) / (tangent[0] ** 2 + tangent[1] ** 2)
+        (north_1, east_1), (north_2, east_2) = tangent, second_derivative
+        parallel_factor = (north_2 * north_1 + east_2 * east_1) / (north_1**2 + east_1**2)
         centripetal = (
-            (curvature[0] - parallel * tangent[0]) * phase_rate**2,
-            (curvature[1] - parallel * tangent[1]) * phase_rate**2,
+            (north_2 - parallel_factor * north_1) * phase_rate**2,
+            (east_2 - parallel_factor * east_1) * phase_rate**2,
         )
         return self._setpoint(place, 0.0, (tangent[0] * phase_rate, tangent[1] * phase_rate, 0.0), centripetal)
 
