@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint
 
-# Interval at which set-points are computed; rate at which the latest is sent; seconds for which it may be sent.
+# Seconds between computed set-points, rate in Hz at which the latest one is sent, and seconds for which it stays valid.
 SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
 RADIUS_ERROR_M, CIRCLE_REPORT_S = 0.5, 2.0
 """Deviation in metres from which a reported radius counts as wrong.

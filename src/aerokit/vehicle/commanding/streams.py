@@ -270,7 +270,7 @@ class SteeringStream(ValueStream[ValueT]):
             order = self._context.arbiter.order(hold_mode)
             try:
                 await cleanup.stop_in(hold_mode, order)
-            except (anyio.get_cancelled_exc_class(), OperationTimeout):  # The hold may have been lost.
+            except (anyio.get_cancelled_exc_class(), OperationTimeout):  # The order to hold may have been lost.
                 cleanup.hold_in_background(order)
                 raise
 
