@@ -756,7 +756,7 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
     behaves as if its sensor had failed. Of several measurements within one period, only the newest is sent. A
     measurement is dropped if it is older than ``valid_for_s`` when it is due to be sent, for example after the event
     loop was blocked. While the vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count
-    measurements. The stream ends only with the block.
+    measurements. The stream ends only with its `async with` block.
 
     Entering raises:
         NotSupported: this firmware does not read such measurements. Nothing was sent.
@@ -785,7 +785,7 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
         """Use of these measurements by the vehicle's estimator: ``"used"``, ``"not used"`` or ``"unknown"``.
 
         No message reports this, so aerokit derives it from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the
-        parameters at the beginning of the block. ``"used"``: the estimator has a position, and its parameters allow no
+        parameters when the stream was entered. ``"used"``: the estimator has a position, and its parameters allow no
         other source of it. ``"not used"``: the estimator has no position. ``"unknown"``: all other cases, for example
         if the vehicle also has a GPS, for sensors that supply no position, or without a recent report.
         """
@@ -4152,8 +4152,8 @@ class Vehicle(VehicleTwin):
     ) -> AbstractContextManager[PostedOrder]:
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
-        Within the block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged or
-        their effect is reported. The retries also end when a newer order about the same subject is given, when the
+        In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
+        or their effect is reported. The retries also end when a newer order about the same subject is given, when the
         vehicle changes to a mode that neither this order nor another order of the last ten seconds explains, and, if
         the order is about motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
         vehicle hold nor monitors late arming; use the actions for that.
@@ -4355,7 +4355,7 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
     def hold(self) -> None:
-        """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's hold mode.
+        """Stop and stay (a fixed wing circles). Returns when HEARTBEAT reports the autopilot's hold mode.
 
         The mode is BRAKE on Copter, LOITER on Plane and boats, HOLD on Rover, POSHOLD on Sub and LOITER on PX4.
 
@@ -4402,10 +4402,9 @@ class Vehicle(VehicleTwin):
         return self._loop.call(self.aio.missing_for_flight)
 
     def why_not_armable(self) -> list[str]:
-        """Return the reasons why arming would be refused now, in the present mode; an empty list means that none is
-        known.
+        """Return the reasons why arming in the present mode would be refused now; an empty list if none is known.
 
-        What only a flight needs is not listed, see :meth:`missing_for_flight`.
+        :meth:`missing_for_flight` also lists what is needed only for a flight.
 
         Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) if it supports that, and collects its status
         texts. Also reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
@@ -4553,9 +4552,9 @@ class Vehicle(VehicleTwin):
         timeout: float | None = None,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Fly circles around a place; returns when the vehicle's reported positions have gone around it ``turns``
-        times.
+        """Fly circles around a place.
 
+        Returns when the vehicle's reported positions have gone around the place ``turns`` times.
         Afterwards a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit
         orders the vehicle to hold.
 
@@ -4951,13 +4950,13 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, max_silence_s=max_silence_s)
 
     def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Land at the present position; returns when the vehicle is on the ground.
+        """Land at the present position. Returns when the vehicle is on the ground.
 
         The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation the
         vehicle continues to land.
 
         Args:
-            timeout: seconds until it is on the ground; None: no limit.
+            timeout: seconds until the vehicle is on the ground; None: no limit.
             max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
@@ -4971,7 +4970,7 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.land, timeout=timeout, max_silence_s=max_silence_s)
 
     def return_to_launch(self, *, timeout: float | None = 600.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Return to launch; the call ends on the ground, or above it if the autopilot does not land by itself.
+        """Return to launch. Returns on the ground, or above home if the autopilot does not land by itself.
 
         Raises the same errors as :meth:`land`.
         """

@@ -338,7 +338,7 @@ async def vehicles_on(
     rates: Mapping[type[Message], float] | None = None,
     on_found: Callable[[Vehicle], object] | None = None,
 ) -> AsyncIterator[Mapping[int, Vehicle]]:
-    """Connect to every vehicle found on a connection, for the duration of the block.
+    """Connect to every vehicle found on a connection, for the duration of the ``async with`` block.
 
     A vehicle that falls silent stays in the mapping; its ``link_state`` and the ages of its cells show the silence.
     Vehicles to which this program is already connected are not in the mapping.

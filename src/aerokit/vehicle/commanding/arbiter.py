@@ -23,8 +23,10 @@ MODE_GRACE_S = 3.0
 ARM_HEARTBEAT_DELAY_S = 1.5
 """Seconds after an accepted arm command in which HEARTBEAT (1 Hz) may still report the previous state."""
 MODE_MAX_AGE_S = 2.5
-"""Maximum age in seconds of a HEARTBEAT that counts as the vehicle's present state. Two HEARTBEATs may be lost. The
-ground-station failsafes of ArduPilot and PX4 act later (FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s).
+"""Maximum age in seconds of a HEARTBEAT that counts as the vehicle's present state.
+
+Two HEARTBEATs may be lost within this time. The ground-station failsafes of ArduPilot and PX4 act later
+(FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s).
 """
 OWN_MODES_MAX_AGE_S = 10.0
 """For this many seconds after the program ordered a mode, a change to that mode does not count as a takeover."""
@@ -43,8 +45,9 @@ def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
 
 
 class CommandArbiter:
-    """Keeps the orders to one vehicle, determines the newest order for each topic, and updates orders with each
-    HEARTBEAT.
+    """Keeps the orders to one vehicle, and updates them with each HEARTBEAT.
+
+    It also determines the newest order about each topic.
 
     Every order of the program is registered here: flight actions, set-points, devices, fleets and classic scripts.
     """
@@ -58,9 +61,7 @@ class CommandArbiter:
         self.arming_orders = 0
         """Number of arm and disarm commands sent."""
         self.mode_is_in_doubt: bool = False
-        """True while the result of a command that changes the mode is unknown, so that the reported mode may change
-        soon.
-        """
+        """True while the result of a mode change is unknown, so that the reported mode may still change."""
         self.mode_settles_at: float = -math.inf
         """Time until which HEARTBEAT may report the mode of an abandoned order."""
         self._any_mode_until = self._arming_accepted_at = self._disarmed_at = -math.inf

@@ -61,10 +61,9 @@ class ArmingActions(VehicleBase):
         return self._health.missing_for_flight()
 
     async def why_not_armable(self) -> list[str]:
-        """Return the reasons why arming would be refused now, in the present mode; an empty list means that none is
-        known.
+        """Return the reasons why arming in the present mode would be refused now; an empty list if none is known.
 
-        What only a flight needs is not listed, see :meth:`missing_for_flight`.
+        :meth:`missing_for_flight` also lists what is needed only for a flight.
 
         Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) if it supports that, and collects its status
         texts. Also reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).

@@ -180,13 +180,13 @@ class FlightActions(VehicleBase):
             )
 
     async def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Land at the present position; returns when the vehicle is on the ground.
+        """Land at the present position. Returns when the vehicle is on the ground.
 
         The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation the
         vehicle continues to land.
 
         Args:
-            timeout: seconds until it is on the ground; None: no limit.
+            timeout: seconds until the vehicle is on the ground; None: no limit.
             max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
@@ -211,7 +211,7 @@ class FlightActions(VehicleBase):
     async def return_to_launch(
         self, *, timeout: float | None = 600.0, max_silence_s: float | None = MAX_SILENCE_S
     ) -> None:
-        """Return to launch; the call ends on the ground, or above it if the autopilot does not land by itself.
+        """Return to launch. Returns on the ground, or above home if the autopilot does not land by itself.
 
         Raises the same errors as :meth:`land`.
         """
@@ -312,7 +312,7 @@ class ModeActions(VehicleBase):
         await self._sender.change_mode(found_mode, self._arbiter.order(found_mode), timeout)
 
     async def hold(self) -> None:
-        """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's hold mode.
+        """Stop and stay (a fixed wing circles). Returns when HEARTBEAT reports the autopilot's hold mode.
 
         The mode is BRAKE on Copter, LOITER on Plane and boats, HOLD on Rover, POSHOLD on Sub and LOITER on PX4.
 

@@ -52,9 +52,9 @@ class ManeuverActions(VehicleBase):
         timeout: float | None = None,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Fly circles around a place; returns when the vehicle's reported positions have gone around it ``turns``
-        times.
+        """Fly circles around a place.
 
+        Returns when the vehicle's reported positions have gone around the place ``turns`` times.
         Afterwards a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit
         orders the vehicle to hold.
 

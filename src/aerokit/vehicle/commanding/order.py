@@ -63,8 +63,10 @@ CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
 }
 """Maps the name of a message to the subjects that it changes. Commands and mission items are not in this table."""
 FAILSAFE_STATES = (MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMINATION)
-"""Values of HEARTBEAT.system_status while a failsafe is active. PX4 reports them seconds before the failsafe changes
-the mode (COM_FAIL_ACT_T). An order that arrives in between cancels the failsafe.
+"""Values of HEARTBEAT.system_status while a failsafe is active.
+
+PX4 reports them seconds before the failsafe changes the mode (COM_FAIL_ACT_T). An order that arrives in between cancels
+the failsafe.
 """
 # Values of MISSION_ITEM.current for an item that ArduPilot executes at once instead of storing it: 2 is a place to fly
 # to, 3 a new altitude (GCS_Common.cpp).
@@ -224,7 +226,7 @@ class Order:
 
     def close(self) -> None:
         """End the posted order, because its `with` block was left."""
-        self.takeover_reason = self.takeover_reason or "its block was left"
+        self.takeover_reason = self.takeover_reason or "its `with` block was left"
 
     def clear_failsafe(self) -> None:
         """Ignore the reported failsafe, because the program has given a new order since."""

@@ -217,8 +217,9 @@ MAX_METRES_PER_DEGREE = 112_000
 """Upper limit in metres for one degree of latitude, or of longitude at the equator."""
 
 MAX_DISTANCE_M = 100_000.0
-"""A place farther away than this is treated as a mistake (swapped coordinates, a lost sign), unless the caller raises
-the limit.
+"""A place farther away than this counts as a mistake, unless the caller raises the limit.
+
+Typical mistakes are swapped coordinates and a lost sign.
 """
 
 

@@ -54,7 +54,7 @@ class ValueStream(Generic[ValueT]):
     The stream stops when the program no longer supplies values, blocks the event loop, or leaves the block, and
     when the vehicle falls silent.
 
-    Subclasses implement entering and leaving the block, and what happens when the stream stops by itself.
+    Subclasses implement `__aenter__`, `__aexit__`, and what happens when the stream stops by itself.
     """
 
     # Nouns for the stream and its value in error texts.
@@ -196,12 +196,13 @@ class SteeringStream(ValueStream[ValueT]):
     """
 
     _prepared_order: Order | None = None
-    """The steering order, if it was already given before the block is entered; see `FlightCleanup.preparing`."""
+    """The steering order, if it was given before the stream is entered; see `FlightCleanup.preparing`."""
     _order: Order | None = None
     _mode: Mode | None = None
     _impact: ImpactDetector | None = None
-    """Ends the stream when the vehicle hits the ground; None if the values determine the thrust, so that the vehicle
-    may brake as suddenly in the air.
+    """Ends the stream when the vehicle hits the ground.
+
+    None for values that determine the thrust: they may also stop the vehicle suddenly in the air.
     """
 
     @property

@@ -76,7 +76,7 @@ class MeasurementStream(Generic[MeasurementT]):
     behaves as if its sensor had failed. Of several measurements within one period, only the newest is sent. A
     measurement is dropped if it is older than ``valid_for_s`` when it is due to be sent, for example after the event
     loop was blocked. While the vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count
-    measurements. The stream ends only with the block.
+    measurements. The stream ends only with its `async with` block.
 
     Entering raises:
         NotSupported: this firmware does not read such measurements. Nothing was sent.
@@ -130,7 +130,7 @@ class MeasurementStream(Generic[MeasurementT]):
         """Use of these measurements by the vehicle's estimator: ``"used"``, ``"not used"`` or ``"unknown"``.
 
         No message reports this, so aerokit derives it from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the
-        parameters at the beginning of the block. ``"used"``: the estimator has a position, and its parameters allow no
+        parameters when the stream was entered. ``"used"``: the estimator has a position, and its parameters allow no
         other source of it. ``"not used"``: the estimator has no position. ``"unknown"``: all other cases, for example
         if the vehicle also has a GPS, for sensors that supply no position, or without a recent report.
         """

@@ -49,7 +49,9 @@ if TYPE_CHECKING:
 
 
 class States:
-    """State cells: each has ``.value`` (raises ValueUnknownError before the first value), ``.latest`` (None before it),
+    """The states of a vehicle, each of which is a cell.
+
+    A cell has ``.value`` (raises ValueUnknownError before the first value), ``.latest`` (None before the first value),
     ``.age`` in seconds, ``.source``, ``.fresh(within=s)``, ``await .wait_until(predicate, held_for=s)`` and
     ``.changes()``.
     """
