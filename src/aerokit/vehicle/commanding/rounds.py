@@ -43,7 +43,8 @@ FRAME_TIMEOUT_S = 5.0
 class RoundFlight:
     """One flight around a place, or to the place if there is no ``counter``.
 
-    Without ``rounds``, the flight lasts until cancelled. ``limits`` are max_distance_m, timeout and max_silence_s. The constructor raises if the vehicle cannot fly there.
+    Without ``rounds``, the flight lasts until cancelled. ``limits`` are max_distance_m, timeout and max_silence_s. The
+    constructor raises if the vehicle cannot fly there.
     """
 
     def __init__(
