@@ -30,7 +30,7 @@ BACKGROUND_COMMAND_TIMEOUT_S = 5.0
 
 
 class Messaging(Protocol):
-    """What transfers need from the session of an autopilot or of another component."""
+    """Interface of the session of an autopilot or another component, as transfers need it."""
 
     on_reboot: list[Callable[[], None]]
 
