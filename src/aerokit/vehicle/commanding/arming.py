@@ -283,7 +283,8 @@ class ArmingActions(VehicleBase):
         if self._arbiter.arming_orders != arming_orders_before:
             raise OperationRejected("arm(): another arm or disarm command was given; the arm command was not sent")
         if not self._arbiter.is_state_recent:
-            raise HeartbeatTimeout(f"arm(): {self._session.describe_link()}; the arm command was not sent")
+            link = self._session.describe_link()
+            raise HeartbeatTimeout(f"arm(): the vehicle is silent; {link}; the arm command was not sent")
 
     async def _wait_until_armable(self) -> None:
         """Wait briefly until SYS_STATUS no longer reports that the pre-arm checks fail, after a change of the mode."""

@@ -261,7 +261,7 @@ class FlightCleanup:
             yield order
             self._sender.raise_if_ended(order)
             if not self._arbiter.is_state_recent:
-                raise HeartbeatTimeout(f"{self._session.describe_link()}; nothing was sent")
+                raise HeartbeatTimeout(f"the vehicle is silent: {self._session.describe_link()}; nothing was sent")
         except BaseException:
             self.hold_in_background(order)
             raise

@@ -91,7 +91,7 @@ async def await_progress(
                 reason += _height_when_disarmed(session)
                 raise OperationRejected(f"{operation}: {reason}", reasons=_reasons(session, reason, started))
             if max_silence_s is not None and session.watch.silent_for_s > max_silence_s:
-                raise HeartbeatTimeout(f"{operation}: {session.describe_link()}")
+                raise HeartbeatTimeout(f"{operation}: the vehicle is silent; {session.describe_link()}")
             if timeout is not None and now - started >= timeout:
                 raise OperationTimeout(
                     f"{operation}: not done within {timeout:g} s; {describe()}; {session.describe_link()}"

@@ -312,7 +312,11 @@ class VehicleSession:
     def describe_link(self) -> str:
         """Return one line about the link's quality, for error texts."""
         received, lost = self.connection.counts(self.system_id)
-        loss = f"{100 * lost / (received + lost):.0f} % of its frames lost" if received + lost else "nothing received"
+        loss = (
+            f"{100 * lost / (received + lost):.0f} % of the vehicle's frames lost"
+            if received + lost
+            else "nothing received"
+        )
         signatures = self._describe_signatures()
         signature_problems = f"{signatures}; " if signatures else ""
         texts = self.texts_since(self.connection.now() - 10.0)
