@@ -312,11 +312,8 @@ class VehicleSession:
     def describe_link(self) -> str:
         """Return one line about the link's quality, for error texts."""
         received, lost = self.connection.counts(self.system_id)
-        loss = (
-            f"{100 * lost / (received + lost):.0f} % of the vehicle's frames lost"
-            if received + lost
-            else "nothing received"
-        )
+        sent = received + lost
+        loss = f"{100 * lost / sent:.0f} % of the vehicle's frames lost" if sent else "nothing received"
         signatures = self._describe_signatures()
         signature_problems = f"{signatures}; " if signatures else ""
         texts = self.texts_since(self.connection.now() - 10.0)
