@@ -283,9 +283,9 @@ class MessagingActions(VehicleBase):
             InvalidArgument: there is no subject, or ``"arm"`` was given without ``armed``. Nothing was sent.
         """
         if not subjects:
-            raise InvalidArgument("posted: subjects are missing: pass 'mode', 'motion' or 'arm'")
+            raise InvalidArgument("posted() needs at least one subject: 'mode', 'motion' or 'arm'")
         if "arm" in subjects and armed is None:
-            raise InvalidArgument("posted: subject 'arm' requires armed=True or armed=False")
+            raise InvalidArgument("posted(): the subject 'arm' requires armed=True or armed=False")
         with (
             self._arbiter.post(subjects, modes=modes, armed=armed) as order,
             PostedOrder(self._session, self._arbiter, self._sender, order) as posted,

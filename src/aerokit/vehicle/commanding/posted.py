@@ -113,7 +113,7 @@ class PostedOrder:
             OperationTimeout: the vehicle accepted the mode but stayed in another mode.
         """
         if mode not in self._order.modes:
-            raise InvalidArgument(f"mode = {mode} is not allowed: it is not a mode of this order")
+            raise InvalidArgument(f"mode = {mode} is not allowed: this order does not lead to this mode")
         for attempts_left in reversed(range(MAX_MODE_ATTEMPTS)):
             try:
                 self._prepare(MavCmd.DO_SET_MODE)

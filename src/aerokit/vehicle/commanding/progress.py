@@ -281,9 +281,9 @@ class VehiclePosition:
             if distance_m > max_distance_m:
                 where = f"{name}, item {index}" if are_items else name
                 raise InvalidArgument(
-                    f"{where} = {place.latitude_deg:.7f}, {place.longitude_deg:.7f} is not allowed: it is"
+                    f"{where} = {place.latitude_deg:.7f}, {place.longitude_deg:.7f} is not allowed: the place is"
                     f" {distance_m / 1000:,.0f} km away, more than max_distance_m = {max_distance_m:,.0f}; nothing was"
-                    " sent. Pass a greater max_distance_m to allow it"
+                    " sent. Pass a greater max_distance_m to allow this place"
                 )
 
     def remaining_distance(self, target: Position) -> float:
@@ -335,7 +335,7 @@ class VehiclePosition:
         altitude = relative_m if relative_m is not None else amsl_m
         if altitude is None:
             raise InvalidArgument(
-                f"target = {target} is not allowed: it has no altitude, and the vehicle's own altitude is unknown; give"
+                f"target = {target} is not allowed: the target has no altitude, and the vehicle's own is unknown; give"
                 " the target altitude_relative_m or altitude_amsl_m"
             )
         check_range("altitude", altitude, -12_000, 100_000)

@@ -161,7 +161,7 @@ class External:
                 return
             if session.autopilot.external.origin_is_final:
                 raise OperationRejected(
-                    f"set_origin: {session.autopilot.firmware} has the origin {present_origin} and keeps it until a"
+                    f"set_origin: {session.autopilot.firmware} has the origin {present_origin}, and keeps it until a"
                     " reboot"
                 )
         latitude, longitude = round(origin.latitude_deg * 1e7), round(origin.longitude_deg * 1e7)
