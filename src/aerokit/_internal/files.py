@@ -36,7 +36,7 @@ def write_atomically(path: str | os.PathLike[str], text: str) -> None:
 
 
 def read_bounded(path: str | os.PathLike[str]) -> bytes:
-    """Read a file.
+    """Read a file of limited size.
 
     Raises:
         FileFormatError: the file is larger than :data:`MAX_FILE_SIZE`.

@@ -258,7 +258,7 @@ class CommandArbiter:
             self._arming_accepted_at = self._now()
 
     def _supersede_arming(self, armed: bool | None) -> None:
-        """End earlier orders to arm or disarm before a command that arms or disarms; None: before other commands."""
+        """End earlier orders to arm or disarm, because a command that arms or disarms is sent; None: another command."""
         if armed is None:
             return
         self.arming_orders += 1

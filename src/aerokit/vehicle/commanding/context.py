@@ -40,7 +40,10 @@ class VehicleContext:
         session.on_reboot.append(self.arbiter.on_reboot)
 
     async def finish(self) -> bool:
-        """At the end of the vehicle's `async with` block, hold the vehicle if a flight was abandoned; True if so."""
+        """At the end of the vehicle's `async with` block, hold the vehicle if a flight was abandoned.
+
+        Returns True if a flight was abandoned.
+        """
         for callback in tuple(self.on_finish):
             callback()
         self.flight_cleanup.end_flights()

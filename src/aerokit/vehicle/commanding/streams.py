@@ -51,8 +51,8 @@ LEAD_TIME_S = 1.0
 class ValueStream(Generic[ValueT]):
     """Sends the latest value at a fixed rate.
 
-    The stream stops when the program no longer supplies values, blocks the event loop, or leaves the block, and
-    when the vehicle falls silent.
+    The stream stops when the program no longer supplies values, blocks the event loop, or leaves the `async with`
+    block, and when the vehicle falls silent.
 
     Subclasses implement `__aenter__`, `__aexit__`, and what happens when the stream stops by itself.
     """
