@@ -258,7 +258,7 @@ class CommandArbiter:
             self._arming_accepted_at = self._now()
 
     def _supersede_arming(self, armed: bool | None) -> None:
-        """End earlier orders to arm or disarm, because a command that arms or disarms is sent; None: another command."""
+        """End earlier orders to arm or disarm, because a command that does so is sent. None: some other command."""
         if armed is None:
             return
         self.arming_orders += 1
