@@ -167,7 +167,7 @@ class Vehicle(
 
         Args:
             initial: stick positions that are sent while the mode is entered; None centres all sticks.
-            mode: the flight mode in which the sticks steer. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane),
+            mode: the flight mode for the sticks. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane),
                 MANUAL (ArduPilot Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
             rate_hz: transmission rate of the latest positions, 2 to 400.
             valid_for_s: seconds for which the latest positions are repeated; the stream stops after that.
