@@ -335,8 +335,8 @@ class VehiclePosition:
         altitude = relative_m if relative_m is not None else amsl_m
         if altitude is None:
             raise InvalidArgument(
-                f"target = {target} is not allowed: the target has no altitude, and the vehicle's own is unknown; give"
-                " the target altitude_relative_m or altitude_amsl_m"
+                f"target = {target} is not allowed: the target has no altitude, and the vehicle's own altitude is"
+                " unknown; give the target altitude_relative_m or altitude_amsl_m"
             )
         check_range("altitude", altitude, -12_000, 100_000)
         if is_relative and not self.accepts_relative_altitude:
