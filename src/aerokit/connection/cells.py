@@ -85,7 +85,7 @@ class StateCell(Generic[T]):
         self._stamp = clock if stamp is None else stamp  # returns the receive time for a value that is set now
         self.waits_for: str = waits_for
         """Names of the messages that carry the value."""
-        # Returns the reason why no values arrive, for time-out errors. The default, str(), returns "": unknown.
+        # Function that explains in time-out errors why no values arrive. The default, `str`, returns "" (unknown).
         self._explain_timeout: Callable[[], str] = str
         self._known = False
         self._latest: T | None = None
@@ -148,7 +148,8 @@ class StateCell(Generic[T]):
             StaleValueError: the value is older.
             ValueUnknownError: no value has been received.
         """
-        age = self.age  # read before the value, so that another thread never gets an age that is too small
+        # The age is read first: if the loop's thread sets a new value in between, the age is too large, not too small.
+        age = self.age
         value = self.value
         if age > within:
             raise StaleValueError(
@@ -227,7 +228,8 @@ class StateCell(Generic[T]):
 
     def forget(self) -> None:
         """Make the value unknown again, e.g. after a reboot. Waiters keep waiting."""
-        self._known = False  # `_latest` is kept, because another thread may just have read `_known` as True
+        # `_latest` is kept, because another thread may have read `_known` as True just before this line.
+        self._known = False
         self._source = None
         self._updated_at = -math.inf
         for sink in tuple(self._sinks):
@@ -316,10 +318,12 @@ class Changes(AsyncIterator[T]):
         cell._follow()
         self._cell = cell
         self._every_arrival = every_arrival
-        self._read_count = self._total() - (1 if cell.is_known else 0)  # a known value is yielded first
+        # The current value counts as unread, because iteration starts with it.
+        self._read_count = self._total() - (1 if cell.is_known else 0)
         self._missed = 0
 
-    def __del__(self) -> None:  # the only notice of the end, because a loop can be left at any time
+    # A reader may leave its loop at any time. That it has ended is then only visible by garbage collection.
+    def __del__(self) -> None:
         if hasattr(self, "_cell"):  # False if __init__ raised
             self._cell._unfollow()
 
@@ -340,7 +344,7 @@ class Changes(AsyncIterator[T]):
         return self._cell.value
 
     def _total(self) -> int:
-        """Return the number of values that the cell has had so far, of the kind that is iterated over."""
+        """Return how many values there were so far: changed ones for `changes`, received ones for `updates`."""
         return self._cell._arrivals if self._every_arrival else self._cell._changes
 
     async def _next_arrival(self) -> None:
@@ -366,7 +370,7 @@ class _Sink(Generic[T]):
 
 
 class _Waiter(_Sink[T]):
-    """One call of ``wait_until``: a future, and a timer for ``held_for``."""
+    """One call of ``wait_until``: a future for the result, and a timer that measures ``held_for``."""
 
     __slots__ = (
         "_cell",
@@ -424,7 +428,7 @@ class _Waiter(_Sink[T]):
         self._stop_hold()
 
     def fail(self, error: BaseException) -> None:
-        # Not set_exception: asyncio logs an exception that a cancelled caller never retrieves.
+        # set_exception() is not used, because asyncio logs an exception that a cancelled caller never retrieves.
         if not self._future.done():
             self._error = error
             self._future.set_result(None)
@@ -449,7 +453,7 @@ class _Waiter(_Sink[T]):
     def _timeout_text(self, timeout: float, description: str) -> str:
         text = f"{description or self._cell.name}: not reached within {timeout:g} s; {self._cell._describe()}"
         if self._held_for > 0:
-            text += f"; it had to hold for {self._held_for:g} s"
+            text += f"; the condition had to be true for {self._held_for:g} s without a break"
         if self._seen_count > 1:
             text += f"; {self._seen_count} values seen, last " + ", ".join(map(repr, self._seen))
         reason = self._cell._explain_timeout()

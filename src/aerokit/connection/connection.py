@@ -105,8 +105,8 @@ class Connection:
         """System ids that have a vehicle object on this connection."""
         self.components: set[tuple[int, int]] = set()
         """(system id, component id) of the components that this program provides on this connection."""
-        # (system id, component id) → function that converts loop time to the component's milliseconds since boot; it
-        # returns None while they are unknown.
+        # Maps (system id, component id) to a function that converts loop time to the component's milliseconds since
+        # boot. The function returns None while the time since boot is unknown.
         self.boot_clocks: dict[tuple[int, int], Callable[[float], float | None]] = {}
         self.link_state: StateCell[LinkState] = StateCell("link_state", self.now, "frame")
         """State of the link, from frames of any sender; ``vehicle.link_state`` is about one vehicle."""
@@ -179,6 +179,7 @@ class Connection:
             )
         frame = Frame.parse(bytes(data))
         is_known = self.bus.dialect.get(frame.message_id) is not None
+        # The frame is decoded only to find its target. An unknown message (None) goes to every peer.
         self._write(frame.raw, self.bus.dialect.decode(frame) if is_known else None, to=None)
 
     def send_as(self, encoder: FrameEncoder, message: Message, *, to: int | None = None) -> None:
@@ -311,7 +312,7 @@ class Connection:
         return self._observers.add_sent(callback)
 
     def check_types(self, types: tuple[type[Any], ...]) -> None:
-        """Raise InvalidArgument unless all types can be subscribed to."""
+        """Raise InvalidArgument unless ``types`` are one or more event classes, or message classes of the dialect."""
         if not types:
             raise InvalidArgument("name at least one message or event class to subscribe to")
         for item in types:
@@ -362,7 +363,7 @@ class Connection:
         return self._unix_epoch_s + self._clock()
 
     def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
-        """Explain, for error texts, why signatures block communication with this component (0: any); "" if none do."""
+        """Return why signatures block communication with this component (0: any), for error texts; "" if none do."""
         return self._gate.describe(
             heartbeat
             for (system, component), heartbeat in self.heartbeats.items()
@@ -388,9 +389,9 @@ class Connection:
         self._observers.close()
 
     def fail(self, error: Exception) -> None:
-        """Close the connection because of an internal error of aerokit, which is the cause of the waiters' errors."""
+        """Close the connection because of an internal error of aerokit, which becomes the cause of raised errors."""
         if not self.is_open and isinstance(error, AerokitError):
-            return  # a background task failed because the connection was closed before
+            return  # a background task failed only because the connection was closed before
         logger.error("the connection is closed because of an internal error of aerokit", exc_info=error)
         closed = ConnectionClosed(f"an internal error of aerokit closed the connection: {error!r}")
         closed.__cause__ = error
@@ -453,7 +454,7 @@ class Connection:
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
         """Called when the vehicle side of a zenoh network refused one of our commands."""
         self.bus.publish(OrderRefused(self._clock(), 0, message, reason, lease_holder))
-        for answer in answers:  # A framer would count these answers as received frames.
+        for answer in answers:  # Not passed to a framer, which would count these answers as frames of the link.
             self.bus.deliver(Frame.parse(answer, self._clock()))
 
     def link_lost(self, error: LinkLost) -> None:
@@ -482,7 +483,7 @@ class Connection:
             self._background.start(self._multilink.watch, "aerokit links")
 
     async def _send_heartbeats(self) -> None:
-        """Once a second: send our heartbeat if the program is active, update the link's state, save the recording."""
+        """Once a second, send our heartbeat if it is not paused, update the link's state, and flush the recording."""
         while self.is_open:
             if self._heartbeat is not None and self._heartbeat.should_send():
                 self.send(self._heartbeat.message)
@@ -535,7 +536,7 @@ class Connection:
 
 
 def _filter_by_system(system_id: int, sink: Sink) -> Sink:
-    """Wrap a sink so that it gets only events of this system and of the link as a whole."""
+    """Wrap a sink so that it gets only events of this system, and events of the whole link (system id 0)."""
 
     def filtered(event: Event) -> None:
         if event.system_id in (0, system_id):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-MAX_WAITING = 1000  # frames
+MAX_WAITING = 1000  # maximum number of sent frames that wait for the first received frame
 
 SETUP_SIGNING = (256).to_bytes(3, "little")  # message id, as in the header of a MAVLink 2 frame
 
@@ -48,11 +48,11 @@ class Recording:
         self._path = os.fspath(path)
         self._unix_epoch_s = time.time() - now
         self._writer: TlogWriter | None = None
-        # Sent frames that wait until the first frame is received and an existing file is replaced; None: write at once.
+        # Sent frames that wait while an existing file is not yet replaced. None: frames are written at once.
         self._waiting: deque[tuple[bytes, float]] | None = None
         try:
             if os.path.isfile(path) and os.path.getsize(path):
-                with open(path, "ab"):  # raises now if the file cannot be written later
+                with open(path, "ab"):  # fails at once if the file is not writable, not with the first received frame
                     self._waiting = deque(maxlen=MAX_WAITING)
             else:
                 self._writer = TlogWriter(path)

@@ -92,14 +92,14 @@ class OwnHeartbeat(Snapshot):
 
     def _check(self) -> None:
         if not isinstance(self.type, int) or not 0 <= self.type <= 255:
-            raise InvalidArgument(f"type = {short_repr(self.type)} is not allowed: a MAV_TYPE, 0 to 255")
+            raise InvalidArgument(f"type = {short_repr(self.type)} is not allowed: it must be a MAV_TYPE (0 to 255)")
         limit = self.fed_within_s
         if limit is not None and not (isinstance(limit, (int, float)) and limit >= 1):
-            raise InvalidArgument(f"fed_within_s = {short_repr(limit)} is not allowed: at least 1 second, or None")
+            raise InvalidArgument(f"fed_within_s = {short_repr(limit)} is not allowed: it must be at least 1, or None")
 
 
 class ActivityMonitor:
-    """Tracks when the program last showed activity. Thread-safe; ``clock`` returns seconds."""
+    """Tracks when the program last called aerokit. Thread-safe; ``clock`` returns seconds."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock, self._fed_at = clock, clock()
@@ -133,13 +133,13 @@ class HeartbeatWatchdog:
         self._paused_at: float | None = None
 
     def require(self, activity: ActivityMonitor, fed_within_s: float) -> None:
-        """Watch this activity from now on. ``fed_within_s`` is the limit if the settings have none."""
+        """Pause the heartbeat by this activity from now on; ``fed_within_s`` is the limit if the settings have none."""
         self.activity = activity
         if self._limit_s is None:
             self._limit_s = fed_within_s
 
     def should_send(self) -> bool:
-        """Return True if the heartbeat is to be sent now."""
+        """Return True if the heartbeat may be sent now. Publish an event when heartbeats pause or continue."""
         idle_s = self.activity.idle_s
         limit_s = math.inf if self._limit_s is None else self._limit_s
         now = self._clock()

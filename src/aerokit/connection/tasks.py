@@ -133,7 +133,7 @@ class Deadlines:
         self._loop = asyncio.get_running_loop()
         self._deadlines: dict[Alarm, float] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0  # stored here, because uvloop's TimerHandle does not give a time that has passed
+        self._timer_at = 0.0  # Stored here, because uvloop's TimerHandle does not return a time in the past.
 
     def set(self, alarm: Alarm, at: float) -> None:
         """Call ``alarm`` at ``at`` (seconds, loop time). This replaces an earlier deadline of the alarm."""
@@ -151,10 +151,11 @@ class Deadlines:
             self._timer = None
 
     def _fire(self, timer_at: float) -> None:
-        # Compared with the time of the timer, not with the clock, because a loop may fire a timer slightly early.
         self._timer = None
+        # An alarm is due if the timer was set for its time or later. The clock is not read, because a loop may fire a
+        # timer slightly early.
         for alarm in [alarm for alarm, at in self._deadlines.items() if at <= timer_at]:
-            if self._deadlines.pop(alarm, None) is not None:  # None: an earlier alarm has cancelled this one
+            if self._deadlines.pop(alarm, None) is not None:  # None if another alarm of this list has cancelled it
                 alarm()
         if self._deadlines:
             self._schedule(min(self._deadlines.values()))
