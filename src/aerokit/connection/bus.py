@@ -202,8 +202,7 @@ class Bus:
     def _entries(self, frame: Frame) -> tuple[_Entry, ...]:
         system_id, message_id = frame.system_id, frame.message_id
         for_all_systems = self._sinks.get((EVERY_SYSTEM, message_id), ())
-        # A sender with the invalid id 0 has the key of the sinks for all systems, which must not get the frame twice.
-        if system_id == EVERY_SYSTEM:
+        if system_id == EVERY_SYSTEM:  # This id is invalid for a sender. The sinks must not get the frame twice.
             return for_all_systems
         return self._sinks.get((system_id, message_id), ()) + for_all_systems
 
@@ -234,8 +233,7 @@ def once(action: Callable[[], None]) -> Detach:
 
     def detach() -> None:
         if pending:
-            only_action = pending.pop()  # removed before the call, because the action may call detach() itself
-            only_action()
+            pending.pop()()  # The action is removed before its call, because it may call detach() itself.
 
     return detach
 

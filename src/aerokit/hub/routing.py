@@ -58,13 +58,11 @@ class ForwardingPlan(Generic[PortT]):
         self.target: tuple[int, int] = target
         """System id and component id; 0 means all."""
         self.outs: tuple[PortT, ...] = outs
-        """Ports that get each frame. Equal tuples in the plans of one port are one object, so comparing them is cheap.
-        """
+        """Ports that get each frame. Plans of one port use the same object for equal tuples, so `is` compares them."""
         self.rate_limited: tuple[tuple[PortT, float], ...] = rate_limited
         """Ports that get at most one frame per interval, with the interval in seconds."""
         self.reason: str = reason
-        """Reason for dropping the frames, a key of `EndpointStatistics.dropped`; "" if only the destination is missing.
-        """
+        """Reason for dropping the frames, a key of `EndpointStatistics.dropped`; "" if there is none."""
         self.is_plain: bool = not (rate_limited or reason)
         """True if each frame goes to `outs`, and nothing else is to be done."""
         self.sender: Sender = sender
@@ -127,7 +125,7 @@ class Router(Generic[PortT]):
         self._senders: dict[int, Sender] = {}  # by system id + 256 · component id
         self._recent = RecentFrames()
         self._port_count = 0  # number of ports created so far
-        self._unproven: dict[int, None] = {}  # senders without a HEARTBEAT, which may be noise
+        self._unproven: dict[int, None] = {}  # senders that sent no HEARTBEAT yet, and may be noise
         self._swept_at = -math.inf
         self._duplicate: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="duplicate")
         self._loop: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="loop")
@@ -135,7 +133,10 @@ class Router(Generic[PortT]):
         self.on_vehicle: Callable[[PortT], object] | None = None
         """Called when an autopilot is received at a port for the first time."""
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
-        """Called with the kind of event, the sender, its port, and its former or other port (None: removed)."""
+        """Called with the kind of event, the sender, the port of the frame, and the sender's former or other port.
+
+        The last argument is None if that port was removed.
+        """
 
     def add(self, port: PortT) -> RouterPort[PortT]:
         self._port_count += 1
@@ -175,26 +176,29 @@ class Router(Generic[PortT]):
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
-                # An equal frame from the same port is another frame with the same number and checksum, by chance.
+                # If the earlier frame arrived at this port, too, it is another frame. Its number and checksum are equal
+                # by chance.
                 if is_new or (newer.get(identity) or older[identity])[0] == number:
                     newer[identity] = record
                     plan.sender.received_at = now
                     plans.append(plan)
                     continue
             plans.append(self.route(node, frame, now))
-            if node.echoes:  # a frame came back: `route` must see every further frame, to detect a loop
+            if node.echoes:
+                # A frame came back. From now on, `route` must process every frame, because it counts them to detect a
+                # loop.
                 streams = {}
         return plans
 
     def route(self, node: RouterPort[PortT], frame: Frame, now: float, is_late: bool = False) -> ForwardingPlan[PortT]:
-        """Return the plan for a frame received at ``node``. ``is_late``: its sequence number is out of order."""
+        """Return the plan for a frame received at ``node``. ``is_late`` is True if its number is out of order."""
         # Hot path. Sender and target are numbers: system id + 256 · component id.
         body, message_id = frame.body, frame.message_id
         source = body[4] | body[5] << 8
         sender = self._senders.get(source)
         if sender is None:
             if message_id not in self._offsets and self._targets.is_unknown(message_id):
-                return self._unknown  # the frame may be noise, because its checksum could not be checked
+                return self._unknown  # Its checksum could not be checked, so the frame may be noise.
             sender = self._add_sender(source, node, now)
         number, recent = node.number, self._recent
         if now >= recent.ends_at or len(recent.newer) >= MAX_RECENT_FRAMES:
@@ -247,7 +251,7 @@ class Router(Generic[PortT]):
         return sender
 
     def _make_room(self, now: float) -> bool:
-        """Forget a sender without heartbeats, or else all silent senders. Return True if there is room."""
+        """Forget a sender without heartbeats, or if there is none, all silent senders. Return True if there is room."""
         if self._unproven:
             source = next(iter(self._unproven))
             del self._unproven[source], self._senders[source]
@@ -278,7 +282,7 @@ class Router(Generic[PortT]):
         return first_port in self._nodes and existed_then and now - received_at <= DUPLICATE_WINDOW_S
 
     def _is_echo(self, earlier: tuple[int, int, float], number: int, now: float) -> bool:
-        """Return True if an equal frame arrived at another port before, be it by chance or because of a loop."""
+        """Return True if an equal frame arrived at another port before, by chance or because of a loop."""
         first_port, port_count, received_at = earlier
         return first_port != number and number <= port_count and now - received_at <= LOOP_WINDOW_S
 
@@ -294,7 +298,7 @@ class Router(Generic[PortT]):
         return True
 
     def _record_new(self, node: RouterPort[PortT], source: int) -> None:
-        """Record a new frame of a sender, which counts against the sender's returning frames."""
+        """Subtract a new frame of a sender from the count of the sender's returning frames (`RouterPort.echoes`)."""
         count = node.echoes.pop(source, 0) - 1
         if count > 0:
             node.echoes[source] = count
@@ -329,14 +333,14 @@ class Router(Generic[PortT]):
         if has_target:
             numbers = self._ports_to(*ids, source, node.number)
             if not numbers:
-                # This plan is not cached, because the number of unknown targets is not limited.
+                # This plan is not cached, because a sender could fill the cache with unknown targets.
                 return ForwardingPlan(plan_key, message_id, ids, reason="no_route")
         else:
             numbers = dict.fromkeys(self._nodes)
             if self._targets.is_order(message_id):
                 numbers = {number: None for number in numbers if not self._is_redundant(number)}
         numbers.pop(node.number, None)
-        if message_id in _RADIOS:  # an autopilot would adapt its rates to a radio that is not its own
+        if message_id in _RADIOS:  # An autopilot would adapt its message rates to a radio that is not its own.
             numbers = {number: None for number in numbers if not self._has_autopilot(number)}
         outs, rate_limited = [], []
         for number in numbers:
@@ -350,11 +354,13 @@ class Router(Generic[PortT]):
                 rate_limited.append((port, period))
         if len(node.plans) >= MAX_PLANS:
             node.forget_plans()
-        shared_outs = node.destinations.setdefault(tuple(outs), tuple(outs))  # one object for equal tuples
+        # Equal tuples become the same object, so that plans can be compared by identity.
+        shared_outs = node.destinations.setdefault(tuple(outs), tuple(outs))
         sender = self._senders.get(source, _UNKNOWN_SENDER)
         plan = ForwardingPlan(plan_key, message_id, ids, shared_outs, tuple(rate_limited), sender=sender)
         node.plans[key] = plan
-        # Heartbeats (0) and frames at other ports change what is known about their sender, so `route` must see them.
+        # The fast path of `route_all` is for broadcasts only. Heartbeats (0), and frames at another port than the
+        # sender's, may change the data about the sender, so `route` must process them.
         if message_id and sender.number == node.number and self._offsets.get(message_id) is None:
             node.streams[source.to_bytes(2, "little") + message_id.to_bytes(3, "little")] = plan
         return plan
@@ -376,7 +382,8 @@ class Router(Generic[PortT]):
             if is_reached:
                 continue
             for number in (here,) if member is origin else member.destinations:
-                # Through another port at which the autopilot is received, it would get the command twice.
+                # A port at which an autopilot is received is left out for other members. The autopilot would otherwise
+                # get the command twice.
                 if member.is_autopilot or not any(autopilot.is_at(number) for autopilot in autopilots):
                     numbers[number] = None
         return numbers

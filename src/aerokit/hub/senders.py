@@ -19,19 +19,19 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link, Peer
 
 DUPLICATE_WINDOW_S = 2.0
-"""A frame with the same sender, number and checksum from another port within this time is a duplicate."""
+"""An equal frame (same sender, number and checksum) from another port is a duplicate for this time after the first."""
 
 REPEAT_WINDOW_S = 0.5
-"""A frame with an out-of-order number that was received at the same port within this time is a duplicate."""
+"""An equal frame from the same port is a duplicate for this time after the first, if its number is out of order."""
 
 LOOP_WINDOW_S = 60.0
-"""Time for which a frame that returns over another port is recognised.
+"""A frame that returns through another port is recognised for this time.
 
 It is below 256 s, after which the sequence numbers of a component that sends only heartbeats repeat.
 """
 
 MIN_LOOP_FRAMES = 8
-"""Number of returning frames of one sender that proves a loop. Fewer may be equal by chance, with two radios."""
+"""This many returning frames of one sender prove a loop. With two radios, a few frames may be equal by chance."""
 
 MAX_RECENT_FRAMES = 1 << 15
 
@@ -84,11 +84,11 @@ class Sender:
         return (self.number,) if self.is_vehicle else self.ports
 
     def is_at(self, number: int) -> bool:
-        """Return True if this port received the sender shortly before the sender's last frame."""
+        """Return True if the sender was received at this port within `ROUTE_TIMEOUT_S` before its last frame."""
         return number == self.number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
     def record_at_other_port(self, number: int, now: float) -> bool:
-        """Record a frame at another port than `number`. Return True if this changes routes."""
+        """Record a frame at another port than `number`. Return True if the routes to the sender change."""
         is_new = now - self.ports.get(number, -math.inf) > ROUTE_TIMEOUT_S
         self.ports[number] = now
         if now - self.received_at > ROUTE_TIMEOUT_S:
@@ -122,8 +122,8 @@ class RecentFrames:
     __slots__ = ("ends_at", "newer", "older")
 
     def __init__(self) -> None:
-        # Maps sender, sequence number and checksum (as one number) to (port number, number of ports created so far,
-        # time).
+        # Maps sender, sequence number and checksum (as one number) to a record of the frame: the number of the port at
+        # which it arrived, the number of ports created until then, and the time.
         self.newer: dict[int, tuple[int, int, float]] = {}
         self.older: dict[int, tuple[int, int, float]] = {}
         self.ends_at: float = float("-inf")
@@ -157,7 +157,7 @@ class IdentityGuard:
         self._current_peer: Peer = None
 
     def admits(self, frame: Frame, framer: Framer, peer: Peer) -> bool:
-        """Return True if this peer may send this frame. Call it for heartbeats, and for all frames if `is_shared`."""
+        """Return True if this peer may send this frame. Call it for heartbeats; if `is_shared`, for every frame."""
         if self._routes.arrived_on_other_peer(frame, peer):
             self._current_peer = peer
             if not self._routes.claims_route(frame, peer, framer.counters_of(frame), is_signed=False):

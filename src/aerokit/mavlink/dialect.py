@@ -85,14 +85,14 @@ class Dialect:
         return self[message_id] if message_id in self.rows else None
 
     def by_name(self, name: str) -> type[Message]:
-        """Return the class of a message by name, ``"GLOBAL_POSITION_INT"``. InvalidArgument if there is none."""
+        """Return the class of the message with a name, such as ``"GLOBAL_POSITION_INT"``; InvalidArgument if none."""
         for message_class in self:
             if name == message_class.NAME:
                 return message_class
         raise InvalidArgument(f"dialect {self.name!r} has no message {name!r}")
 
     def enum(self, name: str) -> type[Any]:
-        """Return an enum by name, ``"MAV_CMD"``. InvalidArgument if there is none."""
+        """Return the enum with a name, such as ``"MAV_CMD"``. InvalidArgument if there is none."""
         if name in self._enums:
             return self._enums[name]
         raise InvalidArgument(f"dialect {self.name!r} has no enum {name!r}")
@@ -114,8 +114,8 @@ class Dialect:
         return self._decoders[frame.message_id](frame.body, frame)
 
     def _decode_first(self, message_id: int, body: bytes, frame: Frame | None) -> Message:
-        # This function replaces itself by the decoder of the class, so that `decode` need not check if the class is
-        # loaded.
+        # The class is loaded at the first decoding. This function then replaces itself by the decoder of the class, so
+        # that `decode` need not check each time whether the class is loaded.
         decoder = self._decoders[message_id] = decoder_of(self[message_id])
         return decoder(body, frame)
 
@@ -178,7 +178,7 @@ class _Extended(Dialect):
 
 
 def _merge_enums(first: type[Any], second: type[Any]) -> type[Any]:
-    # Private dialects add entries to enums of the standard.
+    # A private dialect may add entries to an enum of the standard. If both define an entry, the first one is used.
     members = {**second.__members__, **first.__members__}
     bitmask = issubclass(first, IntFlag)
     return make_enum(first.__module__, first.__name__, bitmask, first.__doc__ or "", members.items())

@@ -19,12 +19,12 @@ _TIME = Struct(">Q")
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
 _MAX_RECORD = 8 + 280
-# The search for the next record after garbage ignores times before the year 2000, because zeros in the header of a
-# frame look like such a time. Where a record is expected, these times are accepted, because the clock may not have been
-# set.
+# After garbage, the search for the next record ignores times before the year 2000, because zeros in the header of a
+# frame look like such a time. Where a record is expected, such a time is accepted, because the computer's clock may
+# have been wrong.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100; a larger number is not a timestamp
-# A time whose first two bytes are these or smaller is before _LAST_TIME.
+# If the first two bytes of a time are not larger than these, the time is before _LAST_TIME.
 _MAX_TIME_PREFIX = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]
 
 
@@ -49,7 +49,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
     data, begin, is_at_end, min_time = b"", 0, False, 0
     end: int | None
     while True:
-        # A record, and the header of the next record, must be in `data`.
+        # `data` must contain a whole record and the header of the next one, so that the record can be verified.
         if not is_at_end and len(data) - begin < 2 * _MAX_RECORD:
             block = file.read(_BLOCK)
             is_at_end = not block
@@ -60,7 +60,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
             if records:
                 yield from records
                 continue
-        # Fast path for unsigned MAVLink 2, which takes half the time of `_record_end`.
+        # A fast path for unsigned MAVLink 2 frames. It takes half the time of `_record_end`.
         try:
             end = begin + 20 + data[begin + 9]
             if (
@@ -73,12 +73,12 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
                 or data[end : end + 2] > _MAX_TIME_PREFIX
             ):
                 end = _record_end(data, begin, min_time)
-        except IndexError:  # the last record, or garbage
+        except IndexError:  # This is the last record, or garbage.
             end = _record_end(data, begin, min_time)
         if end is None:
             if len(data) - begin <= 8:
                 return
-            begin, min_time = begin + 1, _FIRST_TIME  # search for the next record
+            begin, min_time = begin + 1, _FIRST_TIME  # No record begins here: search from the next byte on.
             continue
         yield _TIME.unpack_from(data, begin)[0] / 1e6, data[begin + 8 : end]
         begin, min_time = end, 0

@@ -47,7 +47,7 @@ class ThreadFuture(Generic[T]):
     def wait(self, timeout: float) -> bool:
         """Wait at most ``timeout`` seconds and return True if done."""
         if not self.is_done and self._gate.acquire(timeout=timeout):
-            self._gate.release()  # for other threads that wait
+            self._gate.release()  # Another thread may wait, too.
         return self.is_done
 
     def result(self) -> T:
@@ -56,7 +56,7 @@ class ThreadFuture(Generic[T]):
         if error is not None:
             raise error
         if not self._values:
-            raise LookupError("finished without a result")
+            raise LookupError("the future was finished without a result")
         return self._values[0]
 
     def pop_exception(self) -> BaseException | None:

@@ -361,7 +361,7 @@ class Subscription(SubscriptionTwin[ItemT]):
         return self._loop.call(self.aio.get_nowait)
 
     def close(self, error: Exception | None = None) -> None:
-        """Stop taking items. A waiting reader raises ``error``; without an error, its iteration ends."""
+        """Stop collecting items. A waiting reader raises ``error``; without an error, its iteration ends."""
         self._loop.call(self.aio.close, error)
 
 

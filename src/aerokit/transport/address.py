@@ -25,7 +25,7 @@ ACCEPTED_FORMS = """\
   zenoh://fleet/alpha  zenoh://fleet/alpha?connect=tcp/10.0.0.5:7447      a vehicle on a zenoh network, by name
   zenohin://fleet/alpha?listen=tcp/0.0.0.0:7447                           serve that name, for clients of zenoh:
   IPv6 addresses need brackets: udpin:[::1]:14550"""
-"""Forms of a connection string, for error messages and help texts."""
+"""Accepted forms of a connection string, for error messages and help texts."""
 
 
 class LinkAddress(Snapshot):

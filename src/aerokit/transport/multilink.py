@@ -207,7 +207,7 @@ class MultiLink(Link):
         await asyncio.wait(openings)
         for link in self._own_links:
             link.close()
-        # open() may be called again after this failure. It needs new links, because a closed link cannot be opened again.
+        # open() may be called again, and then needs new links, because a closed link cannot be opened again.
         for index, make_link in enumerate(self._factories):
             if index not in self._foreign:
                 self._links[index] = make_link()

@@ -233,8 +233,8 @@ class ReconnectingLink(Link):
             logger.debug("the link still cannot be opened: %s", error)
             return False
         if current.is_lost:  # The new link was lost while it was being opened.
-            is_end_of_recording = self._receiver is None
-            return is_end_of_recording
+            # Without a receiver, this link has ended, too (the end of a recording). Otherwise another attempt follows.
+            return self._receiver is None
         self._is_up = True
         if self._lost_at is not None:
             self._stable_timer = asyncio.get_running_loop().call_later(STABLE_AFTER_S, self._on_restored)

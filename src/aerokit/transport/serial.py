@@ -73,7 +73,7 @@ class SerialLink(BaseLink):
             self._outbox.write(data)
 
     def discard_unsent(self) -> None:
-        """See `Link.discard_unsent`. Also clears the driver's buffer, so that a partly sent frame may stay incomplete."""
+        """See `Link.discard_unsent`. Also clears the driver's buffer, which may cut off a frame that is being sent."""
         if self._outbox is None or not self._loop or self._loop.is_closed():
             return
         self._outbox.discard()
@@ -226,7 +226,7 @@ def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -
 
 def _open_error(address: str, error: Exception) -> OSError:
     number = error.errno if isinstance(error, OSError) else None
-    # pyserial converts an error of termios without its number, which is only in the text.
+    # An error of termios has no `errno`: its number is only in the text.
     if number is None and str(errno.ENOTTY) in str(error):
         number = errno.ENOTTY
     cause = OSError(number, os.strerror(number)) if number else OSError(str(error))

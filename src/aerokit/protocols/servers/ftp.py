@@ -17,10 +17,10 @@ from aerokit.protocols.servers.host import Channel, ServerHost
 FilesT = TypeVar("FilesT", bound=FileSystem)
 
 
-_BURST_BYTES = 35_000  # size after which a burst ends
-_BURST_BLOCKS = 24  # blocks that a burst sends at once
+_BURST_BYTES = 35_000  # A burst ends after this number of bytes.
+_BURST_BLOCKS = 24  # number of blocks that a burst sends at once
 _CRC_PAUSE_S = 0.002
-_MAX_SIZE = 0xFFFFFFFF  # maximum file size, because sizes and offsets have 32 bits
+_MAX_SIZE = 0xFFFFFFFF  # maximum file size in bytes, because sizes and offsets have 32 bits in MAVFTP
 
 Op = MavFtpOpcode
 
@@ -36,7 +36,7 @@ class FtpSession:
     burst: FtpPacket | None = field(default=None, repr=False)
     """Sequence number and offset of the next block."""
     burst_sent: int = 0
-    """Bytes that the burst has sent."""
+    """Number of bytes that the current burst has sent."""
 
 
 @dataclass(eq=False)
@@ -47,7 +47,7 @@ class FtpPeer:
     sessions: dict[int, FtpSession] = field(default_factory=dict)
     used_at: float = 0.0
     errno: int = 0
-    """Error of the latest failure."""
+    """Error number of the latest failed request; 0 if none failed."""
     request: FtpPacket | None = None
     """The latest request that was executed."""
     reply: FtpPacket | None = None
@@ -76,7 +76,7 @@ class SessionFtpServer(Generic[FilesT]):
     creates_missing: ClassVar[bool] = True
     """True if OpenFileWO creates a missing file."""
     reply_kept: ClassVar[int] = 4
-    """Size of the largest reply that is sent again, in bytes."""
+    """Maximum data size of a reply that is stored, in bytes. A stored reply answers a repeated request."""
     crc_block: ClassVar[int] = 65_536
     crc_blocks_at_once: ClassVar[int] = 8
     """Number of blocks of a file that are read for a checksum before the event loop continues."""
@@ -104,7 +104,7 @@ class SessionFtpServer(Generic[FilesT]):
         return sum(len(peer.sessions) for peer in self._peers.values())
 
     def restart(self) -> None:
-        """Drop all sessions without closing their files, as by a power failure."""
+        """Drop all sessions without closing their files, as a power failure does."""
         self._peers.clear()
 
     def close(self) -> None:
@@ -123,7 +123,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.client
 
     def _is_repeated(self, peer: FtpPeer, request: FtpPacket, last: FtpPacket) -> bool:
-        """Return True if this request is the latest one again, and the last reply answers it.
+        """Return True if this request repeats the latest one, and ``last`` is the reply to the latest one.
 
         Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0. The last reply
         may be the end of a burst, which does not replace the blocks of the burst.
@@ -188,7 +188,8 @@ class SessionFtpServer(Generic[FilesT]):
         return answer.replace(offset=request.offset)
 
     def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
-        # A client that got NOSESSIONSAVAILABLE repeats its request until a session is free, so it needs a new answer.
+        # NOSESSIONSAVAILABLE is not stored: the client repeats its request until a session is free, and then needs a
+        # new answer.
         if answer.size <= self.reply_kept and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
             peer.reply = answer
         self._host.send(answer.message(), peer.channel)
@@ -266,7 +267,7 @@ class SessionFtpServer(Generic[FilesT]):
             if peer.sessions.get(session.number) is not session:
                 return
             due_at = peer.used_at + self.session_timeout_s
-            if self._host.now < due_at:  # the client has sent a request meanwhile
+            if self._host.now < due_at:  # The client has sent a request since this call was scheduled.
                 self._host.call_at(due_at, close_if_due)
                 return
             peer.reply = None
@@ -289,7 +290,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge(request.size.to_bytes(4, "little"))
 
     def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
-        """Start a burst, or continue a running one from another offset. The blocks are the answer, so return None."""
+        """Start a burst, or move a running one to another offset. Return None, because the blocks are the answer."""
         session = self._opened(peer, request)
         is_running = session.burst is not None
         session.burst, session.burst_sent = request.replace(sequence=request.sequence + 1 & 0xFFFF), 0
@@ -308,7 +309,7 @@ class SessionFtpServer(Generic[FilesT]):
         self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
 
     def _send_block(self, peer: FtpPeer, session: FtpSession, burst: FtpPacket, *, may_end: bool) -> None:
-        # In `burst`, the sequence number is that of the reply, not of the request.
+        # Unlike in a request, the sequence number in `burst` is already that of the reply.
         number = session.number
         answer = burst.acknowledge(offset=burst.offset, session=number).replace(sequence=burst.sequence)
         refusal = burst.refuse(MavFtpErr.EOF).replace(sequence=burst.sequence, offset=burst.offset, session=number)
@@ -328,7 +329,7 @@ class SessionFtpServer(Generic[FilesT]):
         session.burst = None if is_complete else next_block
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        """Return as many entries of a folder as fit, from entry number ``offset`` on."""
+        """Answer with the folder's entries from number ``offset`` on: as many as fit into one message."""
         entries = self._entries(self._path(request))
         listing = b""
         for text in [*self.list_prefix, *map(_line, entries)][request.offset :]:
@@ -355,7 +356,7 @@ class SessionFtpServer(Generic[FilesT]):
 
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         old_path, _, new_path = request.data[: request.size].partition(b"\0")
-        if len(old_path) + 2 >= request.size:  # the new path is missing
+        if len(old_path) + 2 >= request.size:  # The data ends after the old path, so there is no new path.
             return self._fault(peer, request, FileFault(EINVAL))
         self.files.rename(checked_path(old_path), checked_path(new_path))
         return request.acknowledge()
@@ -386,7 +387,7 @@ class SessionFtpServer(Generic[FilesT]):
             return
         with suppress(FileFault):
             file.close()
-        if peer.checksum is request:  # otherwise a newer request has replaced this one
+        if peer.checksum is request:  # A newer request may have replaced this one, which then gets no answer.
             peer.checksum, peer.used_at = None, self._host.now
             self._reply(peer, self._adapted(peer, request, answer))
 

@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
 
 LEASE_TIMEOUT_S = 5.0
-"""Silence of the holder after which the control lease is free."""
+"""The control lease becomes free after this silence of its holder."""
 
 NOTICE_INTERVAL_S = 0.5
-"""Minimum interval of notices about refused messages of one kind; set-points come 20 times a second."""
+"""Minimum interval of notices about one message type, because set-points may be refused 20 times a second."""
 
 # Messages that change nothing on the vehicle except its streams. Any client may send them.
 READ_MESSAGES = frozenset(
@@ -83,7 +83,7 @@ _MISSION_WRITES = ("MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_WRITE_PARTIAL_
 
 def is_read_only(frame: Frame) -> bool:
     """Return True if any client may send this frame. Unknown messages count as commands."""
-    if frame.message_id in _READ_IDS:  # the common case, without decoding
+    if frame.message_id in _READ_IDS:  # Most frames need not be decoded.
         return True
     if frame.message_id in (CommandLong.ID, CommandInt.ID):
         return getattr(_decoded(frame), "command", 0) in READ_COMMANDS
@@ -94,7 +94,7 @@ def is_read_only(frame: Frame) -> bool:
 
 
 def rejection_frames(answer: bytes) -> tuple[bytes, ...]:
-    """Return the frames of an answer that reject a command; all others are ignored."""
+    """Return the frames of a notice's ``answer`` that reject a command. All other frames are ignored."""
     return tuple(frame.raw for frame in Framer().receive(answer) if _is_rejection(_decoded(frame)))
 
 
@@ -152,8 +152,9 @@ class ClientFilter:
         self._client, self._lease = client, lease
         self._framer = _framer()
         self._nonce: int | None = None  # nonce of the program that uses this client name
-        self._nonce_at = 0.0  # time at which that program was last heard
-        self._notices: dict[str, tuple[float, int]] = {}  # message name → time of the last notice, refusals since then
+        self._nonce_at = 0.0  # time of the last datagram from that program
+        # Message name → time of the last notice, and the number of refused messages since then.
+        self._notices: dict[str, tuple[float, int]] = {}
 
     def receive(self, data: bytes, mode: ControlMode, now: float, nonce: int = 0) -> tuple[bytes, list[RefusalNotice]]:
         """Process a fresh datagram. Return the accepted frames, and the notices for the client.
@@ -166,7 +167,7 @@ class ClientFilter:
         accepted: list[bytes] = []
         notices: list[RefusalNotice] = []
         frames = self._framer.receive(data, now)
-        if self._framer.waiting:  # datagrams have complete frames: drop a partial one
+        if self._framer.waiting:  # A datagram consists of complete frames, so a partial frame at its end is dropped.
             self._framer = _framer()
         may_control = mode != "never" and not is_namesake
         for frame in frames:
@@ -184,7 +185,7 @@ class ClientFilter:
         return b"".join(accepted), notices
 
     def _is_namesake(self, nonce: int, mode: ControlMode, now: float) -> bool:
-        """Return True if another program recently used this name, unless this program takes control."""
+        """Return True if another program recently used this client name, unless this program takes control."""
         if self._nonce not in (None, nonce) and mode != "take" and now - self._nonce_at <= LEASE_TIMEOUT_S:
             return True
         self._nonce, self._nonce_at = nonce, now
@@ -217,7 +218,7 @@ class ClientFilter:
         name = f"message {frame.message_id}" if message is None else message.NAME
         answer = b"" if message is None or is_late else _answer(frame, message, reason)
         noticed_at, unreported = self._notices.get(name, (-NOTICE_INTERVAL_S, 0))
-        # A notice with an answer is never delayed, because the program waits for it.
+        # A notice with an answer is sent at once, because the client waits for the answer to its command.
         if not answer and now - noticed_at < NOTICE_INTERVAL_S:
             self._notices[name] = (noticed_at, unreported + 1)
             return []
@@ -229,7 +230,7 @@ class ClientFilter:
 
 def _framer() -> Framer:
     framer = Framer()
-    framer.keep_unknown = True  # the lease holder may send messages of other dialects
+    framer.keep_unknown = True  # The client in control may send messages of other dialects.
     return framer
 
 
@@ -241,7 +242,8 @@ def _answer(frame: Frame, message: Message, reason: str) -> bytes:
     """Return the frames by which a vehicle would reject a message; empty if none exist, or for broadcasts."""
     fields: object = message  # `object`, because type checkers do not know that other messages have these fields, too
     system: int = getattr(fields, "target_system", 0)
-    component: int = getattr(fields, "target_component", 0) or 1  # the autopilot answers for all components (0)
+    # A message for all components (0) is answered by the autopilot (1).
+    component: int = getattr(fields, "target_component", 0) or 1
     answer: Message | None = None
     if message.NAME in COMMANDS:
         command: int = getattr(fields, "command", 0)
@@ -275,9 +277,9 @@ class FreshnessChecker:
         self.late: int = 0
         """Datagrams refused because their stamp was too old, or from another vehicle side."""
         self.duplicates: int = 0
-        """Datagrams refused because an equal or later datagram was received before."""
+        """Datagrams refused because the same or a later datagram of the client was already received."""
         self._number = 0
-        self._sent: deque[tuple[int, float]] = deque()  # (number, time) of valid beacons
+        self._sent: deque[tuple[int, float]] = deque()  # (number, send time) of the beacons that stamps may refer to
         self._sequences: OrderedDict[tuple[str, int], int] = OrderedDict()
 
     def beacon(self, now: float, lease_holder: str | None = None) -> Beacon:
@@ -320,7 +322,7 @@ class DelayEstimator:
     """
 
     def __init__(self) -> None:
-        self._min_offset: float | None = None  # our time minus the sender's
+        self._min_offset: float | None = None  # smallest difference so far of our time and the sender's send time
         self._measured_at = 0.0
 
     def delay(self, sent_s: float, now: float) -> float:
@@ -372,7 +374,7 @@ class VehicleSideTracker:
         return True
 
     def accepts(self, epoch: int, sent_s: float, now: float) -> bool:
-        """Return True if frames sent at ``sent_s``, on the vehicle side's clock, are to be delivered."""
+        """Return True if frames are to be delivered. ``sent_s`` is their send time on the vehicle side's clock."""
         if epoch != self.epoch:
             self.foreign += 1
             return False
