@@ -62,7 +62,7 @@ class Bus:
     def __init__(self, dialect: Dialect = STANDARD) -> None:
         self.dialect = dialect
         self.one_at_a_time = False
-        """True to end :meth:`deliver_all` after the current frame."""
+        """If True, :meth:`deliver_all` returns after the current frame, so that the caller can check the next frames."""
         self.wanted: dict[int, int] = {}  # message id → number of sinks
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}
         self._plans: dict[int, _DeliveryPlan] = {}  # cache; the key is system id << 24 | message id
@@ -123,7 +123,7 @@ class Bus:
         return once(lambda: self._detach_event(event_type, sink))
 
     def deliver(self, frame: Frame) -> None:
-        """Deliver a frame, decoded if needed. Exceptions of sinks are logged; the other sinks still get it."""
+        """Deliver a frame, decoded if needed. If a sink raises, the error is logged, and the other sinks are called."""
         self.deliver_all((frame,), _discard)
 
     def deliver_all(

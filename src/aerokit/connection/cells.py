@@ -102,7 +102,7 @@ class StateCell(Generic[T]):
 
     @property
     def value(self) -> T:
-        """The latest value, of any age; raises :class:`ValueUnknownError` before the first."""
+        """The latest value, of any age. Raises :class:`ValueUnknownError` before the first value."""
         self._catch_up()
         if not self._known:
             raise ValueUnknownError(f"{self.name} is not known yet: no {self.waits_for} has been received")
@@ -110,7 +110,7 @@ class StateCell(Generic[T]):
 
     @property
     def latest(self) -> T | None:
-        """The latest value, or None before the first."""
+        """The latest value, of any age; None before the first value."""
         for feed in self._feeds:  # inlined `_catch_up`, to save the call
             if feed.pending:
                 feed.catch_up()
@@ -124,19 +124,19 @@ class StateCell(Generic[T]):
 
     @property
     def updated_at(self) -> float:
-        """Time of the latest value, in seconds of the cell's clock; −inf before the first."""
+        """Time of the latest value, in seconds of the cell's clock; −inf before the first value."""
         self._catch_up()
         return self._updated_at
 
     @property
     def age(self) -> float:
-        """Seconds since the latest value was received; inf before the first."""
+        """Seconds since the latest value was received; inf before the first value."""
         self._catch_up()
         return self._clock() - self._updated_at
 
     @property
     def source(self) -> Source | None:
-        """Sender and message of the latest value; None before the first."""
+        """Sender and message of the latest value; None before the first value."""
         self._catch_up()
         return self._source
 
@@ -401,7 +401,7 @@ class _Waiter(_Sink[T]):
             value = await self._future
         finally:
             self._cell._remove(self)
-            self._stop_hold()
+            self._stop_hold_timer()
             if timer is not None:
                 timer.cancel()
         if self._error is not None:
@@ -418,14 +418,14 @@ class _Waiter(_Sink[T]):
             self.fail(error)
             return
         if not is_met:
-            self._stop_hold()
+            self._stop_hold_timer()
         elif self._held_for <= 0:
             self._future.set_result(value)
         elif self._hold_timer is None:
-            self._hold_timer = self._loop.call_later(self._held_for, self._finish_hold)
+            self._hold_timer = self._loop.call_later(self._held_for, self._on_held_long_enough)
 
     def forget(self) -> None:
-        self._stop_hold()
+        self._stop_hold_timer()
 
     def fail(self, error: BaseException) -> None:
         # set_exception() is not used, because asyncio logs an exception that a cancelled caller never retrieves.
@@ -433,11 +433,11 @@ class _Waiter(_Sink[T]):
             self._error = error
             self._future.set_result(None)
 
-    def _finish_hold(self) -> None:
+    def _on_held_long_enough(self) -> None:
         if not self._future.done():
             self._future.set_result(self._cell.value)
 
-    def _stop_hold(self) -> None:
+    def _stop_hold_timer(self) -> None:
         if self._hold_timer is not None:
             self._hold_timer.cancel()
             self._hold_timer = None

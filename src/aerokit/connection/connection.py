@@ -215,7 +215,7 @@ class Connection:
         return self.link.unsent_bytes
 
     def discard_unsent(self) -> None:
-        """Discard data that was sent but has not left this program, e.g. an outdated command.
+        """Discard written data that has not left this program yet, e.g. an outdated command.
 
         The call discards all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
         stays in :attr:`unsent_bytes`.

@@ -87,6 +87,7 @@ class LoopWatch:
     def arrival(self, now: float) -> float:
         """Return the receive time of data that is read now: ``now``, or earlier if data may have waited."""
         if now < self._check_sleep_at and self.oldest_arrival < math.inf:
+            # The clocks were just checked, and data may still wait since the last pause.
             self._has_read = True
             return self.oldest_arrival
         self._check_sleep_at = now + CHECK_INTERVAL_S / 2
@@ -142,7 +143,7 @@ class LoopWatch:
         """Use the time of reading as receive time again, once nothing was read for `IDLE_ITERATIONS` iterations."""
         self._idle_iterations = 0 if self._has_read else self._idle_iterations + 1
         self._has_read = False
-        if self._timer is None:
+        if self._timer is None:  # The connection is closed.
             return
         if self._idle_iterations < IDLE_ITERATIONS:
             self._loop.call_soon(self._end_assumption_when_idle)
@@ -159,6 +160,8 @@ IPYTHON_HINT = (
 
 def is_unintegrated_ipython() -> bool:
     """Return True in IPython in a terminal without ``%gui asyncio``: the loop then runs only while an input runs."""
+    # `%gui asyncio` sets `active_eventloop`. Without it, IPython runs inputs on an event loop of its own, which stands
+    # still between inputs.
     module = sys.modules.get("IPython.terminal.interactiveshell")
     shell: Any = getattr(getattr(module, "TerminalInteractiveShell", None), "_instance", None)
     if shell is None or getattr(shell, "active_eventloop", None) == "asyncio":

@@ -49,7 +49,7 @@ class BackgroundTasks:
     async def aclose(self) -> None:
         """Cancel all tasks and wait for their end, even if the caller is being cancelled."""
         self.cancel()
-        cancelled: asyncio.CancelledError | None = None
+        cancelled: asyncio.CancelledError | None = None  # a cancellation of the caller, to be raised at the end
         with anyio.CancelScope(shield=True):
             while self._tasks:
                 try:
@@ -73,7 +73,7 @@ async def run_shielded(work: Coroutine[Any, Any, None]) -> None:
     bounded in time. A cancellation is raised afterwards, with an exception of the work as its cause.
     """
     task = asyncio.get_running_loop().create_task(work)
-    cancelled: asyncio.CancelledError | None = None
+    cancelled: asyncio.CancelledError | None = None  # a cancellation of the caller, to be raised at the end
     with anyio.CancelScope(shield=True):
         while not task.done():
             try:

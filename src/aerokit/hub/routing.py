@@ -348,7 +348,7 @@ class Router(Generic[PortT]):
             period = self._period(port, message_id)
             if period is None:
                 continue
-            if period == 0 or has_target:
+            if period == 0 or has_target:  # Rate limits do not apply to messages with a target.
                 outs.append(port)
             else:
                 rate_limited.append((port, period))
@@ -378,6 +378,7 @@ class Router(Generic[PortT]):
         autopilots = [member for member in members if member.is_autopilot]
         numbers: dict[int, None] = {}
         for member in sorted(members, key=lambda member: not member.is_autopilot):
+            # A vehicle needs no further port if one of the chosen ports reaches it.
             is_reached = member.is_vehicle and any(member.is_at(number) for number in numbers)
             if is_reached:
                 continue

@@ -91,7 +91,7 @@ class Sender:
         """Record a frame at another port than `number`. Return True if the routes to the sender change."""
         is_new = now - self.ports.get(number, -math.inf) > ROUTE_TIMEOUT_S
         self.ports[number] = now
-        if now - self.received_at > ROUTE_TIMEOUT_S:
+        if now - self.received_at > ROUTE_TIMEOUT_S:  # The sender is silent at `number`: messages go to the new port.
             self.ports[self.number] = self.received_at
             self.number, self.received_at = number, now
             return True

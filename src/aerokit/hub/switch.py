@@ -97,7 +97,7 @@ class Switch:
             received_count = len(frames)
             frames, late = self._admitted(port, framer, frames)
             if port.gateway is not None or len(frames) != received_count:
-                data = None
+                data = None  # The bytes as received are no longer those of the frames to forward.
         plans = self.router.route_all(node, frames, now, late)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
             for frame, plan in zip(frames, plans, strict=True):
@@ -105,7 +105,7 @@ class Switch:
         if self._ports_to_flush:
             if len(frames) > MAX_BURST_FRAMES:
                 self.flush()
-            elif not (self._is_scheduled or port.reports_bursts):
+            elif not (self._is_scheduled or port.reports_bursts):  # Otherwise the end of the burst flushes.
                 self._is_scheduled = True
                 self._loop.call_soon(self.flush)
 

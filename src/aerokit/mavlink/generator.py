@@ -371,7 +371,7 @@ def _other_files(stems: Sequence[str]) -> str:
 def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
     text = "\n\n".join(render_message(message) for message in messages)
     helpers = "".join(f", {name}" for name in ("pack_bytes", "pack_items", "pack_text") if f"{name}(" in text)
-    stems = MODULES.get(module, MODULES["common"])
+    stems = MODULES.get(module, MODULES["common"])  # COMMON_MORE has messages of the same files as common.
     head = _MESSAGES_HEAD.format(name=stems[0], more=_other_files(stems), helpers=helpers)
     if "Sequence[" not in text:
         head = head.replace("    from collections.abc import Sequence\n\n", "")

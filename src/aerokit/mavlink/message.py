@@ -101,7 +101,7 @@ class Field:
         carries_bytes: bool = False,
     ) -> None:
         self.name = name
-        """Name of the attribute: the name in the standard, with a trailing underscore if that is a Python keyword."""
+        """Name of the attribute: the name in the standard. A Python keyword gets a trailing underscore."""
         self.type = type
         """Type without brackets: ``"uint16_t"``, ``"float"``, ``"char"`` …"""
         self.array_length = array_length

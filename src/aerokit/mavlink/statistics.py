@@ -188,6 +188,7 @@ class SourceStatistics(SourceFields):
             self._swap(sequence, now, count, self._other_count if is_other_longer else 0)
             return IN_ORDER
         if is_other_longer and self._was_missing((self.expected - sequence) & 0xFF or 256):
+            # The frame is in the gap before the current stream, which was counted as lost.
             self.lost -= 1
             self._skipped_over -= 1
         self._other_expected, self._other_count = (sequence + 1) & 0xFF, self._other_count + 1
@@ -206,7 +207,7 @@ class SourceStatistics(SourceFields):
         self._continue_at(sequence)
 
     def _count_alternations(self, now: float, count: int) -> None:
-        """Add to the number of times that two streams have alternated, within the last `_EXPIRY_S`."""
+        """Add to the count of alternations between two streams. After `_EXPIRY_S` without any, it starts again from 0."""
         if now - self._alternated_at > _EXPIRY_S:
             self._alternations = 0
         self._alternations = max(0, self._alternations + count)

@@ -95,7 +95,7 @@ def _record_end(data: bytes, begin: int, min_time: int) -> int | None:
 
 
 def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
-    """Return True if this record contains the start of the real record, which another record follows directly."""
+    """Return True if this record is an error: inside it, a record begins that another one follows directly."""
     for inside in range(begin + 1, end):
         true_end = _frame_end(data, inside)
         if true_end is not None and true_end > end and _frame_end(data, true_end) is not None:
@@ -105,7 +105,7 @@ def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
 
 def _frame_end(data: bytes, begin: int) -> int | None:
     """Return the end of a frame according to its header, which may be beyond the data. None if there is no header."""
-    start = begin + 8  # the frame follows the time, which has 8 bytes
+    start = begin + 8  # The frame follows the time, which has 8 bytes.
     if len(data) - start < 3 or data[start] not in _MAGICS or _TIME.unpack_from(data, begin)[0] > _LAST_TIME:
         return None
     magic, payload_length, flags = data[start : start + 3]

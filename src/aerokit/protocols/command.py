@@ -212,6 +212,7 @@ class CommandExchange(Exchange[CommandAck]):
             attempts = MAX_ATTEMPTS if order_status is None else max_attempts(message.command, _params_of(message))
             is_unrepeatable = attempts == 1
         if attempt_timeout is None:
+            # A command that is sent only once waits as long as all attempts of another command together.
             attempt_timeout = ATTEMPT_TIMEOUT_S * (MAX_ATTEMPTS if is_unrepeatable else 1)
         if attempt_timeout > 0:  # Other values are refused below, with the value that the caller gave.
             attempt_timeout = max(attempt_timeout, min_timeout_s)

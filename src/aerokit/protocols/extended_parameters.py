@@ -104,7 +104,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
         if self._is_streaming and index >= self._next:
             for missing in range(self._next, index):
                 self._window.request(missing)
-            if self._next:
+            if self._next:  # The time before the first value is not a pause of the stream.
                 self._pause_s = max(self._pause_s, now - self._last_at)
             self._next, self._last_at = index + 1, now
             quiet_s = max(self.round_trip.timeout_s(), PAUSES * self._pause_s, MIN_START_TIMEOUT_S)
@@ -176,7 +176,7 @@ class SettingReads(NamedReads[Setting]):
         if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
             self._count_probe()
             self._window.on_answer(PROBE, now)
-            unanswered = [asked for asked in self._names if asked not in self._answers and asked != name]
+            unanswered = [other for other in self._names if other not in self._answers and other != name]
             self._reject_unknown(unanswered, now)
         if name and name in self._window:
             self._window.on_answer(name, now)

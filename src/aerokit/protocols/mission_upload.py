@@ -209,6 +209,7 @@ class MissionUpload(MissionExchange[UploadResult]):
                 self._succeed(not self._was_tail_repeated, ack.opaque_id, now)
         elif result == MavMissionResult.INVALID_SEQUENCE:
             if self._is_accepted:
+                # The vehicle already has the item that was sent, or an item before it was lost.
                 self._send_window(now, ahead=1)
                 if self._outbox:
                     self._wait(now)

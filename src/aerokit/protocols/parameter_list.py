@@ -33,7 +33,7 @@ def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Param
         if type_ is ParameterType.REAL32 and value == value // 1:
             value, type_ = int(value), known.type
         if same_value(float(known.value), float(value)):
-            value = known.value
+            value = known.value  # The reported value is equal, except for bits that a float cannot hold.
     index = known.index if reported.index is None else reported.index
     return Parameter(known.name, value, type_, known.default, index)
 

@@ -257,6 +257,7 @@ class ParameterWrites(ParameterRequests):
             self._window.on_answer(name, now)
             self._window.request(name)
             return
+        # The requested value with another type must be reported twice.
         if is_as_requested and (reported.type == requested.type or unexpected.ends_with(reported)):
             self._window.on_answer(name, now)
             self._settle(name, reported, now)
@@ -268,7 +269,7 @@ class ParameterWrites(ParameterRequests):
         self._window.on_answer(name, now)
         is_unchanged = same_value(reported.value, self._before.get(name, reported.value))
         if is_unchanged and not is_as_requested:
-            self._to_set.add(name)
+            self._to_set.add(name)  # The value is still the old one, so PARAM_SET is sent again.
         if unexpected.are_conclusive(is_unchanged=is_unchanged):
             self._settle(name, reported, now)
         else:

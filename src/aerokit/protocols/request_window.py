@@ -116,7 +116,7 @@ class RequestWindow(Generic[KeyT]):
         lost = []
         for key_in_flight, request_in_flight in self._in_flight.items():
             if request_in_flight.number > request.first_number - overtaken:
-                break
+                break  # All further requests were sent later.
             lost.append(key_in_flight)
         self._requeue(lost)
         return lost

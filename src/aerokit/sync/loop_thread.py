@@ -122,6 +122,7 @@ class LoopThread:
                 while call.is_scheduled and not call.wait(wait_s):
                     if not is_shielded or not self._thread.is_alive():
                         break
+                # An error of the clean-up function must not be lost, so it becomes the cause of the raised exception.
                 failure = call.pop_exception() if is_shielded else None
                 if failure is not None:
                     raise error from failure

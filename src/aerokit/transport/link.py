@@ -350,7 +350,7 @@ class MemoryLink(BaseLink):
         self._wake_up: asyncio.Handle | None = None
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; the far end receives it in a later loop iteration."""
+        """See `Link.write`. The far end receives the data in a later loop iteration."""
         if self._receiver is not None and self._far is not None:
             self._far._post(bytes(data), self)
 

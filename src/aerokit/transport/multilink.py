@@ -137,7 +137,7 @@ class MultiLink(Link):
             if failure is not None and not self._is_closed:
                 logger.warning("one of several links cannot be opened and is retried: %s", failure)
                 self._start_opening(index)
-        self._check_all_lost()
+        self._check_all_lost()  # A link may have been lost while others were still being opened.
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`; None writes to every peer of every link."""

@@ -83,7 +83,7 @@ class SerialLink(BaseLink):
             self._port.reset_output_buffer()
         discarded_bytes = bytes_before - self._waiting_to_be_sent(self._transport)
         self._outbox.reclaimed(discarded_bytes)
-        if discarded_bytes > 0:
+        if discarded_bytes > 0:  # The number of writes in these bytes is unknown: count one.
             self._drop(1)
 
     async def _connect(self) -> None:

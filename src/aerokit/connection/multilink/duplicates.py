@@ -67,7 +67,7 @@ class Copies:
                 self._current = earlier
                 return True
             self.is_late = is_other_link and earlier.is_accepted and age_s <= LATE_COPY_WINDOW_S
-            del self._seen[key]
+            del self._seen[key]  # The new frame, which is not a copy, takes the place of the earlier one.
         self._counts[sender] = count + 1
         self._current = self._seen[key] = _Seen(frame.received_at, link_bit, count + 1)
         if len(self._seen) > MAX_REMEMBERED:

@@ -239,6 +239,7 @@ class LinkChoice:
                 for affected in self.candidates.values():
                     affected.reset_proof()
             elif not self.clock.is_steady:
+                # The clock was paused for a moment, so earlier mismatches of other links prove nothing.
                 for affected in self.candidates.values():
                     affected.reset_mismatches()
         else:

@@ -40,8 +40,8 @@ _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 class LinkProbes:
     """Probes each link to a system twice a second, an idle costly link every five seconds.
 
-    Answers are recorded in ``choices``. A second vehicle under the same system id is reported once, and again after a
-    pause. ``send(message, peer)`` sends a probe.
+    Answers are recorded in ``choices``. A second vehicle under the same system id is reported once, and again if the
+    link led to the known vehicle in between. ``send(message, peer)`` sends a probe.
     """
 
     def __init__(
@@ -70,6 +70,7 @@ class LinkProbes:
         is_attached: bool,
     ) -> None:
         """Send a probe if one is due. ``is_attached``: the system has a vehicle object."""
+        # An unused costly link is probed rarely, but not before it is known which vehicle the link leads to.
         is_idle = candidate.is_costly and candidate is not choice.used
         is_new = not candidate.is_proven and not candidate.is_doubted
         interval_s = IDLE_COSTLY_PROBE_INTERVAL_S if is_idle and not is_new else PROBE_INTERVAL_S
@@ -82,7 +83,7 @@ class LinkProbes:
         # ts1 identifies the probe in the answer: our time in nanoseconds, in which the last three digits differ between
         # systems and links that are probed at the same time.
         ts1 = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
-        if ts1 <= 0 or ts1 in self._pending:
+        if ts1 <= 0 or ts1 in self._pending:  # The number is invalid, or another probe has it: try again later.
             return
         if len(self._pending) >= MAX_PENDING:
             del self._pending[next(iter(self._pending))]

@@ -112,7 +112,7 @@ BROADCASTS = frozenset(message_type.ID for message_type in (m.Heartbeat, m.Times
 
 
 class MultiLinkRoutes:
-    """One :class:`Routes` per link (``make_routes``), and the choice of a link for each system.
+    """Keeps one :class:`Routes` for each link, created by ``make_routes``, and chooses a link for each system.
 
     ``own_source`` is our own (system id, component id). ``attached`` has the system ids with a vehicle object.
     """
@@ -153,7 +153,7 @@ class MultiLinkRoutes:
             choice = self._choices[frame.system_id] = LinkChoice(needs_proof=is_autopilot)
         is_costly = _link(peer) in self._link.costly
         candidate = choice.record_heartbeat(_link(peer), frame.received_at, is_costly=is_costly)
-        if is_autopilot and not choice.needs_proof:
+        if is_autopilot and not choice.needs_proof:  # So far, only other components of this system were received.
             choice.start_with(candidate)
         if counters is not None:
             self._counters.setdefault((frame.system_id, _link(peer)), {})[frame.component_id] = counters

@@ -174,7 +174,7 @@ class ZenohConnect(NetworkLink):
         self._first_beacon.set()
         if self._takes_control:
             self._takes_control = beacon.lease_holder != self.client
-            self._put(b"", self._requested_mode())
+            self._put(b"", self._requested_mode())  # An empty datagram with mode "take" requests control.
 
     def _on_notice(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:
         notice = RefusalNotice.decode(data)

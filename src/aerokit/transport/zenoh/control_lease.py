@@ -329,6 +329,7 @@ class DelayEstimator:
         """Return the delay in seconds of data sent at ``sent_s`` on the sender's clock and received at ``now``."""
         offset = now - sent_s
         if self._min_offset is not None:
+            # The clocks may drift apart, so with time a slightly larger offset counts as no delay.
             min_offset = self._min_offset + _MAX_DRIFT * (now - self._measured_at)
             if offset > min_offset:
                 return offset - min_offset
