@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -107,11 +109,37 @@ async def test_frames_without_subscribers_are_recorded(tmp_path: Path) -> None:
     assert received > 50
 
 
-async def test_existing_file_is_replaced(tmp_path: Path) -> None:
+async def test_earlier_recordings_are_kept_under_numbered_names(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = tmp_path / "twice.tlog"
-    path.write_bytes(b"from another day")
-    await fly(path)
-    assert b"another day" not in path.read_bytes()
+    path.write_bytes(b"second day")
+    (tmp_path / "twice.1.tlog").write_bytes(b"first day")
+    near, _ = memory_link_pair()
+    async with open_connection(near, record=path) as connection:
+        connection.bytes_received(FrameEncoder(7, 1).encode(ATTITUDE), None)
+    assert senders(path)[7] == 1
+    assert [(tmp_path / f"twice.{number}.tlog").read_bytes() for number in (1, 2)] == [b"first day", b"second day"]
+    assert f"{path} existed and was kept as {tmp_path / 'twice.2.tlog'}" in caplog.text
+
+
+def test_recordings_begun_at_once_destroy_no_file(tmp_path: Path) -> None:
+    path = tmp_path / "busy.tlog"
+    path.write_bytes(b"first")
+    barrier, count = threading.Barrier(8), 8
+
+    def record(number: int) -> None:
+        recording = Recording(path, 0.0)
+        barrier.wait(timeout=30)
+        recording.write(FrameEncoder(number + 1, 1).encode(ATTITUDE), 0.0)
+        recording.close()
+
+    with ThreadPoolExecutor(count) as threads:
+        list(threads.map(record, range(count)))
+    files = list(tmp_path.iterdir())
+    assert len(files) == count + 1
+    found = sorted(b"first" if (data := file.read_bytes()) == b"first" else data[13:14] for file in files)
+    assert found == sorted([b"first", *(bytes([number + 1]) for number in range(count))])
 
 
 @pytest.mark.parametrize("speed", ["1", "10", "inf"])

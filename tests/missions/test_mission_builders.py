@@ -170,6 +170,7 @@ WRONG: list[tuple[Callable[[], object], str]] = [
     (lambda: missions.waypoint(POSITION, altitude_amsl_m=3, altitude_relative_m=3), "exactly one of"),
     (lambda: missions.waypoint(Position(*PLACE)), "exactly one of .* not none"),
     (lambda: missions.waypoint(POSITION, 8.5), "longitude_deg = 8.5 .* together with a Position"),  # type: ignore[call-overload]
+    (lambda: missions.take_off(12, POSITION), "the first argument, 12, was taken for the latitude"),  # type: ignore[call-overload]
     (lambda: missions.waypoint(47.0, altitude_amsl_m=3), "give both, or a Position"),  # type: ignore[call-overload]
     (lambda: missions.waypoint(None, altitude_amsl_m=3), "give both, or a Position"),  # type: ignore[call-overload]
     (lambda: missions.take_off(True), "altitude_relative_m = True"),

@@ -17,7 +17,8 @@ def parse_plan_text(text: str, name: str) -> Plan:
     """
     from aerokit.missions import Plan, parse_plan, parse_waypoints
 
-    is_json = text.lstrip("\ufeff \t\r\n").startswith("{")
+    bare = text.lstrip("\ufeff \t\r\n")
+    is_json = bare.startswith("{") or (name.lower().endswith(".plan") and not bare.startswith("QGC WPL"))
     plan = parse_plan(text, name) if is_json else Plan(parse_waypoints(text, name))
     for part in (plan.mission, plan.fence, plan.rally):
         part.check()

@@ -62,7 +62,7 @@ class Bus:
     def __init__(self, dialect: Dialect = STANDARD) -> None:
         self.dialect = dialect
         self.one_at_a_time = False
-        """If True, :meth:`deliver_all` returns after the current frame, so that the caller can check the next frames."""
+        """If True, :meth:`deliver_all` returns after the current frame, so that the caller can check the others."""
         self.wanted: dict[int, int] = {}  # message id → number of sinks
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}
         self._plans: dict[int, _DeliveryPlan] = {}  # cache; the key is system id << 24 | message id

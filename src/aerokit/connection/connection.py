@@ -400,6 +400,8 @@ class Connection:
     def record(self, path: str | os.PathLike[str]) -> None:
         """Record all sent and received frames to a ``.tlog`` file until the connection is closed.
 
+        When the first frame is received, an existing file is renamed to the next free number: ``flight.1.tlog``.
+
         Raises:
             LinkOpenError: the file cannot be written.
             BusyError: the connection is already being recorded.

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import itertools
 import logging
 import os
 import time
 from collections import deque
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, BinaryIO, TypeVar
 
 from aerokit.connection.bus import once
 from aerokit.errors import BusyError, LinkOpenError
@@ -31,10 +33,10 @@ SETUP_SIGNING = (256).to_bytes(3, "little")  # message id, as in the header of a
 
 
 class Recording:
-    """A ``.tlog`` file of one connection. An existing file is replaced when the first frame is received.
+    """A ``.tlog`` file of one connection. An existing file is kept under a numbered name, see :func:`keep_existing`.
 
-    If no frame arrives, an existing file stays. Frames are written unchanged, signatures included; SETUP_SIGNING is
-    left out because it contains the key.
+    The existing file is renamed when the first frame is received; without a frame, it keeps its name. Frames are
+    written unchanged, with their signatures. SETUP_SIGNING is left out, because it contains the key.
 
     ``now`` is the current time on the clock of :meth:`write`. Time stamps are the system time at the start, advanced by
     that clock. The recording therefore has no jump when the system clock is set in flight, e.g. on a companion computer
@@ -48,14 +50,17 @@ class Recording:
         self._path = os.fspath(path)
         self._unix_epoch_s = time.time() - now
         self._writer: TlogWriter | None = None
-        # Sent frames that wait while an existing file is not yet replaced. None: frames are written at once.
+        self._file: BinaryIO | None = None
+        # Sent frames that wait until the first frame is received: an existing file is then renamed. None: nothing waits.
         self._waiting: deque[tuple[bytes, float]] | None = None
         try:
-            if os.path.isfile(path) and os.path.getsize(path):
-                with open(path, "ab"):  # fails at once if the file is not writable, not with the first received frame
-                    self._waiting = deque(maxlen=MAX_WAITING)
-            else:
+            if os.path.exists(path) and not os.path.isfile(path):  # The path is that of a device or a pipe.
                 self._writer = TlogWriter(path)
+            elif os.path.exists(path):
+                _check_renamable(path)
+                self._waiting = deque(maxlen=MAX_WAITING)
+            else:
+                self._open_new()
         except OSError as error:
             raise LinkOpenError(f"cannot record to {self._path}: {error.strerror or error}") from None
 
@@ -63,7 +68,7 @@ class Recording:
         """Add a frame received at this time. Never raises."""
         waiting, self._waiting = self._waiting, None
         if waiting is not None:
-            self._replace_file(waiting)
+            self._begin(waiting)
         self._write(raw, at)
 
     def write_sent(self, raw: bytes, at: float) -> None:
@@ -73,13 +78,25 @@ class Recording:
         else:
             self._waiting.append((raw, at))
 
-    def _replace_file(self, waiting: Iterable[tuple[bytes, float]]) -> None:
+    def _begin(self, waiting: Iterable[tuple[bytes, float]]) -> None:
         try:
-            self._writer = TlogWriter(self._path)
+            self._open_new()
         except OSError as error:
             self._report(error)
         for raw, at in waiting:
             self._write(raw, at)
+
+    def _open_new(self) -> None:
+        """Create the file. An existing file of this name is renamed, even if it was created just before."""
+        while True:
+            try:
+                self._file = open(self._path, "xb")  # noqa: SIM115 - closed by close()
+            except FileExistsError:
+                if (kept := keep_existing(self._path)) is not None:
+                    logger.warning("%s existed and was kept as %s", self._path, kept)
+            else:
+                self._writer = TlogWriter(self._file)
+                return
 
     def _write(self, raw: bytes, at: float) -> None:
         if self._writer is not None and not (raw[0] == MAGIC_V2 and raw[7:10] == SETUP_SIGNING):
@@ -98,24 +115,64 @@ class Recording:
 
     def close(self) -> None:
         """Close the file. Never raises; idempotent."""
+        try:
+            self._close()
+        except OSError as error:
+            self._report(error)
+
+    def _close(self) -> None:
         writer, self._writer = self._writer, None
-        if writer is not None:
-            try:
+        file, self._file = self._file, None
+        try:
+            if writer is not None:
                 writer.close()
-            except OSError as error:
-                self._report(error)
+        finally:
+            if file is not None:
+                file.close()
 
     def _abort(self, error: OSError) -> None:
         self._report(error)
-        writer, self._writer = self._writer, None
-        if writer is not None:
-            try:
-                writer.close()
-            except OSError:
-                logger.debug("the last frames of %s could not be written", self._path)
+        try:
+            self._close()
+        except OSError:
+            logger.debug("the last frames of %s could not be written", self._path)
 
     def _report(self, error: OSError) -> None:
         logger.error("recording to %s has ended: %s", self._path, error.strerror or error)
+
+
+def _check_renamable(path: str | os.PathLike[str]) -> None:
+    """Raise PermissionError if the file cannot be renamed, because its folder does not allow it."""
+    if not os.access(os.path.dirname(os.path.abspath(path)), os.W_OK):
+        raise PermissionError(errno.EACCES, "the file exists and cannot be renamed: its folder is not writable")
+
+
+def keep_existing(path: str | os.PathLike[str]) -> str | None:
+    """Rename a file to the next free numbered name in its folder: ``flight.tlog`` to ``flight.1.tlog``.
+
+    Several programs can do this at the same time: none replaces a file of another one. Returns the new name, or None if
+    the file does not exist any more.
+
+    Raises:
+        OSError: the file cannot be renamed.
+    """
+    path = os.fspath(path)
+    stem, suffix = os.path.splitext(path)
+    for number in itertools.count(1):
+        kept = f"{stem}.{number}{suffix}"
+        try:
+            os.close(os.open(kept, os.O_CREAT | os.O_EXCL | os.O_WRONLY))  # claims the name
+        except FileExistsError:
+            continue
+        try:
+            os.replace(path, kept)
+        except OSError as error:
+            os.unlink(kept)
+            if isinstance(error, FileNotFoundError):
+                return None
+            raise
+        return kept
+    raise AssertionError("unreachable")
 
 
 _ObserverT = TypeVar("_ObserverT")

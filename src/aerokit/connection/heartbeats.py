@@ -181,7 +181,7 @@ class LinkStateTracker:
             self._set(LinkState.CONNECTED, at)
 
     def update(self, now: float, frames: int) -> None:
-        """Set the state from ``frames``, the number of frames received since the start."""
+        """Record activity if ``frames``, the total number of frames received, has increased; otherwise `check`."""
         if frames != self._frames:
             self._frames = frames
             self.record_activity(now)
@@ -194,7 +194,7 @@ class LinkStateTracker:
             self._set(LinkState.SILENT, now)
 
     def mark_lost(self, now: float, *, publish: bool = True) -> None:
-        """Set LOST. ``publish=False`` publishes no event, because the program closed the link itself."""
+        """Set LOST. ``publish=False`` is for a link that the program closed itself: it needs no event."""
         self._set(LinkState.LOST, now, publish=publish)
 
     def _set(self, state: LinkState, now: float, *, publish: bool = True) -> None:

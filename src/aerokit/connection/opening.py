@@ -72,8 +72,9 @@ async def open_connection(
         mavlink_version: version of sent messages, 1 or 2; both are received.
         signing: key that signs sent frames; received frames without its signature are refused (docs/signing.md). None:
             frames are neither signed nor verified.
-        record: ``.tlog`` file for all sent and received frames, unknown messages included. An existing file is replaced
-            when the first frame is received. A full disk ends the recording, not the connection.
+        record: ``.tlog`` file for all sent and received frames, unknown messages included. When the first frame is
+            received, an existing file is renamed to the next free number (``flight.1.tlog``), which logger "aerokit"
+            reports. A full disk ends the recording, not the connection.
         reconnect: True to reopen a lost link (e.g. an unplugged device) until it is back, instead of ending the
             connection; see ``LinkInterrupted`` and ``LinkRestored``. Does not apply to the first opening, or to the end
             of a replay. With several links: True to keep the connection while all of them are lost.

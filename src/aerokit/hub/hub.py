@@ -174,7 +174,9 @@ class Hub:
         return detach
 
     def record(self, path: str | os.PathLike[str]) -> None:
-        """Record every forwarded frame once to a ``.tlog`` file. An existing file is replaced.
+        """Record every forwarded frame once to a ``.tlog`` file.
+
+        When the first frame is forwarded, an existing file is renamed to the next free number: ``flight.1.tlog``.
 
         Signatures that an endpoint removes are not recorded. Nor is SETUP_SIGNING, because it contains a key. A full
         disk ends the recording, not the hub.

@@ -207,7 +207,7 @@ class SourceStatistics(SourceFields):
         self._continue_at(sequence)
 
     def _count_alternations(self, now: float, count: int) -> None:
-        """Add to the count of alternations between two streams. After `_EXPIRY_S` without any, it starts again from 0."""
+        """Add to the count of alternations between two streams. It starts again from 0 if the last was too long ago."""
         if now - self._alternated_at > _EXPIRY_S:
             self._alternations = 0
         self._alternations = max(0, self._alternations + count)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from aerokit._internal.formatting import short_repr
 from aerokit._internal.geo import check_place
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
@@ -258,11 +259,20 @@ def place_item(
     """
     if isinstance(latitude_deg, (Position, Home)):
         if longitude_deg is not None:
-            raise InvalidArgument(f"longitude_deg = {longitude_deg!r} is not allowed together with a Position")
+            raise InvalidArgument(
+                f"longitude_deg = {short_repr(longitude_deg)} is not allowed together with a Position: the second"
+                " argument was taken for the longitude; for an altitude write altitude_relative_m=…"
+            )
         position = travel_target(latitude_deg)
         latitude_deg, longitude_deg = position.latitude_deg, position.longitude_deg
         if altitudes == (None, None, None):
             altitudes = _altitudes_of(position)
+    if isinstance(longitude_deg, (Position, Home)):
+        raise InvalidArgument(
+            f"longitude_deg = {short_repr(longitude_deg)} is not a number: the first argument, {latitude_deg!r}, was"
+            " taken for the latitude, and the place for the longitude; write the place first and the altitude by name:"
+            " (place, altitude_relative_m=…)"
+        )
     z, frame = altitude_and_frame(*altitudes)
     if latitude_deg is None and longitude_deg is None and not is_needed:
         return MissionItem(command, frame, *_four(parameters), z=z)

@@ -77,8 +77,13 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
 def format_waypoints(mission: Mission, *, version: int = 110) -> str:
     """Format a mission as the text of a file, with Mission Planner's precision, or more where a number needs more.
 
+    Values that are not given (NaN) become 0, because Mission Planner rejects a file that contains NaN
+    (https://github.com/ArduPilot/pymavlink/issues/1096). PX4 takes a heading of 0 for north; a .plan file keeps the
+    difference.
+
     Raises:
-        InvalidArgument: ``mission`` is no mission, a number is infinite, or the version is neither 110 nor 120.
+        InvalidArgument: ``mission`` is no mission, a number is infinite, the altitude of a place is NaN, or the version
+            is neither 110 nor 120.
     """
     if not isinstance(mission, Mission):
         raise InvalidArgument(
@@ -164,11 +169,17 @@ def _item_row(item: MissionItem, index: int) -> str:
     numbers = (item.param1, item.param2, item.param3, item.param4, *in_degrees(item))
     if any(math.isinf(number) for number in (*numbers, item.z)):
         raise InvalidArgument(f"{item!r} has an infinite number, which a file cannot store")
-    texts = (*map(str, integers), *(_text(number, 8) for number in numbers), _text(item.z, 6))
+    if math.isnan(item.z) and item.position is not None:
+        raise InvalidArgument(f"{item!r} has a place without an altitude, which a file cannot store")
+    columns = [(number, 8) for number in numbers] + [(item.z, 6)]
+    texts = (
+        *map(str, integers),
+        *(_text(0.0 if math.isnan(number) else number, digits) for number, digits in columns),
+    )
     return "\t".join((*texts, str(int(item.autocontinue))))
 
 
 def _text(value: float, digits: int) -> str:
     """Format a number with ``digits`` decimal places, or with more if they are needed to read the same number back."""
     text = f"{value:.{digits}f}"
-    return text if float(text) == value or math.isnan(value) else repr(float(value))
+    return text if float(text) == value else repr(float(value))

@@ -30,6 +30,7 @@ class ParameterFile(Mapping[str, "int | float"]):
 
     A value is an int if it is written as a whole number. ``types`` are the types in the file (QGroundControl only),
     ``comments`` the lines that begin with ``#``, and ``component_id`` is the component that has these parameters.
+    ``places`` maps names to their places for error texts: "mine.param, line 7".
     """
 
     def __init__(
@@ -40,12 +41,14 @@ class ParameterFile(Mapping[str, "int | float"]):
         types: Mapping[str, ParameterType] | None = None,
         comments: Iterable[str] = (),
         component_id: int | None = None,
+        places: Mapping[str, str] | None = None,
     ) -> None:
         self._values = dict(values)
         self.format: FileFormat = format
         self.types: dict[str, ParameterType] = dict(types or {})
         self.comments: tuple[str, ...] = tuple(comments)
         self.component_id = component_id
+        self.places: dict[str, str] = dict(places or {})
 
     def __getitem__(self, name: str) -> int | float:
         return self._values[name]
@@ -150,14 +153,17 @@ def parameter_file_text(
 
 def _parse_names_and_values(lines: list[tuple[str, str]], comments: list[str]) -> ParameterFile:
     values: dict[str, int | float] = {}
+    places: dict[str, str] = {}
     for place, line in lines:
         fields = line.replace(",", " ").split()
         if len(fields) != 2:
             hint = _directive_hint(fields)
             raise FileFormatError(f"{place}: {line.strip()!r} is not NAME,VALUE or NAME VALUE{hint}")
         _add_value(values, place, fields[0], fields[1], ParameterType.REAL32)
+        places[fields[0]] = place
     _, first_line = lines[0]
-    return ParameterFile(values, format="missionplanner" if "," in first_line else "mavproxy", comments=comments)
+    file_format: FileFormat = "missionplanner" if "," in first_line else "mavproxy"
+    return ParameterFile(values, format=file_format, comments=comments, places=places)
 
 
 def _parse_qgroundcontrol(
@@ -165,10 +171,12 @@ def _parse_qgroundcontrol(
 ) -> ParameterFile:
     values: dict[int, dict[str, int | float]] = {}
     types: dict[int, dict[str, ParameterType]] = {}
+    places: dict[int, dict[str, str]] = {}
     for place, line in lines:
         component, name, text, kind = _parse_columns(place, line)
         _add_value(values.setdefault(component, {}), place, name, text, kind)
         types.setdefault(component, {})[name] = kind
+        places.setdefault(component, {})[name] = place
     selected = _select_component(component_id, values, source)
     return ParameterFile(
         values[selected],
@@ -176,6 +184,7 @@ def _parse_qgroundcontrol(
         types=types[selected],
         comments=comments,
         component_id=selected,
+        places=places[selected],
     )
 
 

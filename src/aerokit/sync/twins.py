@@ -247,12 +247,12 @@ class StateCell(CellTwin[T]):
 
     @property
     def value(self) -> T:
-        """The latest value, of any age; raises :class:`ValueUnknownError` before the first."""
+        """The latest value, of any age. Raises :class:`ValueUnknownError` before the first value."""
         return self.aio.value
 
     @property
     def latest(self) -> T | None:
-        """The latest value, or None before the first."""
+        """The latest value, of any age; None before the first value."""
         return self.aio.latest
 
     @property
@@ -262,17 +262,17 @@ class StateCell(CellTwin[T]):
 
     @property
     def updated_at(self) -> float:
-        """Time of the latest value, in seconds of the cell's clock; −inf before the first."""
+        """Time of the latest value, in seconds of the cell's clock; −inf before the first value."""
         return self.aio.updated_at
 
     @property
     def age(self) -> float:
-        """Seconds since the latest value was received; inf before the first."""
+        """Seconds since the latest value was received; inf before the first value."""
         return self.aio.age
 
     @property
     def source(self) -> Source | None:
-        """Sender and message of the latest value; None before the first."""
+        """Sender and message of the latest value; None before the first value."""
         return self.aio.source
 
     def fresh(self, within: float) -> T:
@@ -415,7 +415,7 @@ class Connection(ConnectionTwin):
         return self._loop.call(lambda: self.aio.unsent_bytes)
 
     def discard_unsent(self) -> None:
-        """Discard data that was sent but has not left this program, e.g. an outdated command.
+        """Discard written data that has not left this program yet, e.g. an outdated command.
 
         The call discards all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
         stays in :attr:`unsent_bytes`.
@@ -460,9 +460,10 @@ class SetpointStream(StreamTwin[SetpointT]):
     any way makes the vehicle hold.
 
     The stream stops by itself if there is no new set-point for ``valid_for_s``, or if the event loop is late by
-    ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, or stays in place for twelve
-    seconds although it should move. ``set`` and leaving the block then raise :class:`SetpointStreamStopped`. If a pilot
-    or a failsafe changed the mode, nothing more is sent to the vehicle.
+    ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, hits the ground (velocities,
+    positions and trajectories only), or stays in place for twelve seconds although it should move. ``set`` and leaving
+    the block then raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changed the mode, nothing more is sent
+    to the vehicle.
     """
 
     @property
@@ -4390,11 +4391,19 @@ class Vehicle(VehicleTwin):
         return self.aio.taken_over
 
     def missing_for_flight(self) -> list[str]:
-        """Return what is still missing before the vehicle can fly, from the state received so far. Sends nothing."""
+        """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
+
+        If its arming checks fail, includes the vehicle's texts about them of the last 35 seconds;
+        :meth:`why_not_armable` requests them. A vehicle may arm all the same: ArduCopter arms in STABILIZE without a
+        position.
+        """
         return self._loop.call(self.aio.missing_for_flight)
 
     def why_not_armable(self) -> list[str]:
-        """Return the reasons why arming would be refused now; an empty list means that none is known.
+        """Return the reasons why arming would be refused now, in the present mode; an empty list means that none is
+        known.
+
+        What only a flight needs is not listed, see :meth:`missing_for_flight`.
 
         Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) if it supports that, and collects its status
         texts. Also reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
@@ -4749,7 +4758,7 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: there is no such state. Nothing was sent.
             NotSupported: the vehicle is not a VTOL. Nothing was sent.
-            OperationRejected: the mode changed, or the vehicle disarmed, during the transition.
+            OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the transition.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ten seconds.
@@ -4815,7 +4824,7 @@ class Vehicle(VehicleTwin):
                 was sent.
             ValueUnknownError: the vehicle's position or home is needed but unknown.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
-            OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
+            OperationRejected: the mode changed (a pilot, a failsafe), or the vehicle disarmed or hit the ground.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not arrive in time, or does not move.
@@ -4870,7 +4879,7 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: the mode changed or the vehicle disarmed meanwhile.
+            OperationRejected: the mode changed, or the vehicle disarmed meanwhile or hit the ground.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.
         """
@@ -4930,8 +4939,8 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: the vehicle is not armed or is already flying; or its mode changed or it disarmed
-                meanwhile.
+            OperationRejected: the vehicle is not armed or is already flying; or its mode changed, it disarmed
+                meanwhile or hit the ground.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -5238,8 +5247,9 @@ def open_connection(
         mavlink_version: version of sent messages, 1 or 2; both are received.
         signing: key that signs sent frames; received frames without its signature are refused (docs/signing.md). None:
             frames are neither signed nor verified.
-        record: ``.tlog`` file for all sent and received frames, unknown messages included. An existing file is replaced
-            when the first frame is received. A full disk ends the recording, not the connection.
+        record: ``.tlog`` file for all sent and received frames, unknown messages included. When the first frame is
+            received, an existing file is renamed to the next free number (``flight.1.tlog``), which logger "aerokit"
+            reports. A full disk ends the recording, not the connection.
         reconnect: True to reopen a lost link (e.g. an unplugged device) until it is back, instead of ending the
             connection; see ``LinkInterrupted`` and ``LinkRestored``. Does not apply to the first opening, or to the end
             of a replay. With several links: True to keep the connection while all of them are lost.
@@ -5315,7 +5325,8 @@ def connect(
         mavlink_version: version of the frames we send, 1 or 2.
         signing: signs everything we send, and rejects frames that are not signed with its key (docs/signing.md).
             None: no signatures.
-        record: a ``.tlog`` file that receives all traffic in both directions; an existing file is replaced.
+        record: a ``.tlog`` file that receives all traffic in both directions; an existing file is kept under a numbered
+            name, ``flight.1.tlog``.
         reconnect: reopen a lost link, with as many attempts as it needs, instead of ending the connection.
         peers: accept datagrams and connections only from these IP addresses and networks: ``"10.0.0.7"``,
             ``["10.0.0.0/24"]``. For links with an open port: udpin, udpbcast, tcpin. None: accept all.

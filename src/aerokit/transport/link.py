@@ -305,7 +305,8 @@ def _hint(address: str, cause: OSError) -> str:
 
 
 _HINTS = {
-    errno.EADDRINUSE: "another program uses this port: a ground station, a simulator, an earlier run",
+    errno.EADDRINUSE: "another program uses this port: a ground station, a simulator, an earlier run; stop it, let the"
+    " vehicle send to a second port, or share the link by `aerokit hub`",
     errno.ECONNREFUSED: "nothing listens there; is the vehicle or simulator running, and is this its port?",
     errno.EHOSTUNREACH: "no route to this host; is the network or radio up?",
     errno.ENETUNREACH: "no route to this network; is the network or radio up?",

@@ -93,7 +93,8 @@ async def connect(
         mavlink_version: version of the frames we send, 1 or 2.
         signing: signs everything we send, and rejects frames that are not signed with its key (docs/signing.md).
             None: no signatures.
-        record: a ``.tlog`` file that receives all traffic in both directions; an existing file is replaced.
+        record: a ``.tlog`` file that receives all traffic in both directions; an existing file is kept under a numbered
+            name, ``flight.1.tlog``.
         reconnect: reopen a lost link, with as many attempts as it needs, instead of ending the connection.
         peers: accept datagrams and connections only from these IP addresses and networks: ``"10.0.0.7"``,
             ``["10.0.0.0/24"]``. For links with an open port: udpin, udpbcast, tcpin. None: accept all.

@@ -7,20 +7,31 @@ import dataclasses
 import os
 import re
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import anyio
 import pytest
 from recorded import SHORT
 
+from aerokit import connect
 from aerokit.apps.cli import main
 from aerokit.apps.cli.arguments import DEFAULT_SIM_ADDRESS, FAULTS, expand_address, fault, is_address_template
 from aerokit.apps.cli.main import make_parser
 from aerokit.apps.cli.sim import _client_address, _inject, simulated_fleet
-from aerokit.sim import HOME, SimulatedCopter, SimulatedPx4
+from aerokit.errors import AerokitError
+from aerokit.sim import HOME, SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.sim.faults import Faults
 from aerokit.testing import run_virtual
 from aerokit.testing.track import true_point
+
+DOCUMENTED_FAULTS = dict(
+    re.findall(
+        r"^\| `(\w+)` \| .*? \| (no|yes|it does not answer)\b.*\|$",
+        (Path(__file__).parents[3] / "docs" / "simulator.md").read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
+)
 
 # ---------------------------------------------------------------------------------------- addresses
 
@@ -110,7 +121,8 @@ def test_sim_after_duration_writes_picture(tmp_path: Path, capsys: pytest.Captur
     assert printed[1].startswith("system 2 on udpout:127.0.0.1:45551")
     assert printed[2].startswith("systems 1 to 2 on tcpin:127.0.0.1:")
     assert printed[3] == "try: aerokit demo --connect udpin:127.0.0.1:45550"
-    assert printed[4:] == ["stopped", f"track written to {picture}"]
+    assert printed[4].startswith("or:  aerokit status udpin:127.0.0.1:45550, ")
+    assert printed[5:] == ["stopped", f"track written to {picture}"]
     assert picture.read_text().count("<polyline") == 4
 
 
@@ -207,3 +219,21 @@ def test_sim_faults_are_fields_and_documented() -> None:
     assert set(FAULTS) <= {field.name for field in dataclasses.fields(Faults)}
     document = (Path(__file__).parents[3] / "docs" / "simulator.md").read_text(encoding="utf-8")
     assert re.findall(r"^\| `(\w+)` \|", document.partition("## Faults")[2].partition("\n## ")[0], re.M) == list(FAULTS)
+
+
+@pytest.mark.sampled(4)
+@pytest.mark.parametrize("name", FAULTS)
+def test_fault_refuses_arming_as_documented(name: str) -> None:
+    values = {"prearm_failures": ["Compass not healthy"], "loss": 0.2, "loss_incoming": 0.2}
+
+    async def scenario() -> bool:
+        copter = SimulatedCopter(boot_time_s=0.0)
+        async with simulated_link(copter) as link, connect(link) as vehicle:
+            await vehicle.wait_ready()
+            setattr(copter.faults, name, values.get(name, True))
+            await anyio.sleep(10.0)
+            with suppress(AerokitError):
+                await vehicle.arm()
+            return copter.is_armed
+
+    assert run_virtual(scenario()) is (DOCUMENTED_FAULTS[name] == "no")

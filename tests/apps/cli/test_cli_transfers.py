@@ -110,8 +110,23 @@ def test_params_set_and_get_round_trip(run: Run) -> None:
 def test_params_set_with_unknown_name_sets_the_others(run: Run) -> None:
     code, out, _ = run("params", "set", "WPNAV_ACCEL=210", "NO_SUCH=1")
     assert code == 5
-    assert "WPNAV_ACCEL      210          set range not checked (--metadata FILE checks it)" in out
+    assert "WPNAV_ACCEL      250 → 210    set range not checked (--metadata FILE checks it)" in out
     assert "NO_SUCH          not set: " in out
+
+
+def test_params_load_with_invalid_values_names_all_and_sets_nothing(run: Run, tmp_path: Path) -> None:
+    file = tmp_path / "bad.param"
+    file.write_text("RTL_ALT,1800\nNOSUCH,4\nFLTMODE1,3.5\nFLTMODE2,300\n")
+    before = run("params", "get", "RTL_ALT")[1]
+    code, out, err = run("params", "load", str(file))
+    assert (code, out) == (2, "")
+    assert err.splitlines() == [
+        f"aerokit: {file}, line 3: FLTMODE1 = 3.5 must be a whole number (it is an INT8)",
+        f"{file}, line 4: FLTMODE2 = 300 must be in -128..127 (it is an INT8)",
+        f"{file}, line 2: the vehicle has no parameter NOSUCH",
+        "nothing was set",
+    ]
+    assert run("params", "get", "RTL_ALT")[1] == before
 
 
 def test_params_list_filters_by_pattern_and_changed(run: Run) -> None:
@@ -176,6 +191,21 @@ def test_mission_check_warns_of_unknown_command_and_missing_take_off(capsys: pyt
     assert "warning: mission item 0: command 9999 is not a MAV_CMD" in out
     assert "warning: the mission does not begin with a take-off" in out
     assert out.endswith("m.waypoints has no errors, but 2 warnings\n")
+
+
+@pytest.mark.parametrize("text", ["", "[1]", '{"a":', "hello"])
+def test_broken_plan_file_gives_error_about_plan(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("bad.plan").write_text(text)
+    assert main(["mission", "check", "bad.plan"]) == 6
+    err = capsys.readouterr().err
+    assert "QGC WPL" not in err
+    assert err.startswith("aerokit: bad.plan")
+
+
+def test_mission_upload_gives_the_warnings_of_check(run: Run) -> None:
+    Path("m.waypoints").write_text(WAYPOINTS.replace("\t3\t22\t", "\t3\t16\t"))
+    out = run("mission", "upload", "m.waypoints")[1]
+    assert "warning: the mission does not begin with a take-off" in out
 
 
 def test_mission_check_of_plan_without_problems_has_no_warnings(capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import anyio
 import pytest
 from cli_harness import HOME, MISSION, ctrl_c, run_on, run_with, wait_until
+from exhaustive import exhaustive
 
 import aerokit
 from aerokit.apps.cli import fly, main
@@ -50,10 +51,17 @@ def test_fly_sim_starts_at_planned_home(capsys: pytest.CaptureFixture[str]) -> N
     assert "simulated copter at 47.397742, 8.545594" in capsys.readouterr().out
 
 
-def test_example_plan_is_flown_to_its_end(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        ("copter", "mission finished: in AUTO, disarmed"),
+        exhaustive(pytest.param("px4", "mission finished: holding in LOITER, disarmed")),
+    ],
+)
+def test_example_plan_is_flown_to_its_end(kind: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:
     plan = Path(__file__).parents[3] / "examples" / "survey.plan"
-    assert run_virtual(run_on(None, "fly", str(plan), "--sim")) == 0
-    assert "mission finished: in AUTO, disarmed" in capsys.readouterr().out
+    assert run_virtual(run_on(None, "fly", str(plan), "--sim", "--vehicle", kind)) == 0
+    assert text in capsys.readouterr().out
 
 
 # ------------------------------------------------------------------------------------ refusals

@@ -5,19 +5,23 @@ from __future__ import annotations
 import argparse
 import asyncio
 import io
+import re
 import sys
 from pathlib import Path
 
 import anyio
 import pytest
-from cli_harness import HOME, MISSION, ctrl_c, run_on, wait_until
+from cli_harness import HOME, MISSION, ctrl_c, run_on, run_with, wait_until
+from exhaustive import exhaustive
 
 import aerokit
-from aerokit.apps.cli import fly
+from aerokit.apps.cli import fly, main
 from aerokit.apps.cli import fly as flown_plan
-from aerokit.apps.cli.output import emit, emit_error
+from aerokit.apps.cli.output import TIMED_OUT, emit, emit_error
 from aerokit.errors import OperationRejected
 from aerokit.mavlink.enums import CopterMode
+from aerokit.mavlink.messages import ParamValue
+from aerokit.mavlink.tlog import read_tlog
 from aerokit.missions import read_waypoint_file
 from aerokit.sim import SimulatedCopter, SimulatorServer, simulated_link
 from aerokit.testing import run_virtual
@@ -133,10 +137,10 @@ def test_fly_fall_ends_with_error_and_sends_nothing(
             with anyio.fail_after(60):
                 return await flight
 
-    assert run_virtual(scenario()) == 4
+    assert run_virtual(scenario()) == 5
     out, err = capsys.readouterr()
-    assert "the vehicle accepted the order and has not moved for 12 s, after it descended" in err
-    assert "failed: flying the mission: the vehicle accepted the order and has not moved" in out
+    assert "flying the mission: the vehicle hit the ground at 1" in err
+    assert "failed: flying the mission: the vehicle hit the ground at 1" in out
     assert out.endswith("recorded in fall.tlog\nnext: aerokit report fall.tlog\n")
 
 
@@ -145,7 +149,7 @@ def test_fly_disarmed_in_air_prints_reasons_once(copter: SimulatedCopter, capsys
         async with simulated_link(copter) as link:
             flight = asyncio.create_task(run_on(link, "fly", "m.waypoints", "--yes"))
             await wait_until(lambda: copter.altitude_m > 8)
-            copter.info("Crash: Disarming: AngErr=121>30, Accel=0.9<3.0")
+            copter.send_text(0, "Crash: Disarming: AngErr=121>30, Accel=0.9<3.0")  # MAV_SEVERITY_EMERGENCY
             copter.arming.disarm()
             with anyio.fail_after(60):
                 return await flight
@@ -212,6 +216,45 @@ def test_demo_repeats_reasons_of_vehicle_while_not_ready(capsys: pytest.CaptureF
 
     assert run_virtual(scenario()) == 1
     after_text = capsys.readouterr().out.partition("! PreArm: Compass not healthy\n")[2]
-    lines = [line for line in after_text.splitlines() if "    still missing: " in line]
+    lines = [line for line in after_text.splitlines() if "    cannot arm yet: " in line]
     assert len(lines) > 5
-    assert all(line.endswith("; PreArm: Compass not healthy") for line in lines)
+    assert all(line.endswith("  cannot arm yet: Compass not healthy") for line in lines)
+
+
+def test_fly_not_ready_prints_no_empty_list(capsys: pytest.CaptureFixture[str]) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0, home=HOME)
+    copter.faults.prearm_failures = ["Compass not healthy"]
+    Path("m.waypoints").write_text(MISSION)
+    assert run_with(copter, ["fly", "m.waypoints", "--yes", "--ready", "10"]) == [TIMED_OUT]
+    out, err = capsys.readouterr()
+    assert "still missing" not in out
+    assert err.endswith("; still missing:\n  - PreArm: Compass not healthy\n")
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [
+        ("gps_lost@15", "end of the recording: in LAND, disarmed, 0.0 m above home"),
+        exhaustive(pytest.param("rc_lost@25", "end of the recording: in RTL, disarmed, 0.0 m above home")),
+        exhaustive(
+            pytest.param("silent@25", "the recording ends with the vehicle armed, because it was silent for 10 s")
+        ),
+    ],
+)
+def test_failed_flight_is_recorded_to_its_end(fault: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("m.waypoints").write_text(MISSION.replace("47.3980\t8.5460", "47.400\t8.5460"))
+    command = ("fly", "m.waypoints", "--sim", "--speedup", "1", "--fault", fault, "--record", "x.tlog")
+    assert run_virtual(run_on(None, *command)) != 0
+    out = capsys.readouterr().out
+    assert text in out
+    parameters = [raw for _, raw in read_tlog("x.tlog") if raw[7:10] == bytes((ParamValue.ID, 0, 0))]
+    assert len(parameters) > 1000
+    if "silent" in fault:
+        assert re.search(r"    - m    silent for [4-9] s; last received: AUTO at 1\d\.\d m\n", out)
+
+
+def test_fault_of_real_vehicle_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("m.waypoints").write_text(MISSION)
+    assert main(["fly", "m.waypoints", "--yes", "--fault", "gps_lost"]) == 2
+    assert main(["demo", "--connect", "tcp:127.0.0.1:1", "--fault", "gps_lost"]) == 2
+    assert "--fault needs --sim" in capsys.readouterr().err

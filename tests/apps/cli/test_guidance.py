@@ -72,7 +72,8 @@ def test_unknown_option_gets_no_far_suggestion(capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("assignment", "hint"),
     [
-        ("RTL_AL=1", "(did you mean 'RTL_ALT' or 'RTL_ALTITUDE' or 'RTL_ALT_TYPE'?)"),
+        ("RTL_AL=1", "(did you mean 'RTL_ALT' or 'RTL_ALT_TYPE' or 'RTL_ALT_FINAL'?)"),
+        ("RTL_ALTITUDE=1", "(did you mean 'RTL_ALT' or 'RTL_ALT_TYPE'?)"),  # a plane's name
         ("BOGUS=1", "; `aerokit params list` shows all names"),
     ],
 )
@@ -152,6 +153,15 @@ def test_sim_hint_chooses_one_of_several_vehicles(address: str, hint: str, capsy
     assert hint in capsys.readouterr().out.splitlines()
 
 
+def test_sim_on_two_ports_prints_vehicle_once_and_programs(capsys: pytest.CaptureFixture[str]) -> None:
+    one, other = "udpout:127.0.0.1:45575", "udpout:127.0.0.1:45576"
+    assert main(["sim", one, other, "--duration", "1", "--speedup", "100"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    place = "udpin:127.0.0.1:45575"
+    assert lines[0] == f"system 1 on {one} and {other}, speed 100x"
+    assert lines[2] == f"or:  aerokit status {place}, aerokit monitor {place}, aerokit serve {place}"
+
+
 # -------------------------------------------------------------------------------------------- flying
 
 
@@ -180,10 +190,11 @@ def test_fly_prints_four_words_for_each_item(capsys: pytest.CaptureFixture[str])
 
 def test_fly_records_and_names_next_command(capsys: pytest.CaptureFixture[str]) -> None:
     copter = SimulatedCopter(boot_time_s=0.0, home=HOME)
+    Path("my flight.tlog").write_text("earlier")
     assert run_with(copter, ["fly", "m.waypoints", "--yes", "--record", "my flight.tlog"]) == [0]
+    assert Path("my flight.1.tlog").read_text() == "earlier"
     assert capsys.readouterr().out.endswith("\nnext: aerokit report 'my flight.tlog'\n")
     assert sum(1 for _ in read_tlog("my flight.tlog")) > 100
-    assert run_with(copter, ["fly", "m.waypoints", "--yes", "--record", "my flight.tlog"]) == [6]
     assert run_with(SimulatedCopter(boot_time_s=0.0, home=HOME), ["fly", "m.waypoints", "--yes"]) == [0]
     assert "next time: --record FILE.tlog" in capsys.readouterr().out.splitlines()[-1]
 

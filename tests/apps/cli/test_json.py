@@ -58,6 +58,7 @@ GROUPS = {
         ["mission", "check", "m.waypoints"],
         ["mission", "upload", "m.waypoints"],
         ["mission", "show"],
+        ["mission", "upload", "odd.waypoints"],
         ["mission", "download", "again.plan"],
         ["mission", "clear"],
         ["mission", "start"],
@@ -95,6 +96,7 @@ GROUPS = {
 @pytest.mark.parametrize("group", GROUPS)
 def test_json_records_match_documentation(group: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("m.waypoints").write_text(MISSION)
+    Path("odd.waypoints").write_text(MISSION.replace("\t3\t22\t", "\t3\t16\t"))
     run_with(copter(), *([*arguments, "--json"] for arguments in GROUPS[group]))
     printed = records(capsys.readouterr().out)
     assert len(printed) >= len(GROUPS[group])

@@ -13,7 +13,9 @@ from flight_harness import Wire
 import aerokit
 from aerokit import messages as m
 from aerokit.apps.cli import main
+from aerokit.apps.cli.listening import _kept_is_printed
 from aerokit.apps.cli.output import TIMED_OUT
+from aerokit.connection.frame_observers import keep_existing
 from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.mavlink.signing import SigningKey
 from aerokit.mavlink.tlog import read_tlog
@@ -40,6 +42,7 @@ def test_status_of_signing_vehicle_names_missing_key(
     assert run_with(copter, ["status"], ["params", "get", "RTL_ALT"]) == [0, TIMED_OUT]
     out, err = capsys.readouterr()
     assert "it signs its frames, and without its key" in out.splitlines()[1]
+    assert "  arming   not known whether it arms: no COMMAND_ACK" in out
     assert "frames are signed" in err.splitlines()[0]
     assert copter.now < 25.0, "both commands must finish soon"
 
@@ -78,8 +81,10 @@ def test_status_prints_all_vehicles(
 
 
 def test_status_prints_what_is_missing_for_flight(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_with(SimulatedCopter(boot_time_s=600.0), ["status"]) == [0]
-    assert "missing  " in (out := capsys.readouterr().out)
+    assert run_with(SimulatedCopter(boot_time_s=600.0), ["status"]) == [1]
+    out = capsys.readouterr().out
+    assert "  arming   cannot arm: " in out
+    assert "position unknown" in out
     assert "ready  " not in out
 
 
@@ -95,11 +100,13 @@ def test_status_without_gps_names_mode_that_allows_arming(
             copter.set_mode(mode)
             copter.faults.gps_lost = True
             await anyio.sleep(20)
-            assert await run_on(link, "status", "--seconds", "8") == 0
+            assert await run_on(link, "status", "--seconds", "8") == (0 if is_for_flight_only else 1)
 
     run_virtual(scenario())
     out = capsys.readouterr().out
-    assert ("missing  for autonomous flight; STABILIZE allows arming:\n" in out) is is_for_flight_only
+    words = "  arming   arms in STABILIZE, but cannot take off by itself or fly GUIDED, AUTO, RTL:\n"
+    assert (words in out) is is_for_flight_only
+    assert ("cannot arm: " in out) is not is_for_flight_only
     assert "the estimator has no absolute horizontal position" in out
 
 
@@ -109,6 +116,16 @@ def test_status_of_ready_vehicle_says_so(capsys: pytest.CaptureFixture[str]) -> 
     out = capsys.readouterr().out
     assert "ready    no reason against arming is reported\n" in out
     assert "missing" not in out
+    assert "position -35.3632610, 149.1652300, height above home 0.0 m\n" in out
+
+
+def test_status_gives_real_reason_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.faults.prearm_failures = ["Compass not healthy"]
+    assert run_with(copter, ["status", "--seconds", "8"]) == [1]
+    out = capsys.readouterr().out
+    assert "  arming   cannot arm: PreArm: Compass not healthy\n" in out
+    assert "SYS_STATUS" not in out
 
 
 def test_status_sends_only_requests_and_restores_rates() -> None:
@@ -125,6 +142,11 @@ def test_status_sends_only_requests_and_restores_rates() -> None:
     assert set(intervals.values()) == {0.0}  # the last request restores the default rate
     others = {type(message) for _, message in wire.sent} - {m.CommandLong, m.Heartbeat, m.Timesync}
     assert others == set()
+
+
+def test_status_without_vehicle_names_simulator(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["status", "udpin:127.0.0.1:45561", "--patience", "0.1"]) == 3
+    assert "in another terminal: aerokit sim udpout:127.0.0.1:45561)" in capsys.readouterr().err
 
 
 def test_status_without_vehicle_lists_ground_stations(capsys: pytest.CaptureFixture[str]) -> None:
@@ -184,11 +206,25 @@ def test_record_interrupted_writes_all_frames(capsys: pytest.CaptureFixture[str]
     assert f"flight.tlog: {received} frames received from system 1 in" in capsys.readouterr().out
 
 
-def test_record_to_existing_file_fails(capsys: pytest.CaptureFixture[str]) -> None:
+def test_record_without_frames_keeps_existing_file(capsys: pytest.CaptureFixture[str]) -> None:
     Path("flight.tlog").write_text("mine")
-    assert main(["record", "udpin:127.0.0.1:0", "flight.tlog", "--seconds", "1"]) == 6
+    assert main(["record", "udpin:127.0.0.1:0", "flight.tlog", "--seconds", "0.1"]) == 1
     assert Path("flight.tlog").read_text() == "mine"
-    assert capsys.readouterr().err == "aerokit: flight.tlog: file exists; nothing was recorded\n"
+    assert "0 bytes: nothing was received" in capsys.readouterr().out
+
+
+def test_monitor_names_kept_recording_at_its_end(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("flight.tlog").write_text("mine")
+    with _kept_is_printed("flight.tlog"):
+        keep_existing("flight.tlog")
+    assert capsys.readouterr().err == "flight.tlog existed and was kept as flight.1.tlog\n"
+
+
+def test_record_to_existing_file_keeps_it_numbered(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("flight.tlog").write_text("mine")
+    assert run_on_messages([(1, 1, m.Heartbeat(2, 3, 81, 0, 3))], "record", "flight.tlog", "--seconds", "2") == 0
+    assert Path("flight.1.tlog").read_text() == "mine"
+    assert len(list(read_tlog("flight.tlog"))) >= 1
 
 
 def test_record_connection_failure_leaves_no_file() -> None:

@@ -52,9 +52,13 @@ def test_set_outside_range_with_force_is_set(metadata: str, capsys: pytest.Captu
 @pytest.mark.parametrize(
     ("value", "options", "note"),
     [
-        ("RTL_ALT=-99999", (), "RTL_ALT          -99999       set range not checked (--metadata FILE checks it)\n"),
+        (
+            "RTL_ALT=-99999",
+            (),
+            "RTL_ALT          1500 → -99999 set range not checked (--metadata FILE checks it)\nranges were not",
+        ),
         ("LOG_BITMASK=1", ("--metadata",), "set range not checked (the metadata does not have this parameter)\n"),
-        ("RTL_ALT=2000", ("--metadata",), "RTL_ALT          2000         set\n"),
+        ("RTL_ALT=2000", ("--metadata",), "RTL_ALT          1500 → 2000  set\n"),
     ],
 )
 def test_set_says_that_range_was_not_checked(
@@ -62,7 +66,8 @@ def test_set_says_that_range_was_not_checked(
 ) -> None:
     given = (*options, metadata) if options else ()
     assert run_with(SimulatedCopter(boot_time_s=0.0), ["params", "set", value, *given]) == [0]
-    assert capsys.readouterr().out.endswith(note)
+    assert note in (out := capsys.readouterr().out)
+    assert ("https://autotest.ardupilot.org/Parameters/ArduCopter/apm.pdef.xml" in out) is not bool(options)
 
 
 def test_set_names_reboot_of_metadata(metadata: str, capsys: pytest.CaptureFixture[str]) -> None:

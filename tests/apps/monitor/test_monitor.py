@@ -247,9 +247,9 @@ async def test_wide_row_of_armed_vehicle_is_not_ready() -> None:
 @pytest.mark.parametrize(
     ("size", "shown"),
     [
-        ((60, 30), ["Compass", "RC", "Gyro"]),
-        ((60, 11), ["Compass", "RC (and 1 more)"]),
-        ((0, 0), ["Compass (and 2 more)"]),
+        ((60, 30), ["cannot arm: Compass", "RC", "Gyro"]),
+        ((60, 11), ["cannot arm: Compass", "RC (and 1 more)"]),
+        ((0, 0), ["cannot arm: Compass (and 2 more)"]),
     ],
 )
 async def test_state_lists_missing_reasons_where_room(size: tuple[int, int], shown: list[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 
 import aerokit
 from aerokit.apps.cli import main
+from aerokit.logs.flights import read_flight
 from aerokit.logs.flights.failsafes import evidence_in_texts
 from aerokit.logs.flights.falls import falls
 from aerokit.logs.flights.flight import FlightLog, LoggedText
@@ -118,6 +120,52 @@ def test_measurements_of_fall_without_power_name_the_current() -> None:
         "tilt up to 3°",
         "battery current 1 A (before: 28 A), so look at what stopped the motors: ESCs, their supply, a command",
     ]
+
+
+def falling_with_outputs(*pulses_us: float) -> list[str]:
+    """Return the measurements of a fall with these motor outputs, and a camera's servo that does not move."""
+    flight = descending(free_fall)
+    (fall,) = falls(flight)
+    unused = [math.nan] * (7 - len(pulses_us))
+    for step in range(120):
+        time_s = step / 2
+        now_us = pulses_us if fall.begins_s <= time_s < fall.time_s else (1500.0,) * len(pulses_us)
+        motors = (1000.0,) * len(pulses_us) if time_s < ARMED_S else now_us
+        flight.outputs.add(time_s, *motors, 1900.0, *unused)
+    return fall_measurements(flight, fall)
+
+
+def test_measurements_of_fall_have_motor_outputs() -> None:
+    assert falling_with_outputs(1100.0, 1150.0, 1100.0, 1120.0) == ["motor outputs 1100 to 1150 µs (before: 1500 µs)"]
+
+
+def test_unequal_motor_outputs_name_the_motor() -> None:
+    assert falling_with_outputs(1500.0, 1950.0, 1500.0, 1050.0) == [
+        "unequal motor outputs 1050 to 1950 µs (before: 1500 µs): output 2 at 1950 µs, output 4 at 1050 µs, so look at"
+        " the motor of output 2"
+    ]
+
+
+def test_measurements_of_px4_fall_name_the_motors(tmp_path: Path) -> None:
+    log = tmp_path / "crash.tlog"
+
+    async def crash() -> None:
+        async with (
+            open_flight("px4", connect=False, seed=1) as flight,
+            aerokit.connect(flight.link, record=log) as vehicle,
+        ):
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(30)
+            await anyio.sleep(6)
+            flight.faults.fail_motor()
+            await anyio.sleep(20)
+
+    run_virtual(crash())
+    first, second, *_ = findings(read_flight(log))
+    assert first.startswith("Fall: from 30.0 m, 17.0 m/s")
+    assert ", so look at what stopped the motors: ESCs, their supply, a command; tilt up to " in second
+    assert re.search(r"motor outputs 1\d\d\d to 1\d\d\d µs \(before: 1\d\d\d µs\)", second)
 
 
 def test_hover_for_minutes_after_fast_descent_is_no_fall() -> None:

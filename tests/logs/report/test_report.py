@@ -23,7 +23,7 @@ from aerokit.logs.flights import FlightLog, TimeSeries, failsafes, read_flight
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, ModeChange, Waypoint
 from aerokit.logs.report import report_html
 from aerokit.logs.report.charts import points, rows_to_draw
-from aerokit.logs.report.statistics import clock, length, span
+from aerokit.logs.report.formatting import clock, length, span
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.tlog import TlogWriter
 from aerokit.position import Position

@@ -83,7 +83,7 @@ async def test_wait_ready_requests_needed_streams() -> None:
 async def test_wait_ready_names_a_failing_check_and_a_silent_vehicle(grounded: Flight) -> None:
     grounded.copter.faults.prearm_failures.append("Compass not healthy")
     await anyio.sleep(3.0)
-    with pytest.raises(OperationTimeout, match="pre-arm checks do not pass"):
+    with pytest.raises(OperationTimeout, match="PreArm: Compass not healthy"):
         await grounded.vehicle.wait_ready(timeout=2.0)
     grounded.copter.faults.silent = True
     with pytest.raises(OperationTimeout, match="heartbeats \\(the last one"):

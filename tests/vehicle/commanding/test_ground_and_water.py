@@ -154,19 +154,20 @@ async def test_go_to_vehicle_does_not_move_times_out() -> None:
                 await stream.fly(VelocitySetpoint(north_m_s=1.0), 30.0)
 
 
-async def fall(copter: SimulatedCopter, begin: Callable[[], None]) -> None:
-    """Go somewhere at 20 m, and call ``begin`` two seconds later."""
+async def fall(copter: SimulatedCopter, begin: Callable[[], None], height_m: float = 20) -> None:
+    """Go somewhere at this height, and call ``begin`` two seconds later."""
     async with guided(copter) as vehicle:
-        await vehicle.take_off(20)
+        await vehicle.take_off(height_m)
         asyncio.get_running_loop().call_later(2.0, begin)
         await vehicle.go_to(vehicle.position.value.offset(north_m=100))
 
 
-async def test_go_to_vehicle_fell_error_names_descent() -> None:
+async def test_go_to_slow_fall_error_names_descent() -> None:
+    """A fall from this height ends below 6 m/s, so it may be a hard landing."""
     copter = SimulatedCopter(boot_time_s=1.0)
-    descent = r"not moved for 1[23] s, after it descended (19|20)\.\d m at up to 1\d\.\d m/s; the vehicle is"
+    descent = r"not moved for 1[23] s, after it descended [12]\.\d m at up to [345]\.\d m/s; the vehicle is"
     with pytest.raises(OperationTimeout, match=descent):
-        await fall(copter, lambda: setattr(copter.faults, "motor_failed", True))
+        await fall(copter, lambda: setattr(copter.faults, "motor_failed", True), 1.6)
 
 
 async def test_go_to_vehicle_disarmed_in_air_error_names_height() -> None:

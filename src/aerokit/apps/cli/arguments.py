@@ -231,5 +231,23 @@ def add_baud(command: argparse._ActionsContainer) -> None:
 def add_record(command: argparse._ActionsContainer) -> None:
     """Add ``--record FILE``; see `aerokit.apps.cli.output.new_recording`."""
     command.add_argument(
-        "--record", type=log_file, metavar="FILE", help="record all messages to a new file: flight.tlog"
+        "--record",
+        type=log_file,
+        metavar="FILE",
+        help="record all messages: flight.tlog (an existing file is kept as flight.1.tlog)",
     )
+
+
+def add_faults(command: argparse._ActionsContainer) -> None:
+    """Add ``--fault NAME[@S]`` for simulated vehicles."""
+    faults = command.add_argument(
+        "--fault",
+        action="append",
+        type=fault,
+        default=[],
+        dest="faults",
+        metavar="NAME[@S]",
+        help="fault of every simulated vehicle, from the start or after S simulated seconds (repeatable):"
+        f" {', '.join(FAULTS)}; loss=0.2 loses a share, 'prearm_failures=TEXT' refuses to arm",
+    )
+    offer(faults, lambda: FAULTS)

@@ -287,8 +287,16 @@ async def await_vehicle(connection: Connection, options: argparse.Namespace, pat
                 return
     raise ConnectFailed(
         f"no autopilot heartbeat on {connection.link.address} within {patience_s:g} s:"
-        f" {explain_no_vehicle(connection, None)}"
+        f" {explain_no_vehicle(connection, None)}{_simulator_hint(connection)}"
     )
+
+
+def _simulator_hint(connection: Connection) -> str:
+    """Return the command that starts a simulated vehicle for this link, if it listens and received nothing."""
+    place = connection.link.address.replace("0.0.0.0", "127.0.0.1")
+    if not place.startswith("udpin:127.0.0.1:") or any(peer.bytes for peer in connection.statistics()):
+        return ""
+    return f" (to simulate one, in another terminal: aerokit sim {place.replace('udpin', 'udpout')})"
 
 
 async def await_end(connection: Connection, seconds: float | None, work: asyncio.Task[None] | None = None) -> bool:

@@ -5,14 +5,15 @@ from __future__ import annotations
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
 
-from aerokit.apps.cli.arguments import add_baud, add_vehicle_kind, address, number, system_id, writable_file
+from aerokit.apps.cli.arguments import add_baud, add_faults, add_vehicle_kind, address, number, system_id, writable_file
 from aerokit.apps.cli.completion import addresses, offer
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_signing_key, connect_to, signing_of
-from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, add_force, add_json, check_not_existing, emit
-from aerokit.apps.cli.sim import simulated_vehicle
+from aerokit.apps.cli.flight_recording import record_parameters
+from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, add_json, emit, new_recording
+from aerokit.apps.cli.sim import faults_begin, simulated_vehicle
 from aerokit.apps.cli.supervised_flight import FlightReport, SupervisedFlight
 from aerokit.apps.cli.terminal import InterruptStack, on_interrupt
-from aerokit.errors import AerokitError, NotSupported, OperationRejected
+from aerokit.errors import AerokitError, InvalidArgument, NotSupported, OperationRejected
 
 if TYPE_CHECKING:
     import argparse
@@ -37,6 +38,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     )
     offer(address_option, addresses)
     add_vehicle_kind(command, "copter, plane (ArduPilot), px4, px4_plane (copter)")
+    add_faults(command)
     command.add_argument(
         "--altitude",
         type=number(1, 500),
@@ -50,10 +52,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--record",
         type=writable_file,
+        default=_DEFAULT_LOG,
         metavar="FILE",
-        help=f"telemetry log to write ({_DEFAULT_LOG}, which is replaced each time)",
+        help=f"record all messages ({_DEFAULT_LOG}); an existing file is kept as demo.1.tlog",
     )
-    add_force(command)
     command.add_argument(
         "--speedup", type=number(0.1, 100), default=5.0, metavar="X", help="simulation speed factor (5)"
     )
@@ -65,10 +67,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 async def run_demo(options: argparse.Namespace) -> int:
     """Fly the demonstration. Return 0 when the vehicle is back on the ground."""
-    if options.record is None:
-        options.record = _DEFAULT_LOG
-    else:
-        check_not_existing(options.record, options)
+    if options.connect is not None and options.faults:
+        raise InvalidArgument("--fault is for the simulated vehicle, not for one on --connect")
     interrupts = InterruptStack()
     with on_interrupt(interrupts.interrupt):
         code = await interrupts.run(lambda: _connect_and_fly(options, interrupts))
@@ -81,6 +81,7 @@ async def run_demo(options: argparse.Namespace) -> int:
 async def _connect_and_fly(options: argparse.Namespace, interrupts: InterruptStack) -> int:
     async with _address(options) as address, AsyncExitStack() as stack:
         emit(options, "connecting", {"address": address}, f"connecting to {address}")
+        stack.enter_context(new_recording(options.record))
         signing = signing_of(options) if options.connect else None
         is_real = options.connect is not None
         vehicle = await stack.enter_async_context(
@@ -109,7 +110,8 @@ async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
         text = f"simulated {options.vehicle} on {address}, speed {options.speedup:g}x"
         record = {"system_ids": [vehicle.system_id], "address": address, "speedup": options.speedup}
         emit(options, "simulated", record, text)
-        yield address
+        async with faults_begin([vehicle], options):
+            yield address
 
 
 class _SquareFlight(SupervisedFlight):
@@ -145,6 +147,7 @@ class _SquareFlight(SupervisedFlight):
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}; waiting until it is ready")
         if vehicle.autopilot.take_off(altitude_m, 0.0, is_vtol=vehicle.is_vtol) is None:
             raise NotSupported(f"demo: {vehicle.autopilot.firmware} cannot take off")
+        await record_parameters(vehicle, self._print)
         await vehicle.wait_ready(timeout=_READY_TIMEOUT_S)
         home = vehicle.home.value
         self._print(f"ready, home is {home.latitude_deg:.6f}, {home.longitude_deg:.6f}; arming")

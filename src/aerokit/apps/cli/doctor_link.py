@@ -245,7 +245,11 @@ class LinkExamination:
                     " (PX4); ArduPilot sends version 1 until it receives version 2",
                 )
             else:
-                advice = "`aerokit status` shows what prevents it from arming" if is_autopilot(heartbeat) else ""
+                advice = (
+                    "`aerokit status` shows what it lacks, to arm or only to fly by itself"
+                    if is_autopilot(heartbeat)
+                    else ""
+                )
                 yield Finding("ok", "sender", text, advice)
 
     def _signing(self) -> Iterator[Finding]:

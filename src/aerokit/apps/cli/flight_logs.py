@@ -11,7 +11,8 @@ from aerokit._internal.formatting import printable
 from aerokit.apps.cli.output import DONE, add_force, add_json, check_not_existing, emit, import_extra
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.logs.flights import check_log_name
-from aerokit.logs.report.statistics import clock, fall_text
+from aerokit.logs.report.formatting import clock
+from aerokit.logs.report.statistics import fall_text
 
 if TYPE_CHECKING:
     import argparse

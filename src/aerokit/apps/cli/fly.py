@@ -7,9 +7,10 @@ from contextlib import AsyncExitStack, suppress
 from typing import TYPE_CHECKING, cast
 
 from aerokit import events
-from aerokit.apps.cli.arguments import add_record, number, vehicle_kind
+from aerokit.apps.cli.arguments import add_faults, add_record, number, vehicle_kind
 from aerokit.apps.cli.completion import kinds, offer
 from aerokit.apps.cli.connecting import add_vehicle, connect_to, default_address, signing_of
+from aerokit.apps.cli.flight_recording import record_parameters, record_to_end
 from aerokit.apps.cli.mission import PARTS, add_max_distance, begins_with_take_off, emit_items, read_plan, upload_parts
 from aerokit.apps.cli.output import (
     DONE,
@@ -61,6 +62,8 @@ class PlanFlight(SupervisedFlight):
         self.sent = "the upload was not completed, nothing was armed"
         await upload_parts(vehicle, self._plan, self._options)
         self.sent = "the plan is on the vehicle, nothing was armed"
+        if self._options.record is not None:
+            await record_parameters(vehicle, self._print)
         confirmed_mission = await self._download_mission() if self._needs_confirmation else ()
         self._print("waiting until the vehicle is ready")
         await vehicle.wait_ready(timeout=self._options.ready)
@@ -193,6 +196,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     simulated.add_argument(
         "--speedup", type=number(0.1, 100), default=10.0, metavar="X", help="simulation speed factor (10)"
     )
+    add_faults(simulated)
     add_record(command)
     add_vehicle(command)
     add_json(command)
@@ -224,8 +228,9 @@ def _check_arguments(options: argparse.Namespace, plan: Plan) -> None:
         raise InvalidArgument(f"{options.file} has no mission items; nothing to fly")
     if options.sim and options.connect is not None:
         raise InvalidArgument("--sim and --connect exclude each other")
-    if options.vehicle is not None and not options.sim:
-        raise InvalidArgument("--vehicle needs --sim")
+    for given, name in ((options.vehicle is not None, "--vehicle"), (bool(options.faults), "--fault")):
+        if given and not options.sim:
+            raise InvalidArgument(f"{name} needs --sim")
     if not (options.sim or options.yes or is_interactive()):
         raise InvalidArgument(
             "cannot ask for confirmation: stdin is not a terminal, and --yes is not given; nothing was sent"
@@ -252,7 +257,13 @@ async def _connect_and_fly(
             flights.append(PlanFlight(vehicle, plan, report, interrupts, options))
             try:
                 code = await flights[-1].fly()
+                # Nobody would land a simulated vehicle whose mission ended in the air.
+                is_followed = code == DONE and not options.sim
+                if is_followed and options.record is not None and flights[-1].armed_by_us:
+                    await record_to_end(vehicle, interrupts, report.print_line)
             except AerokitError:
+                if flights[-1].armed_by_us and options.record is not None:
+                    await record_to_end(vehicle, interrupts, report.print_line)
                 if flights[-1].armed_by_us:
                     report.print_summary(options.record)
                 raise
@@ -263,7 +274,7 @@ async def _connect_and_fly(
 
 async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: AsyncExitStack) -> Link:
     """Start a simulated vehicle of the plan's type at the start of the mission."""
-    from aerokit.apps.cli.sim import simulated_vehicle
+    from aerokit.apps.cli.sim import faults_begin, simulated_vehicle
     from aerokit.sim import simulated_link
     from aerokit.sim.kinds import scale_timeouts
     from aerokit.sim.motion import HOME
@@ -277,6 +288,7 @@ async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: Asyn
     vehicle = simulated_vehicle(kind, home=home, boot_time_s=_SIM_BOOT_TIME_S)
     scale_timeouts([vehicle], options.speedup)
     link = await stack.enter_async_context(simulated_link(vehicle, speedup=options.speedup))
+    await stack.enter_async_context(faults_begin([vehicle], options))
     record = {"system_ids": [vehicle.system_id], "address": link.address, "speedup": options.speedup}
     text = f"simulated {kind} at {home[0]:.6f}, {home[1]:.6f}, speed {options.speedup:g}x"
     emit(options, "simulated", record, text)

@@ -8,8 +8,9 @@ import signal
 import sys
 import threading
 from collections import Counter
-from contextlib import AsyncExitStack, ExitStack, suppress
+from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit.apps.cli.arguments import add_record, log_file
@@ -27,11 +28,9 @@ from aerokit.apps.cli.output import (
     DONE,
     FAILED,
     INTERRUPTED,
-    create_recording,
     emit,
     import_extra,
     new_recording,
-    remove_if_empty,
 )
 from aerokit.apps.cli.terminal import on_interrupt, waiting
 from aerokit.apps.event_text import event_details
@@ -40,6 +39,7 @@ from aerokit.events import Event, LinkReport, StatusTextReceived
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Iterator
 
     from aerokit.connection.connection import Connection
     from aerokit.mavlink.frame import Frame
@@ -57,7 +57,7 @@ EXIT_TIMEOUT_S = 3.0
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_record)
     add_link(command)
-    command.add_argument("file", type=log_file, metavar="FILE", help="new file, flight.tlog; directly after ADDRESS")
+    command.add_argument("file", type=log_file, metavar="FILE", help="flight.tlog; directly after ADDRESS")
     add_seconds(command, "stop after S seconds (at Ctrl-C)")
     command.add_argument(
         "--as-is",
@@ -68,28 +68,28 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 async def run_record(options: argparse.Namespace) -> int:
     """Record until Ctrl-C or for ``--seconds``; a lost link is reopened."""
+    with new_recording(options.file):
+        return await _record_link(options)
+
+
+async def _record_link(options: argparse.Namespace) -> int:
     counts: Counter[tuple[int, int]] = Counter()
 
     def count(frame: Frame, peer: Peer) -> None:
         counts[frame.system_id, frame.message_id] += 1
 
-    create_recording(options.file)
     error: AerokitError | None = None
-    try:
-        async with opened(options, reconnect=True) as connection:
-            started_at = connection.now()
-            connection.record(options.file)
-            connection.observe_frames(count)
-            text = f"recording {connection.link.address} to {options.file} until Ctrl-C"
-            emit(options, "recording", {"address": connection.link.address, "file": options.file}, text)
-            try:
-                is_interrupted = await _record(connection, options)
-            except AerokitError as connection_error:  # raised below, after the counts are reported
-                error, is_interrupted = connection_error, False
-            seconds = connection.now() - started_at
-    except BaseException:
-        remove_if_empty(options.file)
-        raise
+    async with opened(options, reconnect=True) as connection:
+        started_at = connection.now()
+        connection.record(options.file)
+        connection.observe_frames(count)
+        text = f"recording {connection.link.address} to {options.file} until Ctrl-C"
+        emit(options, "recording", {"address": connection.link.address, "file": options.file}, text)
+        try:
+            is_interrupted = await _record(connection, options)
+        except AerokitError as connection_error:  # raised below, after the counts are reported
+            error, is_interrupted = connection_error, False
+        seconds = connection.now() - started_at
     _emit_counts(options, counts, seconds)
     if error is not None:
         raise error
@@ -115,7 +115,7 @@ def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], 
         message = STANDARD.get(message_id)
         messages[str(message_id) if message is None else message.NAME] += count
     systems = sorted({system_id for system_id, _ in counts})
-    size = os.path.getsize(options.file)
+    size = os.path.getsize(options.file) if counts else 0  # without a frame, an earlier recording keeps its name
     record = {
         "file": options.file,
         "seconds": seconds,
@@ -226,6 +226,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
             stack.callback(timer.cancel)
 
         stack.enter_context(new_recording(options.record))
+        stack.enter_context(_kept_is_printed(options.record))
         return await run(
             options.address,
             baud=options.baud,
@@ -233,6 +234,19 @@ async def run_monitor(options: argparse.Namespace) -> int:
             record=options.record,
             on_start=lambda app: stack.enter_context(on_interrupt(app.exit, exit_soon)),
         )
+
+
+@contextmanager
+def _kept_is_printed(path: str | None) -> Iterator[None]:
+    """After the block, print where an earlier recording is now, because Textual hides the log meanwhile."""
+    if path is None or not os.path.isfile(path):
+        yield
+        return
+    earlier = os.stat(path)
+    yield
+    for kept in Path(path).resolve().parent.iterdir():
+        if kept.name != Path(path).name and os.path.samestat(kept.lstat(), earlier):
+            print(f"{path} existed and was kept as {kept.name}", file=sys.stderr)
 
 
 def _detach_terminal() -> None:

@@ -217,6 +217,7 @@ async def _upload(options: argparse.Namespace) -> int:
     plan = read_plan(options.file)
     if not any(getattr(plan, part).to_items() for part in PARTS):
         raise InvalidArgument(f"{options.file} has no items; nothing was uploaded")
+    _emit_warnings(plan, options)
     async with connected(options, changes=True) as vehicle:
         await upload_parts(vehicle, plan, options)
     return DONE
@@ -230,13 +231,18 @@ async def _check(options: argparse.Namespace) -> int:
             emit_items(options, part, items, "in the file")
     if not any(getattr(plan, part).to_items() for part in PARTS) and not options.json:
         print(f"{options.file} has no items")
-    warnings = plan_warnings(plan)
-    for warning in warnings:
-        emit(options, "warning", {"text": warning}, f"warning: {warning}")
+    warnings = _emit_warnings(plan, options)
     if not options.json:
         warning_count = f", but {len(warnings)} warning{'' if len(warnings) == 1 else 's'}" if warnings else ""
         print(f"{options.file} has no errors{warning_count}")
     return DONE
+
+
+def _emit_warnings(plan: Plan, options: argparse.Namespace) -> list[str]:
+    warnings = plan_warnings(plan)
+    for warning in warnings:
+        emit(options, "warning", {"text": warning}, f"warning: {warning}")
+    return warnings
 
 
 async def _clear(options: argparse.Namespace) -> int:

@@ -263,33 +263,24 @@ def check_not_existing(file: str | Path, options: argparse.Namespace) -> None:
         raise FileExistsError(errno.EEXIST, "file exists; use --force to replace it", str(file))
 
 
-def create_recording(path: str) -> None:
-    """Create an empty recording with an exclusive open, so that no other file is replaced.
-
-    Raises:
-        FileExistsError: the file exists.
-    """
-    try:
-        with open(path, "xb"):
-            pass
-    except FileExistsError as error:
-        raise FileExistsError(error.errno, "file exists; nothing was recorded", path) from None
-
-
-def remove_if_empty(path: str) -> None:
-    """Delete a recording that received nothing."""
-    if not os.path.getsize(path):
-        os.unlink(path)
-
-
 @contextmanager
 def new_recording(path: str | None) -> Iterator[None]:
-    """Create the recording of ``--record``, and delete an empty one after the block. ``path`` None: do nothing."""
+    """Check that a recording can be written, and delete it after the block if it is new and empty.
+
+    The connection creates the file, and keeps an existing one under a numbered name
+    (`aerokit.connection.frame_observers.keep_existing`). ``path`` None: do nothing.
+
+    Raises:
+        PermissionError: the folder is not writable.
+    """
     if path is None:
         yield
         return
-    create_recording(path)
+    if not os.access(os.path.dirname(os.path.abspath(path)), os.W_OK):
+        raise PermissionError(errno.EACCES, "the folder is not writable; nothing was recorded", path)
+    is_new = not os.path.exists(path)
     try:
         yield
     finally:
-        remove_if_empty(path)
+        if is_new and os.path.exists(path) and not os.path.getsize(path):
+            os.unlink(path)

@@ -5,35 +5,44 @@ from __future__ import annotations
 import argparse
 import fnmatch
 import sys
+from contextlib import suppress
 from typing import TYPE_CHECKING
+
+import anyio
 
 from aerokit.apps.cli import connecting
 from aerokit.apps.cli.arguments import assignment, writable_file
 from aerokit.apps.cli.completion import assignments, offer, parameter_names
 from aerokit.apps.cli.connecting import add_action
-from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, exit_code, suggestion
+from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, exit_code, near_names, suggestion
 from aerokit.apps.cli.params_metadata import (
-    RANGES_NOT_CHECKED,
     add_metadata,
     check_allowed,
     load_metadata_option,
     metadata_facts,
     metadata_for_check,
+    metadata_source,
     metadata_text,
     reboot_note,
 )
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.apps.parameter_values import with_range_note
-from aerokit.errors import ParameterRejected, ParameterTimeout
+from aerokit.errors import AerokitError, InvalidArgument, ParameterRejected, ParameterTimeout
+from aerokit.parameters import checked_value
+from aerokit.vehicle.parameters.writing import resolve_known
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
     from contextlib import AbstractAsyncContextManager
 
-    from aerokit.parameters import Metadata, Parameter, ParameterTable
+    from aerokit.parameters import Metadata, Parameter, ParameterFile, ParameterTable
     from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
+# Maximum time for reading the names of the vehicle's parameters for a suggestion.
+_NAMES_TIMEOUT_S = 10.0
+# Minimum length of a name that is suggested because the given name begins with it.
+_MIN_BEGINNING = 5
 _FORMATS = ("missionplanner", "mavproxy", "qgroundcontrol")
 
 
@@ -139,9 +148,14 @@ async def _set(options: argparse.Namespace) -> int:
             metadata = await metadata_for_check(vehicle, None, options)
             check_allowed(metadata, dict(options.values))
         results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
+        known = await _names_for_hints(vehicle, results.values())
     if not options.force:
         results = {name: with_range_note(metadata, result, "--metadata FILE") for name, result in results.items()}
-    return _emit_results(options, results.values(), vehicle, metadata)
+    code = _emit_results(options, results.values(), known, metadata)
+    was_set = any(result.error is None and result.outcome != "unchanged" for result in results.values())
+    if was_set and metadata is None and not options.force and not options.json:
+        print(metadata_source(vehicle))
+    return code
 
 
 async def _load(options: argparse.Namespace) -> int:
@@ -149,7 +163,7 @@ async def _load(options: argparse.Namespace) -> int:
 
     file_values, file_metadata = read_parameter_file(options.file), load_metadata_option(options)
     async with connected(options, changes=True) as vehicle:
-        await _download(vehicle, options)
+        _check_file(file_values, await _download(vehicle, options), vehicle)
         metadata = await metadata_for_check(vehicle, file_metadata, options)
         if metadata is not None:
             # Only changes are checked, because a backup may have unusual values that the vehicle has already.
@@ -160,13 +174,37 @@ async def _load(options: argparse.Namespace) -> int:
             results = await vehicle.parameters.upload(
                 file_values, idle_timeout_s=options.patience, on_progress=on_progress
             )
+        table = vehicle.parameters.table
     if options.json:
-        return _emit_results(options, results.values(), vehicle, metadata)
+        return _emit_results(options, results.values(), table, metadata)
     changed = [result for result in results.values() if result.outcome != "unchanged"]
-    code = _emit_results(options, changed, vehicle, metadata)
-    unchecked = f"; {RANGES_NOT_CHECKED}" if changed and metadata is None and not options.force else ""
-    print(f"{len(results)} parameters in {options.file}, {len(changed)} of them differed{unchecked}")
+    code = _emit_results(options, changed, table, metadata)
+    print(f"{len(results)} parameters in {options.file}, {len(changed)} of them differed")
+    if changed and metadata is None and not options.force:
+        print(metadata_source(vehicle))
     return code
+
+
+def _check_file(wanted: ParameterFile, table: ParameterTable, vehicle: Vehicle) -> None:
+    """Check all values of a file with the types of the vehicle.
+
+    Raises:
+        InvalidArgument: a value does not have the type of its parameter. The text names all such values, and the names
+            that the vehicle does not have, with their lines.
+    """
+    is_upper = vehicle.autopilot.name == "ArduPilot"
+    invalid, unknown = [], []
+    for name, value in wanted.items():
+        place, found = wanted.places[name], resolve_known(name.upper() if is_upper else name, table)
+        if found is None:
+            unknown.append(f"{place}: the vehicle has no parameter {name}{suggestion(name, table, 3)}")
+            continue
+        try:
+            checked_value(name, found.to_vehicle(value), found.parameter.type)
+        except InvalidArgument as error:
+            invalid.append(f"{place}: {error}")
+    if invalid:
+        raise InvalidArgument("\n".join([*invalid, *unknown, "nothing was set"]))
 
 
 async def _download(vehicle: Vehicle, options: argparse.Namespace) -> ParameterTable:
@@ -178,18 +216,36 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
     try:
         return await vehicle.parameters.read(name, idle_timeout_s=options.patience)
     except (ParameterRejected, ParameterTimeout) as error:
-        error.args = (f"{error}{_hint(name, error, vehicle)}",)
+        known = await _known_names(vehicle) if isinstance(error, ParameterRejected) else ()
+        error.args = (f"{_with_hint(name, error, known)}",)
         raise
 
 
-def _hint(name: str, error: Exception, vehicle: Vehicle) -> str:
-    """Suggest similar parameter names, or the command that lists them. Empty if the error contains a suggestion."""
-    names = parameter_names(vehicle.autopilot.name)
-    is_missing = "has no parameter" in str(error)  # `names` are those of all vehicle types, so it may be among them
-    if "did you mean" in str(error) or (name.upper() in names and not is_missing):
-        return ""
-    other_names = [known_name for known_name in names if known_name != name.upper()]
-    return suggestion(name, other_names, 3) or "; `aerokit params list` shows all names"
+async def _names_for_hints(vehicle: Vehicle, results: Iterable[ParameterWrite]) -> Collection[str]:
+    """Return the names of the vehicle's parameters if a result needs a suggestion."""
+    is_needed = any("has no parameter" in str(result.error) for result in results)
+    return await _known_names(vehicle) if is_needed else ()
+
+
+async def _known_names(vehicle: Vehicle) -> Collection[str]:
+    """Return the names of the vehicle's parameters; none if reading them takes too long."""
+    with anyio.move_on_after(_NAMES_TIMEOUT_S), suppress(AerokitError):
+        return await vehicle.parameters.download()
+    return ()
+
+
+def _with_hint(name: str, error: Exception, known: Collection[str]) -> str:
+    """Return the text of an error; if the vehicle lacks the name, with similar names that it has, or the command that
+    lists them.
+    """
+    text = str(error)
+    if "has no parameter" not in text or "replaced by" in text or "its name on" in text:
+        return text
+    bare = text.partition(" (did you mean")[0]  # the error knows only the parameters that were read before
+    beginnings = [other for other in known if len(other) >= _MIN_BEGINNING and name.upper().startswith(other)]
+    names = dict.fromkeys([*beginnings, *near_names(name, known, 3)])
+    hint = " or ".join(map(repr, list(names)[:3]))
+    return f"{bare} (did you mean {hint}?)" if hint else f"{bare}; `aerokit params list` shows all names"
 
 
 def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter], metadata: Metadata | None) -> None:
@@ -203,9 +259,9 @@ def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter
 
 
 def _emit_results(
-    options: argparse.Namespace, results: Iterable[ParameterWrite], vehicle: Vehicle, metadata: Metadata | None
+    options: argparse.Namespace, results: Iterable[ParameterWrite], known: Collection[str], metadata: Metadata | None
 ) -> int:
-    """Print a line for each result, and return the exit code.
+    """Print a line for each result, and return the exit code. ``known`` are the vehicle's names, for suggestions.
 
     The exit code is that of the first error, as for ``get``. Without an error, it is FAILED if a value differs from the
     requested value by more than rounding.
@@ -216,9 +272,11 @@ def _emit_results(
             reboot = reboot_note(metadata, result.name, result.value)
             result = result.replace(note="; ".join(filter(None, (result.note, reboot))))
         if result.error is None:
-            text = f"{result.name:16} {_text(result.value):<12} {result.outcome} {result.note}".rstrip()
+            is_same = result.before is None or result.outcome == "unchanged"
+            value = _text(result.value) if is_same else f"{_text(result.before)} → {_text(result.value)}"
+            text = f"{result.name:16} {value:<12} {result.outcome} {result.note}".rstrip()
         else:
-            text = f"{result.name:16} not set: {result.error}{_hint(result.name, result.error, vehicle)}"
+            text = f"{result.name:16} not set: {_with_hint(result.name, result.error, known)}"
         emit(options, "parameter_write", _record(result), text)
         if result.error is not None and code in (DONE, FAILED):
             code = exit_code(result.error)

@@ -22,7 +22,15 @@ if TYPE_CHECKING:
 _SYSTEM_ID_NAMES = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
 # Maximum time for reading the metadata from the vehicle. Reading takes longer over a slow radio and is then given up.
 _READ_TIMEOUT_S = 10.0
-RANGES_NOT_CHECKED = "ranges not checked (--metadata FILE checks them)"
+
+
+def metadata_source(vehicle: Vehicle) -> str:
+    """Return one sentence that says where the file of ``--metadata`` comes from."""
+    if vehicle.autopilot.name == "PX4":
+        place = "is parameters.json, which `make parameters_metadata` writes in PX4's sources"
+    else:
+        place = f"is https://autotest.ardupilot.org/Parameters/{vehicle.autopilot.firmware}/apm.pdef.xml"
+    return f"ranges were not checked: --metadata FILE checks them; FILE {place} (docs/how-to/parameters.md)"
 
 
 def add_metadata(command: argparse.ArgumentParser, *, checks: bool = False) -> None:

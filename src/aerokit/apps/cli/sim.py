@@ -5,17 +5,16 @@ from __future__ import annotations
 import asyncio
 import inspect
 import shlex
-from contextlib import suppress
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from aerokit.apps.cli.arguments import (
     DEFAULT_SIM_ADDRESS,
-    FAULTS,
+    add_faults,
     add_vehicle_kind,
     address_or_template,
     count,
     expand_address,
-    fault,
     home,
     is_address_template,
     number,
@@ -45,7 +44,7 @@ from aerokit.transport.address import parse_address
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 
     from aerokit.sim import AttachableComponent
     from aerokit.testing.track import Track
@@ -58,6 +57,8 @@ _CLIENT_SCHEMES = {
     "udpin": "udpout",
     "zenohin": "zenoh",
 }
+
+_SERIAL_END = "the other end of the serial line"
 
 
 def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
@@ -240,17 +241,7 @@ def _add_conditions(command: argparse.ArgumentParser) -> None:
         metavar="S",
         help="simulated seconds until the vehicle is ready to arm",
     )
-    faults = command.add_argument(
-        "--fault",
-        action="append",
-        type=fault,
-        default=[],
-        dest="faults",
-        metavar="NAME[@S]",
-        help="fault of every vehicle, from the start or after S simulated seconds (repeatable):"
-        f" {', '.join(FAULTS)}; loss=0.2 loses a share, 'prearm_failures=TEXT' refuses to arm",
-    )
-    offer(faults, lambda: FAULTS)
+    add_faults(command)
     add_signing_key(command, "signing key of the vehicles; ArduPilot's first port accepts unsigned messages too")
     command.add_argument(
         "--duration", type=number(0.1, 1e6), metavar="S", help="stop after S simulated seconds (at Ctrl-C)"
@@ -272,13 +263,11 @@ async def run_sim(options: argparse.Namespace) -> int:
     server = _server(vehicles, options.addresses, options.speedup)
     stop = asyncio.Event()
     with on_interrupt(stop.set):
-        async with server:
-            injecting = asyncio.create_task(_inject(vehicles, options))
+        async with server, faults_begin(vehicles, options):
             _emit(server, options)
             real_duration_s = None if options.duration is None else options.duration / options.speedup
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(stop.wait(), real_duration_s)
-            injecting.cancel()
     emit(options, "stopped", {}, "stopped")
     if options.picture is not None:
         from aerokit.testing.picture import save_picture
@@ -287,6 +276,16 @@ async def run_sim(options: argparse.Namespace) -> int:
         record = {"file": options.picture, "what": "track", "count": len(tracks)}
         emit(options, "saved", record, f"track written to {options.picture}")
     return 0
+
+
+@asynccontextmanager
+async def faults_begin(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> AsyncIterator[None]:
+    """Within the block, begin the faults of ``--fault`` at their times."""
+    injecting = asyncio.create_task(_inject(vehicles, options))
+    try:
+        yield
+    finally:
+        injecting.cancel()
 
 
 async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> None:
@@ -353,13 +352,16 @@ def _emit(server: SimulatorServer, options: argparse.Namespace) -> None:
             "address": address,
             "speedup": options.speedup,
         }
-        text = f"{_systems(vehicles)} on {address}, speed {options.speedup:g}x"
-        emit(options, "simulated", record, text)
+        same = [place for place, others in zip(server.addresses, server.vehicles_on, strict=True) if others == vehicles]
+        text = f"{_systems(vehicles)} on {' and '.join(same)}, speed {options.speedup:g}x"
+        emit(options, "simulated", record, text if address == same[0] else None)
     if not options.json:
         vehicles = server.vehicles_on[0]
-        address = _client_address(server.addresses[0], options.addresses[0])
-        system_option = f" --system-id {vehicles[0].system_id}" if len(vehicles) > 1 else ""
-        print(f"try: aerokit demo --connect {address}{system_option}", flush=True)
+        place = _client_address(server.addresses[0], options.addresses[0])
+        choice = f" --system-id {vehicles[0].system_id}" if len(vehicles) > 1 else ""
+        print(f"try: aerokit demo --connect {place}{choice}", flush=True)
+        if place != _SERIAL_END:
+            print(f"or:  aerokit status {place}, aerokit monitor {place}, aerokit serve {place}", flush=True)
 
 
 def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
@@ -378,7 +380,7 @@ def _client_address(address: str, argument: str) -> str:
     if scheme == "pty":
         return location
     if scheme not in _CLIENT_SCHEMES:
-        return "the other end of the serial line"
+        return _SERIAL_END
     return f"{_CLIENT_SCHEMES[scheme]}:{location.replace('0.0.0.0', '127.0.0.1')}"
 
 

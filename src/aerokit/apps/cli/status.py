@@ -9,8 +9,10 @@ import anyio
 
 from aerokit.apps.cli.arguments import number
 from aerokit.apps.cli.connecting import add_link, add_seconds, await_vehicle, opened
-from aerokit.apps.cli.output import DONE, emit
+from aerokit.apps.cli.output import DONE, FAILED, emit
+from aerokit.apps.readiness import Readiness, readiness, readiness_lines
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout
+from aerokit.events import SILENT_AFTER_S
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavType
 from aerokit.mavlink.messages import BatteryStatus, GlobalPositionInt, GpsRawInt, SysStatus
 from aerokit.mavlink.signing import is_signed_with_a_key
@@ -42,7 +44,7 @@ _RELEASE_TIME_S = 0.5
 _MESSAGE_TIMEOUT_S = 0.3
 
 
-def _vehicle_record(vehicle: Vehicle, missing: Sequence[str]) -> dict[str, Any]:
+def _vehicle_record(vehicle: Vehicle, found: Readiness) -> dict[str, Any]:
     version = vehicle.version.latest
     return {
         **overview(vehicle),
@@ -50,12 +52,13 @@ def _vehicle_record(vehicle: Vehicle, missing: Sequence[str]) -> dict[str, Any]:
         "version": None if version is None else str(version),
         "mode": vehicle.mode_name,
         "armed": vehicle.armed.latest,
-        "missing": list(missing),
+        "missing": [*found.against_arming, *found.against_flight],
+        "against_arming": list(found.against_arming),
         **_frame_of(vehicle.connection.heartbeats.get((vehicle.system_id, vehicle.component_id))),
     }
 
 
-def _vehicle_lines(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
+def _vehicle_lines(vehicle: Vehicle, found: Readiness) -> list[str]:
     version = vehicle.version.latest
     heartbeat = vehicle.connection.heartbeats.get((vehicle.system_id, vehicle.component_id))
     frame = _frame_of(heartbeat)
@@ -68,26 +71,23 @@ def _vehicle_lines(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
         f"system {vehicle.system_id}: {vehicle.autopilot.firmware} {version or '(unknown version)'}{type_text}"
         f"{_NO_KEY if lacks_key else ''}",
         f"  mode     {vehicle.mode_name}, {armed}{landed_text}",
+        f"  position {_position(vehicle)}",
         f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or _UNKNOWN}",
         f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or _UNKNOWN}",
         f"  link     {_link(vehicle, frame)}",
-        *_readiness(vehicle, missing),
+        *_readiness(vehicle, found),
     ]
 
 
-def _readiness(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
-    if not missing:
-        if vehicle.armed.latest:
-            return _aligned("ready", ["armed already; arming checks do not apply"])
-        return _aligned("ready", ["no reason against arming is reported"])
-    sensors = vehicle.sensors.latest
-    can_arm = sensors is not None and sensors.prearm_checks_pass is True
-    is_about_estimates = all(text.startswith(("the estimator has no ", "no GPS receiver has ")) for text in missing)
-    texts = [text.replace("arm() changes to", "aerokit changes to") for text in missing]
-    # ArduCopter arms in STABILIZE without a position, for example.
-    if can_arm and is_about_estimates:
-        texts.insert(0, f"for autonomous flight; {vehicle.mode_name} allows arming:")
-    return _aligned("missing", texts)
+def _readiness(vehicle: Vehicle, found: Readiness) -> list[str]:
+    lines = readiness_lines(vehicle, found)
+    if lines and vehicle.armed.latest:  # arming checks do not apply
+        return _aligned("missing", [*found.against_arming, *found.against_flight])
+    if lines:
+        return _aligned("arming", [text.replace("arm() changes to", "aerokit changes to") for text in lines])
+    if vehicle.armed.latest:
+        return _aligned("ready", ["armed already; arming checks do not apply"])
+    return _aligned("ready", ["no reason against arming is reported"])
 
 
 def _component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> tuple[dict[str, Any], str]:
@@ -151,6 +151,15 @@ def _gps(receiver: GpsReceiver) -> str:
     return ", ".join(parts)
 
 
+def _position(vehicle: Vehicle) -> str:
+    here = vehicle.position.latest
+    if here is None:
+        return _UNKNOWN
+    height = _UNKNOWN if here.altitude_relative_m is None else f"{round(here.altitude_relative_m, 1) + 0.0:.1f} m"
+    old = f" ({vehicle.position.age:.0f} s ago)" if vehicle.position.age > SILENT_AFTER_S else ""
+    return f"{here.latitude_deg:.7f}, {here.longitude_deg:.7f}, height above home {height}{old}"
+
+
 def _battery(battery: Battery) -> str:
     values = (
         (battery.remaining_percent, ".0f", "%"),
@@ -195,7 +204,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_status(options: argparse.Namespace) -> int:
-    """Listen, request what is missing, and print the status."""
+    """Listen, request what is missing, and print the status. Return 1 if a vehicle cannot arm."""
     from aerokit.vehicle.connect import vehicles_on
 
     async with opened(options) as connection, vehicles_on(connection, rates={}) as vehicles:
@@ -207,17 +216,21 @@ async def run_status(options: argparse.Namespace) -> int:
         started_at = connection.now()
         await anyio.sleep(options.seconds)
         vehicles_found = dict(vehicles)  # more may be found while reasons are requested
-        reasons = await asyncio.gather(*map(_missing_for_flight, vehicles_found.values()))
+        reasons = await asyncio.gather(*map(_readiness_of, vehicles_found.values()))
         _emit_link(connection, options, connection.now() - started_at)
-        for vehicle, missing in zip(vehicles_found.values(), reasons, strict=True):
-            record = _vehicle_record(vehicle, missing)
-            emit(options, "status", record, "\n".join(_vehicle_lines(vehicle, missing)))
+        for vehicle, found in zip(vehicles_found.values(), reasons, strict=True):
+            record = _vehicle_record(vehicle, found)
+            emit(options, "status", record, "\n".join(_vehicle_lines(vehicle, found)))
         _emit_components(connection, options, vehicles_found)
         await anyio.sleep(_RELEASE_TIME_S)
-    return DONE
+    cannot_arm = any(
+        found.against_arming and found.is_known and not vehicle.is_armed
+        for vehicle, found in zip(vehicles_found.values(), reasons, strict=True)
+    )
+    return FAILED if cannot_arm else DONE
 
 
-async def _missing_for_flight(vehicle: Vehicle) -> list[str]:
+async def _readiness_of(vehicle: Vehicle) -> Readiness:
     for state, message in _REQUESTED:
         cell = getattr(vehicle, state)
         if not cell.is_known:
@@ -225,8 +238,8 @@ async def _missing_for_flight(vehicle: Vehicle) -> list[str]:
                 await _request(vehicle, message, cell)
             except CommandTimeout as error:
                 # A vehicle that does not answer this request would not answer the other requests either.
-                return [str(error), *vehicle.missing_for_flight()]
-    return list(dict.fromkeys([*await vehicle.why_not_armable(), *vehicle.missing_for_flight()]))
+                return Readiness((str(error), *vehicle.missing_for_flight()), (), is_known=False)
+    return readiness(vehicle, await vehicle.why_not_armable())
 
 
 async def _request(vehicle: Vehicle, message: Any, cell: Any) -> None:

@@ -16,6 +16,7 @@ import anyio
 
 from aerokit import events
 from aerokit.apps.cli.output import DONE, INTERRUPTED, MISSION_TEXT, emit, plain_text
+from aerokit.apps.readiness import Readiness, arms_but, readiness
 from aerokit.errors import (
     AerokitError,
     CommandRejected,
@@ -25,7 +26,6 @@ from aerokit.errors import (
 )
 from aerokit.events import SILENT_AFTER_S
 from aerokit.mavlink.enums import MavLandedState
-from aerokit.vehicle.commanding.arming import PREARM_REPORT_INTERVAL_S
 from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class SupervisedFlight(ABC):
             # After any error, a vehicle that this program has armed must not stay armed on the ground.
             text = plain_text(error)
             if not self._prints_reasons:
-                text = text.partition("\n")[0]
+                text = text.partition("\n")[0].removesuffix("; still missing:")
             self._print(f"failed: {text}")
             if self.armed_by_us:
                 await self._make_safe(partial(self._after_failure, error))
@@ -217,7 +217,6 @@ class FlightReport:
     def __init__(self, vehicle: Vehicle, options: argparse.Namespace, speedup: float) -> None:
         self._vehicle, self._options, self._speedup = vehicle, options, speedup
         self._armed_at: float | None = None
-        self._arming_texts: dict[str, float] = {}  # the vehicle's reasons against arming, with their times
         self._armed_s = 0.0
         self._started_at = self._last_line_at = vehicle.connection.now()
         self._highest_m = self._fastest_m_s = self._flown_m = 0.0
@@ -227,7 +226,7 @@ class FlightReport:
 
     def print_line(self, text: str) -> None:
         """Print a line with time and altitude. A closed pipe or a full disk does not end the flight."""
-        position = self._vehicle.position.latest
+        position = None if self._vehicle.heartbeat_age > SILENT_AFTER_S else self._vehicle.position.latest
         altitude = None if position is None else position.altitude_relative_m
         height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"  # + 0.0 turns -0.0 into 0.0
         self._last_line_at = self._vehicle.connection.now()
@@ -314,8 +313,6 @@ class FlightReport:
                 if isinstance(event, events.ModeChanged):
                     self.print_line(f"  mode {event.after}")
                 elif isinstance(event, events.StatusTextReceived) and not MISSION_TEXT.match(event.text):
-                    if self._vehicle.autopilot.arming_reason(event.text) is not None:
-                        self._arming_texts[event.text] = self._vehicle.connection.now()
                     mark = "! " if event.severity <= _WARNING_SEVERITY else ""
                     self.print_line(f"  {mark}{event.text}")
 
@@ -325,11 +322,18 @@ class FlightReport:
             await anyio.sleep(_STATUS_INTERVAL_S / 5)
             if not self.prints_status or vehicle.connection.now() - self._last_line_at < _STATUS_INTERVAL_S:
                 continue
-            missing = [] if vehicle.is_armed else vehicle.missing_for_flight()
-            if missing:
-                oldest = vehicle.connection.now() - PREARM_REPORT_INTERVAL_S
-                texts = [text for text, received_at in self._arming_texts.items() if received_at >= oldest]
-                self.print_line(f"  still missing: {'; '.join([*missing, *texts])}")
+            if vehicle.heartbeat_age > SILENT_AFTER_S:
+                height = vehicle.position.latest and vehicle.position.latest.altitude_relative_m
+                last = "" if height is None else f" at {height:.1f} m"
+                seconds = self._speedup * vehicle.heartbeat_age
+                self.print_line(f"  silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}")
+                continue
+            found = Readiness((), ()) if vehicle.is_armed else readiness(vehicle)
+            if found.against_arming:
+                yet = " yet" if found.is_known else ""
+                self.print_line(f"  {found.prefix}{yet}: {'; '.join([*found.against_arming, *found.against_flight])}")
+            elif found.against_flight:
+                self.print_line(f"  {arms_but(vehicle)}: {'; '.join(found.against_flight)}")
             else:
                 self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.text import Text
 
 from aerokit._internal.formatting import printable
+from aerokit.apps.readiness import readiness
 from aerokit.events import SILENT_AFTER_S, LinkState
 from aerokit.mavlink.enums import MissionState
 
@@ -169,9 +170,12 @@ class VehicleText:
 
     def _missing(self, max_lines: int = 1, width: int = 0) -> Text:
         """Return the reasons that prevent a flight: the first, and as many more as have room."""
-        missing = self._vehicle.missing_for_flight()
+        found = readiness(self._vehicle)
+        missing = list(found.against_arming or found.against_flight)
         if not missing:
             return Text("nothing")
+        if not self._vehicle.armed.latest:
+            missing[0] = f"{found.prefix if found.against_arming else 'arms, cannot fly by itself'}: {missing[0]}"
         shown, used_lines = 1, 0
         for count, reason in enumerate(missing, 1):
             used_lines += math.ceil((len(reason) + _MORE_WIDTH) / max(1, width))

@@ -52,6 +52,8 @@ LOG_READERS: dict[str, Callable[[FlightLog, int | None, Callable[[int], object]]
     ".ulg": read_ulog_flight,
 }
 """Maps the suffix of a log to the function that reads it."""
+# Below this height above home, the vehicle may be on the ground. Slower sinking is noise.
+_FLYING_HEIGHT_M, _SINKING_M_S = 1.0, 0.3
 _SAME_ALTITUDE_M = 5.0  # a smaller difference means that both altitudes are the same value
 
 
@@ -97,17 +99,36 @@ def read_flight(
 
 def _complete(flight: FlightLog) -> None:
     """Close open spans, and derive home, heights and failsafe evidence."""
-    if flight.armed and math.isinf(flight.armed[-1][1]):
+    is_armed_at_end = bool(flight.armed) and math.isinf(flight.armed[-1][1])
+    if is_armed_at_end:
         flight.armed[-1] = (flight.armed[-1][0], flight.duration_s)
-        flight.notes.append("the log ends while the vehicle is armed")
     if flight.home is None and len(flight.track):
         first_armed_row = max(flight.track.index_at(flight.armed[0][0]), 0) if flight.armed else 0
         columns = ("latitude_deg", "longitude_deg", "altitude_amsl_m")
         position = (flight.track[name][first_armed_row] for name in columns)
         flight.set_home(flight.track.times[first_armed_row], *position)
     _complete_altitudes(flight)
+    if is_armed_at_end:
+        flight.notes.append(_armed_at_end(flight))
     flight.failsafe_evidence += evidence_in_texts(flight.texts)
     flight.failsafe_evidence.sort(key=lambda evidence: evidence.time_s)
+
+
+def _armed_at_end(flight: FlightLog) -> str:
+    """Describe the end of a log of a vehicle that is still armed, and what is therefore unknown."""
+    note = "the log ends while the vehicle is armed"
+    height_m = flight.track.at("altitude_relative_m", flight.duration_s, not_older_s=math.inf)
+    if height_m < _FLYING_HEIGHT_M:
+        return note
+    where = "" if math.isnan(height_m) else f", {height_m:.1f} m above home"
+    sink_m_s = flight.velocity.at("down_m_s", flight.duration_s, not_older_s=math.inf)
+    motion = f", sinking at {sink_m_s:.1f} m/s" if sink_m_s >= _SINKING_M_S else ""
+    mode = flight.mode_at(flight.duration_s)
+    in_mode = f" in {mode}" if mode else ""
+    is_silent = bool(flight.silences) and flight.silences[-1].ends_s >= flight.duration_s
+    age = f", {flight.duration_s - flight.silences[-1].begins_s:.0f} s before its end" if is_silent else ""
+    state = f"{where}{in_mode}{motion}{age}"
+    return f"{note}{state}: the rest of the flight, and with it a landing or a crash, was not recorded"
 
 
 def _complete_altitudes(flight: FlightLog) -> None:

@@ -109,6 +109,7 @@ _ACTION_PATTERN = re.compile(
     r"failsafe activated|changed to|switch|fail-?safe.*[-:] *(rtl|land|hold|brake|disarm)", re.I
 )
 
+_PX4_PREFIXES = ("BAT_", "COM_", "FD_", "GF_", "NAV_")
 # Parameters that define when a failsafe triggers, and its action.
 _LIMIT_PARAMETERS: dict[str, tuple[str, ...]] = {
     "battery": (
@@ -157,7 +158,11 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
             recent_groups.append(groups[-1])
         else:
             group.append(evidence)
-    return [_explain(flight, group) for group in groups]
+    kinds = [_kind_of(group) for group in groups]
+    return [
+        _explain(flight, group, is_first_of_kind=kind not in kinds[:number])
+        for number, (kind, group) in enumerate(zip(kinds, groups, strict=True))
+    ]
 
 
 def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -> bool:
@@ -171,12 +176,12 @@ def _kind_of(group: Sequence[FailsafeEvidence]) -> str:
     return next((evidence.kind for evidence in group if evidence.kind != "general"), "general")
 
 
-def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> Failsafe:
+def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_of_kind: bool) -> Failsafe:
     kind, time_s = _kind_of(group), group[0].time_s
     reaction, is_sure = _reaction(flight, time_s, group)
     acted = is_sure or any(evidence.is_action for evidence in group)
     facts = [*_location(flight, time_s), *_CONTEXTS.get(kind, _general_context)(flight, time_s)]
-    facts += _limit_parameters(flight, kind, time_s)
+    facts += _limit_parameters(flight, kind, time_s) or (_missing_parameters(flight, kind) if is_first_of_kind else [])
     facts += _texts_before(flight, time_s)
     return Failsafe(time_s, kind, acted, tuple(group), reaction or "no mode change followed", tuple(facts))
 
@@ -363,9 +368,20 @@ def _max_before(columns: TimeSeries, name: str, time_s: float) -> float | None:
 
 
 def _limit_parameters(flight: FlightLog, kind: str, time_s: float) -> list[str]:
-    values = ((name, flight.parameter_at(name, time_s)) for name in _LIMIT_PARAMETERS.get(kind, ()))
+    values = ((name, flight.parameter_at(name, time_s)) for name in configured_by(flight, kind))
     known = [f"{name} = {value:g}" for name, value in values if not math.isnan(value)]
     return [f"parameters: {', '.join(known)}"] if known else []
+
+
+def _missing_parameters(flight: FlightLog, kind: str) -> list[str]:
+    names = configured_by(flight, kind)
+    return [f"parameters to look at, which the log does not contain: {', '.join(names)}"] if names else []
+
+
+def configured_by(flight: FlightLog, kind: str) -> list[str]:
+    """Return the names of the autopilot's parameters that configure this kind of failsafe; empty if none are known."""
+    is_px4 = {"PX4": True, "ArduPilot": False}.get(flight.autopilot)
+    return [name for name in _LIMIT_PARAMETERS.get(kind, ()) if is_px4 in (None, name.startswith(_PX4_PREFIXES))]
 
 
 def _texts_before(flight: FlightLog, time_s: float) -> list[str]:

@@ -150,6 +150,17 @@ class ParameterChange(Snapshot):
     after: float
 
 
+class Silence(Snapshot):
+    """A time in which nothing was received from the vehicle."""
+
+    begins_s: float
+    """Time of the last message before it."""
+    ends_s: float
+    """Time of the first message after it, or the end of the log."""
+    is_recorded: bool
+    """True if the log contains messages of others in it; otherwise the recording itself may have paused."""
+
+
 class Waypoint(Snapshot):
     """A mission item."""
 
@@ -189,6 +200,10 @@ class FlightLog:
     """UTC of the first entry, in seconds since 1970. A value below one year means that the clock was not set."""
     ends_at: float = 0.0
     """UTC of the last entry."""
+    speed: float = 1.0
+    """Simulated seconds for each recorded second; only in a ``.tlog`` of a simulation at another speed than real time.
+    All times are simulated seconds then.
+    """
     vehicle: str = ""
     """Firmware and its version, if known: ``"ArduCopter V4.5.7"``."""
     autopilot: str = ""
@@ -224,11 +239,15 @@ class FlightLog:
     """Percentage of lost messages, and number of received messages per second. One row for each second."""
     radio: TimeSeries = field(default_factory=lambda: TimeSeries("rssi", "remote_rssi", "noise", "remote_noise"))
     """Signal values of a telemetry radio, in the units of the radio."""
+    outputs: TimeSeries = field(default_factory=lambda: TimeSeries(*(f"output_{number}_us" for number in range(1, 9))))
+    """Pulses of the first eight outputs (SERVO_OUTPUT_RAW); only in a ``.tlog``."""
     gcs_heartbeats: array[float] = field(default_factory=lambda: array("d"))
     """Times of ground station heartbeats; only in a ``.tlog`` that includes sent messages."""
     modes: list[ModeChange] = field(default_factory=list)
     armed: list[tuple[float, float]] = field(default_factory=list)
     """Start and end of each span in which the vehicle was armed."""
+    silences: list[Silence] = field(default_factory=list)
+    """Times without a message of the vehicle; only in a ``.tlog``."""
     texts: list[LoggedText] = field(default_factory=list)
     failsafe_evidence: list[FailsafeEvidence] = field(default_factory=list)
     """Evidence that `aerokit.logs.flights.failsafes.failsafes` evaluates."""
@@ -243,7 +262,7 @@ class FlightLog:
     @property
     def duration_s(self) -> float:
         """Seconds from the first entry to the last."""
-        return max(self.ends_at - self.begins_at, 0.0)
+        return max(self.ends_at - self.begins_at, 0.0) * self.speed
 
     def battery(self, number: int) -> TimeSeries:
         """Return the time series of a battery; created on first use."""

@@ -10,6 +10,7 @@ from aerokit.connection.heartbeats import is_autopilot
 from aerokit.errors import FileFormatError
 from aerokit.logs.flights.codes import clean_text
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TimeSeries, Waypoint
+from aerokit.logs.flights.recording import MIN_SILENCE_S, ClockComparison, LinkCounter, use_simulated_time
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavState, MavType
@@ -30,12 +31,9 @@ NAN = math.nan
 _U16, _E7, _METRES_PER_DEGREE = 0xFFFF, 1e7, 111_319.5
 # A position closer to 0° N 0° E means that the estimator has no position yet.
 _NULL_ISLAND_E7 = 100_000
-_HEARTBEAT_ID, _MAX_SEQUENCE_GAP = b"\0\0\0", 200
+_HEARTBEAT_ID = b"\0\0\0"
 # A mode change within this time after a command is attributed to the command.
 _COMMAND_MAX_AGE_S = 5.0
-# Clocks of vehicles and computers drift by less than this share. A larger drift means that a simulation ran faster or
-# slower than real time. Over the minimum time of comparison, delays of the link average out.
-_MAX_CLOCK_DRIFT, _MIN_CLOCK_COMPARISON_S, _MAX_CLOCK_GAP_S = 0.2, 1.0, 10.0
 # Bits of a type mask that mark position, velocity and attitude as ignored.
 _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
 _MODE_COMMANDS = frozenset(
@@ -101,10 +99,10 @@ class _Reader:
         self._position = (NAN, NAN, NAN)  # latitude, longitude and altitude above sea level
         self._local_position = (NAN, NAN, NAN)  # metres north, east and down of the estimator's origin
         self._relative_m = NAN
-        self._clocks = _ClockComparison()
+        self._clocks = ClockComparison()
         self._is_breached = False
         self._destinations = TimeSeries(*flight.position_target.names)
-        self._link = _LinkCounter(flight)
+        self._link = LinkCounter(flight)
         self._mission_items: dict[int, Waypoint] = {}
         handlers: dict[type[Message], Callable[[float, Any], None]] = {
             m.CommandLong: self._on_command,
@@ -124,6 +122,7 @@ class _Reader:
         handlers_of_vehicle, handlers_of_any_sender = self._handlers_of_vehicle, self._handlers_of_any_sender
         damaged = count = received = 0  # `received` counts frames since the last call of link.count
         expected_sequence, next_second = -1, 0.0
+        received_at, received_count = math.nan, 0  # of the vehicle's last frame
         begins_at = ends_at = 0.0
         with flight.path.open("rb") as file:
             for unix_s, raw in read_tlog(file):
@@ -141,8 +140,11 @@ class _Reader:
                 if sender == source:
                     received += 1
                     if sequence != expected_sequence or unix_s >= next_second:
+                        if unix_s - received_at >= MIN_SILENCE_S:
+                            link.add_silence(received_at - begins_at, unix_s - begins_at, count - received_count - 1)
                         next_s = link.count(unix_s - begins_at, sequence, expected_sequence, received)
                         next_second, received = begins_at + next_s, 0
+                    received_at, received_count = unix_s, count
                     expected_sequence = (sequence + 1) & 0xFF
                     if message_id not in handlers_of_vehicle:
                         continue
@@ -160,7 +162,7 @@ class _Reader:
                     handle(unix_s - begins_at, message)
             on_bytes(file.tell())
         flight.begins_at, flight.ends_at = begins_at, ends_at
-        link.end(received)
+        link.end(received, received_at - begins_at, flight.duration_s, count - received_count)
         self._finish(damaged)
 
     def _finish(self, damaged: int) -> None:
@@ -170,12 +172,6 @@ class _Reader:
         flight.mission = [self._mission_items[number] for number in sorted(self._mission_items)]
         if damaged:
             flight.notes.append(f"{damaged} messages are damaged and were skipped")
-        speed = self._clocks.speed
-        if abs(math.log(speed)) > _MAX_CLOCK_DRIFT:
-            flight.notes.append(
-                f"this is a simulation at {speed:.3g} times real speed, because the vehicle's clock differs from the"
-                f" recording's: 1 s in this report is {speed:.3g} s of the flight"
-            )
         if self._other_vehicles:
             others = ", ".join(map(str, sorted(self._other_vehicles)))
             flight.notes.append(
@@ -185,6 +181,7 @@ class _Reader:
             flight.notes.append(
                 "the log contains no commands to the vehicle, so the causes of mode changes are unknown"
             )
+        use_simulated_time(flight, self._clocks.speed)
 
     def _add_destinations(self) -> None:
         """Use destinations (POSITION_TARGET_GLOBAL_INT) as set-points, if there are no continuous set-points."""
@@ -226,6 +223,7 @@ class _Reader:
             m.AutopilotVersion: self._on_version,
             m.HomePosition: self._on_home,
             m.FenceStatus: self._on_fence,
+            m.ServoOutputRaw: self._on_servo_output,
         }
 
     def _on_vfr_hud(self, time_s: float, message: m.VfrHud) -> None:
@@ -447,6 +445,11 @@ class _Reader:
             message.h_acc / 1e3 if message.h_acc else NAN,
         )
 
+    def _on_servo_output(self, time_s: float, message: m.ServoOutputRaw) -> None:
+        if message.port == 0:
+            pulses = (getattr(message, f"servo{number}_raw") for number in range(1, 9))
+            self._flight.outputs.add(time_s, *(pulse or NAN for pulse in pulses))
+
     def _on_radio(self, time_s: float, message: m.RadioStatus | m.Radio) -> None:
         self._flight.radio.add(time_s, message.rssi, message.remrssi, message.noise, message.remnoise)
 
@@ -468,65 +471,3 @@ def _decoded(raw: bytes, unix_s: float) -> Message | None:
     if x25(frame.body + STANDARD.extras[frame.message_id]) != frame.checksum:
         return None
     return STANDARD.decode(frame)
-
-
-class _ClockComparison:
-    """Compares the vehicle's time since boot with the time of the recording."""
-
-    def __init__(self) -> None:
-        self._previous: tuple[float, int] = (-math.inf, 0)
-        self._recorded_s = self._vehicle_s = 0.0
-
-    def compare(self, time_s: float, boot_ms: int) -> None:
-        previous_s, previous_ms = self._previous
-        self._previous = time_s, boot_ms
-        # Reboots, and pauses of the recording or of its clock, do not count.
-        if boot_ms >= previous_ms and 0 <= time_s - previous_s < _MAX_CLOCK_GAP_S:
-            self._recorded_s += time_s - previous_s
-            self._vehicle_s += (boot_ms - previous_ms) / 1e3
-
-    @property
-    def speed(self) -> float:
-        """Vehicle seconds for one recorded second; 1 if the log is too short."""
-        if min(self._recorded_s, self._vehicle_s) < _MIN_CLOCK_COMPARISON_S:
-            return 1.0
-        return self._vehicle_s / self._recorded_s
-
-
-class _LinkCounter:
-    """Counts received and lost frames per second, by sequence numbers."""
-
-    def __init__(self, flight: FlightLog) -> None:
-        self._series = flight.link
-        self._second = 0
-        self._received = self._lost = 0
-
-    def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
-        """Count frames after a gap, or at the start of a second. Return the start of the next second.
-
-        ``received`` frames arrived since the last call, of which the last has this time and sequence number.
-        """
-        missing = (sequence - expected) & 0xFF if expected >= 0 else 0
-        if missing > _MAX_SEQUENCE_GAP:  # a delayed frame, or a frame from a second link, is not a loss
-            missing = 0
-        if time_s >= self._second + 1:  # only the last frame belongs to the new second
-            self._received += received - 1
-            received = 1
-            if int(time_s) - self._second > 1:  # silence is recorded as 100 % loss
-                missing = 0
-            self._add_row(int(time_s))
-        self._received += received
-        self._lost += missing
-        return self._second + 1
-
-    def end(self, received: int) -> None:
-        self._received += received
-        self._add_row(self._second + 1)
-
-    def _add_row(self, second: int) -> None:
-        sent = self._received + self._lost
-        self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
-        if second - self._second > 1:  # add rows for the seconds without frames
-            self._series.add(self._second + 1, 100.0, 0)
-            self._series.add(second - 1, 100.0, 0)
-        self._second, self._received, self._lost = second, 0, 0

@@ -14,9 +14,10 @@ from aerokit.logs.flights.failsafes import failsafes
 from aerokit.logs.flights.falls import falls
 from aerokit.logs.report.charts import COLOURS, timeline_shapes
 from aerokit.logs.report.comparing import NAMES, comparison
+from aerokit.logs.report.formatting import date
 from aerokit.logs.report.page import page
 from aerokit.logs.report.sections import SECTIONS
-from aerokit.logs.report.statistics import FlightStatistics, date, findings, statistics_of, summary
+from aerokit.logs.report.statistics import FlightStatistics, findings, statistics_of, summary
 
 if TYPE_CHECKING:
     from aerokit.logs.flights.failsafes import Failsafe

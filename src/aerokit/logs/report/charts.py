@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 from aerokit.logs.flights.failsafes import Failsafe, failsafes
 from aerokit.logs.flights.falls import Fall, falls
 from aerokit.logs.flights.flight import ModeChange, TangentPlane
+from aerokit.logs.report.formatting import clock
 from aerokit.logs.report.page import Chart, Paragraphs
 from aerokit.logs.report.simplification import MAX_COORDINATE, simplify
-from aerokit.logs.report.statistics import clock, metres_from_home
+from aerokit.logs.report.statistics import metres_from_home
 from aerokit.missions.item import command_name
 
 if TYPE_CHECKING:

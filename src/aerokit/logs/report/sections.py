@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 from aerokit.logs.flights.failsafes import failsafes
 from aerokit.logs.flights.flight import battery_name
 from aerokit.logs.report.charts import line, over_time, setpoint_line, track_parts
+from aerokit.logs.report.formatting import clock, date, span
 from aerokit.logs.report.page import Collapsed, Paragraphs, Section, Table
-from aerokit.logs.report.statistics import clock, date, span
+from aerokit.logs.report.silences import silence_sentences
 from aerokit.mavlink.enums import MavSeverity
 from aerokit.missions.item import command_name
 
@@ -98,7 +99,13 @@ def failsafe_section(flight: FlightLog) -> Section:
     collapsed = tables[_MAX_OPEN_FAILSAFES:]
     if collapsed:
         parts.append(Collapsed(f"{len(collapsed)} more", collapsed))
-    explanation = "Each failsafe has its evidence, the values measured before it, and the parameters that configure it."
+    explanation = "Each failsafe has its evidence, the values measured before it, and "
+    explanation += (
+        "the parameters that configure it."
+        if flight.parameters
+        else "the names of the parameters that configure it: the log contains no parameters, `aerokit params get NAME`"
+        " reads them from the vehicle."
+    )
     return Section("Failsafes", parts, explanation)
 
 
@@ -253,7 +260,8 @@ def _link(flight: FlightLog) -> Section:
         [line(name.replace("_", " "), flight.radio, name, 0) for name in flight.radio],
         height=220,
     )
-    return _with_parts(section, lost, rate, radio)
+    silences = silence_sentences(flight)
+    return _with_parts(section, Paragraphs(silences) if silences else None, lost, rate, radio)
 
 
 def _texts(flight: FlightLog) -> Section:
@@ -330,11 +338,17 @@ def _about(flight: FlightLog) -> Section:
         ("file", flight.path.name),
         ("vehicle", f"{flight.vehicle}, system {flight.system_id}"),
         ("start", date(flight.begins_at)),
-        ("duration", span(flight.duration_s)),
+        ("duration", _duration(flight)),
     ]
     if flight.home is not None:
         rows.append(("home", f"{flight.home.latitude_deg:.6f}, {flight.home.longitude_deg:.6f}"))
     return Section("About this log", [Table(("property", "value"), rows)])
+
+
+def _duration(flight: FlightLog) -> str:
+    if flight.speed == 1.0:
+        return span(flight.duration_s)
+    return f"{span(flight.duration_s)} simulated, {span(flight.duration_s / flight.speed)} recorded"
 
 
 SECTIONS: tuple[Callable[[FlightLog], Section | None], ...] = (

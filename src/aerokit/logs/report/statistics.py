@@ -4,30 +4,35 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from datetime import datetime, timezone
 from itertools import pairwise
 from statistics import median
 from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
-from aerokit.logs.flights.failsafes import failsafes
+from aerokit.logs.flights.failsafes import configured_by, failsafes
 from aerokit.logs.flights.falls import falls
 from aerokit.logs.flights.flight import TangentPlane, battery_name
+from aerokit.logs.report.formatting import clock, length, number, span
+from aerokit.logs.report.silences import silence_sentences
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from aerokit.logs.flights.falls import Fall
     from aerokit.logs.flights.flight import FlightLog, TimeSeries
 
 # Shorter steps are ignored, because they are noise of a stationary vehicle.
 _MIN_STEP_M = 1.0
-_A_YEAR_S = 365 * 86_400.0
 _MAX_LISTED = 5
 # A hovering multicopter needs 20 to 60 % throttle.
 _HIGH_THROTTLE_PERCENT, _HIGH_ATTITUDE_ERROR_DEG = 90.0, 20.0
-# Below this share of the current before a descent, the motors take less power than a controlled descent needs.
-_LOW_CURRENT_SHARE = 0.5
+# Below this share of the throttle or current before a descent, the motors take less power than a controlled descent
+# needs.
+_LOW_POWER_SHARE = 0.5
+_STOPPED = ", so look at what stopped the motors: ESCs, their supply, a command"
+# An output that was raised by this much by arming and flying drives a motor. Above this difference in the descent, the
+# autopilot tried to lift one side.
+_MOTOR_RAISED_US, _UNEQUAL_US = 200.0, 300.0
 _BEFORE_FALL_S = 5.0
 
 
@@ -64,7 +69,7 @@ class FlightStatistics(Snapshot):
     max_estimator_ratio: float | None
     """Maximum innovation test ratio. Above 1, the estimator rejects a measurement."""
     lost_percent: float | None
-    """Percentage of lost messages."""
+    """Percentage of lost messages, as an average over time. A silence counts as 100 %."""
 
 
 def statistics_of(flight: FlightLog) -> FlightStatistics:
@@ -87,7 +92,6 @@ def statistics_of(flight: FlightLog) -> FlightStatistics:
     levels = [level for axis in "xyz" for level in spans.known(flight.vibration, f"{axis}_m_s2")]
     clips = spans.known(flight.vibration, "clips")
     ratios = [ratio for name in flight.estimator for ratio in spans.known(flight.estimator, name)]
-    lost = spans.known(flight.link, "lost_percent")
     return FlightStatistics(
         armed_s=sum(end - begin for begin, end in flight.armed) if flight.armed else None,
         distance_m=_path_length(north_east, rows) if north_east else None,
@@ -109,7 +113,7 @@ def statistics_of(flight: FlightLog) -> FlightStatistics:
         max_vibration_m_s2=_max(levels),
         clips=clips[-1] - clips[0] if clips else None,
         max_estimator_ratio=_max(ratios),
-        lost_percent=sum(lost) / len(lost) if lost else None,
+        lost_percent=spans.mean(flight.link, "lost_percent"),
     )
 
 
@@ -148,6 +152,18 @@ class _ArmedSpans:
         parts = (values[bisect_left(times, begin) : bisect_right(times, end)] for begin, end in self._spans)
         return [value for part in parts for value in part if math.isfinite(value)]
 
+    def mean(self, columns: TimeSeries, name: str) -> float | None:
+        """Return the average over time; each value holds until the next row, the last one for a second."""
+        times, values = columns.times, columns[name]
+        total = weight = 0.0
+        for begin, end in self._spans:
+            for row in range(bisect_left(times, begin), bisect_right(times, end)):
+                until_s = times[row + 1] if row + 1 < len(times) else times[row] + 1.0
+                seconds = min(until_s, end) - times[row]
+                if math.isfinite(values[row]):
+                    total, weight = total + values[row] * seconds, weight + seconds
+        return total / weight if weight else None
+
 
 def _first_battery(flight: FlightLog, spans: _ArmedSpans, name: str) -> list[float]:
     first = next((flight.batteries[number] for number in sorted(flight.batteries)), None)
@@ -185,16 +201,19 @@ def findings(flight: FlightLog) -> list[str]:
 
 
 def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
-    """Return throttle, tilt, attitude error and battery current in the descent, where the log has them.
+    """Return throttle, tilt, attitude error, motor outputs and battery current in the descent, where the log has them.
 
     An unusual value is followed by advice on what to look at.
     """
     begin_s, end_s = fall.begins_s, fall.time_s - 0.2  # without the impact
     angles = ("roll_deg", "pitch_deg")
     texts = []
+    currents = _currents(flight, begin_s, end_s)
     throttle = _span_and_before(flight.air, "throttle_percent", begin_s, end_s)
     if throttle is not None:
         advice = ", so look at motors, propellers and battery" if throttle.high >= _HIGH_THROTTLE_PERCENT else ""
+        if throttle.is_low and not any(current.is_low for current in currents.values()):
+            advice = _STOPPED
         texts.append(f"throttle {throttle.text('%')}{advice}")
     tilt = _max([abs(angle) for name in angles for angle in flight.attitude.between(name, begin_s, end_s)])
     if tilt is not None:
@@ -203,22 +222,35 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
     if error is not None:
         advice = ", so look at the attitude charts" if error >= _HIGH_ATTITUDE_ERROR_DEG else ""
         texts.append(f"attitude up to {error:.0f}° off its set-point{advice}")
-    for number, battery in sorted(flight.batteries.items()):
+    motors = _motor_outputs(flight, begin_s, end_s)
+    if motors:
+        texts.append(motors)
+    return texts + [f"{name} {current.text('A')}{_STOPPED * current.is_low}" for name, current in currents.items()]
+
+
+def _currents(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _SpanAndBefore]:
+    """Return the current of each battery in a descent, by a name for the text."""
+    currents = {}
+    for index, battery in sorted(flight.batteries.items()):
         current = _span_and_before(battery, "current_a", begin_s, end_s)
         if current is not None:
-            is_low = current.high < _LOW_CURRENT_SHARE * current.before
-            advice = ", so look at what stopped the motors: ESCs, their supply, a command" if is_low else ""
-            name = battery_name(number) if len(flight.batteries) > 1 else "battery"
-            texts.append(f"{name} current {current.text('A')}{advice}")
-    return texts
+            name = battery_name(index) if len(flight.batteries) > 1 else "battery"
+            currents[f"{name} current"] = current
+    return currents
 
 
 class _SpanAndBefore(Snapshot):
-    """Lowest and highest value in a descent, and the median of the seconds before the descent; NaN if unknown."""
+    """Lowest, middle and highest value in a descent, and the median of the seconds before it; NaN if unknown."""
 
     low: float
+    middle: float
     high: float
     before: float
+
+    @property
+    def is_low(self) -> bool:
+        """True if most of the descent had less than half of the value before it."""
+        return self.middle < _LOW_POWER_SHARE * self.before
 
     def text(self, unit: str) -> str:
         low, high = f"{self.low:.0f}", f"{self.high:.0f}"
@@ -232,7 +264,36 @@ def _span_and_before(series: TimeSeries, name: str, begin_s: float, end_s: float
     if not values:
         return None
     values_before = series.between(name, begin_s - _BEFORE_FALL_S, begin_s)
-    return _SpanAndBefore(min(values), max(values), median(values_before) if values_before else math.nan)
+    before = median(values_before) if values_before else math.nan
+    return _SpanAndBefore(min(values), median(values), max(values), before)
+
+
+def _motor_outputs(flight: FlightLog, begin_s: float, end_s: float) -> str:
+    """Describe the outputs to the motors in a descent; empty if the log does not show which outputs drive motors."""
+    armed_s = next((begin for begin, end in reversed(flight.armed) if begin < begin_s), math.nan)
+    motors: dict[str, _SpanAndBefore] = {}
+    for name in flight.outputs:
+        idle_us = flight.outputs.at(name, armed_s - 0.1)
+        pulses = _span_and_before(flight.outputs, name, begin_s, end_s)
+        if pulses is not None and pulses.before - idle_us >= _MOTOR_RAISED_US:
+            motors[name.split("_")[1]] = pulses
+    if not motors:
+        return ""
+    by_pulse = sorted(motors, key=lambda output: motors[output].middle)
+    lowest, highest = by_pulse[0], by_pulse[-1]
+    low_us, high_us = motors[lowest].middle, motors[highest].middle
+    text = _SpanAndBefore(
+        min(pulses.low for pulses in motors.values()),
+        median(pulses.middle for pulses in motors.values()),
+        max(pulses.high for pulses in motors.values()),
+        median(pulses.before for pulses in motors.values()),
+    ).text("µs")
+    if high_us - low_us < _UNEQUAL_US:
+        return f"motor outputs {text}"
+    return (
+        f"unequal motor outputs {text}: output {highest} at {high_us:.0f} µs, output {lowest} at {low_us:.0f} µs, so"
+        f" look at the motor of output {highest}"
+    )
 
 
 def _attitude_errors(flight: FlightLog, name: str, begin_s: float, end_s: float) -> Iterator[float]:
@@ -257,6 +318,7 @@ def summary(flight: FlightLog, statistics: FlightStatistics) -> list[str]:
     """Return sentences, the most important first."""
     sentences = [
         *findings(flight),
+        *silence_sentences(flight),
         _flight_sentence(flight, statistics),
         _modes_sentence(flight),
         _battery_sentence(statistics),
@@ -303,19 +365,34 @@ def _battery_sentence(statistics: FlightStatistics) -> str:
 
 
 def _failsafes_sentence(flight: FlightLog) -> str:
-    acted, warnings = [], []
+    acted, warnings, kinds = [], [], []
     for failsafe in failsafes(flight):
+        at = f"{failsafe.title} at {clock(failsafe.time_s)}"
         if failsafe.acted:
-            acted.append(f"{failsafe.title} at {clock(failsafe.time_s)} ({failsafe.reaction})")
+            acted.append(f"{at} ({failsafe.reaction})")
         else:
-            warnings.append(f"{failsafe.title} at {clock(failsafe.time_s)}")
-    text = "No failsafe was reported"
+            warnings.append(f"{at} ({failsafe.evidence[0].text})")
+            kinds.append(failsafe.kind)
+    sentences = []
     if acted:
-        text = f"{len(acted)} failsafe{'' if len(acted) == 1 else 's'}: {_first_few(acted)}"
+        sentences.append(f"{len(acted)} failsafe{'' if len(acted) == 1 else 's'}: {_first_few(acted)}.")
     if warnings:
-        text += f". {len(warnings)} warning{'' if len(warnings) == 1 else 's'} without a known reaction: "
-        text += _first_few(warnings)
-    return text + "."
+        plural = "" if len(warnings) == 1 else "s"
+        sentences.append(f"{len(warnings)} warning{plural} without a recorded reaction: {_first_few(warnings)}.")
+    unknown = _unknown_actions(flight, kinds)
+    if unknown:
+        sentences.append(f"The log does not contain the parameters that decide on the reaction: {', '.join(unknown)}.")
+    return " ".join(sentences) or "No failsafe was reported."
+
+
+def _unknown_actions(flight: FlightLog, kinds: Iterable[str]) -> list[str]:
+    """Return the names of parameters that decide on the reaction to these kinds of failsafes, if none is in the log."""
+    unknown: list[str] = []
+    for kind in dict.fromkeys(kinds):
+        names = configured_by(flight, kind)
+        if not any(name in flight.parameters for name in names):
+            unknown += [name for name in names if "ACT" in name or "ENABL" in name] or names
+    return unknown
 
 
 def _first_few(texts: list[str]) -> str:
@@ -336,38 +413,3 @@ def _warnings_sentence(statistics: FlightStatistics) -> str:
     if statistics.lost_percent is not None and statistics.lost_percent > 2:
         warnings.append(f"{statistics.lost_percent:.0f} % of the messages lost")
     return "Check: " + "; ".join(warnings) + "." if warnings else ""
-
-
-def clock(seconds: float) -> str:
-    """Format minutes and seconds since the start of the log: ``3:07.5``."""
-    minutes, remaining_s = divmod(round(max(seconds, 0.0), 1), 60)
-    return f"{minutes:.0f}:{remaining_s:04.1f}"
-
-
-def span(seconds: float) -> str:
-    """Format a duration: ``47 s``, ``12 min 5 s``, ``1 h 3 min``."""
-    rounded = round(seconds)
-    if rounded < 60:
-        return f"{rounded} s"
-    if rounded < 3600:
-        return f"{rounded // 60} min {rounded % 60} s" if rounded % 60 else f"{rounded // 60} min"
-    return f"{rounded // 3600} h {rounded % 3600 // 60} min"
-
-
-def length(metres: float) -> str:
-    """Format a distance: ``310 m``, ``3.4 km``."""
-    if metres >= 1000:
-        return f"{metres / 1000:.1f} km"
-    return f"{metres:.0f} m" if metres >= 10 else f"{metres:.1f} m"
-
-
-def number(value: float) -> str:
-    """Format with about three digits."""
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
-
-
-def date(unix_s: float) -> str:
-    """Format as UTC; "at an unknown time" if no clock was set."""
-    if unix_s < _A_YEAR_S:
-        return "at an unknown time"
-    return f"{datetime.fromtimestamp(unix_s, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"

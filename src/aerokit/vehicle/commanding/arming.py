@@ -23,6 +23,7 @@ from aerokit.mavlink.enums import MavCmd, MavLandedState, MavSeverity
 from aerokit.mavlink.messages import Statustext
 from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
 from aerokit.vehicle.commanding.context import VehicleBase
+from aerokit.vehicle.commanding.health import PREARM_REPORT_INTERVAL_S
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, ChangeSignal, await_progress
 from aerokit.vehicle.state.status_text import CHUNK_LENGTH
 
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
 
 FORCE_REBOOT = 20190226
 """param6 of PREFLIGHT_REBOOT_SHUTDOWN that makes ArduPilot reboot even while armed (GCS_Common.cpp)."""
-PREARM_REPORT_INTERVAL_S = 35.0
-"""Seconds in which ArduPilot surely repeats its pre-arm failures, which it does every 30 s."""
 REASONS_S = 3.0
 """Seconds in which a vehicle answers a request to run its pre-arm checks, and reports the reasons."""
 POLL_INTERVAL_S = 0.1
@@ -53,11 +52,19 @@ class ArmingActions(VehicleBase):
     """Arming, disarming and rebooting."""
 
     def missing_for_flight(self) -> list[str]:
-        """Return what is still missing before the vehicle can fly, from the state received so far. Sends nothing."""
+        """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
+
+        If its arming checks fail, includes the vehicle's texts about them of the last 35 seconds;
+        :meth:`why_not_armable` requests them. A vehicle may arm all the same: ArduCopter arms in STABILIZE without a
+        position.
+        """
         return self._health.missing_for_flight()
 
     async def why_not_armable(self) -> list[str]:
-        """Return the reasons why arming would be refused now; an empty list means that none is known.
+        """Return the reasons why arming would be refused now, in the present mode; an empty list means that none is
+        known.
+
+        What only a flight needs is not listed, see :meth:`missing_for_flight`.
 
         Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) if it supports that, and collects its status
         texts. Also reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
@@ -91,11 +98,11 @@ class ArmingActions(VehicleBase):
                 else:
                     await changes.next(min(timeout, request_at - self.connection.now()))
             return
-        # ArduPilot repeats its texts, so duplicates are removed.
-        recent_texts = dict.fromkeys(self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S))
+        recent_texts = self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S)
+        missing_now = self._health.missing_for_flight()
         # Nothing is missing if the vehicle became ready just after the last check.
-        still_missing = [*self._health.missing_for_flight(), *recent_texts] or ["nothing"]
-        missing = "\n  - ".join([*still_missing, *self._health.unarmable_mode()])
+        still = self._session.deduplicate_reasons(*recent_texts, *missing_now) or ("nothing",)
+        missing = "\n  - ".join([*still, *self._health.unarmable_mode()])
         raise OperationTimeout(
             f"the vehicle was not ready within {timeout:g} s ({self._session.describe_link()}); still missing:\n"
             f"  - {missing}"

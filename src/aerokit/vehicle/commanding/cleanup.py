@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.connection.tasks import Cancellation
-from aerokit.errors import AerokitError, BusyError, HeartbeatTimeout, OperationTimeout
+from aerokit.errors import AerokitError, BusyError, HeartbeatTimeout, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags
 from aerokit.vehicle.commanding.arbiter import ARM_HEARTBEAT_DELAY_S, was_armed_by_order
 
@@ -223,10 +223,17 @@ class FlightCleanup:
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
-        """Hold the vehicle if the vehicle's block is left while a call in this block waits for the order."""
+        """Hold the vehicle if the vehicle's block is left while a call in this block waits for the order.
+
+        A vehicle that has hit the ground must hold too, because its target may still be in the air.
+        """
         self._flight = order
         try:
             yield
+        except OperationRejected:
+            if order.impact:
+                self.hold_in_background(order)
+            raise
         finally:
             if self._flight is order:
                 self._flight = None

@@ -16,6 +16,7 @@ from aerokit.connection.tasks import Cancellation
 from aerokit.errors import InvalidArgument, NotSupported, OperationRejected, OperationTimeout
 from aerokit.position import Position
 from aerokit.vehicle.commanding.follow_target import FollowTarget, HasTelemetry
+from aerokit.vehicle.commanding.ground import ImpactDetector
 from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S, VehiclePosition
 from aerokit.vehicle.commanding.setpoints import ZERO, PositionSetpoint, SetpointEncoder
 from aerokit.vehicle.commanding.streams import SteeringStream
@@ -172,6 +173,7 @@ class FollowStream(SteeringStream[TargetState]):
         self._target, self._tracker = target, FollowedTarget(target, self._now)
         self._encode_position = SetpointEncoder(context).position
         self._place, self._max_distance_m = place, max_distance_m
+        self._impact = ImpactDetector(context.session)
         self._reading: Cancellation | None = None
         self._end_reason = ""
         self._bearing_deg = self._course_deg = self._own_altitude_m = 0.0

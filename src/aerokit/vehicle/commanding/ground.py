@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from aerokit.vehicle.commanding.progress import FALL_SINK_M_S
+from aerokit.vehicle.commanding.progress import FALL_SINK_M_S, HIT_GROUND, POSITION_MAX_AGE_S
 from aerokit.vehicle.state.telemetry import height_above_home
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from aerokit.vehicle.session.session import VehicleSession
 
@@ -39,9 +40,18 @@ VELOCITY_MAX_AGE_S = 4.0
 IMPACT_HEIGHT_M = 3.0
 """If the height changes by this distance after a sudden stop, the stop was not on the ground."""
 
+MIN_DROP_M = 1.0
+"""A vehicle that falls to ``IMPACT_M_S`` loses 1.8 m. If it lost less than this, its velocity jumped."""
+
+MAX_SLIDE_M_S = 8.0
+"""A vehicle that is faster than this over ground is not on the ground yet: a fixed wing may have levelled off."""
+
 
 class ImpactDetector:
-    """Detects that a vehicle hits the ground: it sinks at ``IMPACT_M_S`` or faster, and suddenly stops."""
+    """Detects that a vehicle hits the ground: it sinks at ``IMPACT_M_S`` or faster, and suddenly stops.
+
+    Its height must have decreased, and it must not fly on.
+    """
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
@@ -50,6 +60,9 @@ class ImpactDetector:
         # Sink rate before the impact, and height of the place of the impact.
         self._impact_m_s: float | None = None
         self._impact_height_m: float | None = None
+        # Height before the descent; None if it is unknown.
+        self._top_m: float | None = None
+        self._has_stopped = False
 
     def update(self) -> None:
         """Process the vehicle's last reported velocity."""
@@ -61,18 +74,30 @@ class ImpactDetector:
         interval_s = min(cell.updated_at - self._updated_at, MAX_INTERVAL_S)
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = cell.updated_at
+        height_m = self._current_height()
         if velocity.down_m_s >= IMPACT_M_S:
             is_new_descent = cell.updated_at - self._sank_fast_at > max_stop_s
             self._max_sink_m_s = velocity.down_m_s if is_new_descent else max(self._max_sink_m_s, velocity.down_m_s)
             self._sank_fast_at = cell.updated_at
         elif abs(velocity.down_m_s) < STILL_M_S and cell.updated_at - self._sank_fast_at <= max_stop_s:
-            self._impact_m_s, self._impact_height_m = self._max_sink_m_s, height_above_home(self._session.telemetry)
+            if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
+                self._impact_m_s, self._impact_height_m = self._max_sink_m_s, height_above_home(self._session.telemetry)
         elif _has_changed(self._impact_height_m, height_above_home(self._session.telemetry), IMPACT_HEIGHT_M):
             self._impact_m_s = self._impact_height_m = None
+        if velocity.down_m_s < STILL_M_S and cell.updated_at - self._sank_fast_at > max_stop_s:
+            self._top_m = height_m
+        is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S
+        self._has_stopped = self._impact_m_s is not None and (self._has_stopped or is_slow)
 
     def describe(self) -> str:
         """Return the impact as a clause; empty if there was none, or the vehicle has left the place of the impact."""
-        return "" if self._impact_m_s is None else f"the vehicle hit the ground at {self._impact_m_s:.1f} m/s"
+        if self._impact_m_s is None or not self._has_stopped:
+            return ""
+        return f"{HIT_GROUND} at {self._impact_m_s:.1f} m/s"
+
+    def _current_height(self) -> float | None:
+        telemetry = self._session.telemetry
+        return height_above_home(telemetry) if telemetry.position.age <= POSITION_MAX_AGE_S else None
 
 
 class GroundCheck:
@@ -88,6 +113,15 @@ class GroundCheck:
         self._reported_at: float | None = None
         self._reported_height_m: float | None = None
         self._settled_since = math.inf
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Process every velocity that arrives within the block, rather than only the last one before each check."""
+        detach = self._session.telemetry.velocity.observe(lambda *_: self._impact.update())
+        try:
+            yield
+        finally:
+            detach()
 
     @property
     def is_pending(self) -> bool:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from aerokit._internal.arguments import check_kind, checks_arguments
 from aerokit.errors import NotSupported
+from aerokit.vehicle.commanding.ground import ImpactDetector
 from aerokit.vehicle.commanding.progress import StallDetector
 from aerokit.vehicle.commanding.setpoints import (
     AccelerationSetpoint,
@@ -43,6 +44,15 @@ SetpointT = TypeVar("SetpointT")
 # For autopilots that restart their path at each position set-point: a new set-point is sent this many times at the
 # stream's rate, because one may be lost, and then at this interval.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
+
+# Set-points that the autopilot executes with its own limits of acceleration.
+BRAKED_BY_AUTOPILOT = (
+    VelocitySetpoint,
+    BodyVelocitySetpoint,
+    LocalPositionSetpoint,
+    PositionSetpoint,
+    TrajectorySetpoint,
+)
 
 
 @checks_arguments
@@ -194,9 +204,10 @@ class SetpointStream(SteeringStream[SetpointT]):
     any way makes the vehicle hold.
 
     The stream stops by itself if there is no new set-point for ``valid_for_s``, or if the event loop is late by
-    ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, or stays in place for twelve
-    seconds although it should move. ``set`` and leaving the block then raise :class:`SetpointStreamStopped`. If a pilot
-    or a failsafe changed the mode, nothing more is sent to the vehicle.
+    ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, hits the ground (velocities,
+    positions and trajectories only), or stays in place for twelve seconds although it should move. ``set`` and leaving
+    the block then raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changed the mode, nothing more is sent
+    to the vehicle.
     """
 
     _NAME, _VALUE = "set-point stream", "set-point"
@@ -215,6 +226,8 @@ class SetpointStream(SteeringStream[SetpointT]):
         self._restarts_path = is_place and context.session.autopilot.setpoints.position_restarts_path
         self._repeats_left, self._sent_at = INITIAL_REPEATS, -math.inf
         self._stall = StallDetector(context.session)
+        if isinstance(initial, BRAKED_BY_AUTOPILOT):
+            self._impact = ImpactDetector(context.session)
 
     def set(self, setpoint: SetpointT) -> None:
         """Replace the set-point; it is sent at the next tick and resent until ``valid_for_s`` has passed.

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 TEXTS_S = 1.0
 # Values older than this do not describe the present state.
 HEALTH_MAX_AGE_S = 5.0
+PREARM_REPORT_INTERVAL_S = 35.0
+"""Seconds in which ArduPilot surely repeats its pre-arm failures, which it does every 30 s."""
+CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
+"""Reason that is given if no other one explains a refusal to arm."""
 RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
 
@@ -28,7 +32,7 @@ class Health:
 
     def __init__(self, session: VehicleSession) -> None:
         self._session, self._telemetry, self._autopilot = session, session.telemetry, session.autopilot
-        self._restored_at = -math.inf
+        self._restored_at = self._checked_at = -math.inf
         session.at_close(session.connection.bus.attach_event(LinkRestored, self._on_restored))
 
     def _on_restored(self, event: LinkRestored) -> None:
@@ -43,7 +47,19 @@ class Health:
             for cell in (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home)
             if not cell.is_known
         ]
-        return [*missing, *self._out_of_date(), *self._failing()]
+        texts = self._recent_texts()
+        reasons = [*missing, *self._out_of_date(), *texts, *self._failing()]
+        explains = texts or self._failing_sensors() or (self._needs_position() and self._missing_estimates())
+        return [*reasons, *([CHECKS_FAIL] if self._checks_fail() and not explains else [])]
+
+    def _recent_texts(self) -> list[str]:
+        """Return the vehicle's texts about its failing checks, since it was last requested to run them."""
+        if not self._checks_fail() or self._telemetry.is_armed:
+            return []
+        now = self._session.connection.now()
+        since = max(now - PREARM_REPORT_INTERVAL_S, self._checked_at, self._restored_at)
+        reasons = (self._autopilot.arming_reason(text) for text in self.arming_texts(since))
+        return list(dict.fromkeys(reason for reason in reasons if reason))
 
     def _out_of_date(self) -> list[str]:
         """Return the states that are too old to describe the present."""
@@ -80,11 +96,14 @@ class Health:
             await self._session.wait_for_status_texts()
             await self._request_texts(since)
             await self._refresh()
+        failing = self._failing() if self._needs_position() else self._failing_sensors()
+        found = (self.arming_texts(since), self.unarmable_mode(), self._out_of_date(), failing)
+        reasons = self._session.deduplicate_reasons(*(reason for reasons in found for reason in reasons))
+        return reasons or ((CHECKS_FAIL,) if self._checks_fail() else ())
+
+    def _needs_position(self) -> bool:
         mode = self._telemetry.mode.latest
-        needs_position = mode is None or mode.name not in self._autopilot.modes_without_position
-        failing = self._failing() if needs_position else self._failing_sensors()
-        reasons = [*self.arming_texts(since), *self.unarmable_mode(), *self._out_of_date(), *failing]
-        return self._session.deduplicate_reasons(*reasons)
+        return mode is None or mode.name not in self._autopilot.modes_without_position
 
     def unarmable_mode(self) -> list[str]:
         """Return a list with one text if the present mode does not allow arming, otherwise an empty list."""
@@ -123,10 +142,12 @@ class Health:
         """Request the vehicle to run its pre-arm checks, unless it has sent texts about arming since this time."""
         if self.arming_texts(since) or not self._autopilot.runs_prearm_checks:
             return
+        requested_at = self._session.connection.now()
         try:
             await self._session.commands.send_long(MavCmd.RUN_PREARM_CHECKS, attempts=2)
         except (CommandRejected, CommandTimeout):
             return
+        self._checked_at = requested_at
         await anyio.sleep(TEXTS_S)
 
     def arming_texts(self, since: float) -> list[str]:
@@ -134,34 +155,41 @@ class Health:
         return [text for text in self._session.texts_since(since) if self._autopilot.arming_reason(text) is not None]
 
     def _failing(self) -> list[str]:
-        """Return failing sensors, failing pre-arm checks, missing estimates, and a missing GPS fix if it is their
-        cause.
-        """
-        failing, estimator = self._failing_sensors(), self._telemetry.estimator.latest
+        """Return failing sensors, missing estimates, and a missing GPS fix if it is their cause."""
+        return [*self._failing_sensors(), *self._missing_estimates()]
+
+    def _missing_estimates(self) -> list[str]:
+        estimator = self._telemetry.estimator.latest
         if estimator is None or not estimator.missing:
-            return failing
-        failing += [f"the estimator has no {name} ({estimator.message})" for name in estimator.missing]
+            return []
+        missing = [f"the estimator has no {name} ({estimator.message})" for name in estimator.missing]
         receivers = self._telemetry.gps.latest or ()
         if receivers and not any(receiver.has_3d_fix for receiver in receivers):
-            failing.append("no GPS receiver has a 3D fix (GPS_RAW_INT)")
-        return failing
+            missing.append("no GPS receiver has a 3D fix (GPS_RAW_INT)")
+        return missing
+
+    def _checks_fail(self) -> bool:
+        """Return True if the vehicle reports that its pre-arm checks do not pass.
+
+        In a mode that does not allow arming, PX4 evaluates the requirements of that mode, which say nothing about
+        arming.
+        """
+        sensors = self._telemetry.sensors.latest
+        says_nothing = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
+        return sensors is not None and sensors.prearm_checks_pass is False and not says_nothing
 
     def _failing_sensors(self) -> list[str]:
-        """Return failing sensors and failing pre-arm checks.
+        """Return failing sensors.
 
         If the vehicle reports that it can be armed, failing sensors are left out, because they are not required (for
         example an RC receiver on PX4). PX4 reports a missing RC receiver as failing even in modes that do not require a
         receiver.
         """
-        failing: list[str] = []
         sensors = self._telemetry.sensors.latest
-        # PX4 then reports the requirements of the present mode, in which it cannot arm.
-        is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
-        if sensors is not None and sensors.prearm_checks_pass is not True and not is_meaningless:
-            failing += [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing if self._is_required(name)]
-            if sensors.prearm_checks_pass is False:
-                failing.append("the vehicle's pre-arm checks do not pass (SYS_STATUS)")
-        return failing
+        says_nothing = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
+        if sensors is None or sensors.prearm_checks_pass is True or says_nothing:
+            return []
+        return [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing if self._is_required(name)]
 
     def _is_required(self, sensor: str) -> bool:
         """Return False for an RC receiver that the present mode does not require."""

@@ -307,7 +307,7 @@ class ManeuverActions(VehicleBase):
         Raises:
             InvalidArgument: there is no such state. Nothing was sent.
             NotSupported: the vehicle is not a VTOL. Nothing was sent.
-            OperationRejected: the mode changed, or the vehicle disarmed, during the transition.
+            OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the transition.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ten seconds.
@@ -319,12 +319,13 @@ class ManeuverActions(VehicleBase):
         with self._arbiter.auxiliary_order() as order:
             started = self.connection.now()
             await self._sender.send_long(order, MavCmd.DO_VTOL_TRANSITION, float(target_state))
+            impact = self._sender.impact_failure(order)
             with self._session.streaming("vtol_state"):
                 await await_progress(
                     self._session,
                     f"transition_to({state})",
                     is_done=lambda: cell.latest == target_state and cell.updated_at > started,
-                    failure_reason=lambda: order.takeover_reason,
+                    failure_reason=lambda: impact() or order.takeover_reason,
                     describe=lambda: f"MAV_VTOL_STATE is {cell.latest}",
                     timeout=timeout,
                 )

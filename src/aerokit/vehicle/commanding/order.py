@@ -169,6 +169,8 @@ class Order:
         self.is_withdrawn: bool = False
         self.takeover_reason: str = ""
         """The action of another party that ended the order, as a clause; empty if there was none."""
+        self.impact: str = ""
+        """The impact on the ground while a call waited for the order, as a clause; empty if there was none."""
         self.failsafe: str = ""
         """The failsafe that became active after the order, as a clause; empty if there was none."""
         self.unexplained: str = ""

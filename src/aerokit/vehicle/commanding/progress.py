@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal import geo
 from aerokit._internal.arguments import check_range
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavFrame, MavLandedState
+from aerokit.mavlink.enums import MavFrame, MavLandedState, MavSeverity
 from aerokit.position import Position
 from aerokit.vehicle.state.telemetry import height_above_home
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 POLL_INTERVAL_S = 0.25
-"""Seconds between evaluations of the state when no message arrives, as during a silence of the vehicle."""
+"""Maximum seconds between two evaluations of the state, as during a silence of the vehicle."""
 
 MAX_SILENCE_S = 10.0
 """Default number of seconds without a heartbeat after which an operation fails."""
@@ -39,6 +39,9 @@ FALL_SINK_M_S = 3.0
 FALL_EVIDENT_S = 0.5
 """After falling for this time, a vehicle sinks faster than ``FALL_SINK_M_S``, even with air resistance."""
 
+HIT_GROUND = "the vehicle hit the ground"
+"""Beginning of the clause about an impact."""
+
 FALL_STOP_S = 1.5
 """Maximum seconds from a fast descent to a standstill on the ground that together count as a fall."""
 
@@ -54,10 +57,12 @@ async def await_progress(
     max_silence_s: float | None = MAX_SILENCE_S,
     held_for: float = 0.0,
     stall_reason: Callable[[], str | None] | None = None,
+    at_positions: bool = True,
 ) -> None:
     """Return when ``is_done()`` has been true for ``held_for`` seconds.
 
-    All functions are called whenever the vehicle's state changes. ``operation`` is the name for error texts.
+    All functions are called every ``POLL_INTERVAL_S``, and whenever the mode, the arming or the landed state changes;
+    with ``at_positions`` also at each new position. ``operation`` is the name for error texts.
 
     Raises:
         OperationRejected: ``failure_reason()`` returned a reason why the operation cannot succeed.
@@ -68,7 +73,9 @@ async def await_progress(
     """
     started = session.connection.now()
     telemetry = session.telemetry
-    cells = (telemetry.mode, telemetry.armed, telemetry.position, telemetry.landed_state)
+    cells: list[StateCell[Any]] = [telemetry.mode, telemetry.armed, telemetry.landed_state]
+    if at_positions:
+        cells.append(telemetry.position)
     done_since: float | None = None
     with ChangeSignal(session, *cells) as changes:
         while True:
@@ -82,7 +89,7 @@ async def await_progress(
                 return
             if done_since is None and (reason := failure_reason()):
                 reason += _height_when_disarmed(session)
-                raise OperationRejected(f"{operation}: {reason}", reasons=session.texts_since(started))
+                raise OperationRejected(f"{operation}: {reason}", reasons=_reasons(session, reason, started))
             if max_silence_s is not None and session.watch.silent_for_s > max_silence_s:
                 raise HeartbeatTimeout(f"{operation}: {session.describe_link()}")
             if timeout is not None and now - started >= timeout:
@@ -92,6 +99,13 @@ async def await_progress(
             if stall_reason is not None and (stall := stall_reason()):
                 raise OperationTimeout(f"{operation}: {stall}; {describe()}; {session.describe_link()}")
             await changes.next(POLL_INTERVAL_S)
+
+
+def _reasons(session: VehicleSession, reason: str, since: float) -> tuple[str, ...]:
+    """Return the status texts that may explain a failure. Texts about normal progress do not explain an impact."""
+    texts = session.telemetry.texts_since(since)
+    is_impact = reason.startswith(HIT_GROUND)
+    return tuple(text.text for text in texts if not is_impact or text.severity < MavSeverity.INFO)
 
 
 def _height_when_disarmed(session: VehicleSession) -> str:

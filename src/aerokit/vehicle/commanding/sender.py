@@ -11,6 +11,7 @@ from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, Operat
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, MAX_ATTEMPTS, rejection
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S
+from aerokit.vehicle.commanding.ground import ImpactDetector
 from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, REQUEST_COMMANDS
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
 
@@ -219,16 +220,18 @@ class OrderSender:
     def mode_failure(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
         """Return a function that returns why the order cannot succeed, as a clause; None while it may succeed.
 
-        The reasons are: the order was superseded, or the vehicle is disarmed or not in one of ``modes``. The vehicle
-        has three seconds to report one of the modes.
+        The reasons are: the order was superseded, or the vehicle has hit the ground, is disarmed or is not in one of
+        ``modes``. The vehicle has three seconds to report one of the modes.
         """
+        impact = self.impact_failure(order)
         grace_until, settles_at = self._session.connection.now() + MODE_GRACE_S, self._arbiter.mode_settles_at
         was_in_mode = False
 
         def failure_reason() -> str | None:
             nonlocal was_in_mode
-            if order.end:
-                return order.end
+            reason = impact() or order.end
+            if reason:
+                return reason
             if self._session.telemetry.is_confirmed_disarmed:
                 return "the vehicle disarmed"
             if self._session.connection.now() < settles_at:  # The mode of an abandoned order may still be reported.
@@ -240,6 +243,17 @@ class OrderSender:
             if mode not in modes and self._session.connection.now() > grace_until:
                 return f"the vehicle stayed in {mode}"
             return None
+
+        return failure_reason
+
+    def impact_failure(self, order: Order) -> Callable[[], str]:
+        """Return a function that returns a clause once the vehicle has hit the ground during the newest order."""
+        detector = ImpactDetector(self._session)
+
+        def failure_reason() -> str:
+            detector.update()
+            order.impact = detector.describe() if order.is_newest else ""
+            return order.impact
 
         return failure_reason
 

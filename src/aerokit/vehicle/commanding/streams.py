@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.commanding.ground import ImpactDetector
     from aerokit.vehicle.commanding.order import Order
 
     Probe = Callable[..., Awaitable[Mapping[str, object]]]
@@ -198,6 +199,10 @@ class SteeringStream(ValueStream[ValueT]):
     """The steering order, if it was already given before the block is entered; see `FlightCleanup.preparing`."""
     _order: Order | None = None
     _mode: Mode | None = None
+    _impact: ImpactDetector | None = None
+    """Ends the stream when the vehicle hits the ground; None if the values determine the thrust, so that the vehicle
+    may brake as suddenly in the air.
+    """
 
     @property
     def _needs_stream_before_mode(self) -> bool:
@@ -295,6 +300,13 @@ class SteeringStream(ValueStream[ValueT]):
         if self._order is not None and self._order.end:
             return self._order.end
         return None
+
+    def _stop_reason(self, lag: float) -> str | None:
+        if self._impact is not None:
+            self._impact.update()
+            if reason := self._impact.describe():
+                return reason
+        return super()._stop_reason(lag)
 
     def _hold(self) -> bool:
         return self._order is not None and self._context.flight_cleanup.hold_in_background(self._order)

@@ -78,7 +78,7 @@ class TravelActions(VehicleBase):
                 was sent.
             ValueUnknownError: the vehicle's position or home is needed but unknown.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
-            OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
+            OperationRejected: the mode changed (a pilot, a failsafe), or the vehicle disarmed or hit the ground.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not arrive in time, or does not move.
@@ -221,7 +221,7 @@ class TravelActions(VehicleBase):
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: the mode changed or the vehicle disarmed meanwhile.
+            OperationRejected: the mode changed, or the vehicle disarmed meanwhile or hit the ground.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.
         """

@@ -67,13 +67,13 @@ class MissionEndDetector:
         self._grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
         self._left_at: float | None = None  # when the vehicle was first seen disarmed, or in an unexpected mode
-        self._ground = GroundCheck(session)
+        self.ground: GroundCheck = GroundCheck(session)
 
     def has_ended(self) -> bool:
         """Return True if the mission has ended; on the ground, only if the vehicle has landed rather than fallen."""
         is_reported, is_on_ground = self._is_end_reported(), self._is_on_ground
         # The check must see every call, because it watches the velocity.
-        has_landed = self._ground.confirms(is_reported and is_on_ground)
+        has_landed = self.ground.confirms(is_reported and is_on_ground)
         return has_landed if is_on_ground else is_reported
 
     def _is_end_reported(self) -> bool:
@@ -98,10 +98,10 @@ class MissionEndDetector:
         session, now = self._session, self._session.connection.now()
         if self._vehicle_context.arbiter.newest not in (self._order, order):
             return "another order was given"
-        fall = self._ground.fall() if self._is_on_ground else None
+        fall = self.ground.fall()
         if fall:
             return f"{fall}, {self.describe()}"
-        if self._ground.is_pending:  # `has_ended` has not decided yet whether this is a landing.
+        if self.ground.is_pending:  # `has_ended` has not decided yet whether this is a landing.
             return None
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
@@ -295,7 +295,7 @@ class MissionControl(VehiclePlan["Mission"]):
         mode = vehicle_context.sender.mode_for("mission.wait_finished", "mission")
         items = (self._context.caches[0].items or ())[self._context.offset_of(0) :]
         end = MissionEndDetector(vehicle_context, self._tracker, mode, items)
-        with session.streaming("mission_current", "landed_state", "position"):
+        with session.streaming("mission_current", "landed_state", "position"), end.ground.watching():
             await await_progress(
                 session,
                 "mission.wait_finished",
@@ -305,6 +305,7 @@ class MissionControl(VehiclePlan["Mission"]):
                 timeout=timeout,
                 max_silence_s=max_silence_s,
                 stall_reason=MissionStallDetector(session, self._tracker, mode, items, lambda: self._is_paused),
+                at_positions=False,  # No single position ends a mission, which may take hours.
             )
 
     @property

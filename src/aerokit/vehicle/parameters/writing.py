@@ -174,7 +174,7 @@ class ParameterWrite(Snapshot):
     - ``"failed"``: see ``error``; ``value`` is the last known value, or NaN.
 
     ``note`` has further information: another name on this vehicle, a value outside its documented range, a reboot that
-    is needed.
+    is needed. ``before`` is the value that the vehicle had, None if unknown.
     """
 
     name: str
@@ -184,6 +184,7 @@ class ParameterWrite(Snapshot):
     outcome: Outcome
     note: str = ""
     error: AerokitError | None = None
+    before: int | float | None = None
 
 
 def _failed_write(name: str, requested: float, known: Parameter | None, error: AerokitError) -> ParameterWrite:
@@ -314,7 +315,8 @@ class ParameterWriter:
         written = plan.resolved.as_requested(answer)
         notes = (plan.resolved.note, self._note_of(plan.to_send.name, answer.value))
         note = "; ".join(filter(None, notes))
-        return ParameterWrite(name, requested, written.value, written.type, outcome, note)
+        before = plan.resolved.as_requested(plan.old).value
+        return ParameterWrite(name, requested, written.value, written.type, outcome, note, before=before)
 
 
 def _plan_write(resolved: ResolvedParameter, value: int | float) -> _PlannedWrite:

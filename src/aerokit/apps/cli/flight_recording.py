@@ -1,0 +1,82 @@
+"""Complete recordings of flights: with the parameters, and with what follows a failure in the air."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit.apps.cli.output import DONE
+from aerokit.errors import AerokitError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.apps.cli.terminal import InterruptStack
+    from aerokit.vehicle.vehicle import Vehicle
+
+# A radio may need longer for all parameters. The flight then begins without the rest.
+_PARAMETERS_TIMEOUT_S = 10.0
+MAX_SILENCE_S = 10.0
+"""Seconds without a heartbeat after which nothing more is expected to be recorded."""
+_POLL_INTERVAL_S = 0.2
+_MAX_STILL_S = 20.0
+_MAX_DRIFT_M = 1.0
+_MAX_HEIGHT_M = 3.0
+
+
+async def record_parameters(vehicle: Vehicle, print_line: Callable[[str], None]) -> None:
+    """Request all parameters, so that a report on the recording can explain failsafes. Gives up after 10 s.
+
+    MAVFTP would be faster, but a recording of it has no PARAM_VALUE messages, which reports read.
+    """
+    try:
+        table = await vehicle.parameters.download(method="list", timeout=_PARAMETERS_TIMEOUT_S)
+    except AerokitError:
+        print_line(f"  the recording lacks parameters: not all were received within {_PARAMETERS_TIMEOUT_S:g} s")
+    else:
+        print_line(f"  {len(table)} parameters recorded")
+
+
+async def record_to_end(vehicle: Vehicle, interrupts: InterruptStack, print_line: Callable[[str], None]) -> None:
+    """While the vehicle is armed, stay connected until it has disarmed, is silent for 10 s, or Ctrl-C.
+
+    A vehicle that has crashed may stay armed: near the ground, the recording also ends after 20 s without motion.
+    """
+    if not vehicle.is_armed or not vehicle.connection.is_open:
+        return
+    if vehicle.heartbeat_age >= MAX_SILENCE_S:
+        print_line(f"the recording ends with the vehicle armed, because it was silent for {MAX_SILENCE_S:g} s")
+        return
+    print_line(
+        f"still armed: the recording goes on until the vehicle disarms, is silent for {MAX_SILENCE_S:g} s, or Ctrl-C"
+    )
+
+    still = _StillNearGround(vehicle)
+
+    async def wait() -> int:
+        while vehicle.is_armed and vehicle.connection.is_open and vehicle.heartbeat_age < MAX_SILENCE_S:
+            if still.is_so():
+                break
+            await anyio.sleep(_POLL_INTERVAL_S)
+        return DONE
+
+    why = "interrupted" if await interrupts.run(wait) is None else "end of the recording"
+    print_line(f"{why}: {vehicle.describe_now()}")
+
+
+class _StillNearGround:
+    """Detects a vehicle that has not moved for 20 s, at the height of its home or a little above."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
+        self._place, self._since = vehicle.position.latest, vehicle.connection.now()
+
+    def is_so(self) -> bool:
+        here, now = self._vehicle.position.latest, self._vehicle.connection.now()
+        if here is None:
+            return False
+        moved = self._place is None or here.distance_to(self._place) > _MAX_DRIFT_M
+        if moved or abs(here.altitude_relative_m or 0.0) > _MAX_HEIGHT_M:
+            self._place, self._since = here, now
+        return now - self._since >= _MAX_STILL_S

@@ -1,0 +1,133 @@
+"""Lost messages, silences of the vehicle and the speed of a simulation, from a recording itself."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from typing import TYPE_CHECKING
+
+from aerokit.logs.flights.flight import Silence, TimeSeries
+
+if TYPE_CHECKING:
+    from aerokit.logs.flights.flight import FlightLog
+
+NAN = math.nan
+_MAX_SEQUENCE_GAP = 200
+MIN_SILENCE_S = 3.0
+"""Autopilots send HEARTBEAT once a second, and most messages more often."""
+
+# Clocks of vehicles and computers drift by less than this share. A larger drift means that a simulation ran faster or
+# slower than real time. Over the minimum time of comparison, delays of the link average out.
+_MAX_CLOCK_DRIFT, _MIN_CLOCK_COMPARISON_S, _MAX_CLOCK_GAP_S = 0.2, 1.0, 10.0
+
+
+class ClockComparison:
+    """Compares the vehicle's time since boot with the time of the recording."""
+
+    def __init__(self) -> None:
+        self._previous: tuple[float, int] = (-math.inf, 0)
+        self._recorded_s = self._vehicle_s = 0.0
+
+    def compare(self, time_s: float, boot_ms: int) -> None:
+        previous_s, previous_ms = self._previous
+        self._previous = time_s, boot_ms
+        # Reboots, and pauses of the recording or of its clock, do not count.
+        if boot_ms >= previous_ms and 0 <= time_s - previous_s < _MAX_CLOCK_GAP_S:
+            self._recorded_s += time_s - previous_s
+            self._vehicle_s += (boot_ms - previous_ms) / 1e3
+
+    @property
+    def speed(self) -> float:
+        """Vehicle seconds for one recorded second; 1 if the log is too short."""
+        if min(self._recorded_s, self._vehicle_s) < _MIN_CLOCK_COMPARISON_S:
+            return 1.0
+        return self._vehicle_s / self._recorded_s
+
+
+class LinkCounter:
+    """Counts received and lost frames per second, by sequence numbers."""
+
+    def __init__(self, flight: FlightLog) -> None:
+        self._series, self._silences = flight.link, flight.silences
+        self._second = 0
+        self._received = self._lost = 0
+
+    def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
+        """Count frames after a gap, or at the start of a second. Return the start of the next second.
+
+        ``received`` frames arrived since the last call, of which the last has this time and sequence number.
+        """
+        missing = (sequence - expected) & 0xFF if expected >= 0 else 0
+        if missing > _MAX_SEQUENCE_GAP:  # a delayed frame, or a frame from a second link, is not a loss
+            missing = 0
+        if time_s >= self._second + 1:  # only the last frame belongs to the new second
+            self._received += received - 1
+            received = 1
+            if int(time_s) - self._second > 1:  # silence is recorded as 100 % loss
+                missing = 0
+            self._add_row(int(time_s))
+        self._received += received
+        self._lost += missing
+        return self._second + 1
+
+    def add_silence(self, begins_s: float, ends_s: float, others: int) -> None:
+        """Record a silence of the vehicle, with the number of messages of others in it."""
+        self._silences.append(Silence(begins_s, ends_s, others > 0))
+
+    def end(self, received: int, received_s: float, ends_s: float, others: int) -> None:
+        """Count the last frames. A silence until the end of the log is recorded as 100 % loss too."""
+        self._received += received
+        if ends_s - received_s < MIN_SILENCE_S:
+            self._add_row(self._second + 1)
+            return
+        self.add_silence(received_s, ends_s, others)
+        self._add_row(int(ends_s))
+        if ends_s > self._second:
+            self._series.add(ends_s, 100.0, 0)
+
+    def _add_row(self, second: int) -> None:
+        sent = self._received + self._lost
+        self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
+        if second - self._second > 1:  # add rows for the seconds without frames
+            self._series.add(self._second + 1, 100.0, 0)
+            self._series.add(second - 1, 100.0, 0)
+        self._second, self._received, self._lost = second, 0, 0
+
+
+def use_simulated_time(flight: FlightLog, speed: float) -> None:
+    """Convert all times of a recording to seconds of the vehicle, if a simulation ran at another speed.
+
+    Speeds and rates of turn are in the vehicle's seconds, so they fit only these times.
+    """
+    if abs(math.log(speed)) <= _MAX_CLOCK_DRIFT:
+        return
+    recorded_s, flight.speed = flight.duration_s, speed
+    flight.notes.append(
+        f"this is a simulation at {speed:.3g} times real speed, because the vehicle's clock differs from the"
+        f" recording's: all times and durations in this report are simulated; the recording took {recorded_s:.0f} s"
+    )
+    for series in _all_series(flight):
+        for row, time_s in enumerate(series.times):
+            series.times[row] = time_s * speed
+    for row, received_hz in enumerate(flight.link["received_hz"]):
+        flight.link["received_hz"][row] = received_hz / speed
+    for row, time_s in enumerate(flight.gcs_heartbeats):
+        flight.gcs_heartbeats[row] = time_s * speed
+    flight.armed = [(begin * speed, end * speed) for begin, end in flight.armed]
+    flight.silences = [
+        item.replace(begins_s=item.begins_s * speed, ends_s=item.ends_s * speed) for item in flight.silences
+    ]
+    flight.modes = [item.replace(time_s=item.time_s * speed) for item in flight.modes]
+    flight.texts = [item.replace(time_s=item.time_s * speed) for item in flight.texts]
+    flight.parameter_changes = [item.replace(time_s=item.time_s * speed) for item in flight.parameter_changes]
+    flight.failsafe_evidence = [item.replace(time_s=item.time_s * speed) for item in flight.failsafe_evidence]
+
+
+def _all_series(flight: FlightLog) -> list[TimeSeries]:
+    parts = [getattr(flight, part.name) for part in fields(flight)]
+    return [
+        series
+        for part in parts
+        for series in (part.values() if isinstance(part, dict) else (part,))
+        if isinstance(series, TimeSeries)
+    ]

@@ -1,0 +1,104 @@
+"""Sentences about silences of the vehicle, and its configured reaction to a lost ground station."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.logs.report.formatting import clock, span
+
+if TYPE_CHECKING:
+    from aerokit.logs.flights.flight import FlightLog, Silence
+
+_MAX_LISTED = 3
+# After a silence, HEARTBEAT reports the mode within this time.
+_MODE_DELAY_S = 1.5
+
+# Parameters by the name of the firmware; the first one is the action.
+_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "PX4": ("NAV_DLL_ACT", "COM_DL_LOSS_T"),
+    "ArduCopter": ("FS_GCS_ENABLE", "FS_GCS_TIMEOUT", "FS_OPTIONS"),
+    "ArduPlane": ("FS_GCS_ENABL", "FS_LONG_ACTN", "FS_LONG_TIMEOUT"),
+    "Rover": ("FS_GCS_ENABLE", "FS_GCS_TIMEOUT", "FS_ACTION"),
+    "ArduSub": ("FS_GCS_ENABLE", "FS_GCS_TIMEOUT"),
+}
+# Values of the first parameter.
+_ACTIONS: dict[str, dict[int, str]] = {
+    "PX4": {0: "no reaction", 1: "Hold", 2: "Return", 3: "Land", 5: "terminates the flight", 6: "disarms"},
+    "ArduCopter": {
+        0: "no reaction",
+        1: "RTL",
+        2: "RTL",
+        3: "SMART_RTL or RTL",
+        4: "SMART_RTL or LAND",
+        5: "LAND",
+        6: "the mission's landing sequence or RTL",
+        7: "BRAKE or LAND",
+    },
+    "ArduPlane": {0: "no reaction"},
+    "Rover": {0: "no reaction"},
+    "ArduSub": {0: "no reaction", 1: "warning only", 2: "disarms", 3: "ALT_HOLD", 4: "SURFACE"},
+}
+
+
+def silence_sentences(flight: FlightLog) -> list[str]:
+    """Return sentences about the silences while the vehicle was armed, and about the vehicle's failsafe."""
+    silences = [
+        silence for silence in flight.silences if any(begin <= silence.begins_s <= end for begin, end in flight.armed)
+    ]
+    recorded = [silence for silence in silences if silence.is_recorded]
+    sentences = [_sentence(flight, silence) for silence in recorded[:_MAX_LISTED]]
+    more = len(recorded) - _MAX_LISTED
+    if more > 0:
+        sentences.append(f"The log has {more} more silence{'' if more == 1 else 's'} of the vehicle.")
+    if recorded:
+        sentences.append(ground_station_failsafe(flight, recorded[0].begins_s))
+    return sentences + _pauses([silence for silence in silences if not silence.is_recorded])
+
+
+def _pauses(pauses: list[Silence]) -> list[str]:
+    """Return a sentence about times without any message, in which the recording itself may have paused."""
+    if not pauses:
+        return []
+    longest = max(pauses, key=lambda pause: pause.ends_s - pause.begins_s)
+    others = len(pauses) - 1
+    more = f", and in {others} shorter gap{'' if others == 1 else 's'}" if others else ""
+    return [
+        f"The log contains no message at all for {span(longest.ends_s - longest.begins_s)} from"
+        f" {clock(longest.begins_s)} on{more}: the vehicle was silent, or the recording paused."
+    ]
+
+
+def _sentence(flight: FlightLog, silence: Silence) -> str:
+    is_at_end = silence.ends_s >= flight.duration_s
+    before = _state(flight, silence.begins_s)
+    text = f"Nothing was received from the vehicle for {span(silence.ends_s - silence.begins_s)}"
+    text += f" from {clock(silence.begins_s)} on"
+    text += ", until the log ends" if is_at_end else ""
+    text += f"; it was last {before}." if before else "."
+    after = "" if is_at_end else _state(flight, silence.ends_s + _MODE_DELAY_S)
+    return f"{text} Afterwards it was {after}." if after else text
+
+
+def _state(flight: FlightLog, time_s: float) -> str:
+    height_m, mode = flight.track.at("altitude_relative_m", time_s), flight.mode_at(time_s)
+    parts = [] if math.isnan(height_m) else [f"{height_m:.1f} m above home"]
+    return " ".join([*parts, *([f"in {mode}"] if mode else [])])
+
+
+def ground_station_failsafe(flight: FlightLog, time_s: float) -> str:
+    """Say how the vehicle is configured to react to a lost ground station, or that the log does not show it."""
+    firmware = next((name for name in _PARAMETERS if name in flight.vehicle), "")
+    if not firmware:
+        return "How the vehicle reacts to a lost ground station is unknown."
+    names = _PARAMETERS[firmware]
+    values = {name: flight.parameter_at(name, time_s) for name in names}
+    if math.isnan(values[names[0]]):
+        return (
+            f"How the vehicle reacts to a lost ground station is unknown, because the log does not contain {names[0]};"
+            f" look at {', '.join(names)}."
+        )
+    action = _ACTIONS[firmware].get(int(values[names[0]]), "")
+    known = [f"{name} = {value:g}" for name, value in values.items() if value == value]
+    known[0] += f" ({action})" if action else ""
+    return f"The vehicle's reaction, if it lost the ground station too: {', '.join(known)}."
