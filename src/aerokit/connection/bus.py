@@ -33,7 +33,7 @@ __all__ = ["Bus", "Detach", "EndSignal", "Overflow", "Sink", "Subscription", "co
 logger: logging.Logger = logging.getLogger("aerokit")
 
 Detach = Callable[[], None]
-"""Ends an attachment. Calling it a second time does nothing."""
+"""Function that ends an attachment of a sink. A second call does nothing."""
 
 Sink = Callable[[Any], None]
 """Callback for one message, frame or event. The callback must return quickly and cannot await."""
@@ -73,7 +73,7 @@ class Bus:
         return self._attach((system_id, message_type.ID), (MESSAGE, sink))
 
     def require_frames(self, *message_types: type[Message]) -> None:
-        """Make the framer build frames of these types even without subscribers, for code that inspects every frame."""
+        """Make the framer return frames of these types even without a sink, for code that inspects every frame."""
         for message_type in message_types:
             self.attach(message_type, _discard)
 
@@ -88,7 +88,7 @@ class Bus:
         *,
         system_id: int = EVERY_SYSTEM,
     ) -> Detach:
-        """Like :meth:`attach_frames`, but also pass the decoded message if another sink needs it."""
+        """Like :meth:`attach_frames`, but also pass the message to ``sink`` if another sink needs it decoded."""
         return self._attach((system_id, message_type.ID), (BOTH, sink))
 
     def create_on_first(
@@ -272,7 +272,7 @@ class EndSignal:
         self._callbacks: list[EndCallback] = []
 
     def raise_if_ended(self) -> None:
-        """Raise a copy of :attr:`error` if it is set."""
+        """Raise a copy of :attr:`error` if the owner has ended."""
         if self.error is not None:
             raise copy_exception(self.error)
 
@@ -330,7 +330,7 @@ class Subscription(Generic[ItemT]):
         # Function that explains in time-out errors why no items arrive. The default, `str`, returns "": no explanation.
         self._explain_timeout: Callable[[], str] = str
         self.missed: int = 0
-        """Number of items dropped because the reader was slow."""
+        """Number of items that were dropped because the reader was too slow."""
         self._attach = attach
         self._detachers: list[Detach] = []
         self._capacity, self._overflow = capacity, overflow
@@ -398,7 +398,7 @@ class Subscription(Generic[ItemT]):
         self._wake()
 
     def _push(self, item: ItemT) -> None:
-        if self._closed:  # closed by an earlier sink of the same delivery
+        if self._closed:  # An earlier sink of the same delivery has closed this subscription.
             return
         if len(self._queue) < self._capacity:
             self._queue.append(item)

@@ -185,14 +185,14 @@ class StateCell(Generic[T]):
         return await waiter.wait(timeout, description)
 
     def changes(self) -> Changes[T]:
-        """Iterate over values that differ from their predecessor, starting with the current value if there is one.
+        """Iterate over the current value, if there is one, and all later values that differ from the value before.
 
         A slow reader gets only the latest value. The loop can be left at any time.
         """
         return Changes(self, every_arrival=False)
 
     def updates(self) -> Changes[T]:
-        """Like :meth:`changes`, but yield each received value, even if it equals its predecessor."""
+        """Like :meth:`changes`, but yield each received value, even if it equals the value before."""
         return Changes(self, every_arrival=True)
 
     @checked
@@ -289,7 +289,7 @@ class StateCell(Generic[T]):
     def __repr__(self) -> str:
         return f"<StateCell {self._describe()}>"
 
-    if not TYPE_CHECKING:  # type checkers know the attributes of a cell
+    if not TYPE_CHECKING:  # Without these methods, type checkers report the misuse.
 
         def __getattr__(self, name: str) -> NoReturn:
             """Raise an error that suggests ``.value``, e.g. for ``vehicle.position.latitude_deg``."""
@@ -329,7 +329,7 @@ class Changes(AsyncIterator[T]):
 
     @property
     def missed(self) -> int:
-        """Number of values that were replaced before this reader got them."""
+        """Number of values that this reader did not get, because newer values had already replaced them."""
         return self._missed
 
     def __aiter__(self) -> Changes[T]:
@@ -476,7 +476,7 @@ class _Observer(_Sink[T]):
         if self._every_arrival or previous is None or previous != value:
             try:
                 self._callback(previous, value)
-            except Exception:  # other observers must get the value although one is faulty
+            except Exception:  # The other observers must get the value although this one is faulty.
                 logger.exception("an observer of %s raised an exception", self._cell.name)
 
     def forget(self) -> None:

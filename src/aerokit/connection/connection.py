@@ -183,7 +183,7 @@ class Connection:
         self._write(frame.raw, self.bus.dialect.decode(frame) if is_known else None, to=None)
 
     def send_as(self, encoder: FrameEncoder, message: Message, *, to: int | None = None) -> None:
-        """Send a message of another component of this program, which has an encoder of its own. See :meth:`send`."""
+        """Like :meth:`send`, for another component of this program, which has its own encoder."""
         encoder.version, encoder.signing = self._encoder.version, self._encoder.signing
         self._encode_and_write(encoder, message, to)
 
@@ -207,7 +207,7 @@ class Connection:
 
     @property
     def unsent_bytes(self) -> int:
-        """Number of written bytes that have not left this machine, if the link can measure that number.
+        """Number of written bytes that have not left this machine; 0 if the link cannot measure the number.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
         control asserted); see :class:`LinkStalled`. Always 0 for UDP.
@@ -322,7 +322,7 @@ class Connection:
                 raise InvalidArgument(f"{item.NAME} is not in this connection's dialect")
 
     def on_end(self, callback: Callable[[Exception], None]) -> Detach:
-        """Call ``callback(error)`` when the connection ends, or immediately if it has ended already."""
+        """Call ``callback(error)`` when the connection ends, or immediately if the connection has already ended."""
         return self._end_signal.on_end(callback)
 
     # ---------------------------------------------------------------------------------- state
@@ -333,7 +333,7 @@ class Connection:
         return self._end_signal.error is None
 
     def raise_if_ended(self) -> None:
-        """Raise the error that ended the connection (ConnectionClosed, LinkLost), if it has ended."""
+        """Raise the error that ended the connection (ConnectionClosed or LinkLost), unless the connection is open."""
         self._end_signal.raise_if_ended()
 
     def last_heartbeat_at(self, system_id: int, component_id: int) -> float:

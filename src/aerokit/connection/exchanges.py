@@ -64,7 +64,7 @@ class ExchangeRun(Generic[ResultT]):
             self._after_step()
 
     def link_chosen(self, system_id: int, event: LinkSelected) -> None:
-        """Inform the exchange that the connection now uses another of several links."""
+        """Inform the exchange that the connection has switched to another of its links."""
         if event.system_id == system_id and event.before is not None:
             self._exchange.link_changed(self._connection.now())
             self._after_step()
@@ -91,7 +91,7 @@ class ExchangeRun(Generic[ResultT]):
         try:
             for message in exchange.take_outbox():
                 self._connection.send(message)
-        except Exception as error:  # passed on to the caller of result()
+        except Exception as error:  # The exchange ends, and result() raises this error.
             exchange.abort(error)
         if exchange.done:
             self._connection.deadlines.cancel(self._expire)

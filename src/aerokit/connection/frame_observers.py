@@ -51,7 +51,7 @@ class Recording:
         self._unix_epoch_s = time.time() - now
         self._writer: TlogWriter | None = None
         self._file: BinaryIO | None = None
-        # Sent frames that wait until the first frame is received: an existing file is then renamed. None: nothing waits.
+        # Sent frames that wait until a frame is received and the existing file is renamed. None: no frame must wait.
         self._waiting: deque[tuple[bytes, float]] | None = None
         try:
             if os.path.exists(path) and not os.path.isfile(path):  # The path is that of a device or a pipe.

@@ -152,7 +152,7 @@ class FrameReceiver:
         self._is_closed = False
         bus.one_at_a_time = multilink is not None
         gate.on_change = self._update_checks
-        bus.require_frames(Heartbeat)  # routes and diagnosis need heartbeats
+        bus.require_frames(Heartbeat)  # Routes, and the diagnosis of failed connections, need all heartbeats.
 
     def start(self) -> None:
         self._loop_watch.start()

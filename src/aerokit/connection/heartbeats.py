@@ -72,7 +72,7 @@ def discovery_event(
 
 
 BLOCKING_MAX_IDLE_S = 60.0
-"""Seconds without a call after which a blocking program's heartbeat pauses. Programs rarely sleep longer in flight."""
+"""The heartbeat of a blocking program pauses after this many seconds without a call. Programs rarely sleep longer."""
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -116,7 +116,7 @@ class ActivityMonitor:
 
 
 class HeartbeatWatchdog:
-    """Decides each second whether our heartbeat is sent, and publishes an event when that changes."""
+    """Decides each second whether our heartbeat is sent, and publishes an event when heartbeats pause or continue."""
 
     def __init__(self, settings: OwnHeartbeat, clock: Callable[[], float], publish: Callable[[Event], None]) -> None:
         self.message: Heartbeat = Heartbeat(

@@ -66,12 +66,12 @@ class LoopWatch:
         # The largest of three readings is used, because a single reading may be too small; see `_has_slept`.
         self._suspended, self._suspended_before = suspended, max(suspended() for _ in range(3))
         self.late_after: float = math.inf
-        """Data read up to this loop time has not waited. For data read later, call :meth:`arrival`."""
+        """Data that is read before this loop time has not waited. For data that is read later, call :meth:`arrival`."""
         self._ran_at = self._due = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
         self.oldest_arrival: float = math.inf
         """Earliest possible receive time of data that is read now; infinite while no data can have waited."""
-        self._check_sleep_at = -math.inf  # the next time at which to read the clocks, because reading them is slow
+        self._check_sleep_at = -math.inf  # The clocks are not read again before this time, because reading is slow.
         self._has_read = False
         self._idle_iterations = 0
 

@@ -91,7 +91,7 @@ class RouteClaim:
 
 
 def boot_time_ms(frame: Frame) -> int | None:
-    """Return the sender's time since boot in milliseconds, or None if the frame does not contain it."""
+    """Return the sender's time since boot in milliseconds; None if the frame contains no such time."""
     offset = _BOOT_TIME_OFFSETS.get(frame.message_id)
     return None if offset is None else int.from_bytes(frame.body[offset : offset + 4], "little")
 
@@ -191,7 +191,7 @@ class Routes:
         return 0 < (route.sequence - frame.sequence) & 0xFF < 128
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
-        """Return the peers of a component, or of its whole system if the component is 0 or unknown.
+        """Return the peers to which a message for a component goes; if the component is 0 or unknown, for its system.
 
         Peers that send under the ids of another peer are excluded, because they would execute broadcasts.
         """
@@ -335,7 +335,7 @@ _SAME_PEER = object()  # stands for the peer in claims of a second sender that s
 
 
 def _peer_name(peer: Peer) -> str:
-    peer = getattr(peer, "peer", peer)  # with a MultiLink, use the peer of the member link
+    peer = getattr(peer, "peer", peer)  # A peer of a MultiLink contains the peer of one of its links.
     if isinstance(peer, tuple) and len(peer) >= 2:
         host, port = peer[:2]
         return f"[{host}]:{port}" if ":" in str(host) else f"{host}:{port}"

@@ -44,7 +44,7 @@ class SignatureGate:
         self._logged_keep_error: OSError | None = None
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
-        self.on_change: Callable[[], object] = bool  # bool() does nothing
+        self.on_change: Callable[[], object] = bool  # The default, `bool`, does nothing.
         """Called when :attr:`is_open` may have changed."""
 
     def use(self, signing: Signing | None) -> None:

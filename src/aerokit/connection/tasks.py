@@ -136,7 +136,7 @@ class Deadlines:
         self._timer_at = 0.0  # Stored here, because uvloop's TimerHandle does not return a time in the past.
 
     def set(self, alarm: Alarm, at: float) -> None:
-        """Call ``alarm`` at ``at`` (seconds, loop time). This replaces an earlier deadline of the alarm."""
+        """Call ``alarm`` at the loop time ``at``, in seconds. This replaces an earlier deadline of the same alarm."""
         self._deadlines[alarm] = at
         self._schedule(at)
 

@@ -218,14 +218,14 @@ class Hub:
         backoff = Backoff()
         while self._attachments.get(attachment.name) is attachment:
             await anyio.sleep(backoff.next_delay())
-            if self._attachments.get(attachment.name) is not attachment:  # removed meanwhile
+            if self._attachments.get(attachment.name) is not attachment:  # The endpoint was removed meanwhile.
                 return
             try:
                 await attachment.open()
             except LinkError as error:
                 logger.debug("the link still cannot be opened: %s", error)
             else:
-                if self._attachments.get(attachment.name) is not attachment:  # removed meanwhile
+                if self._attachments.get(attachment.name) is not attachment:  # The endpoint was removed meanwhile.
                     attachment.close()
                 return
 

@@ -218,7 +218,7 @@ class Port:
         self.batch: list[bytes] = []
         """Data to write: single frames, or pieces of several."""
         self.joined_frames: int = 0
-        """Number of frames in ``batch``, minus the number of its pieces."""
+        """Difference between the number of frames in ``batch`` and the number of its pieces, for the counters."""
         self.node: RouterPort[Port] | None = None
         self._dialect = dialect
         self._queue_above_bytes, self._may_queue = queue_above_bytes, queue_above_bytes < UNLIMITED
@@ -279,7 +279,7 @@ class Port:
             write(piece, peer)
 
     def drain(self, now: float, unix_time: float) -> None:
-        """Write queued frames while the link accepts them, and drop late commands."""
+        """Drop queued commands that have waited too long, then write queued frames while the link accepts data."""
         self._drop(self._queue.expire(now))
         while self._queue and not self._is_full():
             raw = self._queue.next()

@@ -72,7 +72,7 @@ class ForwardingPlan(Generic[PortT]):
 
 
 class RouterPort(Generic[PortT]):
-    """A port with the router's data about it."""
+    """One port, and what the router stores for it."""
 
     __slots__ = ("destinations", "echoes", "loop_until", "number", "plans", "port", "streams")
 
@@ -169,7 +169,7 @@ class Router(Generic[PortT]):
         if late or node.echoes or now >= recent.ends_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES:
             return [self.route(node, frame, now, frame in late) for frame in frames]
         newer, older, plans = recent.newer, recent.older, []
-        record = number, self._port_count, now  # for `RecentFrames`
+        record = number, self._port_count, now  # value for `RecentFrames.newer`
         for frame in frames:
             body = frame.body
             plan = streams.get(body[4:9])
@@ -242,7 +242,7 @@ class Router(Generic[PortT]):
     # ------------------------------------------------------------------------------------ senders
 
     def _add_sender(self, source: int, node: RouterPort[PortT], now: float) -> Sender:
-        """Return a new sender, which is remembered if there is room."""
+        """Create a sender. It is remembered if there is room."""
         sender = Sender(source, node.number, now)
         if len(self._senders) < MAX_ROUTES or self._make_room(now):
             self._senders[source] = sender
@@ -278,7 +278,7 @@ class Router(Generic[PortT]):
         first_port, port_count, received_at = earlier
         if first_port == number:
             return is_late and now - received_at <= REPEAT_WINDOW_S
-        existed_then = number <= port_count  # this port was not created after the earlier frame
+        existed_then = number <= port_count  # The port already existed when the earlier frame arrived.
         return first_port in self._nodes and existed_then and now - received_at <= DUPLICATE_WINDOW_S
 
     def _is_echo(self, earlier: tuple[int, int, float], number: int, now: float) -> bool:

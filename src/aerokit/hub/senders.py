@@ -107,7 +107,7 @@ class Sender:
         return before != (self.is_vehicle, self.is_autopilot)
 
     def remove_port(self, number: int) -> bool:
-        """Forget a removed port. Return True if the sender was received at no other port."""
+        """Forget a port that was removed. Return True if the sender is not known at any other port."""
         self.reported.discard(number)
         self.ports.pop(number, None)
         if self.number == number and self.ports:

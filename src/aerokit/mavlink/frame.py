@@ -108,7 +108,7 @@ if wire is not None:
 
 
 def is_whole_frame(data: bytes) -> bool:
-    """Return True if the bytes have the length and header of exactly one frame. The checksum is not verified."""
+    """Return True if the bytes are one frame by their header and length. The checksum is not verified."""
     if len(data) < 8 or data[0] not in (MAGIC_V1, MAGIC_V2):
         return False
     if data[0] == MAGIC_V1:

@@ -105,7 +105,7 @@ class Field:
         self.type = type
         """Type without brackets: ``"uint16_t"``, ``"float"``, ``"char"`` …"""
         self.array_length = array_length
-        """Number of elements; 0 if it is not an array."""
+        """Number of elements; 0 if the field is not an array."""
         self.units = units
         """Unit, for example ``"cm/s"``, or empty."""
         self.enum = enum
@@ -289,7 +289,7 @@ def _format_field(name: str, value: object) -> str:
 
 
 def pack_text(value: str, size: int) -> bytes:
-    """Encode a text as UTF-8. ValueError if it exceeds ``size``; struct appends zeros."""
+    """Encode a text as UTF-8. Raises ValueError above ``size`` bytes. The struct format appends missing zeros."""
     data = value.encode()
     if len(data) > size:
         raise ValueError(value)
@@ -297,14 +297,14 @@ def pack_text(value: str, size: int) -> bytes:
 
 
 def pack_bytes(value: bytes, size: int) -> bytes:
-    """Return the bytes. ValueError if they exceed ``size``; struct appends zeros."""
+    """Return the value as bytes. Raises ValueError above ``size`` bytes. The struct format appends missing zeros."""
     if len(value) > size:
         raise ValueError(value)
     return value
 
 
 def pack_items(value: Sequence[float], size: int) -> Sequence[float]:
-    """Return the numbers, with zeros appended up to ``size``. If there are more numbers, struct raises."""
+    """Return the numbers, with zeros appended up to ``size``. If there are more numbers, packing them raises."""
     missing = size - len(value)
     return (*value, *(0,) * missing) if missing else value
 

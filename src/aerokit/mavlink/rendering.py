@@ -140,7 +140,7 @@ def _tuple(name: str, items: list[str]) -> list[str]:
 
 
 def _filled(head: str, items: list[str], tail: str, indent: str) -> list[str]:
-    """Format items in brackets: on one line if they fit, else filling lines."""
+    """Format items in brackets on one line. If they do not fit, break them into lines that are as full as possible."""
     single = f"{head}{', '.join(items)}{',' if len(items) == 1 else ''}{tail}"
     if len(single) <= _WIDTH:
         return [single]
@@ -188,7 +188,7 @@ def _annotation(field: FieldDefinition, *, argument: bool = False) -> str:
 
 
 def _default(field: FieldDefinition) -> str:
-    """Return `` = value`` for a field that a program may omit, i.e. an extension field; else an empty text."""
+    """Return the default, as `` = value``, for a field that a program may omit; an empty text for other fields."""
     if field.default is not None:
         return f" = {field.default}"
     if not field.extension:

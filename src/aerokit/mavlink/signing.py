@@ -219,7 +219,7 @@ class Signing:
 
     @property
     def keep_error(self) -> OSError | None:
-        """Error of the last write of the ``keep`` file; None if it succeeded. The next write retries."""
+        """Error of the last write of the ``keep`` file; None if the write succeeded. The next write tries again."""
         return None if self._timestamp_file is None else self._timestamp_file.error
 
     @property
@@ -298,7 +298,7 @@ _MAX_LENGTH = 64
 
 
 class TimestampFile:
-    """A file with a timestamp that is later than all timestamps used.
+    """A file with a timestamp that is later than all timestamps used so far.
 
     The constructor raises OSError, or FileFormatError if the file contains anything else. A later error must not end a
     flight, so it is stored in ``error`` until writing succeeds.
@@ -309,7 +309,7 @@ class TimestampFile:
         self.timestamp: int = self._read()
         """Timestamp in the file; 0 if there is no file."""
         self.error: OSError | None = None
-        """Error of the last write; None if it succeeded."""
+        """Error of the last write; None if the write succeeded."""
         self._write(self.timestamp)  # Fails at once if the file is not writable, rather than in flight.
 
     def reserve(self, timestamp: int, ahead: int) -> None:

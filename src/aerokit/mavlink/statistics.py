@@ -171,7 +171,7 @@ class SourceStatistics(SourceFields):
         return OTHERS if self.has_duplicates(now) else LATE
 
     def _continue_at(self, sequence: int) -> None:
-        """Make a frame with this number the newest one, without counting the numbers before it as lost."""
+        """Make this sequence number the newest, without counting the numbers before it as lost."""
         self.skip((sequence - self.expected) & 0xFF)
         self.expected += 1
         self._missing, self._missing_at, self._skipped_over = 0, self.expected, 0
@@ -198,7 +198,7 @@ class SourceStatistics(SourceFields):
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, count: int, other_count: int) -> None:
-        """Make the other stream the sender's stream, and the current stream the other one."""
+        """Swap the two streams: the other stream becomes the sender's stream, the current stream the other one."""
         # The gap before the current stream was no loss, so it is subtracted. Frames of the gap may have arrived late,
         # so the result could be negative without max().
         self.lost = max(0, self.lost - self._skipped_over)
@@ -234,7 +234,7 @@ class SourceLimit:
         self._swept_at = -math.inf
 
     def join(self, statistics: FramerStatistics) -> None:
-        """Count the senders of these statistics, too."""
+        """Include the senders of these statistics in the limit."""
         self._statistics.add(statistics)
 
     def leave(self, statistics: FramerStatistics) -> None:

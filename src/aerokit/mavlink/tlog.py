@@ -117,7 +117,7 @@ def _frame_end(data: bytes, begin: int) -> int | None:
 
 
 class TlogWriter:
-    """Writes a log. Can be used as a context manager. Each record is written in one piece."""
+    """Writes a log; also a context manager. Each record is written in one piece."""
 
     def __init__(self, target: str | PathLike[str] | BinaryIO) -> None:
         """Create a new file at a path, or append to a binary file, which the caller closes."""

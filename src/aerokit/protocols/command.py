@@ -95,7 +95,7 @@ MIN_RESEND_FRACTION = 0.75
 
 
 class OrderStatus(Protocol):
-    """State of an order that was sent, which decides whether the order is sent again."""
+    """State of an order. It determines whether the order may be sent again."""
 
     @property
     def end(self) -> str:

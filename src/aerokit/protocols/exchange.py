@@ -56,7 +56,7 @@ class Exchange(ABC, Generic[ResultT]):
 
     @abstractmethod
     def expire(self, now: float) -> None:
-        """Retry or fail, because the deadline has passed. Not called after ``done`` has become True."""
+        """Send again, or fail, because the deadline has passed. Not called any more once ``done`` is True."""
 
     def link_changed(self, now: float) -> None:
         """Handle a switch to another link, which leads to another port of the vehicle.
@@ -76,7 +76,7 @@ class Exchange(ABC, Generic[ResultT]):
         return outbox
 
     def result(self) -> ResultT:
-        """Return the result, or raise the error with which the exchange ended. Only valid once ``done``."""
+        """Return the result, or raise the error with which the exchange ended. Call it only when ``done`` is True."""
         if self._error is not None:
             raise self._error
         if not self.done:

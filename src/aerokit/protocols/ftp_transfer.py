@@ -61,7 +61,7 @@ def is_virtual(path: str) -> bool:
 
 
 class _SentRequest(NamedTuple):
-    """One transmission. Each has its own sequence number, so that every answer measures the round trip."""
+    """One transmission of a request. Each has its own sequence number, so every answer measures the round trip."""
 
     offset: int
     at: float
@@ -159,7 +159,7 @@ class FtpDownload(FtpExchange[int]):
             self._proceed(now)
 
     def _receive_burst(self, reply: FtpMessage, now: float) -> None:
-        """Process a block of a burst, or its end. Replies to earlier bursts may still arrive."""
+        """Process a block of a burst, or the NAK that ends a burst. Replies to earlier bursts may still arrive."""
         for burst in reversed(self._bursts):
             if reply.is_ack and burst.contains(reply):
                 self._on_block(burst, reply, now)

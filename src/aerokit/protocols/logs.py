@@ -156,7 +156,7 @@ class LogDownload(Transfer[int]):
         self._set_deadline()
 
     def _request_gaps(self, now: float) -> None:
-        """After a range has ended, request its long gaps one by one, then all other missing blocks."""
+        """After the end of a range, request its long gaps one after the other, then all other missing blocks."""
         if not self._has_checked_gaps:
             gap = self._first_long_gap()
             if gap is not None:

@@ -115,7 +115,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def was_sent_completely(self) -> bool:
-        """True if all items were sent, so that the vehicle may have them regardless of its answers."""
+        """True if all items were sent, so that the vehicle may have the whole plan even without a confirmation."""
         return self.was_started and self._sent_end == self._end
 
     # --------------------------------------------------------------------------------- events

@@ -274,12 +274,12 @@ class UnexpectedAnswers(Generic[ValueT]):
         return bool(self._answers) and self._is_same(self._answers[-1], answer)
 
     def add(self, answer: ValueT) -> None:
-        """Add an answer. If its value differs from that of the previous answers, those are dropped."""
+        """Add an answer. If its value differs from the value of the previous answers, these are dropped."""
         if not self.ends_with(answer):
             self._answers.clear()
         self._answers.append(answer)
 
     def are_conclusive(self, *, is_unchanged: bool) -> bool:
-        """Return True if the last answer is final. ``is_unchanged``: its value is the one from before the write."""
+        """Return True if the answers suffice to end the write. ``is_unchanged``: they have the value from before it."""
         needed = ANSWERS_TO_SETTLE_UNCHANGED if is_unchanged else ANSWERS_TO_SETTLE
         return len(self._answers) >= needed

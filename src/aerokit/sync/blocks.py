@@ -84,7 +84,7 @@ class BlockingContext:
             self._misused("async with")
 
         async def __aexit__(self, *_: object) -> None:
-            """Unused; Python looks it up before ``__aenter__``."""
+            """Not called. It must exist, because Python looks it up before it calls ``__aenter__``."""
 
     def _misused(self, word: str) -> NoReturn:
         self.close()
@@ -223,7 +223,7 @@ class MeasurementTwin(BlockTwin["MeasurementStream[T]"], Generic[T]):
 class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
     """Gimbals by device id; ``T`` is the twin of a gimbal."""
 
-    if TYPE_CHECKING:  # the generated twin defines these
+    if TYPE_CHECKING:  # The generated twin defines these members.
 
         @property
         def ids(self) -> tuple[int, ...]:
@@ -247,11 +247,11 @@ class CalibrationTwin(IteratorTwin["Calibration", "CalibrationStep"]):
 
 
 class PhotoIntervalTwin(BlockTwin["PhotoInterval"], IteratorTwin["PhotoInterval", "Capture"]):
-    """Takes pictures while its ``with`` block runs; an iterator over them."""
+    """Takes pictures while its ``with`` block runs. Iterating over it yields the pictures."""
 
 
 class LogStreamTwin(BlockTwin["LogStream"], IteratorTwin["LogStream", bytes]):
-    """A flight log while PX4 writes it; an iterator over its bytes."""
+    """A flight log while PX4 writes it. Iterating over it yields its bytes."""
 
 
 class ShieldedBlockTwin(TwinOf[ShieldedT]):
@@ -269,7 +269,7 @@ class TemporarilyTwin(ShieldedBlockTwin["TemporaryParameters"]):
 
 
 class TransactionTwin(ShieldedBlockTwin["Transaction"]):
-    """Block of parameter changes that are undone if it raises."""
+    """Block of parameter changes, which are undone if the block raises."""
 
     def __enter__(self) -> Self:
         self._loop.enter(self.aio)
@@ -286,7 +286,7 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
         self._context = context
 
     def vehicles(self) -> Iterator[VehicleFound]:
-        """Yield each autopilot once: those found so far, then new ones, until the connection ends.
+        """Yield each autopilot once, until the connection ends: first those already known, then new ones.
 
         Raises:
             ConnectionClosed, LinkLost: the connection ended.

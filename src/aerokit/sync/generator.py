@@ -69,7 +69,7 @@ def source_of(node: ast.expr) -> str:
 
 
 def render_call(function: str, arguments: Sequence[str], indent: str = "        ") -> str:
-    """Return a call; one argument per line if it would be too long."""
+    """Return the source of a call: on one line, or with one argument per line if it would be too long."""
     line = f"{function}({', '.join(arguments)})"
     if len(indent) + len(line) < WIDTH:  # One column is left free for a comma.
         return line
@@ -103,7 +103,7 @@ def arguments_of(arguments: ast.arguments) -> list[str]:
 
 
 def _lines(arguments: Iterable[str], indent: str) -> str:
-    """Return one argument per line; a longer one is wrapped before its ``| None``."""
+    """Return the arguments, one per line. An argument that is too long is wrapped before its ``| None``."""
     lines = ""
     for argument in arguments:
         if len(indent) + len(argument) + 1 > WIDTH:
@@ -229,7 +229,7 @@ class Page:
         return f"{name}(self._loop, {expression})" if name in self._twins else expression
 
     def render_member(self, twin: Twin, member: ClassMember) -> str:
-        """Return the source of the twin of a member, and import what it needs."""
+        """Return the source of the twin of a member, and add the imports that the source needs."""
         self.import_names_in(member.returns, member.module)
         node, name = member.node, member.name
         if node is None or not {"property", "cached_property"}.isdisjoint(decorators_of(node)):
@@ -269,7 +269,7 @@ class Page:
         return render_function(node, returns, member.text, body)
 
     def _property_twin(self, twin: Twin, member: ClassMember) -> str:
-        """Return the source of a property. It is cached if its value is a twin, so that each access gives the same."""
+        """Return the source of a property. A twin is cached, so that each access returns the same object."""
         name, read = member.name, f"self.aio.{member.name}"
         if name in twin.called:
             read = f"self._loop.call(lambda: {read})"

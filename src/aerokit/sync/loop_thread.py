@@ -102,7 +102,7 @@ class LoopThread:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
-        """Run a function; after Ctrl-C wait ``interrupt_timeout_s`` for its end, or without limit if None."""
+        """Run a function. After Ctrl-C, wait ``interrupt_timeout_s`` for its end; None means without limit."""
         call: _Call[T] | None = None
         try:
             call = _Call(functools.partial(function, *args, **kwargs))
@@ -213,7 +213,7 @@ class LoopThread:
         return threading.current_thread() is self._thread
 
     def wait_for(self, future: ThreadFuture[Any]) -> None:
-        """Wait for a future; Ctrl-C interrupts on every system. Raises ConnectionClosed if the loop ends first."""
+        """Wait for a future; Ctrl-C interrupts the wait on every system. ConnectionClosed if the loop ends first."""
         while not future.wait(SIGNAL_CHECK_INTERVAL_S):
             if not self._thread.is_alive() and not future.is_done:
                 raise ConnectionClosed(CLOSED_DURING_CALL)
@@ -294,7 +294,7 @@ class _ContextTask(Generic[T]):
 
 
 class _AsyncContext(AbstractAsyncContextManager[T]):
-    """A synchronous context manager as an asynchronous one."""
+    """Wraps a synchronous context manager, so that it can be used as an asynchronous one."""
 
     def __init__(self, context: AbstractContextManager[T]) -> None:
         self._context = context
@@ -333,9 +333,9 @@ class _Calls:
         task.add_done_callback(lambda task: self._tasks.pop(task).finish())
 
     def end_soon(self, function: Callable[[], object] | None = None) -> None:
-        """Call a function on the loop, then end the loop. From any thread; does not block; idempotent."""
+        """Call a function on the loop, then end the loop. May be called from any thread; never blocks; idempotent."""
         if self._loop is not None and self.is_of_this_process:
-            with contextlib.suppress(RuntimeError):  # the loop has ended
+            with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 self._loop.call_soon_threadsafe(self._end_after, function, context=self.context)
 
     def finish(self, thread: threading.Thread) -> None:

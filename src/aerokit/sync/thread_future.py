@@ -51,7 +51,7 @@ class ThreadFuture(Generic[T]):
         return self.is_done
 
     def result(self) -> T:
-        """Return the result, or raise the error (once), or LookupError if there is neither."""
+        """Return the result, or raise the error, which is done once. Raises LookupError if there is neither."""
         error = self.pop_exception()
         if error is not None:
             raise error
@@ -60,7 +60,7 @@ class ThreadFuture(Generic[T]):
         return self._values[0]
 
     def pop_exception(self) -> BaseException | None:
-        """Return the error and forget it: its traceback refers to this object, which would be a reference cycle."""
+        """Return the error and forget it, because its traceback refers to this object: a reference cycle."""
         error, self._error = self._error, None
         return error
 

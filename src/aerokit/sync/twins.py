@@ -310,14 +310,14 @@ class StateCell(CellTwin[T]):
         )
 
     def changes(self) -> Changes[T]:
-        """Iterate over values that differ from their predecessor, starting with the current value if there is one.
+        """Iterate over the current value, if there is one, and all later values that differ from the value before.
 
         A slow reader gets only the latest value. The loop can be left at any time.
         """
         return Changes(self._loop, self._loop.call(self.aio.changes))
 
     def updates(self) -> Changes[T]:
-        """Like :meth:`changes`, but yield each received value, even if it equals its predecessor."""
+        """Like :meth:`changes`, but yield each received value, even if it equals the value before."""
         return Changes(self._loop, self._loop.call(self.aio.updates))
 
 
@@ -330,7 +330,7 @@ class Changes(ChangesTwin[T]):
 
     @property
     def missed(self) -> int:
-        """Number of values that were replaced before this reader got them."""
+        """Number of values that this reader did not get, because newer values had already replaced them."""
         return self.aio.missed
 
 
@@ -343,7 +343,7 @@ class Subscription(SubscriptionTwin[ItemT]):
 
     @property
     def missed(self) -> int:
-        """Number of items dropped because the reader was slow."""
+        """Number of items that were dropped because the reader was too slow."""
         return self.aio.missed
 
     def get(self, timeout: float | None = None) -> ItemT:
@@ -407,7 +407,7 @@ class Connection(ConnectionTwin):
 
     @property
     def unsent_bytes(self) -> int:
-        """Number of written bytes that have not left this machine, if the link can measure that number.
+        """Number of written bytes that have not left this machine; 0 if the link cannot measure the number.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
         control asserted); see :class:`LinkStalled`. Always 0 for UDP.

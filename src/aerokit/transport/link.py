@@ -86,7 +86,7 @@ class PeerListener(Receiver, Protocol):
 
 
 def keeps_peers(receiver: Receiver) -> bool:
-    """Return True if the receiver decides which peers a link remembers."""
+    """Return True if the receiver is a `PeerKeeper` that decides which peers a link remembers."""
     return isinstance(receiver, PeerKeeper) and receiver.keeps_peers
 
 
@@ -139,11 +139,11 @@ class Link(ABC):
         return 0
 
     def unsent_bytes_to(self, peer: Peer) -> int:
-        """Return `unsent_bytes` of one peer, or of all peers if the link does not count them separately."""
+        """Return the unsent bytes of one peer; if the link does not count per peer, those of all peers."""
         return self.unsent_bytes
 
     def discard_unsent(self) -> None:
-        """Discard data that has not left, and count it in `dropped_writes`.
+        """Discard written data that has not left this machine, and count it in `dropped_writes`.
 
         Data in the kernel's TCP buffer cannot be discarded; it stays in `unsent_bytes`.
         """

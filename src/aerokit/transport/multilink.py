@@ -111,7 +111,7 @@ class MultiLink(Link):
         self._links[link].discard_unsent()
 
     def is_available(self, link: int) -> bool:
-        """Return True if a link is open and not interrupted."""
+        """Return True if the link with this index is open."""
         return self._is_available[link]
 
     async def open(self, receiver: Receiver) -> None:
@@ -169,7 +169,7 @@ class MultiLink(Link):
         if not self._is_closed:
             self._is_closed, self._receiver = True, None
             for task in self._openings:
-                with contextlib.suppress(RuntimeError):  # the loop is closed
+                with contextlib.suppress(RuntimeError):  # The loop may be closed.
                     task.cancel()
             for link in self._own_links:
                 link.close()

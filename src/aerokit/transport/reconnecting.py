@@ -87,7 +87,7 @@ class ReconnectingLink(Link):
         self._receiver: Receiver | None = None  # None before the opening and after the end: nothing is called
         self._current: _CurrentReceiver | None = None  # receiver of the current link; callbacks of others are ignored
         self._was_opened = self._is_closed = self._is_up = False
-        self._lost_at: float | None = None  # None while the link is not reported as lost
+        self._lost_at: float | None = None  # time of the reported loss; None while no loss is reported
         self._reopening: asyncio.Task[None] | None = None
         self._stable_timer: asyncio.TimerHandle | None = None
         self._dropped = 0
@@ -258,7 +258,7 @@ class ReconnectingLink(Link):
     def _cancel_reopening(self) -> None:
         self._cancel_stable_timer()
         if self._reopening is not None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
+            with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 self._reopening.cancel()
 
     def _cancel_stable_timer(self) -> None:

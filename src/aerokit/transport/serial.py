@@ -135,7 +135,7 @@ class SerialLink(BaseLink):
         if transport is None or self._loop is None:
             return
         if outbox is not None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
+            with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 outbox.close()
         transport.pause_reading()
         if self._loop.is_running():
@@ -158,7 +158,7 @@ class SerialLink(BaseLink):
 
     def _close_port(self, transport: Any) -> None:
         unsent = self._waiting_to_be_sent(transport)
-        with contextlib.suppress(RuntimeError):  # the loop is closed
+        with contextlib.suppress(RuntimeError):  # The loop may be closed.
             # `_release` has called this before. The call has no effect before the transport's first loop iteration.
             transport.pause_reading()
             transport.flush()
@@ -183,7 +183,7 @@ class _SerialProtocol(asyncio.Protocol):
     def resume_writing(self) -> None:
         # The outbox resumes in a later loop iteration, because the transport calls this method during a write.
         if self._link._outbox is not None and self._link._loop is not None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
+            with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 self._link._loop.call_soon(self._link._outbox.resume)
 
     # The replaced methods report their errors themselves. This is called for all other errors.

@@ -71,7 +71,7 @@ class _TcpLink(BaseLink):
     def _add_stream(self, stream: _Stream) -> None:
         self._streams.add(stream)
         self._released.clear()
-        if self._receiver is None:  # the link was closed while this connection was being made
+        if self._receiver is None:  # The link was closed while this connection was being made.
             stream.close()
         else:
             self._on_connected(stream)
@@ -308,7 +308,7 @@ class _Stream(asyncio.Protocol):
         """Send remaining data for up to `LINGER_S`, then close. Close at once if the connection is stalled."""
         if self._transport is None or self._outbox is None or self._transport.is_closing():
             return
-        with contextlib.suppress(RuntimeError):  # the loop is closed
+        with contextlib.suppress(RuntimeError):  # The loop may be closed.
             if self._outbox.is_stalled:
                 self._abort()
                 return

@@ -242,7 +242,7 @@ class UdpBroadcast(_UdpLink):
     once. Data for one peer is never broadcast. ``peers`` are the IP addresses and networks to accept; None: all.
     """
 
-    _received_at: float  # set with _remote
+    _received_at: float  # time of the last datagram from `_remote`; set together with `_remote`
 
     def __init__(self, host: str, port: int, *, peers: PeerFilter | None = None) -> None:
         super().__init__("udpbcast", host, port)
@@ -289,7 +289,7 @@ class UdpBroadcast(_UdpLink):
 
 
 class _DatagramProtocol(asyncio.DatagramProtocol):
-    """Reads the socket on loops without add_reader."""
+    """asyncio protocol that receives datagrams on loops without ``add_reader``."""
 
     def __init__(self, link: _UdpLink) -> None:
         self._link = link

@@ -120,7 +120,7 @@ ACKNOWLEDGEMENTS = frozenset(message_type.ID for message_type in (m.CommandAck, 
 
 
 class _Stream:
-    """The frames of one component."""
+    """State of the frames that one component sends over all links."""
 
     __slots__ = ("acknowledgements", "newest", "received_at")
 
@@ -197,7 +197,7 @@ class MergedStreams:
         return True
 
     def _stream(self, frame: Frame) -> _Stream:
-        """Return the stream of the frame's sender; a new stream replaces the oldest if there are too many."""
+        """Return the stream of the frame's sender. If there are too many streams, a new one replaces the oldest."""
         key = frame.component_id << 8 | frame.system_id
         stream = self._streams.get(key)
         if stream is None:

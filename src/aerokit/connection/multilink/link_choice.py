@@ -30,7 +30,7 @@ MIN_COPIES = 3
 
 
 class Candidate:
-    """One link to one system."""
+    """One link over which a system was received: its quality, and the evidence that it leads to the vehicle."""
 
     def __init__(self, link: int, *, is_costly: bool, now: float) -> None:
         self.link = link
@@ -46,7 +46,7 @@ class Candidate:
         self.is_stalled: bool = False
         """True while written data stays in this machine's buffers."""
         self.loss: float | None = None
-        """Share of frames lost over the last seconds, 0 to 1; None: unknown."""
+        """Fraction of frames lost over the last seconds, 0 to 1; None if unknown."""
         self.round_trip_s: float | None = None
         """Smoothed round-trip time of the probes; None before the first answer."""
         self.is_proven: bool = False
@@ -58,7 +58,7 @@ class Candidate:
         self.hardware: HardwareId | None = None
         """Hardware id received over the link; None if none was received."""
         self.is_other_hardware: bool = False
-        """True if :attr:`hardware` belongs to another vehicle: neither clock nor copies can then prove the link."""
+        """True if :attr:`hardware` is another vehicle's. The link is then not proven by its clock or by copies."""
         self._hardware_requests = self._answers_since_request = 0
         self._clock_matches = self._clock_mismatches = self._copies = 0
         self._last_counts = (0, 0)  # numbers of frames received and lost at the last call of `record_counts`
@@ -197,15 +197,15 @@ class LinkChoice:
         self.candidates: dict[int, Candidate] = {}
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
-        """The vehicle's hardware id, as received over the link that was in use then."""
-        self._hardware_link = -1  # the link over which `hardware` was received; its next id replaces `hardware`
+        """The vehicle's hardware id, which was received over the link in use at that time."""
+        self._hardware_link = -1  # link over which `hardware` was received; the next id over it replaces `hardware`
         self.used: Candidate | None = None
         """The link in use; None before the first choice."""
         self.former: Candidate | None = None
-        """The link used before; it may still deliver answers."""
+        """The link in use before the last switch. Answers may still arrive over it."""
         self.changed_at: float = -math.inf
         self.fresh_after: float = -math.inf
-        """Telemetry received before this time is older than the last telemetry of the former link."""
+        """Telemetry that arrives before this time may be older than the last telemetry of the former link."""
         self._better: Candidate | None = None  # link that is better than the link in use, since `_better_since`
         self._better_since = 0.0
         self._command_at = -math.inf  # time of the last command to the system
@@ -278,7 +278,7 @@ class LinkChoice:
         return now - candidate.shared_at <= SHARED_MAX_AGE_S
 
     def choose(self, now: float) -> str | None:
-        """Select the link to use. Return the reason for a change; None without a change."""
+        """Select the link to use. Return the reason if it changes, otherwise None."""
         alive = sorted(
             (link for link in self.candidates.values() if self.may_be_used(link) and link.is_alive(now)),
             key=lambda candidate: (candidate.is_costly, candidate.cost_s),
@@ -324,7 +324,7 @@ class LinkChoice:
         return candidate.is_hardware_pending and not can_compare_ids
 
     def _adopt_hardware(self, used: Candidate) -> None:
-        """Make the id received over the link in use the vehicle's id, unless another link's id contradicts it."""
+        """Make the hardware id of the link in use the vehicle's id, unless it contradicts an id from another link."""
         hardware = used.hardware
         if hardware is None or not hardware.has_value:
             return

@@ -134,7 +134,7 @@ class MultiLinkRoutes:
         self._choices: dict[int, LinkChoice] = {}
         self._merged = MergedStreams(len(link.names), self._choices)
         self.copies: Copies = self._merged.copies
-        # (system, link) → component → counters
+        # Maps (system id, link) to the counters of each component: component id → counters.
         self._counters: dict[tuple[int, int], dict[int, SourceStatistics]] = {}
         self._probes = LinkProbes(link.names, self._choices, bus, send)
         self._states = LinkStates(link, self._choices, now, bus.publish)
@@ -241,7 +241,7 @@ class MultiLinkRoutes:
             if (candidate := choice.candidates.get(link)) is not None:
                 candidate.is_available = is_available
                 if not is_available:
-                    candidate.is_stalled = False  # a lost link has no unsent data
+                    candidate.is_stalled = False  # A lost link has no unsent data.
                 self._choose(system_id, choice, now)
         self._states.set_state(link, LinkState.CONNECTED if is_available else LinkState.LOST, now)
 

@@ -227,7 +227,7 @@ class ZenohConnect(NetworkLink):
         self._schedule_poll()
 
     def _describe_missing(self) -> str:
-        names = sorted({key.split("/")[2] for key in self._alive})  # aerokit/FLEET/NAME/alive/EPOCH
+        names = sorted({key.split("/")[2] for key in self._alive})  # A key is aerokit/FLEET/NAME/alive/EPOCH.
         keys = self._keys
         if keys.name in names:
             return f"{keys.name} is on the network, but sent nothing for {self._open_timeout_s:g} s"

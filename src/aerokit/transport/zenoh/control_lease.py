@@ -127,7 +127,7 @@ class ControlLease:
             self._received_at = now
 
     def acquire(self, client: str, now: float) -> bool:
-        """Acquire the lease if it is free. Return True if the client holds it."""
+        """Acquire the lease for a client if it is free. Return True if the client now holds the lease."""
         if self.holder(now) is None:
             self.take(client, now)
         return self._holder == client
@@ -240,7 +240,7 @@ def _decoded(frame: Frame) -> Message | None:
 
 def _answer(frame: Frame, message: Message, reason: str) -> bytes:
     """Return the frames by which a vehicle would reject a message; empty if none exist, or for broadcasts."""
-    fields: object = message  # `object`, because type checkers do not know that other messages have these fields, too
+    fields: object = message  # The type is `object`, because the class Message does not declare these fields.
     system: int = getattr(fields, "target_system", 0)
     # A message for all components (0) is answered by the autopilot (1).
     component: int = getattr(fields, "target_component", 0) or 1
@@ -346,9 +346,9 @@ class VehicleSideTracker:
         self.lease_holder: str | None = None
         """Client that holds the control lease according to the last beacon; None: free."""
         self.late: int = 0
-        """Dropped frames and beacons that arrived too late."""
+        """Number of datagrams and beacons dropped because they arrived too late."""
         self.foreign: int = 0
-        """Dropped frames and beacons of another vehicle side with the same name."""
+        """Number of datagrams and beacons dropped because another vehicle side with the same name sent them."""
         self.received_at: float = 0.0
         """Time of the last valid beacon."""
         self._nonce, self._mode = nonce, mode
@@ -385,7 +385,7 @@ class VehicleSideTracker:
         return True
 
     def stamp(self, now: float, mode: ControlMode | None = None) -> Stamp | None:
-        """Make the stamp of a datagram; None if nothing may be sent, because beacons are missing."""
+        """Make the stamp for a datagram. Return None if no datagram may be sent, because beacons are missing."""
         if self.epoch is None or self.is_silent(now):
             return None
         self._sequence += 1

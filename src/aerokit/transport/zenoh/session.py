@@ -52,7 +52,7 @@ class LoopQueue(Generic[ItemT]):
             if self._is_scheduled:
                 return
             self._is_scheduled = True
-        with contextlib.suppress(RuntimeError):  # the loop is closed
+        with contextlib.suppress(RuntimeError):  # The loop may be closed.
             self._loop.call_soon_threadsafe(self._drain)
 
     def close(self) -> None:
