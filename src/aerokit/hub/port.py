@@ -131,7 +131,7 @@ class SigningGateway:
         self._extras, self._refused = crc_extras, refused
 
     def admitted(self, frame: Frame, unix_time: float) -> Frame | None:
-        """Verify a received frame. Return it without its signature, or None if it is refused."""
+        """Verify a received frame. Return the frame without its signature; None if the frame is refused."""
         try:
             refusal = self.signing.check(frame, unix_time)
         except Exception as error:  # `check` calls the program's function `allow_unsigned`.

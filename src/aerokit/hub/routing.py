@@ -53,14 +53,14 @@ class ForwardingPlan(Generic[PortT]):
         sender: Sender = _UNKNOWN_SENDER,
     ) -> None:
         self.key: int = key
-        """Key of sender and message, for any target."""
+        """Number that identifies sender and message; the same for all targets."""
         self.message_id: int = message_id
         self.target: tuple[int, int] = target
         """System id and component id; 0 means all."""
         self.outs: tuple[PortT, ...] = outs
         """Ports that get each frame. Plans of one port use the same object for equal tuples, so `is` compares them."""
         self.rate_limited: tuple[tuple[PortT, float], ...] = rate_limited
-        """Ports that get at most one frame per interval, with the interval in seconds."""
+        """(port, interval in seconds) of ports with a rate limit, which get at most one frame per interval."""
         self.reason: str = reason
         """Reason for dropping the frames, a key of `EndpointStatistics.dropped`; "" if there is none."""
         self.is_plain: bool = not (rate_limited or reason)

@@ -26,7 +26,7 @@ TIMEOUTS_BEFORE_BACKOFF = 3
 
 
 class AdaptiveWindow:
-    """Number of requests in flight: as many as the link carries without delaying their answers.
+    """Limits the number of requests in flight to what the link carries without delaying the answers.
 
     The window grows while answers arrive as fast as the fastest answers so far. It shrinks when answers take much
     longer, because they then wait in a queue. Loss does not shrink the window unless most requests are lost, because
@@ -221,9 +221,9 @@ class Reassembly:
         self.start: int = start
         self.block_size: int = block_size
         self.position = start
-        """Offset up to which everything was written."""
+        """Everything before this offset was written."""
         self.tail: int = start
-        """End of the last block received."""
+        """End of the received block with the largest offset."""
         self.end: int | None = None
         """Size of the file; None while unknown."""
         self.gaps: dict[int, None] = {}

@@ -217,7 +217,7 @@ class _Parser:
         return self.network("udpin", text, {})
 
     def network(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
-        """Parse ``host:port``."""
+        """Parse the part of a network address after its scheme: ``host:port``."""
         if text.startswith("["):
             host, bracket, tail = text[1:].partition("]")
             if not bracket or not _is_ipv6(host):
@@ -242,7 +242,7 @@ class _Parser:
         return LinkAddress(kind, host=host, port=self.port(kind, tail), options=tuple(sorted(options.items())))
 
     def zenoh(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
-        """Parse ``fleet/name``."""
+        """Parse the part of a zenoh address after its scheme: ``fleet/name``."""
         from aerokit.transport.zenoh.keys import check_name  # imported here because few addresses need it
 
         for key in ("connect", "listen"):

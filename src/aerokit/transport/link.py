@@ -71,7 +71,7 @@ class BurstListener(Receiver, Protocol):
     """A receiver that processes the data of one read burst together. Used by links with `Link.reports_bursts`."""
 
     def burst_ended(self) -> None:
-        """Called after the ``bytes_received`` calls of one burst, before those of a later loop iteration."""
+        """Called at the end of a burst, after its last ``bytes_received`` and before that of any later data."""
 
 
 @runtime_checkable
@@ -79,7 +79,7 @@ class PeerListener(Receiver, Protocol):
     """A receiver that is notified of connecting and disconnecting peers, i.e. the clients of a TCP server."""
 
     def peer_joined(self, peer: Peer) -> None:
-        """Called when a peer has connected. It may never send anything."""
+        """Called when a peer has connected, even if the peer never sends anything."""
 
     def peer_left(self, peer: Peer) -> None:
         """Called when a peer has disconnected."""

@@ -12,7 +12,7 @@ WRITE_TIMEOUT_S = 1.0
 """Seconds after which waiting data is dropped, because a late command is worse than none."""
 
 STALLED_AFTER_S = 1.0
-"""Time without progress after which a link counts as stalled."""
+"""A link counts as stalled if data waits, and none has left this machine for this many seconds."""
 
 _POLL_INTERVAL_S = 0.25
 _MAX_JOINED_BYTES = 1024  # Small frames that have waited are joined to writes of up to this size.
@@ -98,7 +98,7 @@ class Outbox:
         self._forwarded_bytes -= count
 
     def close(self) -> None:
-        """Forward waiting data, or drop it if the transport is stalled. Only ``dropped`` is called afterwards."""
+        """Forward waiting data; if the transport is stalled, drop it. Afterwards, only ``dropped`` is called."""
         if self._is_closed:
             return
         self._is_closed = True

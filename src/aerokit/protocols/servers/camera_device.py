@@ -51,7 +51,7 @@ class CameraDevice:
     stream_bits_s: int = 4_000_000
     thermal_celsius: tuple[float, float] | None = None
     capabilities: int = 0
-    """CAMERA_CAP_FLAGS."""
+    """Capabilities of the camera (CAMERA_CAP_FLAGS)."""
     max_images: int = 10_000
     """Maximum number of images in the image log."""
     shutter_s: float = 0.0
@@ -87,7 +87,7 @@ class CameraDevice:
 
     @property
     def free_mib(self) -> float:
-        """Free space for images and videos."""
+        """Free space for images and videos, in MiB."""
         return math.inf
 
     @property
@@ -315,7 +315,7 @@ class Tracking:
         self.is_lost: bool = False
 
     def lose(self) -> None:
-        """Lose the target."""
+        """Simulate the loss of the target."""
         self.is_lost = True
 
     async def track_point(self, command: ReceivedCommand) -> int:
@@ -346,7 +346,7 @@ class Tracking:
 
     @property
     def flags(self) -> int:
-        """CAMERA_TRACKING_STATUS_FLAGS."""
+        """State of the tracking (CAMERA_TRACKING_STATUS_FLAGS)."""
         if self.mode == CameraTrackingMode.NONE:
             return 0
         return Flags.ERROR if self.is_lost else Flags.ACTIVE

@@ -171,7 +171,7 @@ class RunningCommand:
     def __init__(self, command: ReceivedCommand, cancel: Callable[[], None]) -> None:
         self.command = command
         self.progress: int = UNKNOWN_PROGRESS
-        """Percent; 255 if unknown."""
+        """Progress in percent; 255 if unknown."""
         self.cancel = cancel
 
 

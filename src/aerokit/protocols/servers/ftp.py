@@ -27,7 +27,7 @@ Op = MavFtpOpcode
 
 @dataclass(eq=False)
 class FtpSession:
-    """An open file."""
+    """A file that a client has opened."""
 
     number: int
     file: FileHandle
@@ -68,10 +68,10 @@ class SessionFtpServer(Generic[FilesT]):
     burst: int = _BURST_BLOCKS
     max_clients: ClassVar[int] = 16
     max_sessions: ClassVar[int] = 4
-    """Sessions of one client."""
+    """Maximum number of sessions of one client."""
     session_timeout_s: ClassVar[float] = 10.0
     list_prefix: ClassVar[tuple[bytes, ...]] = ()
-    """Lines before the entries of each folder."""
+    """Lines that each listing of a folder has before the folder's entries."""
     line_end: ClassVar[bytes] = b"\0"
     creates_missing: ClassVar[bool] = True
     """True if OpenFileWO creates a missing file."""
@@ -119,7 +119,7 @@ class SessionFtpServer(Generic[FilesT]):
             self.receive(FtpPacket.parse(message), channel)
 
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
-        """Return the key of the client."""
+        """Return the key under which the state of this request's client is stored."""
         return request.client
 
     def _is_repeated(self, peer: FtpPeer, request: FtpPacket, last: FtpPacket) -> bool:

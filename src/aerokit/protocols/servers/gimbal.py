@@ -45,7 +45,7 @@ class GimbalMount:
     vendor: str = "aerokit"
     model: str = "gimbal"
     capabilities: int = ALL_CAPABILITIES
-    """GIMBAL_DEVICE_CAP_FLAGS."""
+    """Capabilities of the gimbal (GIMBAL_DEVICE_CAP_FLAGS)."""
     can_point_at_positions: bool = True
     limits: tuple[tuple[float, float], ...]
     """Minimum and maximum of roll, pitch and yaw in radians."""

@@ -32,7 +32,7 @@ class MessageStreams:
         self._streams: dict[tuple[Channel, int], _Stream] = {}
 
     def commands(self) -> dict[int, CommandHandler]:
-        """Return the handlers by MAV_CMD."""
+        """Return the handler for each MAV_CMD that requests or streams messages."""
         return {
             MavCmd.REQUEST_MESSAGE: self._request_message,
             MavCmd.SET_MESSAGE_INTERVAL: self._set_interval,

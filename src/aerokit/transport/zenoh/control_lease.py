@@ -239,7 +239,7 @@ def _decoded(frame: Frame) -> Message | None:
 
 
 def _answer(frame: Frame, message: Message, reason: str) -> bytes:
-    """Return the frames by which a vehicle would reject a message; empty if none exist, or for broadcasts."""
+    """Return the frames by which a vehicle would reject a message. Empty for broadcasts, or without such frames."""
     fields: object = message  # The type is `object`, because the class Message does not declare these fields.
     system: int = getattr(fields, "target_system", 0)
     # A message for all components (0) is answered by the autopilot (1).
@@ -270,7 +270,7 @@ _MAX_DRIFT = 0.001  # maximum relative drift of two clocks; quartz clocks are te
 
 
 class FreshnessChecker:
-    """The vehicle side: makes beacons, and checks the stamps of received datagrams."""
+    """Used by the vehicle side: makes beacons, and checks the stamps of received datagrams."""
 
     def __init__(self, epoch: int) -> None:
         self.epoch: int = epoch
@@ -338,7 +338,7 @@ class DelayEstimator:
 
 
 class VehicleSideTracker:
-    """The client side: tracks one vehicle side by its beacons, and makes stamps."""
+    """Used by a client: tracks one vehicle side by its beacons, and makes the stamps of datagrams."""
 
     def __init__(self, nonce: int, mode: ControlMode = "free") -> None:
         self.epoch: int | None = None
