@@ -173,7 +173,7 @@ class Bus:
 
     def publish(self, event: Event) -> None:
         """Deliver an event to the sinks of its class and base classes."""
-        for event_type in type(event).__mro__[:-1]:
+        for event_type in type(event).__mro__[:-1]:  # all classes of the event, without `object`
             for sink in self._event_sinks.get(event_type, ()):
                 try:
                     sink(event)

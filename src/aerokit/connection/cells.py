@@ -218,7 +218,7 @@ class StateCell(Generic[T]):
         self._updated_at = self._stamp()
         self._arrivals += 1
         if self._sinks:
-            for sink in tuple(self._sinks):
+            for sink in tuple(self._sinks):  # A copy, because a sink may remove itself.
                 sink.receive(value)
 
     def _add_age(self, seconds: float) -> None:

@@ -264,7 +264,7 @@ class Connection:
         """
         self.check_types(types)
 
-        def attach(sink: Sink) -> list[Detach]:
+        def attach(sink: Sink) -> list[Detach]:  # called when the `with` block of the subscription is entered
             return [self.on_end(subscription.close), *self.attach(types, sink, system_id=system_id)]
 
         subscription: Subscription[ItemT] = Subscription(attach, capacity=capacity, overflow=overflow)
@@ -280,6 +280,7 @@ class Connection:
             ConnectionClosed, LinkLost: the connection ended.
         """
         self.raise_if_ended()
+        # New discoveries are queued while the earlier ones are yielded.
         with self.subscribe(VehicleFound, capacity=MAX_ROUTES) as discoveries:
             earlier_discoveries = [
                 discovery_event(heartbeat, self.now(), *source) for source, heartbeat in self.heartbeats.items()

@@ -71,7 +71,7 @@ class PeerTable:
         if framer is None:
             framer = self._add_unverified(peer)
         frames = framer.receive(data, now)
-        if framer.statistics.frames:
+        if framer.statistics.frames:  # The first valid frame makes the sender a peer.
             del self._unverified[peer]
             if not self._make_room(now):
                 framer.close()

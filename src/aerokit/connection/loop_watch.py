@@ -111,7 +111,7 @@ class LoopWatch:
         if has_slept or late_s > LATE_THRESHOLD_S:
             self._assume_waiting_data()
         self._set_timer(now)
-        if late_s > BLOCKED_THRESHOLD_S:
+        if late_s > BLOCKED_THRESHOLD_S:  # The pause may have begun just after the timer was set.
             self._on_blocked(late_s + CHECK_INTERVAL_S)
 
     def _has_slept(self) -> bool:

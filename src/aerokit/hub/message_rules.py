@@ -67,7 +67,7 @@ class Filters:
         """Return the minimum interval of a message in seconds: None if it is not sent, 0 if there is no limit."""
         if not (self._only or self._block or self._rates):
             return 0.0
-        if message_id not in self._dialect.rows:
+        if message_id not in self._dialect.rows:  # An unknown message matches no pattern.
             return None if self._only else 0.0
         if message_id not in self._periods:
             self._periods[message_id] = self._period(self._dialect[message_id].NAME)

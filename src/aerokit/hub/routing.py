@@ -289,10 +289,10 @@ class Router(Generic[PortT]):
     def _is_loop(self, node: RouterPort[PortT], source: int, first_port: int, now: float) -> bool:
         """Count a returning frame. Return True if a loop is proven, now or during the last `LOOP_WINDOW_S`."""
         count = node.echoes[source] = min(node.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
-        is_known = now < node.loop_until
-        if count < MIN_LOOP_FRAMES and not is_known:
+        was_proven = now < node.loop_until
+        if count < MIN_LOOP_FRAMES and not was_proven:
             return False
-        if not is_known:
+        if not was_proven:
             self._report("loop", source, node, first_port)
         node.loop_until = now + LOOP_WINDOW_S
         return True
@@ -318,7 +318,7 @@ class Router(Generic[PortT]):
             self.forget_plans()
             if self.on_vehicle is not None:
                 self.on_vehicle(node.port)
-            if sender.number != node.number:
+            if sender.number != node.number:  # The autopilot was received at another port before.
                 self._report("duplicate_sender", sender.source, node, sender.number)
 
     # -------------------------------------------------------------------------------------- plans

@@ -99,7 +99,7 @@ class Sender:
 
     def record_heartbeat(self, body: bytes) -> bool:
         """Record from a HEARTBEAT whether the sender is a vehicle or an autopilot. Return True if that has changed."""
-        if len(body) <= _AUTOPILOT:
+        if len(body) <= _AUTOPILOT:  # The payload is too short for a HEARTBEAT.
             return False
         before = self.is_vehicle, self.is_autopilot
         self.is_vehicle = body[_TYPE] != _GROUND_STATION
@@ -179,7 +179,7 @@ class IdentityGuard:
     def _publish(self, event: Event) -> None:
         if isinstance(event, RouteChanged):
             source = event.system_id, event.component_id
-            self._reported_at.pop(source, None)
+            self._reported_at.pop(source, None)  # The peer that owned the ids may now be the duplicate: report it.
             text = f"messages for {source[0]}/{source[1]} are sent here now, no longer to {event.before}"
             self._report("route_changed", self._current_peer, text)
         elif isinstance(event, DuplicateSender):

@@ -109,6 +109,7 @@ class MessageDefinition:
     @property
     def crc_extra(self) -> int:
         """Byte derived from the definition; the checksum of a frame fails if the sender has another definition."""
+        # https://mavlink.io/en/guide/serialization.html#crc_extra
         text = self.name + " "
         for field in self.wire_fields:
             if not field.extension:
@@ -229,6 +230,7 @@ def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
             if first is None:
                 merged[enum.name] = enum
                 continue
+            # An entry in a later file replaces an entry with the same name.
             entries = {entry.name: entry for entry in (*first.entries, *enum.entries)}
             ordered = sorted(entries.values(), key=lambda entry: entry.value)
             merged[enum.name] = replace(first, entries=tuple(ordered))
@@ -334,7 +336,7 @@ def _integer(text: str) -> int:
     for operator in ("<<", "**"):
         if operator in text:
             left, right = (int(part.strip(), 0) for part in text.split(operator))
-            if not (0 <= left <= _MAX_VALUE and 0 <= right <= 64):
+            if not (0 <= left <= _MAX_VALUE and 0 <= right <= 64):  # A hostile file must not create a huge number.
                 raise ValueError(f"{text!r} is not a valid enum value")
             return _in_range(left << right if operator == "<<" else int(left**right))
     return _in_range(int(text.strip(), 0))

@@ -48,7 +48,7 @@ class Dialect:
         self._decoders: dict[int, Callable[[bytes, Frame | None], Message]] = {
             message_id: partial(self._decode_first, message_id) for message_id in rows
         }
-        if wire is not None:
+        if wire is not None:  # Compiled code is available, and decodes faster.
             self.table: Any = wire.table(
                 rows, lambda message_id: layout_of(self[message_id]), partial(Dialect.decode, self)
             )
@@ -169,8 +169,11 @@ class _Extended(Dialect):
             except InvalidArgument:
                 continue
         if not enum_types:
-            return super().enum(name)
-        if len(enum_types) == 1 or enum_types[1].__members__.keys() <= enum_types[0].__members__.keys():
+            return super().enum(name)  # This raises InvalidArgument.
+        is_first_complete = len(enum_types) == 1 or (
+            enum_types[1].__members__.keys() <= enum_types[0].__members__.keys()
+        )
+        if is_first_complete:
             return enum_types[0]
         if name not in self._enums:
             self._enums[name] = _merge_enums(*enum_types)

@@ -325,7 +325,7 @@ def _number_problem(value: Any, kind: str) -> str | None:
     """Explain why a value does not fit into this type, or return None. The module struct decides what is a number."""
     if kind in INTEGER_RANGES:
         low, high = INTEGER_RANGES[kind]
-        try:
+        try:  # With the largest type, this fails only for a huge number, or for a value that is no integer.
             struct.pack("<q" if low < 0 else "<Q", value)
         except (struct.error, OverflowError, TypeError):
             if not hasattr(value, "__index__"):
@@ -382,7 +382,7 @@ def make_enum(
     """
     base: Any = _Flags if bitmask else enum.IntEnum
     enum_type: type[Any]
-    if _simple_enum is not None and not is_external:
+    if _simple_enum is not None and not is_external:  # `_simple_enum` does not check names.
         body = {"__module__": module, "__qualname__": name, "__doc__": doc, **dict(members)}
         enum_type = _simple_enum(base)(type(name, (), body))
     else:

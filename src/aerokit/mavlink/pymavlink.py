@@ -59,6 +59,7 @@ def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
 
 def _class_of(message: Any) -> type[Message]:
     message_type: Any = type(message)
+    # Classes of pymavlink have these attributes. For any other object, the message's name must be in the standard.
     if hasattr(message_type, "ordered_fieldnames") and hasattr(message_type, "crc_extra"):
         return _counterpart(int(message_type.id), int(message_type.crc_extra), message_type)
     try:
@@ -109,7 +110,7 @@ def _converted(message_class: type[Message], field: Field, value: Any) -> Any:
     """Convert a value of pymavlink to the type of aerokit's field."""
     if field.is_text:
         return _text(value)
-    if field.type == "char" and isinstance(value, str):
+    if field.type == "char" and isinstance(value, str):  # an array of `char` that carries bytes
         return value.encode()
     is_real = field.type in REAL_TYPES
     if not field.array_length:
@@ -262,7 +263,7 @@ def _decoder_for(message_class: Any) -> Decoder:
         fields.update(zip(names, values))  # noqa: B905 - same length
         for name, raw_name in texts:
             raw = fields[raw_name] = fields[raw_name].rstrip(b"\0")
-            text_bytes = raw.partition(b"\0")[0] if b"\0" in raw else raw
+            text_bytes = raw.partition(b"\0")[0] if b"\0" in raw else raw  # A text ends at the first NUL.
             fields[name] = text_bytes.decode("ascii", "replace")
         return message
 

@@ -55,6 +55,7 @@ def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> Load
     classes: dict[int, Any] | None = getattr(module, "mavlink_map", None)
     if classes is None:
         raise InvalidArgument(f"{module.__name__} is not a pymavlink dialect: it has no mavlink_map")
+    # Negative ids are those of pseudo messages such as BAD_DATA.
     definitions = [_message(cls) for _, cls in sorted(classes.items()) if cls.id >= 0]
     enums = [_enum(name, entries) for name, entries in getattr(module, "enums", {}).items()]
     name = module.__name__.rpartition(".")[2]

@@ -201,7 +201,7 @@ class Signing:
         stamp = self.timestamp_now(now)
         if stamp > LAST_TIMESTAMP:
             raise InvalidArgument(f"the timestamps of {self.key!r} are exhausted: use another key")
-        self._advance(stamp + 1)
+        self._advance(stamp + 1)  # The next frame must have a later timestamp.
         link_and_timestamp = bytes((self.link_id,)) + stamp.to_bytes(6, "little")
         return link_and_timestamp + self._hash(frame + link_and_timestamp)
 

@@ -104,13 +104,13 @@ class SourceStatistics(SourceFields):
             self._last_expected, self._advanced_at = self.expected, now
         ahead = (sequence - self.expected) & 0xFF
         if self._other_expected >= 0 and (sequence - self._other_expected) & 0xFF < _MAX_STEP:
-            if now - self._other_at < _EXPIRY_S:
+            if now - self._other_at < _EXPIRY_S:  # The frame continues the other stream.
                 return self._continue_other(sequence, now)
             self._other_expected = -1
         if ahead < _HALF:
             self._on_gap(ahead, sequence, now)
             return IN_ORDER
-        if self._was_missing(256 - ahead):
+        if self._was_missing(256 - ahead):  # A frame that counted as lost has arrived late.
             self._unreceived -= 1
             self.lost -= 1
             return LATE
@@ -124,7 +124,7 @@ class SourceStatistics(SourceFields):
     def _on_gap(self, ahead: int, sequence: int, now: float) -> None:
         """Process a frame after ``ahead`` missing frames, which count as lost until they arrive late."""
         self.lost += ahead
-        if ahead > _MAX_GAP:
+        if ahead > _MAX_GAP:  # The frame may belong to another stream.
             self._begin_stream(now)
             self._skipped_over = ahead
         missing_bits = ((1 << ahead) - 1) << 1  # bit 0 is this frame

@@ -89,7 +89,7 @@ def _record_end(data: bytes, begin: int, min_time: int) -> int | None:
     end = _frame_end(data, begin)
     if end is None or end > len(data) or _TIME.unpack_from(data, begin)[0] < min_time:
         return None
-    if len(data) - end <= 8 or _frame_end(data, end) is not None:
+    if len(data) - end <= 8 or _frame_end(data, end) is not None:  # The log ends here, or another record follows.
         return end
     return None if _looks_shifted(data, begin, end) else end
 

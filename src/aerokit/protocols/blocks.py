@@ -245,7 +245,7 @@ class Reassembly:
         """Add a block, and return True if it was missing. A block shorter than ``block_size`` ends the file."""
         if not data or (offset - self.start) % self.block_size or not self._is_missing(offset):
             return False
-        if offset >= self.tail:
+        if offset >= self.tail:  # All blocks between the tail and this block are missing.
             self.gaps.update(dict.fromkeys(range(self.tail, offset, self.block_size)))
             self.tail = offset + len(data)
         else:
@@ -270,7 +270,7 @@ class Reassembly:
             self._bytes_ahead -= len(self._ahead.pop(offset))
         if self.tail < end:
             self.gaps.update(dict.fromkeys(range(self.tail, end, self.block_size)))
-        self.tail = max(end, self.position)
+        self.tail = max(end, self.position)  # Data beyond the end may already have been written.
 
     def missing(self, size: int | None = None) -> tuple[tuple[int, int], ...]:
         """Return the missing ranges as (offset, size); ``size`` is the expected size of the file, if known.

@@ -408,6 +408,6 @@ def _checked_number(command: int, field: str, value: float) -> float:
         number = float(value)
     except (TypeError, ValueError):
         raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} is not a number") from None
-    if math.isinf(number) or abs(number) > FLOAT32_MAX:
+    if math.isinf(number) or abs(number) > FLOAT32_MAX:  # NaN is allowed: many commands use it for "unchanged".
         raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} does not fit into 32 bits")
     return number

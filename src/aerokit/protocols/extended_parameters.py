@@ -235,7 +235,7 @@ class SettingWrite(Transfer[Setting]):
         elif settings_equal(reported.value, self._value):
             self._measure(now)
             self._finish(reported)
-        elif not self._is_writing and not self._is_stale(now):
+        elif not self._is_writing and not self._is_stale(now):  # While it writes, a component reports the old value.
             self._measure(now)
             self._on_unexpected_value(reported, now)
 

@@ -47,8 +47,7 @@ SHORT_FILE = 20 * DATA_SIZE  # Up to this size in bytes, repeating a burst costs
 MAX_REPEATED_BURSTS = 3
 # Maximum number of remembered bursts. Blocks of earlier bursts may still arrive.
 MAX_BURSTS = 32
-# Sequence numbers wrap around. If two blocks are farther apart than this number of bytes, their sequence numbers do not
-# show their distance.
+# Sequence numbers wrap around, so they do not show the distance of two blocks that are farther apart than this.
 MAX_BLOCK_DISTANCE = SEQUENCE_COUNT // 2 * DATA_SIZE
 # If no block arrives in the time of this many blocks, the burst has not started (first number), or has ended (second
 # number), because radios hardly ever lose so many blocks in a row.
@@ -210,6 +209,7 @@ class FtpDownload(FtpExchange[int]):
             self._stop_bursting()
         if reply.error_code == MavFtpErr.EOF:
             self._end_at(end)
+        # After the first block, such an error is a failure, because the server does support bursts.
         elif is_latest and reply.error_code in NO_BURST and self._into.done == self._into.start:
             self._supports_bursts = False
         elif is_latest:

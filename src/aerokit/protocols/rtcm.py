@@ -24,7 +24,7 @@ def _crc_table() -> tuple[int, ...]:
     for byte in range(256):
         crc = byte << 16
         for _ in range(8):
-            crc = crc << 1 ^ (0x1864CFB if crc & 0x800000 else 0)
+            crc = crc << 1 ^ (0x1864CFB if crc & 0x800000 else 0)  # 0x1864CFB: polynomial of CRC-24Q
         table.append(crc)
     return tuple(table)
 
@@ -105,8 +105,9 @@ class RtcmReader:
             if len(buffer) - begin < HEADER_SIZE:
                 break
             size = _frame_size(buffer, begin)
-            if size is not None and len(buffer) - begin < size:
+            if size is not None and len(buffer) - begin < size:  # The rest of the message has not arrived yet.
                 break
+            # If no valid message begins here, the search continues at the next byte.
             if size is None or crc24q(buffer[begin : begin + size]):
                 begin += 1
                 self.skipped_bytes += 1

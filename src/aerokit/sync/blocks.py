@@ -131,7 +131,7 @@ class TwinOf(ReadOnly, Generic[AsyncT]):
         try:
             yield entered
         finally:
-            with contextlib.suppress(ConnectionClosed):
+            with contextlib.suppress(ConnectionClosed):  # If the loop has ended, there is nothing left to exit.
                 self._loop.call(block.__exit__, None, None, None)
 
     @contextmanager

@@ -309,6 +309,7 @@ def generate(name: str = "twins") -> str:
         module, _, function_name = path.rpartition(".")
         page.at_run_time.add((module, f"{function_name} as {function_name}_async"))
     page.for_types -= page.at_run_time
+    # Imports in HEAD that this file does not use are left out.
     text = HEAD if variables else HEAD.replace("import TYPE_CHECKING, TypeVar", "import TYPE_CHECKING")
     if "@cached_property" not in "".join(classes):
         text = text.replace("from functools import cached_property\n", "")

@@ -268,7 +268,7 @@ class OpenContext(Generic[T]):
 
     def close(self) -> None:
         """Exit the context manager and wait for it. Idempotent."""
-        if self._loop.is_current:
+        if self._loop.is_current:  # The loop's own thread must not wait for the loop.
             self._task.close.set()
         elif not self._call.is_done:
             with contextlib.suppress(ConnectionClosed):

@@ -167,7 +167,7 @@ class _Parser:
             self.fail("it is empty")
         if "\0" in text:
             self.fail("it contains a NUL character")
-        if text.lower() == "pty" or text.lower().startswith("pty:"):
+        if text.lower() == "pty" or text.lower().startswith("pty:"):  # The rest is a path, without any options.
             return LinkAddress("pty", path=text[len("pty:") :])
         scheme, after_scheme = self.split_scheme(text)
         if scheme in _SCHEMES:
@@ -181,6 +181,7 @@ class _Parser:
         if match := _URL.fullmatch(text):
             return match[1].lower(), match[2]
         match = _SCHEME.fullmatch(text)
+        # Without "//", only a known word is a scheme. Any other word may be a host.
         if match and match[1].lower() in (*_SCHEMES, *_PYMAVLINK_ONLY, "http", "https", "ftp"):
             return match[1].lower(), match[2]
         return "", text

@@ -365,7 +365,7 @@ class MemoryLink(BaseLink):
         self._inbox.clear()
         was_open, self._loop = self._loop is not None, None
         if was_open and self._far is not None:
-            self._far._post(None, self)
+            self._far._post(None, self)  # The far end reports its loss after the data that was written before.
 
     def _post(self, data: bytes | None, sender: MemoryLink) -> None:
         """Schedule the arrival of data from ``sender``; None means that ``sender`` was closed."""

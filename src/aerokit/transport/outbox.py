@@ -160,7 +160,7 @@ class Outbox:
         self._timer = None
         self._drop_outdated()
         pending, now = self._pending(), self._loop.time()
-        sent_bytes = self._forwarded_bytes - pending
+        sent_bytes = self._forwarded_bytes - pending  # Forwarded bytes that are no longer pending have left.
         is_idle = not (pending or self._waiting or self._is_full)
         if sent_bytes != self._sent_bytes or is_idle:
             self._sent_bytes, self._progress_at = sent_bytes, now

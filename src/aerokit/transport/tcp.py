@@ -125,7 +125,7 @@ class TcpConnect(_TcpLink):
             try:
                 return await self._connect_to(address)
             except OSError as error:
-                first_error = first_error or error
+                first_error = first_error or error  # The first address is the preferred one, so its error is raised.
         raise first_error or OSError(errno.EADDRNOTAVAIL, "the host has no address")
 
     async def _connect_to(self, address: SocketAddress) -> None:
@@ -235,6 +235,7 @@ class TcpListen(_TcpLink):
         await self._server.start_serving()
 
     def _on_connected(self, stream: _Stream) -> None:
+        # The host is unknown if the client has already disconnected.
         host = stream.peer[0] if isinstance(stream.peer, tuple) else ""
         if (host and not self._allowed.allows(host)) or not self._make_room():
             stream.close()

@@ -81,7 +81,7 @@ class _UdpLink(BaseLink):
         _enlarge_buffer(sock)
         try:
             self._loop.add_reader(sock, self._on_readable)
-        except NotImplementedError:
+        except NotImplementedError:  # The loop has no add_reader, e.g. the Proactor loop on Windows.
             await self._connect_without_reader(sock)
 
     async def _connect_without_reader(self, sock: socket.socket) -> None:

@@ -129,7 +129,7 @@ class Candidate:
         """Record whether the hardware id received over the link contradicts that of the vehicle."""
         if is_other:
             self._doubt()
-            self.was_proven = False
+            self.was_proven = False  # The link now leads to another vehicle, so an earlier proof is void.
         elif self.is_other_hardware:
             self.is_doubted = False
         self.is_other_hardware = is_other
@@ -259,7 +259,7 @@ class LinkChoice:
         another link before, the link in use leads to another vehicle.
         """
         candidate = self.candidates[link]
-        if hardware.has_value or candidate.hardware is None:
+        if hardware.has_value or candidate.hardware is None:  # An empty id does not replace a known one.
             candidate.hardware = hardware
         if candidate is self.used:
             self._adopt_hardware(candidate)
@@ -309,7 +309,8 @@ class LinkChoice:
         """
         if candidate is not self.used:
             return not candidate.is_proven and candidate.request_hardware()
-        return len(self.candidates) > 1 and not is_attached and candidate.request_hardware()
+        has_other_links = len(self.candidates) > 1  # Otherwise there is no other id to compare with.
+        return has_other_links and not is_attached and candidate.request_hardware()
 
     def _is_same_by_hardware(self, candidate: Candidate, now: float) -> bool:
         """Return True if this link leads to the vehicle by its hardware id, and was proven, and no other is alive."""

@@ -97,12 +97,14 @@ class LinkProbes:
     def is_answer(self, frame: Frame, link: int) -> bool:
         """Return True if this TIMESYNC answers one of our probes over any link. Record such an answer."""
         message = self._bus.dialect.decode(frame)
-        if not isinstance(message, m.Timesync) or not message.tc1 or message.ts1 not in self._pending:
+        is_request = isinstance(message, m.Timesync) and not message.tc1  # In an answer, tc1 is the vehicle's time.
+        if not isinstance(message, m.Timesync) or is_request or message.ts1 not in self._pending:
             return False
         now = frame.received_at
         round_trip_s = self._round_trip_of(message, frame.system_id, link, now)
         choice = self._choices.get(frame.system_id)
         if round_trip_s is not None and choice is not None and link in choice.candidates:
+            # The vehicle read its clock at about the middle of the round trip.
             choice.record_answer(link, now - round_trip_s / 2, message.tc1 / 1e9, round_trip_s, now)
             self._report_doubt(frame, choice.candidates[link])
         return True

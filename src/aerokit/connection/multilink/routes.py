@@ -76,6 +76,7 @@ class LinkStates:
             for system_id, choice in self._choices.items()
             if link in choice.candidates
         }
+        # The status has the worst loss and round trip of all systems that are received over the link.
         losses = [candidate.loss for candidate in candidates.values() if candidate.loss is not None]
         round_trips = [
             candidate.round_trip_s for candidate in candidates.values() if candidate.round_trip_s is not None
@@ -264,7 +265,7 @@ class MultiLinkRoutes:
         """Update the counts of all links, send probes that are due, and choose the link for each system."""
         for system_id, choice in self._choices.items():
             for link, candidate in choice.candidates.items():
-                if now - candidate.received_at > CANDIDATE_TIMEOUT_S:
+                if now - candidate.received_at > CANDIDATE_TIMEOUT_S:  # The system is no longer received here.
                     self._counters.pop((system_id, link), None)
                     continue
                 counters = self._counters.get((system_id, link), {}).values()

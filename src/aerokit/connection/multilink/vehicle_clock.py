@@ -42,7 +42,7 @@ class VehicleClock:
         if not self.is_steady:
             if (speed := self._measured_speed) is not None:
                 self._former_speed = speed, at
-            self._samples.clear()
+            self._samples.clear()  # The pause would make the speed measured over older samples too small.
         self._samples.append((at, vehicle_s))
         return continues
 

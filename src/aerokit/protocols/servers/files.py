@@ -251,7 +251,7 @@ class FileTree:
         if isinstance(node, dict):
             raise FileFault(EISDIR)
         if node is None:
-            self.reserve(0)
+            self.reserve(0)  # A new name also needs free space.
             folder[name] = _File()
         else:
             self.reserve(-node.size)
@@ -300,7 +300,7 @@ class FileTree:
         mounted = self.mounted(path)
         if mounted is not None:
             mount, path_in_mount = mounted
-            if path_in_mount:
+            if path_in_mount:  # A mount has no folders of its own.
                 raise FileFault(ENOENT)
             return mount.entries()
         folder = self._find(path)

@@ -151,7 +151,7 @@ class SessionFtpServer(Generic[FilesT]):
             idle_keys = [idle for idle, peer in self._peers.items() if not peer.sessions and peer.checksum is None]
             if not idle_keys:
                 return None
-            del self._peers[idle_keys[0]]
+            del self._peers[idle_keys[0]]  # A client without open files makes room for the new one.
         peer = self._peers.setdefault(key, FtpPeer(channel))
         peer.channel = channel
         return peer
@@ -173,7 +173,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
         """Execute a request. A handler that returns None answers later."""
         handler = _HANDLERS.get(request.opcode)
-        peer.request, peer.reply = request, None
+        peer.request, peer.reply = request, None  # The reply to the previous request must not be sent again.
         try:
             answer = self._unknown(request) if handler is None else handler(self, peer, request)
         except Refused as refused:
@@ -365,7 +365,7 @@ class SessionFtpServer(Generic[FilesT]):
         """Compute a checksum in slices, so that a large file does not block the event loop."""
         path = self._path(request)
         is_repeated = peer.checksum is not None and request.repeats(peer.checksum)
-        if not is_repeated:
+        if not is_repeated:  # The running computation also answers a repeated request.
             file, peer.checksum = self.files.open(path), request
             self._continue_crc32(peer, request, file, 0, 0)
         return None

@@ -218,6 +218,7 @@ class ZenohConnect(NetworkLink):
     def _poll(self) -> None:
         tracker, now = self._tracker, self._now()
         if tracker.epoch is not None and tracker.is_silent(now):
+            # The end of the liveliness token shows a loss earlier than a long silence does.
             if self._keys.alive(tracker.epoch) not in self._alive:
                 self._lose("the vehicle side has left the network")
                 return

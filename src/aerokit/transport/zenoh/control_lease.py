@@ -301,7 +301,7 @@ class FreshnessChecker:
         self._sequences[key] = stamp.sequence
         self._sequences.move_to_end(key)
         if len(self._sequences) > _MAX_NONCES:
-            self._sequences.popitem(last=False)
+            self._sequences.popitem(last=False)  # the client that was silent for longest
         return True
 
     def _is_fresh(self, stamp: Stamp) -> bool:
@@ -366,7 +366,7 @@ class VehicleSideTracker:
                 self.foreign += 1
                 return False
             self.epoch, self._beacon, self._delays = beacon.epoch, 0, DelayEstimator()
-        elif beacon.number <= self._beacon:
+        elif beacon.number <= self._beacon:  # A newer beacon was already received.
             return False
         if self._delays.delay(beacon.clock_s, now) > MAX_DELAY_S:
             self.late += 1
