@@ -202,7 +202,7 @@ class Bus:
     def _entries(self, frame: Frame) -> tuple[_Entry, ...]:
         system_id, message_id = frame.system_id, frame.message_id
         for_all_systems = self._sinks.get((EVERY_SYSTEM, message_id), ())
-        if system_id == EVERY_SYSTEM:  # This id is invalid for a sender. The sinks must not get the frame twice.
+        if system_id == EVERY_SYSTEM:  # The sender's id is invalid. Only the sinks for all systems get the frame.
             return for_all_systems
         return self._sinks.get((system_id, message_id), ()) + for_all_systems
 

@@ -322,7 +322,7 @@ class Changes(AsyncIterator[T]):
         self._read_count = self._total() - (1 if cell.is_known else 0)
         self._missed = 0
 
-    # A reader may leave its loop at any time. That it has ended is then only visible by garbage collection.
+    # A reader may leave its loop at any time. Only garbage collection then shows that the iteration has ended.
     def __del__(self) -> None:
         if hasattr(self, "_cell"):  # False if __init__ raised
             self._cell._unfollow()

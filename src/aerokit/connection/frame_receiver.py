@@ -307,6 +307,6 @@ class FrameReceiver:
             self.heartbeats[source] = heartbeat
             if is_new:
                 self._bus.publish(discovery_event(heartbeat, self._clock(), *source))
-            if len(self.heartbeats) > MAX_ROUTES:  # There are fewer routes, so some of these components have expired.
+            if len(self.heartbeats) > MAX_ROUTES:  # There are at most MAX_ROUTES routes, so some have expired.
                 for expired in [source for source in self.heartbeats if not self._routes.has_route(source)]:
                     del self.heartbeats[expired]

@@ -133,7 +133,7 @@ class HeartbeatWatchdog:
         self._paused_at: float | None = None
 
     def require(self, activity: ActivityMonitor, fed_within_s: float) -> None:
-        """Pause the heartbeat by this activity from now on; ``fed_within_s`` is the limit if the settings have none."""
+        """Pause the heartbeat when this activity ends; ``fed_within_s`` is the limit if the settings have none."""
         self.activity = activity
         if self._limit_s is None:
             self._limit_s = fed_within_s

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-# Telemetry at 10 Hz or more arrives within this interval, and each time postpones the check. Together with
-# LATE_THRESHOLD_S, the interval is 0.2 s.
+# Telemetry at 10 Hz or more arrives within this interval, and each time postpones the check. The check is late after
+# 0.2 s: this interval plus LATE_THRESHOLD_S.
 CHECK_INTERVAL_S = 0.12
 
 LATE_THRESHOLD_S = 0.08

@@ -234,7 +234,7 @@ class Routes:
             self._publish(DuplicateSender(frame.received_at, frame.system_id, frame.component_id))
 
     def evictable_peers(self, peers: Iterable[Peer], now: float) -> list[Peer]:
-        """Return the first peer without a live component, or an empty list. Forget the claims of that peer.
+        """Return a list with the first peer without a live component, if there is one, and forget its claims.
 
         A component is live if it has a vehicle object, or sent a heartbeat in the last 30 s.
         """

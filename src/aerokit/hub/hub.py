@@ -304,7 +304,7 @@ async def _wait_until_closed(attachments: list[Attachment]) -> None:
 @checked
 @async_block
 async def shared(connection: Connection, endpoints: Iterable[str | Endpoint | Link]) -> AsyncIterator[Hub]:
-    """Share an open connection with other programs during an ``async with`` block, whose target is the hub.
+    """Share an open connection with other programs during an ``async with`` block; ``as`` gives the hub.
 
     ``aerokit.connect(…, share=[…])`` does the same. See `Hub.share`.
 

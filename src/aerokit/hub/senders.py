@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link, Peer
 
 DUPLICATE_WINDOW_S = 2.0
-"""An equal frame (same sender, number and checksum) from another port is a duplicate for this time after the first."""
+"""A frame with the same sender, number and checksum is a duplicate if another port received one this short before."""
 
 REPEAT_WINDOW_S = 0.5
-"""An equal frame from the same port is a duplicate for this time after the first, if its number is out of order."""
+"""A frame with an out-of-order number is a duplicate if the same port received an equal one this short before."""
 
 LOOP_WINDOW_S = 60.0
-"""A frame that returns through another port is recognised for this time.
+"""A frame that returns through another port is recognised up to this time after it was first received.
 
 It is below 256 s, after which the sequence numbers of a component that sends only heartbeats repeat.
 """

@@ -114,8 +114,8 @@ class SharedLink(Link):
             self._receiver.bytes_received(unsigned, None)
 
     def _on_end(self, error: Exception) -> None:
-        # The loss is reported in the next loop iteration, because the connection may have ended during a write, and a
-        # link never calls its receiver then.
+        # The loss is reported in the next loop iteration, because the connection may have ended during a write. A link
+        # must not call its receiver during a write.
         self._loss_report = asyncio.get_running_loop().call_soon(self._report_loss, error)
 
     def _report_loss(self, error: Exception) -> None:

@@ -157,7 +157,7 @@ class BlockRequests:
         return block.previous_sent_at if is_too_early else None
 
     def take_due(self, now: float, *, limit: int | None = None) -> list[int]:
-        """Return the offsets to request now, retries first, and count them as sent. ``limit`` bounds the window."""
+        """Return the offsets to request now, retries first, and count them as sent. The window is at most ``limit``."""
         overdue = [offset for offset, block in self._in_flight.items() if self._due_at(block) <= now]
         self._requeue(overdue)
         if overdue:

@@ -70,7 +70,7 @@ UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
 
 
 def max_attempts(command: int, params: Sequence[float]) -> int:
-    """Return how often a command may be sent: once if a repetition had a further effect, else `MAX_ATTEMPTS` times."""
+    """Return how often a command may be sent: `MAX_ATTEMPTS`, or once if a repetition would have a further effect."""
     if command not in UNREPEATABLE_COMMANDS:
         return MAX_ATTEMPTS
     _, condition = UNREPEATABLE_COMMANDS[command]

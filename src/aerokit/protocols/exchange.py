@@ -146,8 +146,8 @@ class RoundTrip:
         return min(backed_off_s, max(self._max_s, first_s))
 
 
-# After the time of this many messages without any, the vehicle has stopped sending: radios hardly ever lose so many in
-# a row.
+# If no message arrives in the time of this many messages, the vehicle has stopped sending, because radios hardly ever
+# lose so many in a row.
 SILENT_MESSAGES = 10
 
 
@@ -172,8 +172,9 @@ class MessageStream:
 
     @property
     def due_at(self) -> float:
-        """Deadline for the next message. If it passes, the stream counts as ended; before the first message, as not
-        started.
+        """Deadline for the next message.
+
+        If it passes, the stream counts as ended; before the first message, it counts as not started.
         """
         silence_s = self._round_trip.timeout_s(max(1, self.failures - 1))
         if self._received_at is not None and self._interval.smoothed_s is not None:

@@ -42,8 +42,8 @@ BUSY_TIMEOUT_S = 9.0
 
 BUSY_RETRY_INTERVAL_S = 1.0
 
-# The time-out grows with each attempt up to the first number of attempts. It then stays the same for the second number
-# of attempts, and then grows again.
+# The time-out grows during the first GROWING_ATTEMPTS attempts, stays the same during the next CONSTANT_ATTEMPTS
+# attempts, and then grows again.
 GROWING_ATTEMPTS, CONSTANT_ATTEMPTS = 5, 7
 
 # After this many seconds without messages, the vehicle may have dropped the transfer. PX4 drops it after 5 s, ArduPilot

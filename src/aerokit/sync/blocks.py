@@ -262,7 +262,7 @@ class ShieldedBlockTwin(TwinOf[ShieldedT]):
 
 
 class TemporarilyTwin(ShieldedBlockTwin["TemporaryParameters"]):
-    """Block that sets parameters, and whose target is the results. Its exit restores the previous values."""
+    """Block that sets parameters; ``as`` gives the results. Its exit restores the previous values."""
 
     def __enter__(self) -> dict[str, ParameterWrite]:
         return self._loop.enter(self.aio)
@@ -312,7 +312,7 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
 
 
 class OpenedTwin(TwinOf[T], BlockingContext):
-    """Twin of an object whose context is open on a loop thread. If the thread was started for it, it ends with it."""
+    """Twin of an object whose context is open on a loop thread. Closing it ends the thread, unless that is shared."""
 
     def __init__(self, loop: LoopThread, context: OpenContext[T], *, owns_loop: bool) -> None:
         super().__init__(loop, context.value)

@@ -159,7 +159,7 @@ class SerialLink(BaseLink):
     def _close_port(self, transport: Any) -> None:
         unsent = self._waiting_to_be_sent(transport)
         with contextlib.suppress(RuntimeError):  # The loop may be closed.
-            # `_release` has called this before. The call has no effect before the transport's first loop iteration.
+            # `_release` has already called this, but a call before the transport's first loop iteration has no effect.
             transport.pause_reading()
             transport.flush()
         if unsent:

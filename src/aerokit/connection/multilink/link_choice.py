@@ -313,7 +313,7 @@ class LinkChoice:
         return has_other_links and not is_attached and candidate.request_hardware()
 
     def _is_same_by_hardware(self, candidate: Candidate, now: float) -> bool:
-        """Return True if this link leads to the vehicle by its hardware id, and was proven, and no other is alive."""
+        """Return True if the link was proven before, its hardware id matches, and no other link is alive."""
         is_same = (
             self.hardware is not None and candidate.hardware is not None and self.hardware.confirms(candidate.hardware)
         )
