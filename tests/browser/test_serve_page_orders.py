@@ -112,8 +112,10 @@ def test_page_shows_why_vehicle_is_not_ready(browser: Any, copters: tuple[list[S
         try:
             page.locator("#readiness.warn li", has_text="Compass not healthy").wait_for(timeout=30_000)
             arm = page.locator("button[data-order='arm']")
-            assert (arm.is_disabled(), arm.locator("small").inner_text()) == (True, "Not ready")
-            picture(page, "not-ready")
+            assert (arm.is_disabled(), arm.locator("small").inner_text()) == (True, "Cannot arm")
+            page.locator("#readiness.warn strong", has_text="Cannot arm").wait_for()
+            assert arm.get_attribute("title") == "Cannot arm: Compass not healthy"
+            picture(page, "cannot-arm")
         finally:
             second.faults.prearm_failures = []
         page.locator("#readiness.good", has_text="Ready to arm").wait_for(timeout=30_000)
@@ -150,7 +152,8 @@ READINESS = """async (vehicle) => {
     box.id = "shown";
     document.getElementById("shown")?.remove();
     document.getElementById("readiness").after(box);
-    const known = { firmware: "ArduCopter", link: { state: "connected", heartbeat_age_s: 0 }, missing_for_flight: [] };
+    const link = { state: "connected", heartbeat_age_s: 0 };
+    const known = { firmware: "ArduCopter", link, missing_for_flight: [], not_armable: [] };
     const show = (more) => showReadiness(box, { ...known, states: {}, ...vehicle, ...more }, { isOpen: true });
     show({});
     if (box.querySelector("details")) {
@@ -165,7 +168,7 @@ def test_readiness_shows_all_reasons_and_notes(browser: Any, copters: tuple[list
     with serving(copters[1]) as server, opened(browser, server["page"]) as page:
         reasons = [f"Reason {number}" for number in range(1, 7)]
         rows = page.evaluate(READINESS, {"missing_for_flight": reasons})
-        assert rows == ["Not ready", *reasons[:4], "and 3 more", *reasons[4:], "A seventh"]
+        assert rows == ["Not known yet whether it can arm", *reasons[:4], "and 3 more", *reasons[4:], "A seventh"]
         armed = {"armed": {"value": True, "age_s": 0}, "landed_state": {"value": "ON_GROUND", "age_s": 0}}
         assert page.evaluate(READINESS, {"states": armed}) == ["Armed: propellers may turn"]
         after_return = {"mode": "RTL", "arms_in": "GUIDED", "unless": None}
@@ -178,10 +181,16 @@ def test_readiness_shows_all_reasons_and_notes(browser: Any, copters: tuple[list
             "Ready to arm",
             "Arm changes the mode to GUIDED first: ArduCopter cannot arm in AUTO unless AUTO_OPTIONS allows it",
         ]
-        assert page.evaluate(READINESS, {"unarmable_mode": {"mode": "RTL", "arms_in": None}}) == [
-            "Not ready",
-            "ArduCopter cannot arm in RTL",
-        ]
+        sensors = {"sensors": {"value": {}, "age_s": 0}}
+        for vehicle_type, title in ((2, "Arms, but is not ready to fly"), (10, "Arms, but cannot drive by itself yet")):
+            missing = {"missing_for_flight": ["home"], "states": sensors, "vehicle_type": vehicle_type}
+            assert page.evaluate(READINESS, missing)[0] == title
+        disarming = {"age_s": 3, "armed_for_s": 4, "parameter": "DISARM_DELAY", "delay_s": 10, "is_automatic": False}
+        text = "Disarmed 4 s after arming, not by an order of this server (DISARM_DELAY = 10 s)"
+        assert page.evaluate(READINESS, {"disarming": disarming}) == ["Ready to arm", text]
+        assert page.evaluate(READINESS, {"disarming": {**disarming, "age_s": 61}}) == ["Ready to arm"]
+        refused = {"missing_for_flight": ["compass", "home"], "not_armable": ["compass"]}
+        assert page.evaluate(READINESS, refused) == ["Cannot arm", "compass"]
 
 
 OBSTACLE = """async ([order, landed, age, type, link]) => {
@@ -204,7 +213,7 @@ def test_disarm_needs_known_ground(browser: Any, copters: tuple[list[SimulatedCo
 
 
 def test_resume_is_disabled_on_known_ground(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
-    on_ground = "On the ground: use Start mission"
+    on_ground = "On the ground: use Start"
     cases = {("ON_GROUND", 0, 2): on_ground, ("IN_AIR", 0, 2): "", ("ON_GROUND", 9, 2): "", ("ON_GROUND", 0, 10): ""}
     with serving(copters[1]) as server, opened(browser, server["page"]) as page:
         found = {case: page.evaluate(OBSTACLE, ["mission/resume", *case, "connected"]) for case in cases}
@@ -215,7 +224,7 @@ def test_take_off_dialog_reports_disarming(browser: Any, copters: tuple[list[Sim
     with serving(copters[1]) as server, opened(browser, server["page"]) as page:
         page.locator("#readiness.good", has_text="Ready to arm").wait_for(timeout=30_000)
         order(page, "arm")
-        page.locator("button[data-order='mission/resume'][disabled]", has_text="Use Start mission").wait_for()
+        page.locator("button[data-order='mission/resume'][disabled]", has_text="Use Start").wait_for()
         picture(page, "resume-on-ground")
         page.locator("button[data-order='take_off']:enabled").click()
         page.locator("dialog .yes:enabled").wait_for()

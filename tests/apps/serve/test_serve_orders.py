@@ -12,6 +12,7 @@ import pytest
 from flight_harness import open_flight
 from serve_stage import HOST, TOKEN, Stage, open_stage
 
+import aerokit
 from aerokit.apps.serve import make_app
 from aerokit.apps.serve.orders import ORDERS
 from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE
@@ -21,6 +22,7 @@ from aerokit.mavlink.messages import FileTransferProtocol, MissionCount, ParamSe
 from aerokit.missions import Fence, FencePolygon, Mission, Plan, format_plan, take_off, waypoint
 from aerokit.parameters import Metadata, ParameterMetadata
 from aerokit.position import Position
+from aerokit.sim import SimulatedSub, simulated_link
 
 pytestmark = pytest.mark.anyio
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -72,6 +74,7 @@ async def test_command_without_token_is_refused(is_open: bool) -> None:
         ("take_off", {"altitude_m": -3}, "altitude_m = -3"),
         ("take_off", {"altitude_m": 5, "force": True}, "unknown argument"),
         ("go_to", {"latitude_deg": 95, "longitude_deg": 0}, "latitude"),
+        ("go_to", {"latitude_deg": -35, "longitude_deg": 149, "altitude_relative_m": -20}, "-20 is below home"),
         ("mode", {"mode": "GIUDED"}, "did you mean 'GUIDED'"),
         ("mode", {"mode": True}, "mode = True is no"),
         ("mission/start", {"item": -1}, "item"),
@@ -186,6 +189,42 @@ async def test_keys_are_bounded_and_single_use(
             answer = await stage.submit("arm", Idempotency_Key=f"flood-{number:04}")
             assert answer.json()["error"] == "KeyUsed"
         assert not stage.flight.copter.is_armed
+
+
+async def test_replaced_order_names_its_successor() -> None:
+    async with open_stage() as stage:
+        await stage.submit("arm")
+        started = await stage.submit("take_off?wait=false", {"altitude_m": 20}, Idempotency_Key="the-take-off")
+        assert started.status_code == 202
+        await anyio.sleep(3)
+        assert (await stage.submit("hold", Idempotency_Key="the-hold")).status_code == 200
+        listed = (await stage.client.get("/api/orders", headers=BEARER)).json()["orders"]
+        found = {each["key"]: (each["state"], each["replaced_by"]) for each in listed}
+        assert found["the-take-off"] == ("failed", "the-hold")
+        assert found["the-hold"] == ("done", None)
+
+
+async def test_order_ended_by_pilot_is_not_replaced() -> None:
+    async with open_stage() as stage:
+        await stage.submit("arm")
+        await stage.submit("take_off?wait=false", {"altitude_m": 20}, Idempotency_Key="the-take-off")
+        await anyio.sleep(3)
+        stage.flight.pilot_takes_over()
+        await anyio.sleep(3)
+        found = (await stage.client.get("/api/orders/the-take-off", headers=BEARER)).json()
+        assert (found["state"], found["replaced_by"]) == ("failed", None)
+
+
+async def test_submarine_goes_below_home() -> None:
+    async with simulated_link([SimulatedSub(boot_time_s=0.0)]) as link, aerokit.connect(link) as vehicle:
+        await vehicle.wait_ready()
+        place = vehicle.position.value
+        await vehicle.set_mode("GUIDED")
+        await vehicle.arm()
+        position = {"latitude_deg": place.latitude_deg, "longitude_deg": place.longitude_deg}
+        go_to = next(each for each in ORDERS if each.name == "go_to")
+        await go_to.run(vehicle, {**position, "altitude_relative_m": -3})
+        assert (vehicle.position.value.altitude_relative_m or 0.0) < -1
 
 
 async def test_refusal_contains_reasons() -> None:
@@ -419,12 +458,21 @@ async def test_plan_is_checked_in_either_format_and_nothing_is_sent() -> None:
         stage.flight.wire.clear()
         assert (await stage.client.post("/api/plan", json={"plan": waypoints})).status_code == 401
         answer = await stage.client.post("/api/plan", json={"plan": waypoints, "name": "a.waypoints"}, headers=BEARER)
-        assert answer.json() == {"mission_items": 1, "fence_areas": 0, "rally_points": 0}
+        checked = answer.json()
+        counts = {name: checked[name] for name in ("mission_items", "fence_areas", "rally_points")}
+        assert counts == {"mission_items": 1, "fence_areas": 0, "rally_points": 0}
+        assert [each["name"] for each in checked["items"]] == ["NAV_TAKEOFF"]
+        assert (checked["fence"]["polygons"], checked["rally"]) == ([], [])
         broken = await stage.client.post(
             "/api/plan", json={"plan": waypoints.replace("-35", "x"), "name": "a.waypoints"}, headers=BEARER
         )
         assert (broken.status_code, broken.json()["error"]) == (400, "FileFormatError")
         assert broken.json()["detail"].startswith("a.waypoints: line 2: ")
+        no_json = await stage.client.post("/api/plan", json={"plan": "no JSON", "name": "a.plan"}, headers=BEARER)
+        assert (no_json.status_code, no_json.json()["error"]) == (400, "FileFormatError")
+        assert no_json.json()["detail"].startswith("a.plan: ")
+        assert "JSON" in no_json.json()["detail"]
+        assert "QGC WPL" not in no_json.json()["detail"]
         assert not stage.flight.wire.all(MissionCount)
         uploaded = await stage.submit("mission/upload", {"plan": waypoints, "name": "a.waypoints"})
         assert uploaded.json()["arguments"]["mission_items"] == 1

@@ -315,7 +315,8 @@ async def test_fence_and_rally_points_are_read() -> None:
 async def test_state_has_reasons_against_flight_and_failsafe() -> None:
     async with open_stage() as stage, Socket(stage.app, query="rate_hz=2") as socket:
         before = (await socket.next("state"))["vehicles"][0]
-        assert before["missing_for_flight"] == []
+        assert (before["missing_for_flight"], before["not_armable"]) == ([], [])
+        assert (before["crash"], before["disarming"], before["unread"]) == (None, None, ["DISARM_DELAY"])
         assert before["failsafe"] == {"action": None, "because": None, "unread": ["FS_GCS_ENABLE"]}
         await stage.client.get("/api/vehicles/1/parameters/FS_GCS_ENABLE", headers=BEARER)
         stage.flight.copter.faults.prearm_failures = ["Compass not healthy"]
@@ -323,7 +324,28 @@ async def test_state_has_reasons_against_flight_and_failsafe() -> None:
         socket.sent.clear()
         after = (await socket.next("state"))["vehicles"][0]
         assert after["missing_for_flight"][0] == "Compass not healthy"
+        assert after["not_armable"] == ["Compass not healthy"], "the general reason adds nothing to it"
         assert after["failsafe"]["because"] == "FS_GCS_ENABLE = 0"
+
+
+async def test_state_separates_not_armable_from_not_ready_to_fly() -> None:
+    async with open_stage() as stage:
+
+        def state() -> dict[str, object]:
+            return dict(json.loads(stage.app._served.snapshot())["vehicles"][0])
+
+        await stage.flight.vehicle.set_mode("STABILIZE")
+        stage.flight.copter.faults.gps_lost = True
+        await anyio.sleep(15)
+        assert state()["missing_for_flight"] != []
+        assert state()["not_armable"] == []
+        assert (await stage.submit("arm")).status_code == 200
+        await stage.submit("disarm")
+        await stage.flight.vehicle.set_mode("LAND")
+        await anyio.sleep(1)
+        text = "ArduCopter needs a position to arm in GUIDED, to which Arm would change the mode"
+        assert state()["not_armable"][0] == text  # type: ignore[index]
+        assert (await stage.submit("arm")).status_code == 409
 
 
 @pytest.mark.parametrize(

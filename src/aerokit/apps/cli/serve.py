@@ -177,7 +177,8 @@ def _server_class(uvicorn: Any) -> Any:
 
 
 def _emit_serving(options: argparse.Namespace, app: ServeApp, port: int) -> None:
-    host: str = {"0.0.0.0": _LOOPBACK, "::": "::1"}.get(options.host, options.host)  # a browser cannot open the former
+    # A browser cannot open an address that stands for all interfaces.
+    host = {"0.0.0.0": _LOOPBACK, "::": "::1"}.get(str(options.host), str(options.host))
     url = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
     # Browsers do not send the part after the #, so that the token never reaches a server log.
     page = url if options.read_only and _is_loopback(options.host) else f"{url}#token={app.token}"

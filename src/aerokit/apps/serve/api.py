@@ -114,6 +114,10 @@ _ORDER: dict[str, Any] = {
         "state": {"enum": ["running", "done", "failed"]},
         "result": {},
         "problem": {"anyOf": [{"$ref": "#/components/schemas/Problem"}, {"type": "null"}]},
+        "replaced_by": {
+            "type": ["string", "null"],
+            "description": "key of the later order of this server that replaced this one, which is then `failed`",
+        },
     },
 }
 _METADATA = ("short_description", "description", "unit", "minimum", "maximum", "reboot_required", "read_only")
@@ -392,12 +396,15 @@ class HttpApi:
         arguments = await read_body(request, UPLOAD.max_body_size)
         UPLOAD.check(arguments)
         _, _, plan = parse_plan_body(arguments)
-        counts = {
+        checked = {
             "mission_items": len(plan.mission),
             "fence_areas": len(plan.fence.polygons) + len(plan.fence.circles),
             "rally_points": len(plan.rally),
+            "items": _items(plan.mission),
+            "fence": to_jsonable(plan.fence),
+            "rally": _items(plan.rally),
         }
-        return json_response(counts)
+        return json_response(checked)
 
     async def _parameters(self, request: Request) -> Response:
         vehicle, is_refresh = self._vehicle_of(request), self._is_refresh(request)

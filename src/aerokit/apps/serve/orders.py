@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal.formatting import to_jsonable
 from aerokit.apps.parameter_values import check_values, with_range_note
 from aerokit.apps.plan_text import parse_plan_text
+from aerokit.apps.serve.flight_watch import SURFACE_TYPES
 from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE, HttpProblem, problem_of
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import BusyError, HeartbeatTimeout, InvalidArgument, OperationRejected
 from aerokit.events import LinkState
 from aerokit.mavlink.enums import MavLandedState, MavType
 from aerokit.position import Position
+from aerokit.vehicle.commanding.order import SUPERSEDED
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -42,7 +44,8 @@ MAX_USED_KEYS = 100_000
 STATE_MAX_AGE_S = 5.0
 """Maximum age in seconds of the state on which a client bases an order."""
 _LANDED_STATE_MAX_AGE_S = 3.0
-_SURFACE_TYPES = (MavType.GROUND_ROVER, MavType.SURFACE_BOAT, MavType.SUBMARINE)
+_NOT_MOTION = ("arm", "disarm", "mission/upload", "set_parameter")
+"""Orders that do not replace a running order about the vehicle's motion."""
 _KEY = re.compile(r"[A-Za-z0-9._~-]{8,64}")
 
 
@@ -89,7 +92,18 @@ class OrderType:
                 raise InvalidArgument(f"{self.name}: argument {name} is missing ({argument.text})")
 
 
+async def _disarm(vehicle: Vehicle, values: dict[str, Any]) -> None:
+    await vehicle.disarm(force=bool(values.get("force")))
+
+
 async def _go_to(vehicle: Vehicle, values: dict[str, Any]) -> None:
+    altitude_m = values.get("altitude_relative_m")
+    is_below_home = isinstance(altitude_m, (int, float)) and altitude_m < 0
+    if is_below_home and vehicle.autopilot.vehicle_type != MavType.SUBMARINE:
+        raise InvalidArgument(
+            f"go_to: altitude_relative_m = {altitude_m:g} is below home; allowed is 0 or more, except for submarines"
+            " (altitude_amsl_m is not limited); nothing was sent"
+        )
     position = {name: values.pop(name) for name in tuple(values) if name in _POSITION}
     await vehicle.go_to(Position(**position), **values)
 
@@ -98,7 +112,7 @@ async def _resume(vehicle: Vehicle, values: dict[str, Any]) -> None:
     # ArduCopter, on the ground after a finished mission, takes off and flies from the first item.
     landed = vehicle.landed_state
     is_on_ground = landed.latest == MavLandedState.ON_GROUND and landed.age <= _LANDED_STATE_MAX_AGE_S
-    if vehicle.is_armed and is_on_ground and vehicle.autopilot.vehicle_type not in _SURFACE_TYPES:
+    if vehicle.is_armed and is_on_ground and vehicle.autopilot.vehicle_type not in SURFACE_TYPES:
         raise OperationRejected(
             "mission/resume: the vehicle is on the ground, where it would take off: order mission/start;"
             " nothing was sent"
@@ -172,6 +186,11 @@ _GO_TO = {
 }
 _ALTITUDE = {"altitude_m": OrderArgument("number", "metres above home, above 0, at most 10,000", True)}
 _MODE = {"mode": OrderArgument(("string", "integer"), "the autopilot's name or number of the mode", True)}
+_DISARM = {
+    "force": OrderArgument(
+        "boolean", "true: also if the vehicle reports that it flies; refused unless it has a `crash` (false)"
+    )
+}
 _ITEM = {"item": OrderArgument("integer", "first item, counted from 0 (0)")}
 _VALUE = {
     "value": OrderArgument("number", "finite", True),
@@ -196,7 +215,7 @@ UPLOAD = OrderType(
 )
 ORDERS = (
     OrderType("arm", "Arm the motors: propellers may start to turn", lambda vehicle, _: vehicle.arm()),
-    OrderType("disarm", "Stop the motors, on the ground", lambda vehicle, _: vehicle.disarm(), is_safe=True),
+    OrderType("disarm", "Stop the motors, on the ground", _disarm, _DISARM, is_safe=True),
     OrderType("take_off", "Take off and climb", lambda vehicle, values: vehicle.take_off(**values), _ALTITUDE),
     OrderType("go_to", "Go to a position", _go_to, _GO_TO),
     OrderType("hold", "Stop and hold position", lambda vehicle, _: vehicle.hold(), is_safe=True),
@@ -216,6 +235,19 @@ ORDERS = (
 SET_PARAMETER = OrderType("set_parameter", "Set a parameter", _set_parameter, _VALUE)
 
 
+_RECORD_FIELDS = (
+    "key",
+    "system_id",
+    "order",
+    "arguments",
+    "given_unix_s",
+    "state",
+    "result",
+    "problem",
+    "replaced_by",
+)
+
+
 @dataclass(eq=False)
 class OrderRecord:
     """One order and its result."""
@@ -228,12 +260,13 @@ class OrderRecord:
     state: str = "running"
     result: Any = None
     problem: dict[str, Any] | None = None
+    replaced_by: str | None = None
+    """Key of the later order that replaced this one."""
     ended: asyncio.Event = field(default_factory=asyncio.Event)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields that the API shows."""
-        names = ("key", "system_id", "order", "arguments", "given_unix_s", "state", "result", "problem")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in _RECORD_FIELDS}
 
     def is_same(self, system_id: int, order: str, arguments: Mapping[str, Any]) -> bool:
         """Return True if a request repeats this order."""
@@ -273,7 +306,7 @@ class OrderRunner:
             return earlier
         if earlier is not None or key in self._used_keys:
             raise HttpProblem(409, "KeyUsed", "this Idempotency-Key was used for another order; nothing was sent")
-        self._check(vehicle, order_type, seen_at_s)
+        self._check(vehicle, order_type, recorded_arguments, seen_at_s)
         unix_s = vehicle.connection.unix_time()
         record = OrderRecord(key, vehicle.system_id, order_type.name, recorded_arguments, unix_s)
         self._store(record)
@@ -296,7 +329,9 @@ class OrderRunner:
         """Cancel running orders; the vehicle holds, as after any cancelled action."""
         await self._background.aclose()
 
-    def _check(self, vehicle: Vehicle, order_type: OrderType, seen_at_s: float | None) -> None:
+    def _check(
+        self, vehicle: Vehicle, order_type: OrderType, arguments: Mapping[str, Any], seen_at_s: float | None
+    ) -> None:
         """Raise unless the order may be sent now."""
         vehicle.connection.raise_if_ended()
         now = asyncio.get_running_loop().time()
@@ -306,6 +341,13 @@ class OrderRunner:
                 "Late",
                 f"the client's state of the vehicle is older than {STATE_MAX_AGE_S:g} s; nothing was sent: check the"
                 " current state, then repeat the order",
+            )
+        if arguments.get("force") and order_type.name == "disarm" and self._served.crash(vehicle) is None:
+            raise HttpProblem(
+                409,
+                "NotCrashed",
+                "disarm: force is allowed only after the server has seen the vehicle hit the ground and stay there;"
+                " nothing was sent",
             )
         if order_type.is_safe:
             return
@@ -345,11 +387,21 @@ class OrderRunner:
             raise
         except Exception as error:
             record.state, record.problem = "failed", problem_of(error)
+            record.replaced_by = self._replacing(record, error)
             if record.problem["status"] == 500:
                 logger.exception("order %s to vehicle %d failed", record.order, record.system_id)
         finally:
             record.ended.set()
             self._publish(record)
+
+    def _replacing(self, record: OrderRecord, error: Exception) -> str | None:
+        """Return the key of the newest order that replaced this one; None if the order ended for another reason."""
+        if not isinstance(error, OperationRejected) or SUPERSEDED not in str(error):
+            return None
+        keys = list(self._records)
+        later = [self._records[key] for key in keys[keys.index(record.key) + 1 :]]
+        moving = [each for each in later if each.system_id == record.system_id and each.order not in _NOT_MOTION]
+        return moving[-1].key if moving else None
 
     def _publish(self, record: OrderRecord) -> None:
         self._served.publish({"type": "order", **record.to_dict()})

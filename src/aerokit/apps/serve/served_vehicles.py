@@ -15,6 +15,7 @@ import anyio
 
 from aerokit._internal.formatting import to_jsonable
 from aerokit.apps.serve.failsafe import ground_station_failsafe
+from aerokit.apps.serve.flight_watch import FlightWatch
 from aerokit.apps.serve.requests import HttpProblem
 from aerokit.connection.connection import Connection
 from aerokit.connection.tasks import BackgroundTasks
@@ -42,6 +43,7 @@ MIN_TRACK_STEP_M = 0.5
 TRACK_GAP_S = 3.0
 PREARM_TEXT_MAX_AGE_S = 35.0
 """Maximum age in seconds of a text about a failed arming check. ArduPilot repeats these texts every 30 s."""
+_CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
 MIN_CHECK_INTERVAL_S = 5.0
 """Minimum seconds between two requests to run the arming checks, for a vehicle whose readiness alternates."""
 
@@ -63,6 +65,7 @@ class ServedVehicles:
         # The failing sensors for which the arming checks were requested last, and the time of that request.
         self._requested_for: dict[Vehicle, tuple[str, ...]] = {}
         self._requested_at: dict[Vehicle, float] = {}
+        self._watches: dict[Vehicle, FlightWatch] = {}
         self._listeners: list[Listener] = []
         self._attached: dict[Connection, list[Detach]] = {}
         self._message_count = 0
@@ -81,6 +84,7 @@ class ServedVehicles:
         else:
             raise InvalidArgument(f"source = {source!r} is not a connection, a vehicle or a mapping of vehicles")
         self._attach_new_connections()
+        self.listen(self._on_message)
         self._background.start(self._record_tracks, "aerokit serve tracks")
         self._background.start(self._request_arming_checks, "aerokit serve checks")
 
@@ -98,6 +102,10 @@ class ServedVehicles:
                 404, "UnknownVehicle", f"no vehicle has system id {system_id} (vehicles: {known_ids}); nothing was sent"
             )
         return vehicle
+
+    def crash(self, vehicle: Vehicle) -> dict[str, Any] | None:
+        """Return the impact after which a vehicle has not moved; None if there was none, or it is silent."""
+        return self._watch(vehicle).crash if vehicle.link_state.latest is LinkState.CONNECTED else None
 
     def texts(self, system_id: int) -> list[dict[str, Any]]:
         return list(self._texts.get(system_id, ()))
@@ -135,7 +143,19 @@ class ServedVehicles:
             for detach in detaches:
                 detach()
         self._attached.clear()
+        for watch in self._watches.values():
+            watch.close()
+        self._watches.clear()
         await self._background.aclose()
+
+    def _watch(self, vehicle: Vehicle) -> FlightWatch:
+        if vehicle not in self._watches:
+            self._watches[vehicle] = FlightWatch(vehicle)
+        return self._watches[vehicle]
+
+    def _on_message(self, message: Mapping[str, Any]) -> None:
+        if message["type"] == "order" and (vehicle := self._vehicles.get(message["system_id"])) is not None:
+            self._watch(vehicle).on_order(message["order"])
 
     async def _follow_connection(self, connection: Connection) -> None:
         async with vehicles_on(connection) as vehicles:
@@ -166,6 +186,7 @@ class ServedVehicles:
         silent: set[int] = set()  # system ids whose next position comes after a gap
         while True:
             for system_id, vehicle in tuple(self._vehicles.items()):
+                self._watch(vehicle)
                 position, track = vehicle.position.latest, self._tracks.setdefault(system_id, [])
                 if position is None or vehicle.position.age > TRACK_GAP_S:
                     silent.add(system_id)
@@ -190,15 +211,19 @@ class ServedVehicles:
             await anyio.sleep(TRACK_INTERVAL_S)
 
     def _state_of(self, vehicle: Vehicle) -> dict[str, Any]:
-        """Return the overview of a vehicle, with the conditions missing for flight and the mission progress.
+        """Return the overview of a vehicle, with what the page shows besides: see docs/serve.md.
 
         ``mission_item`` counts items without home, unlike the state ``mission_current``, which counts them as on the
         wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if ``arm`` does not change the mode.
         """
-        mission = vehicle.mission
+        mission, watch, missing = vehicle.mission, self._watch(vehicle), self._missing_for_flight(vehicle)
         return {
             **overview(vehicle),
-            "missing_for_flight": self._missing_for_flight(vehicle),
+            "missing_for_flight": missing,
+            "not_armable": not_armable(vehicle, missing),
+            "crash": watch.crash,
+            "disarming": watch.disarming,
+            "unread": _unread(vehicle, watch.disarm_parameter),
             "failsafe": ground_station_failsafe(vehicle),
             "mission_item": mission.current.latest,
             "mission_items": mission.count.latest,
@@ -225,6 +250,34 @@ def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
     if vehicle.link_state.latest is not LinkState.CONNECTED or not is_disarmed or sensors is None:
         return None
     return tuple(sensors.failing) if sensors.prearm_checks_pass is False else None
+
+
+def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
+    """Return why ``arm`` would be refused, from the state received so far; empty if no reason is known.
+
+    ``missing`` are the conditions missing for flight. ArduPilot arms without most of them, in modes without position.
+    """
+    autopilot, unarmable = vehicle.autopilot, _unarmable_mode(vehicle)
+    if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False:
+        return []
+    if unarmable is not None and unarmable["arms_in"] is None:
+        unless = f" unless {unarmable['unless']} allows it" if unarmable["unless"] else ""
+        return [f"{autopilot.firmware} cannot arm in {unarmable['mode']}{unless}", *missing]
+    sensors, estimator = vehicle.sensors.latest, vehicle.estimator.latest
+    if missing and sensors is not None and sensors.prearm_checks_pass is False:
+        return [reason for reason in missing if len(missing) == 1 or reason != _CHECKS_FAIL]
+    mode = vehicle.mode.latest
+    arms_in = unarmable["arms_in"] if unarmable is not None else None if mode is None else mode.name
+    needs_position = bool(autopilot.modes_without_position) and arms_in not in (None, *autopilot.modes_without_position)
+    if needs_position and estimator is not None and estimator.missing:
+        change = "" if unarmable is None else ", to which Arm would change the mode"
+        return [f"{autopilot.firmware} needs a position to arm in {arms_in}{change}", *missing]
+    return []
+
+
+def _unread(vehicle: Vehicle, parameter: str | None) -> list[str]:
+    """Return the parameters that ``disarming`` needs and that have not been read."""
+    return [] if parameter is None or vehicle.parameters.known(parameter) is not None else [parameter]
 
 
 def _is_flying_mission(vehicle: Vehicle) -> bool:

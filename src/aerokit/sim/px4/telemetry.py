@@ -251,8 +251,8 @@ def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
     motion = px4.motion
     yaw = motion.yaw
     if not px4.is_armed:
-        position_and_velocity, acceleration = (math.nan,) * 6, (0.0, 0.0, 100.0)
-        return m.PositionTargetLocalNed(px4.time_boot_ms, 1, 63, *position_and_velocity, *acceleration, yaw, 0.0)
+        unknown, acceleration = (math.nan, math.nan, math.nan), (0.0, 0.0, 100.0)
+        return m.PositionTargetLocalNed(px4.time_boot_ms, 1, 63, *unknown, *unknown, *acceleration, yaw, 0.0)
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     acceleration = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down)
     return m.PositionTargetLocalNed(

@@ -4,24 +4,27 @@ import { drawAttitude } from "./attitude.js";
 import { age, byId, element, number, show } from "./dom.js";
 import { colourOf, MapView } from "./map.js";
 import { Orders } from "./orders.js";
-import { currentItem, MissionPanel, OrderPanel, outcome, ParameterPanel, TextPanel } from "./panels.js";
-import { inWords, isConnected, showReadiness, showSilences } from "./readiness.js";
+import { targetAltitude } from "./facts.js";
+import { currentItem, MissionPanel, OrderPanel, ParameterPanel, shownState, TextPanel } from "./panels.js";
+import { disarmText, inWords, isConnected, showCrashes, showReadiness, showSilences } from "./readiness.js";
 import { ask, hasToken, openStream, useToken } from "./server.js";
 import { ageOf, BigValues, bitNames, StateTable } from "./state.js";
 
 const page = { vehicles: new Map(), selected: undefined, receivedAt: 0, atSeconds: null, isOpen: false, isReadOnly: false, modesOf: undefined };
 const selected = () => page.vehicles.get(page.selected);
 
-const map = new MapView(byId("map"), (place, y) => { pick(false); orders.goTo(place, heightNow(), y); });
+const map = new MapView(byId("map"), (place, y) => { pick(false); orders.goTo(place, targetAltitude(page.running(page.selected)) ?? heightNow(), y); });
 const big = new BigValues(byId("tiles-of-state"));
 const table = new StateTable();
 const missions = new MissionPanel(draw, (file) => orders.upload(file));
 const texts = new TextPanel();
 const orderList = new OrderPanel();
+page.running = (id) => orderList.running(id);
 const orders = new Orders(byId("orders"), {
-  vehicle: selected, seenAt: () => page.atSeconds, pick: () => pick(!map.isPicking), toast, record, changed: draw,
+  vehicle: selected, seenAt: () => page.atSeconds, pick: () => pick(!map.isPicking), toast, record, changed: draw, running: page.running, preview,
 });
-const parameters = new ParameterPanel((id, parameter) => { if (!page.isReadOnly && hasToken()) orders.setParameter(id, parameter); });
+const canSet = () => !page.isReadOnly && hasToken();
+const parameters = new ParameterPanel((id, parameter) => { if (canSet()) orders.setParameter(id, parameter); }, canSet);
 
 // ------------------------------------------------------------------------------------------- panels
 
@@ -107,7 +110,7 @@ async function loadTrack(id) {
 const asked = new Set();
 
 function loadFailsafe(vehicle) {
-  for (const name of isConnected(vehicle) ? vehicle.failsafe.unread : []) {
+  for (const name of isConnected(vehicle) ? [...vehicle.failsafe.unread, ...vehicle.unread] : []) {
     const key = `${vehicle.system_id} ${name}`;
     if (!asked.has(key)) ask("GET", `api/vehicles/${vehicle.system_id}/parameters/${name}`).catch(() => {});
     asked.add(key);
@@ -127,6 +130,25 @@ function pick(isOn) {
   byId("map").classList.toggle("picking", map.isPicking);
   byId("hint").hidden = !map.isPicking;
   if (map.isPicking) show(byId("hint"), `click the target position for vehicle ${page.selected}`);
+}
+
+// The plan of the open upload dialog, until it closes; of its parts, the vehicle keeps those that the file does not have.
+let previewed = null;
+
+function preview(plan) {
+  if (plan && !previewed) map.showAll();
+  else if (!plan && previewed) map.showBefore();
+  previewed = plan;
+}
+
+function shownPlan(vehicle) {
+  const fence = missions.fence(page.selected);
+  if (!previewed) return { plan: { items: missions.items(page.selected), current: vehicle ? currentItem(vehicle) : null }, fence };
+  const { items, fence: { polygons, circles }, rally } = previewed, hasFence = polygons.length + circles.length > 0;
+  return {
+    plan: { items: items.length ? items : missions.items(page.selected), current: null },
+    fence: { ...(hasFence ? { polygons, circles } : fence), rally: rally.length ? rally.map((each) => each.position).filter(Boolean) : fence.rally },
+  };
 }
 
 function onMap(vehicle) {
@@ -175,14 +197,15 @@ function drawNow() {
   const vehicle = selected();
   showVehicles();
   showSilences(byId("silences"), page);
+  showCrashes(byId("crashes"), page);
   showReadiness(byId("readiness"), vehicle, page);
   big.show(vehicle, page.receivedAt);
   tab.show(vehicle, page.receivedAt);
   const attitude = vehicle && vehicle.states.attitude;
   drawAttitude(byId("attitude"), attitude && attitude.value, ageOf(attitude, page.receivedAt) > 3);
-  const target = orders.target ?? orderList.running(page.selected, "go_to")?.arguments;
-  const plan = { items: missions.items(page.selected), current: vehicle ? currentItem(vehicle) : null };
-  map.draw([...page.vehicles.values()].map(onMap), page.selected, plan, target, missions.fence(page.selected));
+  const target = orders.target ?? page.running(page.selected).filter((each) => each.order === "go_to").pop()?.arguments;
+  const { plan, fence } = shownPlan(vehicle);
+  map.draw([...page.vehicles.values()].map(onMap), page.selected, plan, target, fence);
   byId("follow").setAttribute("aria-pressed", String(map.follows !== null));
   page.hasToken = hasToken();
   orders.enable(vehicle, page);
@@ -203,7 +226,7 @@ function toast(text, kind, key) {
   byId("toasts").append(made);
   placeToasts();
   byId("toasts").scrollTop = byId("toasts").scrollHeight;
-  setTimeout(() => made.remove(), kind === "failed" ? 15000 : 5000);
+  setTimeout(() => made.remove(), kind === "failed" || kind === "note" ? 15000 : 5000);
 }
 
 // Toasts never cover the orders: they are above them, or below where there is more room.
@@ -228,8 +251,8 @@ function record(order, isNew = true) {
   }
   if (isNew && !announced.has(order.key + order.state)) {
     announced.add(order.key + order.state);
-    const why = order.problem ? `: ${inWords(order.problem, page.vehicles.get(order.system_id))}` : "";
-    toast(`Vehicle ${order.system_id}: ${outcome(order)}${why}`, order.state, order.key);
+    const why = order.problem && !order.replaced_by ? `: ${inWords(order.problem, page.vehicles.get(order.system_id))}` : "";
+    toast(`Vehicle ${order.system_id}: ${orderList.outcome(order)}${why}`, shownState(order), order.key);
   }
   draw();
 }
@@ -248,6 +271,10 @@ function onMessage(message) {
     page.atSeconds = message.at_s;
     for (const { system_id } of message.vehicles) if (!page.vehicles.has(system_id)) loadTrack(system_id);
     message.vehicles.forEach((each) => { each.disarmedAt = disarmedAt(page.vehicles.get(each.system_id), each); });
+    for (const each of message.vehicles) {
+      const before = page.vehicles.get(each.system_id), text = disarmText(each);
+      if (text && before && !disarmText(before)) toast(`Vehicle ${each.system_id}: ${text}`, "note");
+    }
     page.vehicles = new Map(message.vehicles.map((each) => [each.system_id, each]));
     message.vehicles.forEach(loadFailsafe);
     for (const { system_id, states } of message.vehicles) addToTrack(system_id, states.position);

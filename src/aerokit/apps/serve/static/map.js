@@ -99,6 +99,14 @@ export class MapView {
     this.scale = 0.72 * Math.min(this.width / wide, this.height / tall);
   }
 
+  // Fits everything into the map until `showBefore`.
+  showAll() {
+    this.before = { centre: this.centre, scale: this.scale, isMoved: this.isMoved, follows: this.follows };
+    Object.assign(this, { isMoved: false, follows: null });
+  }
+
+  showBefore() { Object.assign(this, this.before); }
+
   listen() {
     const fingers = new Map();
     let travelled = 0;

@@ -1,13 +1,14 @@
 // Orders: buttons, and the confirmation dialog that names vehicle and order. Every order needs it, and is sent once.
 
 import { age, byId, element, show } from "./dom.js";
+import { needsForce, orderFacts, valueProblem } from "./facts.js";
 import { distanceText } from "./map.js";
 import { aboutParameter, parameterProblem } from "./panels.js";
 import { capitalized, dialogObstacle, inWords, obstacle } from "./readiness.js";
 import { ask, hasToken, newKey, Refusal, useToken } from "./server.js";
 import { ageOf } from "./state.js";
 
-// name, text of the button, text of the dialog, fields [name, label, value, step], class of the button
+// name, text of the button, text of the dialog (or a function of the values), fields [name, label, value, step], class of the button
 export const BUTTONS = [
   ["arm", "Arm", "arm the motors: propellers may start to turn", [], "main"],
   ["take_off", "Take off", "take off and climb", [["altitude_m", "Metres above home", 10, "any"]], "main"],
@@ -16,21 +17,27 @@ export const BUTTONS = [
   ["land", "Land", "land at its current position", [], "rest"],
   ["return_to_launch", "Return", "return to the launch position", [], "rest"],
   ["disarm", "Disarm", "stop the motors", [], ""],
-  ["mission/start", "Start mission", "fly its mission from item N; it takes off if the mission has a takeoff item", [["item", "From item", 0, "1"]], ""],
+  ["mission/start", "Start mission", ({ item = "N" }) => `fly its mission from item ${item}; it takes off if the mission has a takeoff item`, [["item", "From item", 0, "1"]], ""],
   ["mission/pause", "Pause", "pause its mission and hold", [], ""],
   ["mission/resume", "Resume", "resume its mission", [], ""],
 ];
 
 export class Orders {
-  // page: {vehicle(), seenAt(), pick(), toast(text, kind), record(order), changed()}
+  // page: {vehicle(), seenAt(), pick(), toast(text, kind), record(order), changed(), running(id), preview(plan)}
   constructor(box, page) {
     this.page = page;
     this.buttons = [];
     this.target = null; // the position that the open dialog asks about
     this.recheck = null; // updates the open dialog
-    byId("dialog").addEventListener("close", () => { if (!byId("dialog").open) this.target = this.recheck = null; this.page.changed(); });
+    byId("dialog").addEventListener("close", () => {
+      if (!byId("dialog").open) {
+        this.target = this.recheck = null;
+        page.preview(null);
+      }
+      page.changed();
+    });
     for (const [name, title, text, fields, kind] of BUTTONS) {
-      const clicked = () => (name === "pick" ? page.pick() : this.confirm({ order: name, title, text, fields }));
+      const clicked = () => (name === "pick" ? page.pick() : this.confirm(this.wanted(name, title, text, fields)));
       const button = element("button", { type: "button", class: kind, onclick: clicked }, element("span", {}, title), element("small", {}));
       button.dataset.order = name;
       this.buttons.push(button);
@@ -43,12 +50,20 @@ export class Orders {
     box.append(this.modes);
   }
 
+  wanted(order, title, text, fields) {
+    const vehicle = this.page.vehicle(), isForced = order === "disarm" && vehicle && needsForce(vehicle);
+    return { order, title, text, fields, ...(isForced ? { fixed: { force: true } } : {}) };
+  }
+
   // Disables what cannot work now, with the reason below the title.
   enable(vehicle, page) {
     for (const button of this.buttons) {
-      const name = button.dataset.order ?? "mode", why = obstacle(name === "pick" ? "go_to" : name, vehicle, page);
+      const chosen = button.dataset.order ?? "mode", name = chosen === "pick" ? "go_to" : chosen, why = obstacle(name, vehicle, page);
+      const isBusy = String(Boolean(vehicle) && this.page.running(vehicle.system_id).some((each) => each.order === name));
+      if (button.getAttribute("aria-busy") !== isBusy) button.setAttribute("aria-busy", isBusy);
+      const title = why === "Cannot arm" ? `Cannot arm: ${vehicle.not_armable.join("; ")}` : why;
       if (button.disabled !== Boolean(why)) button.disabled = Boolean(why);
-      if (button.title !== why) button.title = why;
+      if (button.title !== title) button.title = title;
       if (button !== this.modes) show(button.children[1], capitalized(why.split(": ").pop())); // the button is narrow
     }
   }
@@ -58,14 +73,16 @@ export class Orders {
     if (!vehicle) return;
     try {
       const plan = await file.text(), name = file.name;
-      const { mission_items: count, fence_areas: areas, rally_points: rally } = await ask("POST", "api/plan", { plan, name });
+      const checked = await ask("POST", "api/plan", { plan, name });
+      const { mission_items: count, fence_areas: areas, rally_points: rally } = checked;
       const parts = [[count, "mission items"], [areas, "fence areas"], [rally, "rally points"]];
       const replaced = parts.filter(([each]) => each).map(([each, what]) => `${each} ${each === 1 ? what.slice(0, -1) : what}`);
       this.confirm({
-        order: "mission/upload", title: "Upload", fields: [], fixed: { name, plan },
+        order: "mission/upload", title: "Upload", fields: [], fixed: { name, plan }, preview: checked, place: "beside",
         text: `get ${replaced.join(", ") || "nothing"} from ${file.name}, instead of those it has`,
         about: [
           vehicle.states.armed?.value ? "The vehicle is armed." : "",
+          "The map shows the plan.",
           areas && rally ? "" : "What the file does not contain (fence, rally points) stays as it is.",
         ].filter(Boolean),
       });
@@ -120,6 +137,7 @@ export class Orders {
       input.value = typeof value === "number" ? String(+value.toFixed(7)) : value;
       return [name, input, element("label", {}, label, input)];
     });
+    const will = element("span", {}), facts = element("div", { class: "facts" });
     const yes = element("button", { type: "submit", class: "yes" }, `Yes, ${wanted.title.charAt(0).toLowerCase()}${wanted.title.slice(1)} · vehicle ${id}`);
     const problem = element("p", { class: "problem", hidden: true, role: "alert" });
     const force = element("input", { type: "checkbox", name: "force", onchange: () => enable() });
@@ -132,12 +150,17 @@ export class Orders {
       const why = dialogObstacle(wanted.order, page.vehicles.get(id), page);
       show(blocked, why);
       blocked.hidden = !why;
+      const lines = orderFacts(wanted.order, page.vehicles.get(id), this.page.running(id));
+      if (facts.dataset.drawn !== lines.join("\n")) facts.replaceChildren(...lines.map((line) => element("p", {}, line)));
+      facts.dataset.drawn = lines.join("\n");
       enable();
     };
     const check = () => {
-      const text = wanted.problem?.(values()) || "";
+      const text = wanted.problem?.(values()) || valueProblem(wanted.order, values(), vehicle);
       show(problem, text);
-      problem.hidden = forced.hidden = !text;
+      problem.hidden = !text;
+      forced.hidden = !text || wanted.order !== "parameter";
+      show(will, typeof wanted.text === "function" ? wanted.text(values()) : wanted.text);
       force.checked = false;
       enable();
     };
@@ -153,14 +176,15 @@ export class Orders {
     dialog.className = wanted.place ?? "";
     dialog.replaceChildren(element("form", { onsubmit: give, oninput: (event) => { if (event.target !== force) check(); } },
       element("h2", {}, `${wanted.title}?`),
-      element("p", {}, element("span", { class: "target" }, `Vehicle ${id}`), ` (${vehicle.firmware}) will ${wanted.text}.`),
+      element("p", {}, element("span", { class: "target" }, `Vehicle ${id}`), ` (${vehicle.firmware}) will `, will, "."),
       wanted.target ? element("p", { class: "where" }) : null,
       ...(wanted.about ?? []).map((line) => element("p", { class: "detail" }, line)),
-      ...inputs.map(([, , label]) => label), blocked, problem, forced,
+      facts, ...inputs.map(([, , label]) => label), blocked, problem, forced,
       token ? element("label", {}, "Token", token) : null,
       element("div", { class: "buttons" }, cancel, yes)));
     if (dialog.open) dialog.close();
     this.target = wanted.target ?? null;
+    this.page.preview(wanted.preview ?? null);
     dialog.showModal();
     check();
     this.page.changed();

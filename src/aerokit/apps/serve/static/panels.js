@@ -86,8 +86,10 @@ export class MissionPanel {
 export const currentItem = (vehicle) => vehicle.mission_item ?? null;
 
 export class ParameterPanel {
-  constructor(setParameter) {
+  constructor(setParameter, isSettable) {
     this.setParameter = setParameter;
+    this.isSettable = isSettable;
+    this.rows = [];
     this.tables = new Map();
     this.body = element("tbody", {});
     this.note = element("p", { class: "note" });
@@ -117,6 +119,7 @@ export class ParameterPanel {
   }
 
   show(vehicle) {
+    if (this.node.classList.contains("settable") !== this.isSettable()) this.filter();
     if (!vehicle || vehicle.system_id === this.vehicle) return;
     this.vehicle = vehicle.system_id;
     this.load(this.vehicle);
@@ -142,13 +145,14 @@ export class ParameterPanel {
   filter() {
     const words = this.search.value.trim().toUpperCase().split(/\s+/);
     let count = 0;
+    this.node.classList.toggle("settable", this.isSettable());
     for (const { node, text } of this.rows) {
       node.hidden = !words.every((word) => text.includes(word));
       count += !node.hidden;
     }
     const note = (this.tables.get(this.vehicle) || {}).note;
     const near = !count && words.length === 1 ? nearName(words[0], this.rows.map((each) => each.name)) : "";
-    show(this.note, note ?? `${count} of ${this.rows.length} parameters${near ? `: did you mean ${near}?` : ""}`);
+    show(this.note, note ?? `${count} of ${this.rows.length} parameters${near ? `: did you mean ${near}?` : count && this.isSettable() ? " · click one to set it" : ""}`);
   }
 }
 
@@ -305,8 +309,16 @@ export class OrderPanel {
     this.drawn = undefined;
   }
 
-  running(id, order) {
-    return [...this.records.values()].filter((each) => each.state === "running" && each.system_id === id && each.order === order).pop();
+  // The running orders of a vehicle, the newest last.
+  running(id) {
+    return [...this.records.values()].filter((each) => each.state === "running" && each.system_id === id);
+  }
+
+  // An order and its state, in words.
+  outcome(record) {
+    if (!record.replaced_by) return outcome(record);
+    const newer = this.records.get(record.replaced_by);
+    return `${orderText(record)}: replaced by ${newer ? orderTitle(newer) : "a newer order"}`;
   }
 
   show() {
@@ -315,11 +327,14 @@ export class OrderPanel {
     const shown = [...this.records.values()].reverse();
     this.node.replaceChildren(...shown.map((each) => element("div", { class: "text" },
       element("time", {}, clock(each.given_unix_s)),
-      element("span", {}, `vehicle ${each.system_id}: `, element("span", { class: each.state }, outcome(each)),
-        each.problem ? element("div", { class: "detail" }, inWords(each.problem)) : null))));
+      element("span", {}, `vehicle ${each.system_id}: `, element("span", { class: shownState(each) }, this.outcome(each)),
+        each.problem && !each.replaced_by ? element("div", { class: "detail" }, inWords(each.problem)) : null))));
     if (!shown.length) this.node.replaceChildren(element("p", { class: "note" }, "no orders yet"));
   }
 }
+
+// An order that the next one replaced has not failed.
+export const shownState = (record) => (record.replaced_by ? "replaced" : record.state);
 
 // Text after the name of an order; other orders list their arguments.
 const ORDER_TEXTS = {
@@ -336,12 +351,17 @@ const BEGUN = {
   "mission/resume": () => "mission resumed",
 };
 
-// An order and its state, in words.
-export function outcome(record) {
+function outcome(record) {
   const text = record.state === "done" && BEGUN[record.order];
   if (text) return text(record.arguments);
   const note = record.order === "set_parameter" && record.result?.note;
   return `${orderText(record)}: ${record.state === "running" ? "ordered" : record.state}${note ? `; ${note}` : ""}`;
+}
+
+// An order as a reason or an effect of another one: without the place of "go to".
+export function orderTitle(record) {
+  const height = record.arguments.altitude_relative_m;
+  return record.order === "go_to" ? `go to a position${typeof height === "number" ? ` at ${+height.toFixed(2)} m` : ""}` : orderText(record);
 }
 
 function orderText(record) {

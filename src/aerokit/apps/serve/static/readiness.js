@@ -34,20 +34,25 @@ export function obstacle(order, vehicle, page) {
   switch (order) {
     case "arm":
       if (isArmed) return "Armed";
-      return vehicle.missing_for_flight.length && valueOf(vehicle, "sensors")?.prearm_checks_pass === false ? "Not ready" : "";
+      return vehicle.not_armable?.length ? "Cannot arm" : "";
     case "disarm":
-      return isArmed === false ? "Disarmed" : isSurface || isOnGround ? "" : isFlying ? "Land first" : "May be flying";
+      return isArmed === false ? "Disarmed" : isSurface || isOnGround || vehicle.crash ? "" : isFlying ? "Land first" : "May be flying";
     case "take_off":
-      return isSurface ? "Does not fly" : isArmed === false ? "Arm first" : isFlying ? "Flying" : lacksPosition(vehicle) ? "No position" : "";
+      if (page.running?.(vehicle.system_id).some((each) => each.order === "take_off")) return "Running";
+      return isSurface ? "Does not fly" : isArmed === false ? "Arm first" : vehicle.crash ? "Crashed" : isFlying ? "Flying" : lacksPosition(vehicle) ? "No position" : "";
     case "go_to":
-      return isArmed === false ? "Arm first" : isOnGround && !isSurface ? "Take off first" : lacksPosition(vehicle) ? "No position" : "";
-    case "hold": case "land": case "return_to_launch": return isArmed === false && isOnGround ? "Not flying" : "";
+      return isArmed === false ? "Arm first" : vehicle.crash ? "Crashed" : isOnGround && !isSurface ? "Take off first" : lacksPosition(vehicle) ? "No position" : "";
+    case "return_to_launch":
+      if (isArmed && isOnGround && !isSurface) return "On the ground";
+      // falls through
+    case "hold": case "land": return isArmed === false && isOnGround ? "Not flying" : "";
     case "mission/start": case "mission/resume":
       if (vehicle.mission_items === 0) return "No mission";
       if (isArmed === false) return "Arm first";
+      if (vehicle.crash) return "Crashed";
       if (vehicle.is_flying_mission && mission?.state === "ACTIVE" && (isFlying || isSurface)) return "Running";
       // ArduCopter, on the ground after a finished mission, would take off and fly from the first item.
-      if (order === "mission/resume" && isOnGround && !isSurface) return "On the ground: use Start mission";
+      if (order === "mission/resume" && isOnGround && !isSurface) return "On the ground: use Start";
       return lacksPosition(vehicle) ? "No position" : "";
     case "mission/pause":
       return isArmed === false || mission?.state === "NO_MISSION" || !vehicle.is_flying_mission ? "None runs" : "";
@@ -58,10 +63,33 @@ export function obstacle(order, vehicle, page) {
 const EKF_POS_HORIZ = 8 + 16, EKF_CONST_POS_MODE = 128; // bits of EKF_STATUS_REPORT: relative or absolute position
 
 // ArduCopter, armed, changes to GUIDED and AUTO only with a horizontal position (system.cpp, position_ok).
-function lacksPosition(vehicle) {
+export function lacksPosition(vehicle) {
   const estimator = vehicle.states.estimator;
   if (vehicle.firmware !== "ArduCopter" || estimator?.value?.message !== "EKF_STATUS_REPORT" || estimator.age_s > 5) return false;
   return !(estimator.value.flags & EKF_POS_HORIZ) || Boolean(estimator.value.flags & EKF_CONST_POS_MODE);
+}
+
+// What a vehicle that arms cannot do yet. The page uses these words wherever it does not say "Cannot arm".
+export function flightGap(vehicle) {
+  if (!vehicle.states.sensors) return "Not known yet whether it can arm";
+  if (SURFACE_TYPES.has(vehicle.vehicle_type)) return "Arms, but cannot drive by itself yet";
+  return lacksPosition(vehicle) ? "Arms, but cannot take off yet" : "Arms, but is not ready to fly";
+}
+
+export const withoutSource = (reason) => reason.replace(/ \([A-Z_]+\)$/, "");
+
+// "It hit the ground at 11.6 m/s at 06:07:11 and has not moved since"
+export function crashText(vehicle, name = "It") {
+  const since = isConnected(vehicle) && valueOf(vehicle, "armed") ? " and has not moved since" : "";
+  return `${name} ${vehicle.crash.text.replace(/^the vehicle /, "")} at ${clock(vehicle.crash.at_unix_s)}${since}`;
+}
+
+// How a vehicle disarmed that was not in the air, without an order of this server; "" if it was longer ago.
+export function disarmText({ disarming: known }) {
+  if (!known || known.age_s * 1000 > RECENT_MS) return "";
+  const after = `${Math.round(known.armed_for_s)} s after arming`, { parameter, delay_s: delay } = known;
+  if (known.is_automatic) return `Disarmed by the vehicle ${after}, because it was not in the air (${parameter} = ${delay} s)`;
+  return `Disarmed ${after}, not by an order of this server${parameter && delay !== 0 ? ` (${parameter}${delay === null ? "" : ` = ${delay} s`})` : ""}`;
 }
 
 const RECENT_MS = 60_000;
@@ -99,16 +127,20 @@ function readiness(vehicle, page, heartbeatAge) {
   if (!vehicle) return ["unknown", "No vehicle yet", []];
   if (!page.isOpen) return ["unknown", "Readiness unknown", ["No connection to the server"]];
   if (!isConnected(vehicle)) return ["bad", `No contact for ${age(heartbeatAge)}`, []];
-  const missing = vehicle.missing_for_flight, landed = landedState(vehicle);
+  const missing = vehicle.missing_for_flight, landed = landedState(vehicle), disarmed = disarmText(vehicle);
+  if (vehicle.crash) {
+    const title = valueOf(vehicle, "armed") === false ? "Crashed" : "Crashed: propellers may turn";
+    return ["bad", title, [crashText(vehicle), ...missing]];
+  }
   if (valueOf(vehicle, "armed")) {
     const title = landed === "ON_GROUND" ? "Armed: propellers may turn" : FLYING.has(landed) ? "Flying" : "Armed";
     return [missing.length || landed === "ON_GROUND" ? "warn" : "good", title, missing];
   }
   const mode = vehicle.unarmable_mode, unless = mode?.unless ? ` unless ${mode.unless} allows it` : "";
   const cannot = mode && `${vehicle.firmware} cannot arm in ${mode.mode}${unless}`;
-  if (cannot && !mode.arms_in) return ["warn", "Not ready", [cannot, ...missing]];
-  const note = cannot ? [`Arm changes the mode to ${mode.arms_in} first: ${cannot}`] : [];
-  return missing.length ? ["warn", "Not ready", [...missing, ...note]] : ["good", "Ready to arm", note];
+  const notes = [disarmed, cannot && mode.arms_in ? `Arm changes the mode to ${mode.arms_in} first: ${cannot}` : ""].filter(Boolean);
+  if (vehicle.not_armable.length) return ["warn", "Cannot arm", [...vehicle.not_armable, ...(disarmed ? [disarmed] : [])]];
+  return missing.length ? ["warn", flightGap(vehicle), [...missing, ...notes]] : ["good", "Ready to arm", notes];
 }
 
 export function showReadiness(box, vehicle, page) {
@@ -116,7 +148,7 @@ export function showReadiness(box, vehicle, page) {
   const drawn = [kind, title, ...reasons].join("\n");
   if (box.dataset.drawn === drawn) return;
   box.dataset.drawn = drawn;
-  const items = reasons.map((reason) => element("li", {}, capitalized(reason.replace(/ \([A-Z_]+\)$/, ""))));
+  const items = reasons.map((reason) => element("li", {}, capitalized(withoutSource(reason))));
   const more = items.splice(MAX_REASONS), isOpen = box.querySelector("details")?.open ?? false;
   const rest = more.length ? element("details", { open: isOpen }, element("summary", {}, `and ${more.length} more`), element("ul", {}, ...more)) : null;
   box.className = kind;
@@ -141,6 +173,18 @@ export function showSilences(box, page) {
     show(place, `${silence === undefined ? "" : `For ${age(silence)}. `}${lastPosition(vehicle, page)}`);
     show(failsafe, failsafeText(vehicle.failsafe));
   });
+}
+
+// One banner for each vehicle that hit the ground.
+export function showCrashes(box, page) {
+  const crashed = page.isOpen ? [...page.vehicles.values()].filter((each) => each.crash) : [];
+  const texts = crashed.map((each) => {
+    const isArmed = valueOf(each, "armed") !== false;
+    return `${crashText(each, `Vehicle ${each.system_id}`)}. ${isArmed ? "It is still armed: propellers may turn." : "It is disarmed."}`;
+  });
+  if (box.dataset.drawn === texts.join("\n")) return;
+  box.dataset.drawn = texts.join("\n");
+  box.replaceChildren(...texts.map((text) => element("div", { class: "silence" }, element("strong", { role: "alert" }, text))));
 }
 
 function lastPosition(vehicle, page) {
