@@ -19,10 +19,11 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link, Peer
 
 DUPLICATE_WINDOW_S = 2.0
-"""A frame with the same sender, number and checksum is a duplicate if another port received one this short before."""
+"""A frame that another port received less than this many seconds before, with equal number and checksum, is a duplicate.
+"""
 
 REPEAT_WINDOW_S = 0.5
-"""A frame with an out-of-order number is a duplicate if the same port received an equal one this short before."""
+"""An out-of-order frame that the same port received less than this many seconds before is a duplicate."""
 
 LOOP_WINDOW_S = 60.0
 """A frame that returns through another port is recognised up to this time after it was first received.

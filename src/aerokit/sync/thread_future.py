@@ -51,7 +51,7 @@ class ThreadFuture(Generic[T]):
         return self.is_done
 
     def result(self) -> T:
-        """Return the result, or raise the error. An error is raised only once; then, and without either, LookupError."""
+        """Return the result, or raise the error. An error is raised only once. LookupError if there is neither."""
         error = self.pop_exception()
         if error is not None:
             raise error
