@@ -239,6 +239,7 @@ class FrameReceiver:
         return sum(source.received for source in sources), sum(source.lost for source in sources)
 
     def _on_blocked(self, seconds: float) -> None:
+        """Publish that the event loop was blocked, and log a warning if heartbeats were late."""
         if seconds >= BLOCKED_WARNING_S:
             logger.warning(
                 "the event loop was blocked for %.1f s: no messages or heartbeats were processed; %s",

@@ -240,6 +240,7 @@ class _Diagnosis:
         self._systems = {system for counters in statistics for system, _ in counters.sources}
 
     def text(self) -> str:
+        """Return the explanation, which depends on how far the received data could be interpreted."""
         if not self._bytes:
             return "no bytes were received: is the vehicle on, and is it sending to this address?"
         if not self._frames:
@@ -271,6 +272,7 @@ class _Diagnosis:
         return f"{received}, but no HEARTBEAT among them"
 
     def _without_vehicle(self) -> str:
+        """Explain why heartbeats were received, but none of the wanted vehicle."""
         autopilots = sorted({system for (system, _), heartbeat in self._heartbeats.items() if is_autopilot(heartbeat)})
         if autopilots:
             names = ", ".join(map(str, autopilots))

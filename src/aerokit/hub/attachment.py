@@ -241,6 +241,7 @@ class Attachment:
         self._peers.forget(peer)
 
     def _forget_port(self, peer: Peer) -> None:
+        """Remove the port of a peer. The counters of its framer stay in the endpoint's totals."""
         framer = self._peers.framers.get(peer)
         if framer is not None:
             self._former_totals = [

@@ -236,6 +236,7 @@ class TargetFields:
 
 
 def _field_offsets(message_type: type[Message]) -> FieldOffsets | None:
+    """Return the offsets of the target's ids in `Frame.body`; None if the message has no target."""
     names = {field.name for field in message_type.FIELDS}
     system = _SYSTEM_FIELDS.get(message_type.NAME, "target_system")
     if system not in names:

@@ -19,11 +19,10 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link, Peer
 
 DUPLICATE_WINDOW_S = 2.0
-"""A frame that another port received less than this many seconds before, with equal number and checksum, is a duplicate.
-"""
+"""Seconds in which an equal frame (same sender, number and checksum) from another port counts as a duplicate."""
 
 REPEAT_WINDOW_S = 0.5
-"""An out-of-order frame that the same port received less than this many seconds before is a duplicate."""
+"""Seconds in which an equal frame from the same port counts as a duplicate, if its number is out of order."""
 
 LOOP_WINDOW_S = 60.0
 """A frame that returns through another port is recognised up to this time after it was first received.

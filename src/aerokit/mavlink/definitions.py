@@ -250,6 +250,7 @@ def _find_include(include: str, file: Path, search: Sequence[Path]) -> Path:
 
 
 def _message(node: Element, origin: str) -> MessageDefinition:
+    """Parse a ``<message>``. Fields after ``<extensions/>`` are extension fields."""
     fields: list[FieldDefinition] = []
     extension = False
     for child in node:
@@ -359,6 +360,7 @@ def _text(node: Element | None) -> str:
 
 
 def _remarks(node: Element) -> tuple[str, ...]:
+    """Return one sentence for each ``<deprecated>``, ``<superseded>`` and ``<wip>`` of a message or entry."""
     remarks: list[str] = []
     for child in node:
         if child.tag in ("deprecated", "superseded"):

@@ -134,6 +134,7 @@ def x25_in_python() -> Callable[[bytes], int]:
 
 
 def _fastest_x25() -> Callable[[bytes], int]:
+    """Return the checksum function of the compiled module, else that of ``fastcrc``, else the one in Python."""
     if wire is not None:
         compiled: Callable[[bytes], int] = wire.x25
         return compiled

@@ -341,6 +341,7 @@ def _number_problem(value: Any, kind: str) -> str | None:
 
 
 def _text_problem(value: Any, size: int) -> str | None:
+    """Explain why a value does not fit into a text field of this size in bytes, or return None."""
     if not isinstance(value, str):
         return f"must be a str of at most {size} bytes"
     try:

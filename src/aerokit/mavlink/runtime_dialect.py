@@ -94,6 +94,7 @@ def compile_message(definition: MessageDefinition) -> type[Message]:
 def _load(
     name: str, definitions: Iterable[MessageDefinition], enums: Iterable[EnumDefinition], standard: Standard
 ) -> LoadedDialect:
+    # Several files of a dialect may contain the same definition, but not different ones with the same id.
     by_id: dict[int, MessageDefinition] = {}
     for definition in definitions:
         earlier = by_id.setdefault(definition.id, definition)
@@ -182,7 +183,7 @@ def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra:
 
 
 def _enum(name: str, entries: dict[int, Any]) -> EnumDefinition:
-    end_marker = f"{name}_ENUM_END"
+    end_marker = f"{name}_ENUM_END"  # pymavlink adds this entry to each enum.
     definitions = [
         EntryDefinition(entry.name, value, entry.description)
         for value, entry in entries.items()

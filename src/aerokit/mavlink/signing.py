@@ -327,6 +327,7 @@ class TimestampFile:
         write_atomically(self._path, f"{timestamp}\n")
 
     def _read(self) -> int:
+        """Return the stored timestamp; 0 if there is no file."""
         try:
             with self._path.open("rb") as file:
                 text = file.read(_MAX_LENGTH).decode("ascii", "replace")

@@ -176,6 +176,7 @@ class SettingReads(NamedReads[Setting]):
         if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
             self._count_probe()
             self._window.on_answer(PROBE, now)
+            # The component answers requests, so other names without an answer may be unknown to it.
             unanswered = [other for other in self._names if other not in self._answers and other != name]
             self._reject_unknown(unanswered, now)
         if name and name in self._window:

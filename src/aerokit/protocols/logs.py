@@ -110,7 +110,7 @@ class LogDownload(Transfer[int]):
             )
             self._send_end()
             return
-        if self._is_streaming and now >= self._stream.due_at:
+        if self._is_streaming and now >= self._stream.due_at:  # The current range has ended early, or never started.
             self._is_streaming = False
             self._stream.failures += 1
         self._proceed(now)
@@ -321,6 +321,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
 
     def expire(self, now: float) -> None:
         self._stream.failures += 1
+        # Before the first entry, `_missing` is None.
         is_unanswered = self._missing is None and self._stream.failures == self._max_unanswered
         if is_unanswered or self._is_idle(now):
             self._fail(self._timed_out())

@@ -242,6 +242,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._finish(DownloadResult(items, self._count or 0, self._opaque_id))
 
     def _time_out(self, now: float) -> None:
+        """Cancel the download and fail, because the vehicle has stopped answering."""
         self._outbox += self.cancellation()
         missing = [seq for seq in self._indices if seq not in self._items]
         details = "no MISSION_COUNT was received" if self._count is None else f"missing: {format_ranges(missing)}"

@@ -130,6 +130,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             return
         silence_s, self._received_at = now - self._received_at, now
         if isinstance(message, MissionAck):
+            # After a long silence, ERROR means that the vehicle's transfer has expired. The upload then starts again.
             has_expired = self._is_accepted and silence_s >= TRANSFER_EXPIRY_S
             if message.type == MavMissionResult.ERROR and has_expired:
                 self._restart(now)
@@ -272,6 +273,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._finish(UploadResult(is_confirmed, opaque_id, max(0, self._confirmed_end - self.offset)))
 
     def _time_out(self, now: float) -> None:
+        """Cancel the upload and fail, because the vehicle has stopped answering."""
         self._outbox += self.cancellation()
         missing = range(max(self._confirmed_end, self.offset), self._end)
         details = f"items {format_ranges(missing)} were not confirmed" if self._is_accepted else "no item was requested"
@@ -306,6 +308,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._send(seq, now, again=True)
 
     def _send(self, seq: int, now: float, *, again: bool = False) -> None:
+        """Send one item. With ``again``, it is not sent if an earlier transmission may still be answered."""
         if again and self._is_in_flight(seq, now):
             return
         make_message = to_wire_float if self._as_float else to_wire

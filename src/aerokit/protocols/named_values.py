@@ -65,7 +65,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         if self._is_idle(now):
             self._fail(ParameterTimeout(self._timeout_text(), missing=self._missing()))
             return
-        if self._quiet_at is not None and now >= self._quiet_at:
+        if self._quiet_at is not None and now >= self._quiet_at:  # The stream has stopped.
             self._on_quiet(now)
         self._step(now)
 
@@ -99,6 +99,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
             self._report_progress(now, min(len(self._received), count), count)
 
     def _step(self, now: float) -> None:
+        """Finish, or send the requests that are due. Called after each message and at each deadline."""
         self._conclude()
         if self.done:
             return
@@ -196,6 +197,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
         self._report_progress(now, len(self._answers), len(self._names))
 
     def _step(self, now: float) -> None:
+        """Finish, or send the requests that are due. Called after each message and at each deadline."""
         if len(self._answers) < len(self._names):
             self._before_sending(now)
         if len(self._answers) == len(self._names):

@@ -166,6 +166,7 @@ class RequestWindow(Generic[KeyT]):
             self._limit = max(self._limit - 1, self._size)
 
     def _send(self, key: KeyT, now: float) -> None:
+        """Record a transmission of the request, and the time at which its answer is overdue."""
         self._sent_count += 1
         request = self._requests.get(key)
         if request is None:

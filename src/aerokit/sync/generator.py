@@ -323,6 +323,7 @@ def generate(name: str = "twins") -> str:
 
 
 def _class(page: Page, twin: Twin) -> str:
+    """Return the source of one twin class."""
     original = getattr(importlib.import_module(twin.module), twin.name)
     base = f"{twin.base}[{twin.parameter}]" if twin.parameter else twin.base
     if base in GENERIC_BASES:

@@ -219,6 +219,7 @@ class LoopThread:
                 raise ConnectionClosed(CLOSED_DURING_CALL)
 
     def _start(self, call: _Call[Any]) -> None:
+        """Schedule the start of a call on the loop."""
         if self.is_current:
             raise BusyError(
                 "a blocking call on the event loop's own thread would be a deadlock; predicates and callbacks run"

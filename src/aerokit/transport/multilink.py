@@ -263,6 +263,7 @@ class MultiLink(Link):
         receiver.link_lost(lost)
 
     def _on_restored(self, index: int) -> None:
+        """Continue with a link that was opened or reopened. It may end an interruption of all links."""
         self._is_available[index] = True
         for peer in self._kept[index]:
             self._links[index].keep_peer(peer)

@@ -241,6 +241,7 @@ class ReconnectingLink(Link):
         return True
 
     def _on_restored(self) -> None:
+        """Report that the link is back, because the reopened link has been stable or has delivered bytes."""
         self._cancel_stable_timer()
         if self._lost_at is None:
             return

@@ -132,6 +132,7 @@ def _as_iterable(peers: PeerFilter) -> Iterable[object]:
 
 
 def _parse_network(peer: object) -> Network:
+    """Convert one value of ``peers``. A single IP address becomes a network with one address."""
     reason = "wrong type"
     if isinstance(peer, _PEER_TYPES):
         try:

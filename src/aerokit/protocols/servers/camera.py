@@ -86,6 +86,7 @@ def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[M
 
 
 def _streams(camera: CameraDevice, number: int) -> list[m.VideoStreamInformation]:
+    """Return VIDEO_STREAM_INFORMATION for one stream, or for all streams if ``number`` is 0."""
     return [
         m.VideoStreamInformation(
             **_stream_fields(camera, stream),
@@ -106,6 +107,7 @@ def _stream_status(camera: CameraDevice, number: int) -> list[m.VideoStreamStatu
 
 
 def _stream_fields(camera: CameraDevice, stream: int) -> dict[str, Any]:
+    """Return the fields that VIDEO_STREAM_INFORMATION and VIDEO_STREAM_STATUS have in common."""
     return {
         "stream_id": stream,
         "flags": _flags(camera, stream),

@@ -172,6 +172,7 @@ class _Settings:
         self._camera = camera
 
     async def set_mode(self, command: ReceivedCommand) -> int:
+        """Set the CAMERA_MODE in param 2, unless the camera is taking images or recording."""
         camera, mode = self._camera, whole(command.param2)
         if not camera.can(CameraCapFlags.HAS_MODES):
             return MavResult.UNSUPPORTED

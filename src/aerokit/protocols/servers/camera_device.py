@@ -280,6 +280,7 @@ class Captures:
         self._camera.host.call_later(interval_s, send_status)
 
     def status(self) -> CameraCaptureStatus:
+        """Return the CAMERA_CAPTURE_STATUS for the current series and video."""
         camera = self._camera
         is_series = self._remaining != 0 and self.interval_s > 0.0
         if is_series:

@@ -317,6 +317,7 @@ class FileTree:
         folder[name] = {}
 
     def remove_folder(self, path: str) -> None:
+        """Remove a folder, which must be empty."""
         folder, name = self._parent(path)
         node = self._find(path)
         if not isinstance(node, dict):
@@ -326,6 +327,7 @@ class FileTree:
         del folder[name]
 
     def _find(self, path: str) -> _File | _Folder:
+        """Return the file or folder with this path; raises FileFault if there is none."""
         node: _File | _Folder = self._root
         for part in _parts(path):
             if not isinstance(node, dict):

@@ -236,6 +236,7 @@ class SessionFtpServer(Generic[FilesT]):
             raise fault
 
     def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        """Open a file for OpenFileRO, OpenFileWO or CreateFile, and return the ACK with its size and session."""
         if len(peer.sessions) >= self.max_sessions:
             return request.refuse(MavFtpErr.NOSESSIONSAVAILABLE)
         path = self._path(request)

@@ -296,6 +296,7 @@ class MissionServer:
         self._end(upload, _R.OPERATION_CANCELLED)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
+        """Process an item. Only the expected item from the client that uploads is stored."""
         upload = self._uploads.get(self._key(message.mission_type))
         if upload is None or message.mission_type != upload.mission_type:
             self._answer_item(message, _R.ERROR, channel)
@@ -310,6 +311,7 @@ class MissionServer:
         """Answer an item that no upload expects. Ignored here, because the expected item is requested again anyway."""
 
     def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
+        """Store the expected item of an upload, and request the next one."""
         result = self._put(upload, message)
         if result != _R.ACCEPTED:
             self._end(upload, result)

@@ -173,6 +173,7 @@ class TypedParameterServer(ParameterProtocolServer):
             self.start_list(channel)
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
+        """Answer with the value, or with a PARAM_ERROR that has the unknown name or index."""
         name, index = request.param_id, request.param_index
         name_and_index = self.requested(name, index)
         if name_and_index is not None:

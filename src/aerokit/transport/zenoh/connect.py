@@ -177,6 +177,7 @@ class ZenohConnect(NetworkLink):
             self._put(b"", self._requested_mode())  # An empty datagram with mode "take" requests control.
 
     def _on_notice(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:
+        """Report that the vehicle side has refused messages of this client."""
         notice = RefusalNotice.decode(data)
         if notice is None:
             return
