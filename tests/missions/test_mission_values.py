@@ -198,7 +198,7 @@ def test_rally_points_round_trip() -> None:
     assert points.positions == (Position(47.3977419, 8.545594, altitude_relative_m=40.0),)
     assert RallyPoints.from_items(points.to_items()) == points
     assert (len(points), points[0], list(points)) == (1, item, [item])
-    with pytest.raises(InvalidArgument, match="in rally points"):
+    with pytest.raises(InvalidArgument, match="among rally points"):
         RallyPoints([WAYPOINT]).check()
     with pytest.raises(InvalidArgument, match=r"frame = .* a global frame"):
         RallyPoints([item.replace(frame=2)]).check()

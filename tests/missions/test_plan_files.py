@@ -488,10 +488,10 @@ def test_plan_file_error_counts_further_incomplete_items() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "x.plan: line 1, column 1: not valid JSON"),
-        ('{\n "fileType": \n}', "x.plan: line 3, column 1: not valid JSON"),
-        ('{"version": NaN}', "x.plan: not valid JSON: NaN is not allowed"),
-        ("[" * 100_000, "x.plan: not valid JSON"),
+        ("", "x.plan: line 1, column 1: the text is not valid JSON"),
+        ('{\n "fileType": \n}', "x.plan: line 3, column 1: the text is not valid JSON"),
+        ('{"version": NaN}', "x.plan: the text is not valid JSON: NaN is not allowed"),
+        ("[" * 100_000, "x.plan: the text is not valid JSON"),
         ("[]", "x.plan: the document = .*: expected an object"),
         ('{"fileType": "Plan", "version": 1}', "the document has no 'mission'"),
     ],

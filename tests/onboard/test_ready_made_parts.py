@@ -127,7 +127,7 @@ async def test_settings_of_definition_file_are_served() -> None:
         settings = vehicle.component(100).settings
         await settings.download()
         await settings.set("CAM_MODE", 1)
-        with pytest.raises(InvalidArgument, match="either"):
+        with pytest.raises(InvalidArgument, match="cannot have both"):
             component.parameters.add("SPEED", 1.0)
     assert eye.calls == [("CAM_MODE", 1)]
 

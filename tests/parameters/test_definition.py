@@ -97,7 +97,7 @@ def test_invalid_definitions_are_ignored() -> None:
 
 def test_excluded_setting_cannot_be_set() -> None:
     text = refusal(CAMERA, "CAM_ISO", 400, CAM_EXPMODE=0)
-    assert text == "CAM_ISO = 400 is not allowed now: excluded by CAM_EXPMODE = Auto"
+    assert text == "CAM_ISO = 400 is not allowed now: the setting is excluded by CAM_EXPMODE = Auto"
     assert CAMERA.checked("CAM_ISO", 400, {"CAM_EXPMODE": 1}) == 400
     assert CAMERA.excluded_by("CAM_EV", {"CAM_EXPMODE": 1}) == ("CAM_EXPMODE = Manual",)
     assert CAMERA.excluded_by("CAM_EV", {}) == ()

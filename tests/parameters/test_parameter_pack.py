@@ -151,7 +151,7 @@ def test_damaged_pack_error_names_position() -> None:
     ):
         with pytest.raises(RemoteProtocolError, match=f"byte 6: .*{text}"):
             unpack_parameters(file(entry))
-    with pytest.raises(RemoteProtocolError, match="has 1 parameters, its header says 2"):
+    with pytest.raises(RemoteProtocolError, match="has 1 parameters, but its header says 2"):
         unpack_parameters(file(good, count=2))
     with pytest.raises(RemoteProtocolError, match="twice"):
         unpack_parameters(file(good, good))

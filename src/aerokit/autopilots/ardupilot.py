@@ -152,7 +152,7 @@ BLIMP = ModeTable(
         4: "RTL",
         5: "AUTO",
         6: "HOLD",
-    }  # 5, 6: pymavlink only
+    }  # The modes 5 and 6 exist only in pymavlink.
 )
 
 TRACKER = ModeTable({0: "MANUAL", 1: "STOP", 2: "SCAN", 3: "SERVOTEST", 4: "GUIDED", 10: "AUTO", 16: "INITIALISING"})
@@ -435,12 +435,12 @@ def ardupilot_for(vehicle_type: int) -> ArduPilot:
 
 
 def _landed_state(heartbeat: Heartbeat) -> int | None:
-    """Return the landed state according to MAV_STATE: STANDBY on the ground, ACTIVE in the air, else None."""
+    """Return the landed state for a MAV_STATE: STANDBY means on the ground, ACTIVE in the air, others are unknown."""
     if heartbeat.system_status == MavState.STANDBY:
         return MavLandedState.ON_GROUND
     return MavLandedState.IN_AIR if heartbeat.system_status == MavState.ACTIVE else None
 
 
 def _text_after(text: str, *prefixes: str) -> str | None:
-    """Return the text without the prefix that it begins with; None if it begins with none of them."""
+    """Return the text without its prefix; None if the text begins with none of the prefixes."""
     return next((text[len(prefix) :].strip() for prefix in prefixes if text.startswith(prefix)), None)

@@ -70,9 +70,9 @@ VTOLS = (
 class TakeOff(Snapshot):
     """Take-off procedure of a vehicle.
 
-    First change to ``mode`` (None: keep the current mode), then arm, then send ``command`` with ``params``. If
-    ``command`` is None, the vehicle takes off when armed in ``mode``. After the take-off, the vehicle changes to
-    ``mode_after`` by itself (None: it stays in ``mode``).
+    The caller changes to ``mode`` (None: the current mode is kept), arms, and sends ``command`` with ``params``. If
+    ``command`` is None, the vehicle takes off when it is armed in ``mode``. After the take-off, the vehicle changes to
+    ``mode_after`` by itself (None: the vehicle stays in ``mode``).
     """
 
     mode: Mode | None
@@ -82,7 +82,7 @@ class TakeOff(Snapshot):
 
 
 class SetpointRules(Snapshot):
-    """Supported guided set-points, and how the autopilot treats the stream.
+    """Set-points that the autopilot supports, and how it treats a stream of set-points.
 
     - ``stream_before_mode``: the stream must be running before the mode is requested.
     - ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED, yaw is relative to the current heading instead of north.
@@ -110,9 +110,9 @@ class SetpointRules(Snapshot):
 
 
 class StickRules(Snapshot):
-    """Interpretation of MANUAL_CONTROL.
+    """How an autopilot interprets MANUAL_CONTROL.
 
-    - ``signed_throttle``: the throttle ranges from −1000 to 1000; otherwise from 0 to 1000.
+    - ``signed_throttle``: if True, the throttle ranges from −1000 to 1000; otherwise from 0 to 1000.
     - ``release``: how the sticks are released to the transmitter. ``"axes"``: by MANUAL_CONTROL with axes that have no
       value; ``"channels"``: by RC_CHANNELS_OVERRIDE with channels of 0; ``"none"``: there is no such message.
     """
@@ -143,7 +143,7 @@ class GimbalRules(Snapshot):
 
 
 class Reposition(Snapshot):
-    """Interpretation of MAV_CMD_DO_REPOSITION (192).
+    """How an autopilot interprets MAV_CMD_DO_REPOSITION (192).
 
     - ``relative_altitude``: frames relative to home are supported; otherwise the altitude must be above mean sea level.
     - ``yaw``: param4 is a heading in radians.
@@ -192,23 +192,23 @@ class Autopilot:
     external: ExternalRules = ExternalRules()
     """External measurements that the autopilot accepts by MAVLink."""
     sticks: StickRules | None = None
-    """Interpretation of MANUAL_CONTROL; None if MANUAL_CONTROL is not known to work."""
+    """How the autopilot interprets MANUAL_CONTROL; None if the message is not known to work."""
     actuators_until: tuple[int, int] | None = None
-    """First version (major, minor) that no longer has SET_ACTUATOR_CONTROL_TARGET; None if no version has it."""
+    """First version (major, minor) without SET_ACTUATOR_CONTROL_TARGET; None if no version has ever had it."""
     reposition: Reposition | None = None
-    """Interpretation of MAV_CMD_DO_REPOSITION; None if the command is not known to work."""
+    """How the autopilot interprets MAV_CMD_DO_REPOSITION; None if the command is not known to work."""
     home_is_item_0 = False
     """True if item 0 of a mission is home."""
     acks_per_command: ClassVar[Mapping[int, int]] = {}
-    """Maps a MAV_CMD to the number of COMMAND_ACKs for each transmission. Commands with one ack are not listed."""
+    """Maps a MAV_CMD to the number of COMMAND_ACKs for each transmission, if there is more than one."""
     signing_key_restriction = ""
-    """Clause for error texts about the links on which SETUP_SIGNING is accepted; empty if there is no restriction."""
+    """Clause for error texts that names the links on which SETUP_SIGNING is accepted; empty if all links are."""
     runs_prearm_checks = False
     """True if MAV_CMD_RUN_PREARM_CHECKS (401) repeats the failing checks as status texts."""
     calibrates_compasses_by_command = False
     """True if MAV_CMD_DO_START_MAG_CAL (42424) calibrates compasses; otherwise PREFLIGHT_CALIBRATION does."""
     speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED,))
-    """SPEED_TYPEs of MAV_CMD_DO_CHANGE_SPEED (178) that the autopilot applies to the speed with this name."""
+    """SPEED_TYPEs of MAV_CMD_DO_CHANGE_SPEED (178) that change the speed that the type names, and not another speed."""
     circles_by: Literal["orbit", "reposition", "setpoints"] | None = None
     """Way to circle a place: MAV_CMD_DO_ORBIT (34), DO_REPOSITION (192) with a radius, or set-points; None if there is
     none.
@@ -243,7 +243,7 @@ class Autopilot:
     upload is complete.
     """
     mission_completes_at_home = False
-    """True if a mission that ends with a return is complete at home, False if it is complete when the return begins."""
+    """True if a mission that ends with a return is reported as complete at home, False if already at its return."""
     mission_starts_by_command = False
     """True if MAV_CMD_MISSION_START (300) starts the mission even on the ground. The command does not arm."""
     sets_current_by_command = False
@@ -272,25 +272,28 @@ class Autopilot:
     is_surface_vehicle = False
     """True for vehicles that drive or float on the surface, so that altitudes are meaningless for them."""
     mission_needs_take_off = False
-    """True if a mission is refused on the ground unless its first navigation command is a take-off."""
+    """True if the autopilot refuses a mission on the ground unless its first navigation command is a take-off."""
     mode_when_landed: ClassVar[str | None] = None
-    """Mode to which the vehicle changes after landing; None if it stays in the landing mode."""
+    """Mode to which the vehicle changes by itself after landing; None if it stays in the landing mode."""
     unarmable_modes: frozenset[str] = frozenset()
     """Modes in which the autopilot refuses to arm, or disarms at once."""
     armable_by_option: Mapping[str, str] = {}
-    """Maps each mode in which only a parameter allows arming to this parameter."""
+    """Maps each mode in which arming must be allowed by a parameter to this parameter."""
     modes_without_position: frozenset[str] = frozenset()
     """Modes in which the autopilot arms without an estimate of the position."""
     prearm_depends_on_mode = False
     """True if the pre-arm bit of SYS_STATUS applies to the current mode only."""
     modes_with_rc: frozenset[str] | None = None
-    """Modes that require an RC receiver or MANUAL_CONTROL; None if the receiver's health bit matters in every mode."""
+    """Modes in which the health bit of the RC receiver counts, because they need RC or MANUAL_CONTROL.
+
+    None: the bit counts in every mode.
+    """
     camera_by_trigger_only = False
     """True if the autopilot's own camera supports only DO_DIGICAM_CONTROL and DO_TRIGGER_CONTROL."""
     video_addresses_camera = False
     """True if the stream id of VIDEO_START_CAPTURE selects a camera."""
     arming_mode: ClassVar[str | None] = None
-    """Mode in which to arm if the current mode does not allow arming. A vehicle armed in it stays at rest."""
+    """Mode in which to arm if the current mode does not allow arming. A vehicle armed in this mode stays at rest."""
 
     def __init__(self, vehicle_type: int) -> None:
         self.vehicle_type = vehicle_type
@@ -308,7 +311,7 @@ class Autopilot:
         return self.mode(heartbeat.custom_mode, heartbeat.base_mode, extra)
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
-        """Return the mode of these numbers. Without CUSTOM_MODE_ENABLED, base_mode determines the name."""
+        """Return the mode with these numbers. Without CUSTOM_MODE_ENABLED, base_mode determines the name."""
         if base_mode & CUSTOM_MODE_ENABLED:
             return Mode(self.modes.name_of(custom_mode, extra), custom_mode, base_mode)
         return Mode(base_mode_name(base_mode), custom_mode, base_mode)
@@ -336,7 +339,7 @@ class Autopilot:
     def modes_of_command(
         self, command: int, params: Sequence[float], extra: Mapping[int, str] = NO_MODES
     ) -> tuple[Mode, ...]:
-        """Return the modes that a command may lead to; empty if there are none or they are unknown."""
+        """Return the modes to which a command may change; empty if there are none or they are unknown."""
         if command == MavCmd.DO_SET_MODE:
             return self._modes_of_order(params, extra)
         purposes = PURPOSES_OF_COMMANDS.get(command, ())
@@ -353,7 +356,7 @@ class Autopilot:
         return None if self.arming_mode is None else self.modes.find(self.arming_mode)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
-        """Return the name to store for an entry of AVAILABLE_MODES, or None if it is not new."""
+        """Return the name to store for an entry of AVAILABLE_MODES; None if the name is already known."""
         return name if name and custom_mode not in self.modes.numbers else None
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
@@ -368,10 +371,9 @@ class Autopilot:
         return None
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
-        """Return the parameter for the altitude of a return: its possible names, newest first, each with its units per
-        metre.
+        """Return the possible names of the parameter for the altitude of a return, newest first.
 
-        The result is empty if there is no such parameter.
+        Each name comes with its units per metre. The result is empty if there is no such parameter.
         """
         return ()
 
@@ -395,7 +397,7 @@ class Autopilot:
         return bit_names(enabled & present & ~health & ~PREARM_CHECK, SENSORS)
 
     def prearm_checks_pass(self, present: int, enabled: int, health: int) -> bool | None:
-        """Return True if the vehicle can be armed according to SYS_STATUS; None if it does not report that."""
+        """Return True if the vehicle can be armed according to SYS_STATUS; None if SYS_STATUS does not report this."""
         return bool(health & PREARM_CHECK) if present & enabled & PREARM_CHECK else None
 
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
@@ -415,7 +417,7 @@ class Autopilot:
 
     @staticmethod
     def _missing_estimates(flags: int, *, required: int, horizontal: int) -> tuple[str, ...]:
-        """Return the missing estimates: all of ``required``, and one of those in ``horizontal``."""
+        """Return the missing estimates. The vehicle needs all of ``required``, and one of those in ``horizontal``."""
         missing = bit_names(required & ~flags, ESTIMATES)
         return missing if flags & horizontal else (*missing, ESTIMATES[POS_HORIZ_ABS])
 
@@ -464,7 +466,7 @@ class Autopilot:
     """
 
     unsupported_commands: frozenset[int] = frozenset()
-    """MAV_CMDs that the firmware does not handle. Actions that need one raise NotSupported before anything is sent."""
+    """MAV_CMDs that the firmware does not handle. Actions that need such a command raise NotSupported at once."""
     reports_gripper_by_text: bool = False
     """True if a status text reports the end of a gripper's movement, False if the acknowledgement reports it."""
     highres_imu_field_ut: float = 100.0

@@ -30,8 +30,8 @@ class ExternalRule(Snapshot):
 
     - ``required``: for each parameter, its alternative names, and the values with which the autopilot reads the
       messages
-    - ``sole_source``: for each parameter, its name, and the values with which the estimator has no other source of
-      position or velocity; parameters that the vehicle does not have are ignored
+    - ``sole_source``: for each parameter, its name, and the values with which the measurement is the estimator's only
+      source of position or velocity; parameters that the vehicle does not have are ignored
     """
 
     required: tuple[tuple[tuple[str, ...], tuple[float, ...]], ...] = ()
@@ -88,7 +88,7 @@ ARDUPILOT_EXTERNAL = ExternalRules(
         "landing_target": ExternalRule(((("PLND_ENABLED",), (1.0,)), (("PLND_TYPE",), (1.0,)))),
         "optical_flow": ExternalRule(((("FLOW_TYPE",), (5.0,)),)),
     },
-    ned_frame=MavFrame.LOCAL_FRD,  # The only frame that GCS_Common.cpp, handle_odometry accepts. Read as NED.
+    ned_frame=MavFrame.LOCAL_FRD,  # GCS_Common.cpp, handle_odometry accepts only this frame and treats it as NED.
     origin_is_final=True,  # GCS_Common.cpp, set_ekf_origin
 )
 

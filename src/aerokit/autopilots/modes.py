@@ -92,7 +92,9 @@ class ModeTable:
 
     def _check(self, number: int) -> int:
         if not 0 <= number <= _MAX_CUSTOM_MODE:
-            raise InvalidArgument(f"mode = {number} is not allowed: a custom_mode from 0 to {_MAX_CUSTOM_MODE}")
+            raise InvalidArgument(
+                f"mode = {number} is not allowed: it must be a custom_mode from 0 to {_MAX_CUSTOM_MODE}"
+            )
         return int(number)
 
     def _unknown_name_text(self, name: str, extra: Mapping[int, str]) -> str:

@@ -101,7 +101,7 @@ class Px4(Autopilot):
     setpoints: SetpointRules = SetpointRules(stream_before_mode=True, attitude_rate=True, trajectory=True)
     sticks: StickRules | None = StickRules(release="none")
     external: ExternalRules = PX4_EXTERNAL
-    actuators_until: tuple[int, int] | None = (1, 14)  # removed on 2023-03-06 by commit 27658354 (MavlinkReceiver.cpp)
+    actuators_until: tuple[int, int] | None = (1, 14)  # commit 27658354 of 2023-03-06 (MavlinkReceiver.cpp)
     reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
     gimbals: GimbalRules = GimbalRules(
         has_secondary=False,
@@ -116,7 +116,7 @@ class Px4(Autopilot):
     silent_without_logs = True
     _bytewise_by_default = True
     has_parameter_hash = True
-    unknown_currents_ca: frozenset[int] = frozenset((-1, -100))  # inside PX4, −1 A means "unknown"
+    unknown_currents_ca: frozenset[int] = frozenset((-1, -100))  # Inside PX4, −1 A (-100) means "unknown".
     reposition_purpose: Purpose = "hold"
     prearm_depends_on_mode = True
     # Commander.cpp repeats the failing checks as texts (measured with 1.17 in simulation).
@@ -144,7 +144,7 @@ class Px4(Autopilot):
     mission_storage = "px4"
     mission_upload_window = 6
     reports_mission_checksum = True
-    overwrites_plans_in_place: frozenset[int] = frozenset()  # new items go into a second storage area
+    overwrites_plans_in_place: frozenset[int] = frozenset()  # New items go into a second storage area.
     repeats_item_reached = True
     unsupported_messages: frozenset[str] = frozenset(
         ("EKF_STATUS_REPORT", "WIND", "RANGEFINDER", "AHRS", "AHRS2", "MEMINFO", "POWER_STATUS", "RAW_IMU")
@@ -176,10 +176,10 @@ class Px4(Autopilot):
             # even CLIMB_SPEED (navigator_main.cpp).
             self.speed_types: frozenset[int] = frozenset((SpeedType.AIRSPEED, SpeedType.GROUNDSPEED))
         if vehicle_type == MavType.FIXED_WING:
-            self.arrival_radius_m: float = 120.0  # a plane circles with NAV_LOITER_RAD, 80 m by default
+            self.arrival_radius_m: float = 120.0  # A plane circles with NAV_LOITER_RAD, 80 m by default.
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
-        """Return the mode of these numbers. An external mode's registered name takes precedence over EXTERNAL1 etc."""
+        """Return the mode with these numbers. The registered name of an external mode replaces EXTERNAL1 etc."""
         if custom_mode in _EXTERNAL_MODES and custom_mode in extra:
             return Mode(extra[custom_mode], custom_mode, base_mode)
         return super().mode(custom_mode, base_mode, extra)
@@ -205,7 +205,7 @@ class Px4(Autopilot):
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
         """Return the name if it belongs to an external mode.
 
-        An external mode slot without a registered mode is called "(Mode not available)".
+        PX4 reports the name "(Mode not available)" for an external mode that is not registered.
         """
         if name.startswith("("):
             return None
@@ -233,7 +233,7 @@ class Px4(Autopilot):
         return () if self._cannot_fly else (("RTL_RETURN_ALT", 1.0),)
 
     def take_off_needs_home(self) -> bool:
-        """True: PX4's NAV_TAKEOFF needs an altitude above mean sea level."""
+        """Return True, because PX4's NAV_TAKEOFF needs an altitude above mean sea level."""
         return not self._cannot_fly
 
     def failing_sensors(self, present: int, enabled: int, health: int) -> tuple[str, ...]:

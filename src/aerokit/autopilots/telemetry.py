@@ -120,7 +120,7 @@ _GROUPS: Mapping[int, tuple[str, ...]] = {
 
 _IDS: Mapping[str, int] = {row[0]: message_id for message_id, row in INDEX.items()}
 
-# Message id → MAV_DATA_STREAM, from ArduPilot's GCS_MAVLink_Parameters.cpp.
+# Maps message id to MAV_DATA_STREAM, from ArduPilot's GCS_MAVLink_Parameters.cpp.
 ARDUPILOT_GROUPS: Mapping[int, int] = {_IDS[name]: group for group, names in _GROUPS.items() for name in names}
 
 _ALSO_STREAMED = (
@@ -136,7 +136,7 @@ _ALSO_STREAMED = (
 # Class names of messages that any autopilot sends as a stream. Other messages are sent when needed.
 STREAMED_MESSAGES = frozenset((*(name for names in _GROUPS.values() for name in names), *_ALSO_STREAMED))
 
-# First number of each FIRMWARE_VERSION_TYPE, and the suffix for its version texts.
+# Lowest type byte that counts as each FIRMWARE_VERSION_TYPE, and the suffix of its version texts.
 _VERSION_TYPES = ((255, ""), (192, "-rc"), (128, "-beta"), (64, "-alpha"), (0, "-dev"))
 
 

@@ -27,7 +27,7 @@ def change_speed(
     kind: Literal["air", "ground", "climb", "descent"] = "ground",
     throttle_percent: float | None = None,
 ) -> MissionItem:
-    """Change the speed to 0 to 1,000 m/s, or to the vehicle's default: -2, on PX4 -1.
+    """Change the speed (0 to 1,000 m/s). -2 stands for the vehicle's default speed, on PX4 -1.
 
     ``kind`` selects the speed; ``"climb"`` and ``"descent"`` are for copters. ``throttle_percent`` (0 to 100) is for
     planes without airspeed sensor; None leaves it unchanged.
@@ -63,7 +63,7 @@ def delay_until(hour: int, minute: int = 0, second: int = 0) -> MissionItem:
     """
     return action_item(
         MavCmd.NAV_DELAY,
-        -1.0,  # no duration
+        -1.0,  # There is no duration, but a time of day.
         whole_number("hour", hour, 0, 23),
         whole_number("minute", minute, 0, 59),
         whole_number("second", second, 0, 59),
@@ -201,7 +201,9 @@ def take_photo(*, camera: int = 0) -> MissionItem:
 
 
 def take_photos(count: int = 0, *, interval_s: float = 0.0, camera: int = 0) -> MissionItem:
-    """Take ``count`` photos, at most 65,535, one every ``interval_s`` seconds; 0: until :func:`stop_photos`.
+    """Take ``count`` photos, one every ``interval_s`` seconds.
+
+    ``count`` is at most 65,535; 0 means until :func:`stop_photos`.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_IMAGE_START_CAPTURE
     """

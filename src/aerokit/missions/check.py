@@ -23,7 +23,7 @@ from aerokit.missions.item import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-MAX_ITEMS = 65_535  # MISSION_COUNT has 16 bits
+MAX_ITEMS = 65_535  # The number of items in MISSION_COUNT has 16 bits.
 
 _FRAMES = frozenset(int(frame) for frame in MavFrame)
 _FRAME_TEXT = "a global frame (0, 3, 10, or 5, 6, 11) or a local one (1, 4, 7, 20, 21)"
@@ -61,7 +61,10 @@ def check_count(count: int, *, home_is_item_0: bool = False) -> None:
 
 
 def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) -> None:
-    """Raise :class:`InvalidArgument` if MISSION_ITEM_INT cannot carry the item. Its text begins with ``where``."""
+    """Raise :class:`InvalidArgument` if MISSION_ITEM_INT cannot carry the item.
+
+    The error text begins with ``where``.
+    """
     if not isinstance(item, MissionItem):
         raise InvalidArgument(f"{where} = {item!r} is not a MissionItem")
     _check_integer(where, "command", item.command, 0xFFFF)
@@ -84,7 +87,7 @@ def check_jumps(items: Sequence[MissionItem]) -> None:
     for index, item in enumerate(items):
         if item.command == MavCmd.DO_JUMP:
             is_valid = 0 <= item.param1 < len(items) and float(item.param1).is_integer()
-            allowed = f"an item of this mission: 0 to {len(items) - 1}, the first item is 0"
+            allowed = f"the number of an item of this mission, 0 to {len(items) - 1} (the first item is 0)"
         elif item.command == MavCmd.DO_JUMP_TAG:
             is_valid = item.param1 in tags
             allowed = f"the tag of a JUMP_TAG in this mission: {sorted(tags) or 'it has none'}"
@@ -95,7 +98,7 @@ def check_jumps(items: Sequence[MissionItem]) -> None:
 
 
 def _wrong(where: str, field: str, value: object, allowed: str) -> InvalidArgument:
-    return InvalidArgument(f"{where}: {field} = {value!r} is not allowed: {allowed}")
+    return InvalidArgument(f"{where}: {field} = {value!r} is not allowed: it must be {allowed}")
 
 
 def _check_integer(where: str, field: str, value: object, high: int) -> None:
@@ -106,12 +109,12 @@ def _check_integer(where: str, field: str, value: object, high: int) -> None:
 def _check_command(where: str, command: int, mission_type: int) -> None:
     is_fence_command, is_rally_command = command in FENCE_COMMANDS, command in RALLY_COMMANDS
     if mission_type == MavMissionType.FENCE:
-        is_allowed, allowed = is_fence_command, "fence commands (5000 to 5004), in a fence"
+        is_allowed, allowed = is_fence_command, "a fence command (5000 to 5004), because it is in a fence"
     elif mission_type == MavMissionType.RALLY:
-        is_allowed, allowed = is_rally_command, "NAV_RALLY_POINT (5100), in rally points"
+        is_allowed, allowed = is_rally_command, "NAV_RALLY_POINT (5100), because it is among rally points"
     else:
         is_allowed = not is_fence_command and not is_rally_command
-        allowed = "commands other than those of fences and rally points, in a mission"
+        allowed = "a command that is not for fences or rally points, because it is in a mission"
     if not is_allowed:
         raise _wrong(where, "command", int(command), allowed)
 

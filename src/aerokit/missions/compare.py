@@ -37,20 +37,20 @@ FIELDS = ("param1", "param2", "param3", "param4", "x", "y", "z")
 
 
 class ItemStorage(Enum):
-    """Form in which items are stored. A comparison tolerates the loss of precision that it causes."""
+    """Form in which items are stored. Comparisons tolerate the loss of precision that this form causes."""
 
     WIRE = "wire"
-    """Only MISSION_ITEM_INT: 32-bit floats, equivalent frames."""
+    """Only changes made by MISSION_ITEM_INT: rounding to 32-bit floats, and equivalent frames."""
     ARDUPILOT = "ardupilot"
-    """MISSION_ITEM_INT, and ArduPilot's storage of 15 bytes for each item."""
+    """Changes made by MISSION_ITEM_INT, and by ArduPilot's storage of 15 bytes for each item."""
     PX4 = "px4"
-    """MISSION_ITEM_INT, and PX4's item structure."""
+    """Changes made by MISSION_ITEM_INT, and by PX4's item structure."""
     ANY = "any"
-    """Any of the other three."""
+    """Changes made by any of the other three."""
 
 
 _ARDUPILOT: dict[int, tuple[str, ...]] = {
-    MavCmd.NAV_WAYPOINT: ("u", "-cc"),  # the first string is for Copter, Rover and Sub, the second for Plane
+    MavCmd.NAV_WAYPOINT: ("u", "-cc"),  # The first string is for Copter, Rover and Sub, the second for Plane.
     MavCmd.NAV_LOITER_UNLIM: ("--r",),
     MavCmd.NAV_LOITER_TURNS: ("n-R?",),
     MavCmd.NAV_LOITER_TIME: ("u-g?",),
@@ -108,7 +108,7 @@ _ARDUPILOT: dict[int, tuple[str, ...]] = {
     MavCmd.DO_VTOL_TRANSITION: ("b",),
     MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: ("u",),
     MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: ("u",),
-    MavCmd.NAV_FENCE_CIRCLE_INCLUSION: ("f", "u"),  # before 4.5, the radius was stored as an integer
+    MavCmd.NAV_FENCE_CIRCLE_INCLUSION: ("f", "u"),  # The second string is for firmware before 4.5.
     MavCmd.NAV_FENCE_CIRCLE_EXCLUSION: ("f", "u"),
     MavCmd.DO_WINCH: ("bbff",),
     MavCmd.NAV_SCRIPT_TIME: ("bbhhss",),
@@ -155,17 +155,17 @@ def _px4_letters(item: MissionItem) -> str:
 
 def _convert(letter: str, value: float) -> Iterator[float]:
     """Yield the converted value. Yield nothing if the conversion overflows, because the result is undefined in C."""
-    if letter in ("", "-"):
+    if letter in ("", "-"):  # not stored
         yield 0.0
-    elif letter == "2":
+    elif letter == "2":  # always 2
         yield 2.0
-    elif letter == "?":
+    elif letter == "?":  # true if above 0
         yield 1.0 if value > 0 else 0.0
-    elif letter == "g":
+    elif letter == "g":  # only the sign
         yield -1.0 if value < 0 else 1.0
     elif not math.isfinite(value):
         yield math.nan
-    elif letter in _INTEGERS:
+    elif letter in _INTEGERS:  # an integer with a range
         low, high = _INTEGERS[letter]
         if low <= math.trunc(value) <= high:
             yield float(math.trunc(value))
@@ -174,6 +174,7 @@ def _convert(letter: str, value: float) -> Iterator[float]:
 
 
 def _convert_special(letter: str, value: float) -> Iterator[float]:
+    """Yield a finite value in the form that ``letter`` stands for, other than an integer with a range."""
     whole = math.trunc(value)
     if letter == "f":  # 32-bit float
         yield struct.unpack("<f", struct.pack("<f", value))[0]
@@ -243,7 +244,7 @@ def item_differences(
 ) -> tuple[str, ...]:
     """Describe each field that differs: ``"z is 20.0 instead of 30.0"``.
 
-    ``single_precision``: places were sent as 32-bit floats (MISSION_ITEM), whose steps are up to 1.7 m.
+    With ``single_precision``, the comparison tolerates the steps of up to 1.7 m between 32-bit floats (MISSION_ITEM).
     """
     if expected.command != actual.command:
         return (f"the command is {actual.name} instead of {expected.name}",)
@@ -295,7 +296,7 @@ def _same_number(expected: MissionItem, actual: MissionItem, field: str, storage
     if _close(value, actual_value):
         return True
     if field == "param4" and expected.command in _HEADING_IS_PARAM4 and storage in (ItemStorage.PX4, ItemStorage.ANY):
-        # A heading, for which 359.9995 and 0 are close.
+        # The number is a heading, so 359.9995 and 0 are close to each other.
         turn = abs(value - actual_value) % 360.0
         if min(turn, 360.0 - turn) <= HEADING_TOLERANCE_DEG:
             return True
@@ -308,7 +309,7 @@ def _same_place(
     value, actual_value = getattr(expected, field), getattr(actual, field)
     scale = xy_scale(expected.command, expected.frame)
     if scale != 1:
-        tolerance = 1.0
+        tolerance = 1.0  # for rounding, in units of x and y
         if single_precision:
             tolerance += _float_step(value / scale) * scale
         return bool(abs(value - actual_value) <= tolerance)
@@ -330,7 +331,7 @@ def _same_altitude(expected: MissionItem, actual: MissionItem, storage: ItemStor
         return any(_close(stored, actual.z) for stored in _stored_values(expected, "z", storage))
     if storage not in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
         return False
-    if expected.command in RALLY_COMMANDS:  # ArduPilot stores whole metres
+    if expected.command in RALLY_COMMANDS:  # ArduPilot stores whole metres.
         return math.isfinite(expected.z) and _close(math.trunc(expected.z), actual.z)
     return abs(expected.z - actual.z) <= ALTITUDE_TOLERANCE_M
 

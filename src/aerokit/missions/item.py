@@ -15,7 +15,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.position import Home, Position, travel_target
 
-DEFAULT_XY = 0x7FFFFFFF  # this value of x or y means "not given", like NaN in the other parameters
+DEFAULT_XY = 0x7FFFFFFF  # In x or y, this value means "not given", like NaN in the other parameters.
 
 FENCE_COMMANDS = frozenset(
     {
@@ -229,7 +229,7 @@ class MissionItem(Snapshot):
 
     def _key(self) -> tuple[Any, ...]:
         values: tuple[Any, ...] = self._values(self)
-        # NaN, the only value that differs from itself, is replaced, so that items with NaN can be equal.
+        # Replace NaN, the only value that differs from itself, so that items with NaN can be equal.
         return tuple("NaN" if value != value else value for value in values)
 
     def __eq__(self, other: object) -> bool:
@@ -252,9 +252,10 @@ def place_item(
     *parameters: float,
     is_needed: bool = False,
 ) -> MissionItem:
-    """Create an item at a place. One of ``altitudes`` (relative to home, to mean sea level and to terrain) is given.
+    """Create an item at a place.
 
-    A Position supplies latitude and longitude, and also the altitude if none is given. Home supplies no altitude. If no
+    One of the three ``altitudes`` is given: above home, above mean sea level or above the terrain. A Position supplies
+    latitude and longitude, and also the altitude if none is given. Home supplies no altitude. If no
     place is given and ``is_needed`` is False, the item has 0°, 0°, which ArduPilot takes for the current position.
     """
     if isinstance(latitude_deg, (Position, Home)):
@@ -296,7 +297,7 @@ def _altitudes_of(position: Position) -> Altitudes:
 def altitude_and_frame(
     relative_m: float | None, amsl_m: float | None, terrain_m: float | None
 ) -> tuple[float, MavFrame]:
-    """Return the altitude that is given, which must be exactly one, and its frame."""
+    """Return the altitude that is given and its frame. Exactly one altitude must be given."""
     candidates = (
         ("altitude_relative_m", relative_m, MavFrame.GLOBAL_RELATIVE_ALT),
         ("altitude_amsl_m", amsl_m, MavFrame.GLOBAL),
@@ -335,7 +336,7 @@ def whole_number(name: str, value: object, low: int, high: int) -> float:
     """Return the value as a float; raise :class:`InvalidArgument` unless it is a whole number from low to high."""
     if isinstance(value, int) and not isinstance(value, bool) and low <= value <= high:
         return float(value)
-    raise InvalidArgument(f"{name} = {value!r} is not allowed: a whole number from {low} to {high}")
+    raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a whole number from {low} to {high}")
 
 
 def heading(name: str, value: float | None) -> float:

@@ -97,7 +97,7 @@ class Mission(_ItemSequence):
         return cls(*without_home(items)) if home_is_item_0 else cls(items)
 
 
-# Commands for `inclusion` True and False.
+# Maps `inclusion` to the command.
 _POLYGON = {True: MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, False: MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION}
 
 _CIRCLE = {True: MavCmd.NAV_FENCE_CIRCLE_INCLUSION, False: MavCmd.NAV_FENCE_CIRCLE_EXCLUSION}
@@ -136,8 +136,8 @@ class FenceCircle(Snapshot):
 
 
 class Fence(Snapshot):
-    """A geofence: ``Fence(polygons=[FencePolygon([...])], circles=[FenceCircle(home, 300.0)])``. ``Fence()`` is no
-    fence.
+    """A geofence: ``Fence(polygons=[FencePolygon([...])], circles=[FenceCircle(home, 300.0)])``. ``Fence()`` is an
+    empty fence.
 
     ``return_point`` is the destination after a breach (Plane, and PX4 if configured). Both sequences are converted to
     tuples.
@@ -246,7 +246,7 @@ def _place(item: MissionItem, index: int) -> Position:
         place = Position(item.x / 1e7, item.y / 1e7)
     except InvalidArgument as error:
         raise RemoteProtocolError(f"item {index} ({item.name}): {error}") from error
-    # Only a return point has an altitude; `_return_item` writes 0 in the frame GLOBAL if it is unknown.
+    # Only a return point has an altitude. In the frame GLOBAL, 0 means that it is unknown (`_return_item`).
     has_altitude = item.command == MavCmd.NAV_FENCE_RETURN_POINT and (item.z != 0 or item.frame != MavFrame.GLOBAL)
     position_with_altitude = item.position if has_altitude else None
     return position_with_altitude or place
@@ -299,7 +299,7 @@ class Plan(Snapshot):
     source: str = ""
 
     def _key(self) -> tuple[Any, ...]:
-        return tuple(self.to_dict().values())[:-1]  # without the last field, `source`
+        return tuple(self.to_dict().values())[:-1]  # Leave out the last field, `source`.
 
     def __eq__(self, other: object) -> bool:
         return self._key() == other._key() if isinstance(other, Plan) else NotImplemented

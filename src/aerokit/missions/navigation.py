@@ -63,12 +63,12 @@ def waypoint(
     pass_by_m: float = 0.0,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Fly to a place and hold there for ``hold_s`` seconds (0 to 65,535; ArduPilot: whole seconds; Plane: not
-    supported).
+    """Fly to a place and hold there for ``hold_s`` seconds.
 
-    ``acceptance_radius_m`` is the distance at which the place counts as reached (0: the vehicle's parameter);
-    ArduCopter ignores it. ``pass_by_m`` is the distance at which a plane may pass the place, negative for the other
-    side. ArduPlane stores both distances in whole metres up to 255.
+    ``hold_s`` is 0 to 65,535; ArduPilot stores whole seconds, and ArduPlane does not support it. A place counts as
+    reached at a distance of ``acceptance_radius_m`` (0: the vehicle's parameter); ArduCopter ignores this distance. A
+    plane may pass the place at a distance of ``pass_by_m``, negative for the other side. ArduPlane stores both
+    distances in whole metres up to 255.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_WAYPOINT
     """
     return place_item(

@@ -62,7 +62,7 @@ def write_plan_file(path: str | os.PathLike[str], plan: Plan | Mission) -> None:
 def parse_plan(text: str, name: str = "plan") -> Plan:
     """Parse the text of a file. Errors begin with ``name``."""
     document = load_json(text, name)
-    # Checked before the missing fields, because another kind of file lacks most of them.
+    # Check the kind of file before the missing fields, because a file of another kind lacks most of these fields.
     for key, allowed in (("fileType", "Plan"), ("version", 1)):
         member = document.child(key)
         if member is not None:
@@ -82,7 +82,7 @@ def parse_plan(text: str, name: str = "plan") -> Plan:
 def format_plan(plan: Plan | Mission) -> str:
     """Format a plan or a mission as the text of a file.
 
-    For a plan that was read from a file, only changes are applied to its text.
+    If the plan was read from a file, only the changed parts of that file's text are replaced.
 
     Raises:
         InvalidArgument: ``plan`` is neither a plan nor a mission, or a .plan file cannot store a value: rally points
@@ -101,7 +101,7 @@ def format_plan(plan: Plan | Mission) -> str:
         raise InvalidArgument("the plan cannot be written: it was read from a file that is nested too deeply") from None
     except InvalidArgument:
         raise
-    except FileFormatError as error:  # the error is in the text from which the plan was read
+    except FileFormatError as error:  # The text from which the plan was read is invalid.
         raise InvalidArgument(f"the plan cannot be written: {error}") from error
     except ValueError as error:
         raise InvalidArgument("a number of the plan is not finite, and a .plan file cannot store it") from error
@@ -220,7 +220,7 @@ def _read_fence(value: JsonValue) -> Fence:
 def _check_version(value: JsonValue, *content_keys: str) -> int:
     """Return the version; raise FileFormatError unless it is 2, or 1 without content.
 
-    Version 1 had other contents, but QGroundControl has written it for empty fences and empty rally points, too.
+    Version 1 had other contents, but QGroundControl has also written it for empty fences and empty rally points.
     """
     is_empty = not any(value.members().get(key) for key in content_keys)
     allowed = (1, 2) if is_empty else (2,)
@@ -265,7 +265,7 @@ def _required_place(value: JsonValue) -> Position:
 
 
 def _read_place(value: JsonValue, *, altitude: str) -> Position | None:
-    """Return the place; None if coordinates are null. ``altitude`` tells its reference: "amsl" or "relative"."""
+    """Return the place; None if coordinates are null. ``altitude`` is its reference: "amsl" or "relative"."""
     elements = value.elements(2, 3)
     latitude, longitude = elements[0].number(-90, 90, null=True), elements[1].number(-180, 180, null=True)
     if math.isnan(latitude) or math.isnan(longitude):

@@ -34,8 +34,9 @@ def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
     command = LANDING_PATTERNS[pattern["complexItemType"].value]
     is_relative = pattern["altitudesAreRelative"].boolean()
     frame = MavFrame.GLOBAL_RELATIVE_ALT if is_relative else MavFrame.GLOBAL
-    approach = pattern.child("landingApproachCoordinate") or pattern["loiterCoordinate"]  # The latter in older files.
-    heading = 0.0 if command == MavCmd.NAV_LAND else math.nan  # as QGroundControl sends it
+    # Older files have a loiterCoordinate instead of the landingApproachCoordinate.
+    approach = pattern.child("landingApproachCoordinate") or pattern["loiterCoordinate"]
+    heading = 0.0 if command == MavCmd.NAV_LAND else math.nan  # QGroundControl sends these values.
     return (
         MissionItem(MavCmd.DO_LAND_START, MavFrame.MISSION),
         *_reset_items(pattern),
@@ -45,6 +46,7 @@ def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
 
 
 def _reset_items(pattern: JsonValue) -> list[MissionItem]:
+    """Create the items before an approach that reset speed, photos and video."""
     items = []
     if _flag(pattern, "useDoChangeSpeed"):
         speed = pattern["finalApproachSpeed"].number(0)
@@ -58,7 +60,7 @@ def _reset_items(pattern: JsonValue) -> list[MissionItem]:
 
 
 def _approach(pattern: JsonValue, frame: MavFrame, place: JsonValue) -> MissionItem:
-    # Either a waypoint, or a descent in a circle that is left tangentially. Older files have only circles.
+    # The approach is a waypoint, or a descent in a circle that is left tangentially. Older files have only circles.
     if not _flag(pattern, "useLoiterToAlt", default=True):
         return MissionItem(MavCmd.NAV_WAYPOINT, frame, 0.0, 0.0, 0.0, math.nan, *_place(place))
     radius = pattern["loiterRadius"].number(0)
@@ -113,14 +115,14 @@ def merged_entries(
 
     ``groups`` has the items of each old entry.
     """
-    # Entries before `head_end` are kept, and stand for the items before `first_new`.
+    # Keep the entries before `head_end`, which contain the items before `first_new`.
     head_end, first_new = 0, 0
     while head_end < len(groups):
         group = groups[head_end]
         if not _matches(group, items[first_new : first_new + len(group)]):
             break
         head_end, first_new = head_end + 1, first_new + len(group)
-    # Entries from `tail_start` on are kept, and stand for the items from `end_new` on.
+    # Keep the entries from `tail_start` on, which contain the items from `end_new` on.
     tail_start, end_new = len(groups), len(items)
     while tail_start > head_end:
         group = groups[tail_start - 1]
@@ -177,7 +179,7 @@ def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
 def _jump_ids(
     entries: Sequence[JsonValue], groups: Sequence[Sequence[JsonValue] | None], sizes: Sequence[int]
 ) -> dict[int, int]:
-    """Map doJumpId to index. Simple items take precedence over those inside surveys."""
+    """Map each doJumpId to the index of its item. Simple items take precedence over those inside surveys."""
     ids_of_simple_items: dict[int, int] = {}
     ids_in_surveys: dict[int, int] = {}
     first = 0
@@ -202,7 +204,7 @@ def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
         params[5].number(-180, 180, null=True)
     if command == MavCmd.DO_JUMP:
         numbers[0] = _jump_target(params[0], ids)
-    if math.isnan(numbers[6]) and has_place(command):  # `params` has no altitude.
+    if math.isnan(numbers[6]) and has_place(command):  # The file has no altitude in `params`.
         frame, numbers[6] = _planned_altitude(value, frame)
     param1, param2, param3, param4, latitude, longitude, z = numbers
     x, y = (from_degrees(number, command, frame) for number in (latitude, longitude))
@@ -217,7 +219,7 @@ def _jump_target(param: JsonValue, ids: dict[int, int]) -> float:
 
 
 def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
-    """Return frame and altitude according to the fields for display."""
+    """Return the frame and the altitude of the fields for display (AltitudeMode, Altitude, AMSLAltAboveTerrain)."""
     mode_member = value.child("AltitudeMode")
     mode = 0 if mode_member is None else mode_member.integer(0, 0xFF)
     # Mode 3 is an altitude above the terrain, which the planner has converted to one above mean sea level.
@@ -254,9 +256,9 @@ def load_json(text: str, name: str) -> JsonValue:
         return JsonValue(json.loads(text, parse_constant=_no_constant), name, "")
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
-        raise FileFormatError(f"{name}: {where}: not valid JSON: {error.msg}") from error
+        raise FileFormatError(f"{name}: {where}: the text is not valid JSON: {error.msg}") from error
     except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{name}: not valid JSON: {error}") from error
+        raise FileFormatError(f"{name}: the text is not valid JSON: {error}") from error
 
 
 def _no_constant(text: str) -> None:
@@ -264,7 +266,7 @@ def _no_constant(text: str) -> None:
 
 
 class JsonValue:
-    """A value in a JSON document. Its methods raise :class:`FileFormatError` if it has another type."""
+    """A value in a JSON document. Its methods raise :class:`FileFormatError` if the value has another type."""
 
     __slots__ = ("name", "path", "value")
 
@@ -274,8 +276,8 @@ class JsonValue:
         self.path: str = path
 
     def error(self, expected: str) -> FileFormatError:
-        """Create an error for a value that is not as expected."""
-        # The value is encoded incrementally, because a large value need not be formatted completely to be truncated.
+        """Create an error that says what was expected instead of this value."""
+        # Encode only the beginning of the value, because a large value would take long and is shortened anyway.
         text = "".join(islice(json.JSONEncoder().iterencode(self.value), 41))
         if len(text) > 40:
             text = f"{text[:37]}..."
@@ -301,7 +303,7 @@ class JsonValue:
         return self.value
 
     def elements(self, *sizes: int) -> list[JsonValue]:
-        """Return the elements of an array. If ``sizes`` are given, the array must have one of them."""
+        """Return the elements of an array. If ``sizes`` are given, the array must have one of these lengths."""
         if not isinstance(self.value, list):
             raise self.error("an array")
         if sizes and len(self.value) not in sizes:

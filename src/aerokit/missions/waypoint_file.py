@@ -2,7 +2,7 @@
 
 See https://mavlink.io/en/file_formats/#mission_plain_text_file. Each line is an item, separated by tabs: index, current
 flag, frame, command, parameters 1 to 4, latitude (or x, or parameter 5), longitude, altitude, autocontinue. In version
-110, item 0 is home, and jump targets count it. Version 120 has no home.
+110, item 0 is home, and jump targets count home as an item. Version 120 has no home.
 """
 
 from __future__ import annotations
@@ -113,7 +113,10 @@ class _Row:
         self._integer("current", 0xFF)
 
     def is_home(self) -> bool:
-        """Return True for a waypoint above mean sea level. Mission Planner used to write command 0 for home."""
+        """Return True if this line can be home, because it is a waypoint above mean sea level.
+
+        Mission Planner used to write command 0 for home.
+        """
         return self.command in (0, MavCmd.NAV_WAYPOINT) and canonical_frame(self.frame) == MavFrame.GLOBAL
 
     def home(self) -> Position | None:

@@ -157,8 +157,8 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
     """Convert the items of a mission that was made for ArduPilot, so that another autopilot accepts them.
 
     ArduPilot accepts commands without a place in any frame, PX4 only in MAV_FRAME_MISSION. ArduPilot takes the place
-    0°, 0° for the current position. It is replaced by the destination of the previous item, in the first item by
-    ``here`` (latitude and longitude in degrees, None if unknown).
+    0°, 0° for the current position. This place is replaced by the destination of the previous item, in the first item
+    by ``here`` (latitude and longitude in degrees, None if unknown).
     """
     current_xy = None if here is None else (round(here[0] * 1e7), round(here[1] * 1e7))
     for item in items:
@@ -179,7 +179,7 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
 # MISSION_ITEM_INT, not truncated. Missions have home as item 0.
 MAGIC = 0x763D
 HEADER = struct.Struct("<5H")
-NO_CLEAR = 1  # option: keep existing items, and replace only items that are in the file
+NO_CLEAR = 1  # option of a packed plan: replace only the items that are in the file, and keep all others
 PACKED_PATHS = {0: "@MISSION/mission.dat", 1: "@MISSION/fence.dat", 2: "@MISSION/rally.dat"}
 
 _ITEM_LENGTH = messages.MissionItemInt.LENGTH
@@ -211,8 +211,8 @@ def pack_items(
 
     A whole plan has ``first`` 0 and no options. ArduPilot accepts :data:`NO_CLEAR` only for missions: items from index
     ``first`` on are replaced or appended, all others are kept. Jump targets must then be below the number of items in
-    the file (4.7). ArduPilot processes a file when it is closed, and first clears the old mission. If it refuses an
-    item, the new mission consists of the items before the refused one.
+    the file (4.7). ArduPilot processes a file when it is closed, and first clears the old mission. If ArduPilot refuses
+    an item, the new mission consists of the items before the refused item.
     """
     if len(items) + first > MAX_ITEMS:
         raise InvalidArgument(f"{len(items) + first} items are too many: at most {MAX_ITEMS} are possible")

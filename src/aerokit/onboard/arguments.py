@@ -41,7 +41,7 @@ class Param(Snapshot):
 
 
 class CommandArgument(Snapshot):
-    """One argument of a handler."""
+    """One argument of a command handler, with its type and allowed range."""
 
     name: str
     number: int
@@ -54,14 +54,14 @@ class CommandArgument(Snapshot):
         if not math.isfinite(value):
             if self.is_optional and math.isnan(value):  # NaN means that the parameter is missing.
                 return None
-            raise InvalidArgument(f"{self.name} = {value} is not allowed: a number")
+            raise InvalidArgument(f"{self.name} = {value} is not allowed: it must be a finite number")
         if not self.range.minimum <= value <= self.range.maximum:
             low, high = self.range.minimum, self.range.maximum
             raise InvalidArgument(f"{self.name} = {value:g} is not allowed: {low:g} to {high:g}")
         if self.type is float:
             return value
         if value != int(value):
-            raise InvalidArgument(f"{self.name} = {value:g} is not allowed: a whole number")
+            raise InvalidArgument(f"{self.name} = {value:g} is not allowed: it must be a whole number")
         if self.type is bool:
             if value not in (0, 1):
                 raise InvalidArgument(f"{self.name} = {value:g} is not allowed: 0 or 1")
@@ -69,7 +69,9 @@ class CommandArgument(Snapshot):
         try:
             return self.type(int(value))
         except ValueError:
-            raise InvalidArgument(f"{self.name} = {value:g} is not allowed: a {self.type.__name__}") from None
+            raise InvalidArgument(
+                f"{self.name} = {value:g} is not allowed: it must be a {self.type.__name__}"
+            ) from None
 
 
 def arguments_of(function: Callable[..., Any]) -> tuple[CommandArgument, ...]:
@@ -107,7 +109,7 @@ def _hint(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
 
 
 def _argument(function_name: str, name: str, number: int, hint: Any) -> CommandArgument:
-    """Interpret an annotation: a number type, perhaps optional, perhaps Annotated with a Range or a Param."""
+    """Interpret an annotation: a number type, which may be optional, or Annotated with a Range or a Param."""
     allowed = Range()
     if get_origin(hint) is Annotated:
         hint, *extras = get_args(hint)

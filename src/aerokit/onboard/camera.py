@@ -91,7 +91,7 @@ class CameraDriver:
     ) -> None:
         for name, text in (("vendor", vendor), ("model", model)):
             if len(text.encode()) > 32:
-                raise InvalidArgument(f"{name} = {text!r} is not allowed: at most 32 bytes")
+                raise InvalidArgument(f"{name} = {text!r} is not allowed: it must have at most 32 bytes")
         self.vendor: str = vendor
         self.model: str = model
         self.resolution: tuple[int, int] = resolution
@@ -102,9 +102,9 @@ class CameraDriver:
         self.definition: bytes | None = definition
         self.gimbal_id: int = gimbal_id
         self.zoom_percent: float = math.nan
-        """Zoom to report; assign it when it changes."""
+        """Zoom that is reported, in percent. Assign the new value when the zoom changes."""
         self.focus_percent: float = math.nan
-        """Focus to report; assign it when it changes."""
+        """Focus that is reported, in percent. Assign the new value when the focus changes."""
 
     async def take_photo(self, index: int) -> Photo:
         """Take a picture and return it. ``index`` is the number of the picture, from 0."""
@@ -184,7 +184,7 @@ def capabilities_of(camera: CameraDriver) -> int:
         flags |= CameraCapFlags.CAPTURE_VIDEO
     if camera.has_modes:
         flags |= CameraCapFlags.HAS_MODES
-    else:
+    else:  # A camera without modes takes photos and videos at any time.
         flags |= CameraCapFlags.CAN_CAPTURE_IMAGE_IN_VIDEO_MODE | CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
     if _implements(camera, "zoom_to") or _implements(camera, "zoom_at"):
         flags |= CameraCapFlags.HAS_BASIC_ZOOM
@@ -244,6 +244,7 @@ class CameraAdapter(CameraDevice):
         return storage is None or (storage.is_ready and storage.available_mib > 0)
 
     def expose(self, done: Callable[[Shot | None], None]) -> None:
+        """Take a photo in a task, then call ``done`` with the result, or with None after an error."""
         time_boot_ms, unix_time = self._host.time_boot_ms, self._host.connection.unix_time()
 
         async def take() -> None:
@@ -346,7 +347,7 @@ class CameraAdapter(CameraDevice):
 
 
 def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
-    """Return a function that creates the CAMERA_IMAGE_CAPTURED of a photo from the fields that the server adds."""
+    """Return a function that creates the CAMERA_IMAGE_CAPTURED of a photo. Its arguments are the remaining fields."""
     if not isinstance(photo, Photo):
         raise InvalidArgument(f"take_photo returned {photo!r}, not a Photo")
     place = photo.position

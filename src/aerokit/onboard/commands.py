@@ -77,7 +77,7 @@ class CommandRequest:
             return Position(latitude, longitude, altitude_amsl_m=altitude_m)
         if frame in _RELATIVE:
             return Position(latitude, longitude, altitude_relative_m=altitude_m)
-        raise InvalidArgument(f"frame = {frame} is not allowed: a global MAV_FRAME")
+        raise InvalidArgument(f"frame = {frame} is not allowed: it must be a global MAV_FRAME")
 
     def report_progress(self, percent: int) -> None:
         """Send IN_PROGRESS with this percentage (0 to 100) now, and repeat it until the next report."""
@@ -140,7 +140,7 @@ class ComponentCommands:
         self.handlers[command] = partial(self._execute, function, arguments_of(function))
 
     def add_guarded(self, handlers: Mapping[int, CommandHandler]) -> None:
-        """Register handlers of a protocol server that call the program's code, and turn its exceptions into results."""
+        """Register handlers of a protocol server that call the program's code. Its exceptions become results."""
 
         def guard(handler: CommandHandler) -> CommandHandler:
             def guarded(command: ReceivedCommand) -> int | CommandProgress | None:
@@ -160,7 +160,7 @@ class ComponentCommands:
         return await result if inspect.isawaitable(result) else result
 
     def begin(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Begin to call a function as `call` does; return the result of a plain function, otherwise an awaitable."""
+        """Like `call`, but return the result of a plain function at once, and an awaitable for other functions."""
         if inspect.iscoroutinefunction(function) or not self.uses_threads:
             return function(*arguments)
         return self._call_in_thread(function, *arguments)
@@ -205,7 +205,7 @@ class ComponentCommands:
         def report(percent: int) -> None:
             if loop is None:
                 self._running.report(started, percent)
-            else:  # This function was called from a thread.
+            else:  # The handler runs in a thread, which must not call the event loop's objects directly.
                 loop.call_soon_threadsafe(self._running.report, started, percent)
 
         request = CommandRequest(command, report)
@@ -229,6 +229,7 @@ class ComponentCommands:
         self._tasks.start(run, f"aerokit {command_name(command.command)}")
 
     async def _finish(self, running: RunningCommand, function: Callable[..., Any], answer: Awaitable[Any]) -> None:
+        """Wait for the result of a handler, and acknowledge the command."""
         try:
             outcome = outcome_of(await answer)
         except asyncio.CancelledError:
@@ -242,7 +243,7 @@ class ComponentCommands:
     def _fail(self, running: RunningCommand, function: Callable[..., Any], error: Exception) -> None:
         """Answer with the result for an error, and explain it in a status text."""
         name = getattr(function, "__name__", "run")
-        if name == "run":  # aerokit's own wrapper, whose name tells the sender nothing
+        if name == "run":  # The name of aerokit's own wrapper tells the sender nothing.
             name = command_name(running.command.command)
         self._host.report_error(name, error)
         self._running.finish(running, Outcome(result_of(error)))

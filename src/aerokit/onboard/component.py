@@ -147,10 +147,10 @@ class OnboardComponent:
             InvalidArgument: a value is out of range.
         """
         if state not in MavState.__members__.values():
-            raise InvalidArgument(f"state = {state} is not allowed: a MAV_STATE, 0 to 8")
+            raise InvalidArgument(f"state = {state} is not allowed: it must be a MAV_STATE (0 to 8)")
         old = self._heartbeat
         heartbeat = m.Heartbeat(old.type, old.autopilot, base_mode, custom_mode, state, MAVLINK_VERSION)
-        heartbeat.encode()  # raises InvalidArgument before the old heartbeat is replaced
+        heartbeat.encode()  # Raises InvalidArgument before the old heartbeat is replaced.
         self._heartbeat = heartbeat
         self._host.send(heartbeat)
 
@@ -191,12 +191,10 @@ class OnboardComponent:
     def message(
         self, message_type: type[Message], *, hz: float = 0.0
     ) -> Callable[[Callable[[], Message | None]], Callable[[], Message | None]]:
-        """Decorator: send the message that the function returns.
-
-        The message is sent on request, and at intervals that other programs set.
+        """Decorator: send the message that the function returns, on request and at intervals that other programs set.
 
         The function returns None while it has no values. ``hz`` (0 to 200) is the rate at which the message is sent to
-        all programs from the start; 0 sends it only on request.
+        all programs from the start. With 0, the message is sent only on request.
 
         Raises:
             InvalidArgument: ``hz`` is out of range, or the message already has a function.
@@ -231,7 +229,7 @@ class OnboardComponent:
         """Send an event to all programs (EVENT). A receiver that missed the event can request it again.
 
         Args:
-            event_id: id in the component's event metadata, ``component_id << 24`` plus a number.
+            event_id: id in the component's event metadata: ``component_id << 24`` plus the number of the event.
             arguments: at most 40 bytes.
             severity: MAV_SEVERITY, 0 to 7.
 
@@ -253,7 +251,7 @@ class OnboardComponent:
             writable: True if any sender may write, rename and remove files in the directory.
 
         Raises:
-            InvalidArgument: there is no such directory, or the component already serves one.
+            InvalidArgument: there is no such directory, or the component already serves a directory.
         """
         root = Path(directory)
         if not root.is_dir():
@@ -276,7 +274,7 @@ class OnboardComponent:
             InvalidArgument: the content is too large, or the kind is unknown.
         """
         if len(content) > MAX_METADATA_BYTES:
-            raise InvalidArgument(f"content has {len(content)} bytes, at most {MAX_METADATA_BYTES} are allowed")
+            raise InvalidArgument(f"content has {len(content)} bytes; at most {MAX_METADATA_BYTES} are allowed")
         self._identity.offer(CompMetadataType[kind.upper()], f"/{kind}.json", lambda: content)
 
     def _is_congested(self) -> bool:
@@ -284,8 +282,9 @@ class OnboardComponent:
 
     @property
     def missions(self) -> ComponentMissions:
-        """Missions, fences and rally points that other programs upload and download. They are served after the first
-        access.
+        """Missions, fences and rally points that other programs upload and download.
+
+        The component serves them from the first access to this property on.
         """
         if self._missions is None:
             self._missions = ComponentMissions(self._host, self._tasks, self._commands)
@@ -378,9 +377,9 @@ class OnboardComponent:
         """Answer ARM_AUTHORIZATION_REQUEST (https://mavlink.io/en/services/arm_authorization.html).
 
         Args:
-            authorize: function or coroutine function, called with the vehicle's system id. It returns the number of
-                seconds for which arming is allowed, at most 255. An exception denies arming; its text is sent as a
-                status text. To give a reason, return a :class:`~aerokit.onboard.CommandResult` with a
+            authorize: function or coroutine function, called with the vehicle's system id. The function returns the
+                number of seconds for which arming is allowed, at most 255. An exception denies arming, and its text is
+                sent as a status text. To give a reason, return a :class:`~aerokit.onboard.CommandResult` with a
                 MAV_ARM_AUTH_DENIED_REASON as ``detail``.
 
         Raises:

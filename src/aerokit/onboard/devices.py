@@ -100,7 +100,7 @@ STATUS_HZ = 5.0
 
 
 def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
-    """Serve DO_WINCH and WINCH_STATUS."""
+    """Execute DO_WINCH by the driver, and send WINCH_STATUS."""
 
     async def do_winch(
         _: CommandRequest, instance: float | None, action: int, length: float | None, rate: float | None
@@ -114,9 +114,9 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         elif name == "set_rate":
             arguments = (rate,)
         if None in arguments:
-            raise InvalidArgument("length and rate are required")
+            raise InvalidArgument("length or rate is missing: this action needs it")
         if name == "pay_out" and rate is not None and rate <= 0:
-            raise InvalidArgument(f"rate = {rate:g} is not allowed: above 0")
+            raise InvalidArgument(f"rate = {rate:g} is not allowed: it must be above 0")
         await services.commands.call(getattr(winch, name), *arguments)
 
     def status() -> m.WinchStatus:
@@ -134,7 +134,7 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
 def add_gripper(
     services: ComponentServices, grab: Callable[[], Awaitable[Any]], release: Callable[[], Awaitable[Any]]
 ) -> None:
-    """Serve DO_GRIPPER."""
+    """Execute DO_GRIPPER by the two functions."""
 
     async def do_gripper(_: CommandRequest, instance: float | None, action: GripperActions) -> None:
         if action == GripperActions.RELEASE:
@@ -148,7 +148,7 @@ def add_gripper(
 
 
 def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> None:
-    """Serve ARM_AUTHORIZATION_REQUEST.
+    """Answer ARM_AUTHORIZATION_REQUEST.
 
     ``authorize`` returns the seconds for which arming is allowed, or a CommandResult, and raises an error to deny it.
     """

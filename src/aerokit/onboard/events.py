@@ -38,13 +38,15 @@ class EventSender:
         if not 0 <= event_id <= 0xFFFFFFFF:
             raise InvalidArgument(f"event_id = {event_id} is not allowed: 0 to 4294967295")
         if len(arguments) > MAX_ARGUMENT_BYTES:
-            raise InvalidArgument(f"arguments has {len(arguments)} bytes, at most {MAX_ARGUMENT_BYTES} fit")
+            raise InvalidArgument(
+                f"arguments has {len(arguments)} bytes; at most {MAX_ARGUMENT_BYTES} fit into the message"
+            )
         check_severity(severity)
         is_first = self._sequence < 0
         self._sequence = (self._sequence + 1) & 0xFFFF
-        levels = severity << 4 | severity  # the level for logs, and the level for other programs
+        levels = severity << 4 | severity  # one half byte for logs, the other for other programs
         time_ms, data = self._host.time_boot_ms, bytes(arguments).ljust(MAX_ARGUMENT_BYTES, b"\0")
-        destination = (0, 0)  # all components
+        destination = (0, 0)  # the message is for all components
         event = m.Event(*destination, event_id, time_ms, self._sequence, levels, data)
         self._sent.append(event)
         self._host.send(event)
@@ -57,7 +59,7 @@ class EventSender:
         self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
 
     def _on_request(self, request: m.RequestEvent, channel: Channel) -> None:
-        # Sequence numbers have 16 bits, and wrap around.
+        # Sequence numbers have 16 bits and wrap around, so `last_sequence` may be below `first_sequence`.
         count = ((request.last_sequence - request.first_sequence) & 0xFFFF) + 1
         requested = {(request.first_sequence + i) & 0xFFFF for i in range(min(count, MAX_STORED_EVENTS))}
         stored = [event for event in self._sent if event.sequence in requested]

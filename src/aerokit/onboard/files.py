@@ -29,7 +29,7 @@ _ERROR_NUMBERS = {errno.ENOTEMPTY: 39, errno.ELOOP: ENOENT, errno.ENAMETOOLONG: 
 
 
 def _raises_file_fault(function: FunctionT) -> FunctionT:
-    """Turn OSError into FileFault."""
+    """Decorator: turn an OSError into a FileFault with the same error number."""
 
     @wraps(function)
     def guarded(*args: Any, **kwargs: Any) -> Any:
@@ -114,7 +114,7 @@ class DirectoryFiles:
         if target.exists() and not target.is_file():
             raise FileFault(ENOENT)
         descriptor = os.open(target, flags | _SAFE_FLAGS, 0o644)
-        # Checked again, because another program may have replaced the file by a device in between.
+        # Check again, because another program may have replaced the file by a device since the check above.
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)
             raise FileFault(ENOENT)
@@ -122,7 +122,7 @@ class DirectoryFiles:
 
     @_raises_file_fault
     def entries(self, path: str) -> list[Entry]:
-        """Return files and directories, by name."""
+        """Return the files and directories in a directory, sorted by name."""
         sizes: dict[str, int | None] = {}  # None for directories
         if self._root is not None:
             try:
@@ -137,7 +137,7 @@ class DirectoryFiles:
             except (OSError, FileFault):
                 if path not in self._memory:
                     raise
-        if self._root is None or path in self._memory:  # Raises if the path is in neither of them.
+        if self._root is None or path in self._memory:  # Without a directory, `entries` raises for an unknown path.
             sizes.update(self._memory.entries(path))
         return sorted(sizes.items())
 

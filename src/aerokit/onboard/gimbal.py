@@ -63,10 +63,11 @@ class GimbalDriver:
     ) -> None:
         for name, (low, high) in (("roll_deg", roll_deg), ("pitch_deg", pitch_deg), ("yaw_deg", yaw_deg)):
             if not -360.0 <= low <= high <= 360.0:
-                raise InvalidArgument(f"{name} = ({low}, {high}) is not allowed: minimum and maximum, −360 to 360")
+                raise InvalidArgument(f"{name} = ({low}, {high}) is not allowed: both must be −360 to 360, in order")
         if not max_rate_deg_s > 0 or not 0 <= attitude_hz <= 100:
             raise InvalidArgument(
-                f"max_rate_deg_s = {max_rate_deg_s}, attitude_hz = {attitude_hz} are not allowed: above 0, and 0 to 100"
+                f"max_rate_deg_s = {max_rate_deg_s}, attitude_hz = {attitude_hz} are not allowed: max_rate_deg_s must"
+                " be above 0, and attitude_hz 0 to 100"
             )
         self.vendor: str = vendor
         self.model: str = model
@@ -75,7 +76,7 @@ class GimbalDriver:
         self.attitude_hz: float = attitude_hz
 
     def point(self, target: GimbalTarget) -> None:
-        """Start to turn to a target within the limits. Called on the event loop; must return at once."""
+        """Start to turn to a target within the limits. Called on the event loop, so it must return at once."""
         raise NotImplementedError
 
     def attitude(self) -> tuple[float, float, float]:
@@ -87,8 +88,9 @@ class GimbalDriver:
         return 0.0
 
     def look_at(self, position: Position | None) -> None:
-        """Start to point at a position, or ahead for None. If not overridden, commands to point at a position are
-        UNSUPPORTED.
+        """Start to point at a position; None means to point ahead again.
+
+        If a subclass does not override this method, commands to point at a position are UNSUPPORTED.
         """
         raise NotImplementedError
 
@@ -137,7 +139,7 @@ class GimbalAdapter(GimbalMount):
     def point(self, angles: Angles, flags: int, *, locked: bool) -> None:
         limited = [max(low, min(high, angle)) for angle, (low, high) in zip(angles, self.limits, strict=True)]
         if locked:
-            limited[2] = angles[2]  # The yaw limits are relative to the nose, not to north.
+            limited[2] = angles[2]  # A locked yaw is relative to north, but the yaw limits are relative to the nose.
         roll, pitch, yaw = map(math.degrees, limited)
         is_retracted = bool(flags & ManagerFlags.RETRACT)
         target = GimbalTarget((roll, pitch, yaw), rates=None, yaw_locked=locked, is_retracted=is_retracted)

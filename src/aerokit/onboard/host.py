@@ -43,7 +43,8 @@ class ComponentHost:
         self.component_id = component_id
         self.knows_command: Callable[[int], bool] = lambda _: True
         self._accepts = None if accepts is None else frozenset(accepts)
-        # A component with the ids of the connection uses its encoder, so that both share one sequence of frames.
+        # A component with the ids of the connection has no encoder of its own. It uses that of the connection, so that
+        # their frames have one common sequence of numbers.
         has_ids_of_connection = (system_id, component_id) == (connection.source_system, connection.source_component)
         self._encoder = None if has_ids_of_connection else FrameEncoder(system_id, component_id)
         self._started_at = connection.now()
@@ -97,12 +98,12 @@ class ComponentHost:
         data = "".join(char if char.isprintable() else " " for char in text)
         data = data.encode("ascii", "replace").decode()[:MAX_TEXT_SIZE]
         if len(data) <= TEXT_SIZE:
-            self.send(m.Statustext(severity, data, id=0, chunk_seq=0))  # id 0: the text has only one chunk.
+            self.send(m.Statustext(severity, data, id=0, chunk_seq=0))  # id 0 means that the text has only one chunk.
             return
         self._text_id = self._text_id % 0xFFFF + 1
         for number, start in enumerate(range(0, len(data), TEXT_SIZE)):
             self.send(m.Statustext(severity, data[start : start + TEXT_SIZE], self._text_id, number))
-        if len(data) % TEXT_SIZE == 0:  # an empty chunk follows if the last chunk is full
+        if len(data) % TEXT_SIZE == 0:  # A full chunk does not end the text, so an empty chunk must follow.
             self.send(m.Statustext(severity, "", self._text_id, len(data) // TEXT_SIZE))
 
     def report_error(self, subject: str, error: Exception) -> None:

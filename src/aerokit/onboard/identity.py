@@ -41,7 +41,7 @@ class Identity(Snapshot):
         for name, size in (("vendor", 32), ("model", 32), ("version", 24), ("hardware_version", 24)):
             value = getattr(self, name)
             if not isinstance(value, str) or len(value.encode()) > size:
-                raise InvalidArgument(f"{name} = {value!r} is not allowed: a text of at most {size} bytes")
+                raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a text of at most {size} bytes")
         _ = self.version_number  # Raises InvalidArgument if the version is invalid.
         if not 0 <= self.uid < 1 << 64:
             raise InvalidArgument(f"uid = {self.uid} is not allowed: 0 to 2**64 - 1")
@@ -51,7 +51,9 @@ class Identity(Snapshot):
         """The version in the form of AUTOPILOT_VERSION, which has one byte for each number."""
         parts = [*self.version.split("."), "0", "0", "0"][:4]
         if not all(part.isdecimal() and int(part) <= 255 for part in parts):
-            raise InvalidArgument(f"version = {self.version!r} is not allowed: numbers up to 255, such as '1.4.2'")
+            raise InvalidArgument(
+                f"version = {self.version!r} is not allowed: it must consist of numbers up to 255, such as '1.4.2'"
+            )
         major, minor, patch, release_type = map(int, parts)
         return major << 24 | minor << 16 | patch << 8 | release_type
 

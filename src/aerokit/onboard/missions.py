@@ -56,15 +56,17 @@ class ComponentMissions:
         """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
         To refuse a list, the function returns False or a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes
-        the result INVALID and a status text. It may be a coroutine function. An empty list is a request to clear the
-        list.
+        the result INVALID and a status text. The function may be a coroutine function. An empty list is a request to
+        clear the list.
         """
         self._on_upload = function
         return function
 
     def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
-        """Decorator: ``function(index)`` continues the mission at an item. Requests to do so are refused if it returns
-        False or raises, and without such a function.
+        """Decorator: ``function(index)`` continues the mission at an item.
+
+        Requests to change the current item are refused if the function returns False or raises, or if there is no such
+        function.
         """
         self._on_current = function
         return function
@@ -110,7 +112,7 @@ class ComponentMissions:
             return
 
         async def wait() -> None:
-            result = int(MavMissionResult.OPERATION_CANCELLED)  # if this task is cancelled
+            result = int(MavMissionResult.OPERATION_CANCELLED)  # the answer if this task is cancelled
             try:
                 result = _result_of(await verdict)
             except Exception as error:

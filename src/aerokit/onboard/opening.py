@@ -64,8 +64,8 @@ async def component(
         type: MAV_TYPE of the heartbeat: ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH, GRIPPER …
         autopilot: MAV_AUTOPILOT of the heartbeat; INVALID for everything that is not a flight controller.
         identity: vendor, model and versions that the component reports.
-        parameters_file: JSON file that stores the parameters; it is replaced atomically after each change. None:
-            parameters are not stored.
+        parameters_file: JSON file that stores the parameters; the file is replaced atomically after each change. With
+            None, parameters are not stored.
         bytewise: True to encode integers in PARAM_VALUE bytewise, as PX4 does; False to cast them to float, as
             ArduPilot does. The component's capabilities announce the encoding. Clients that decide by the field
             ``autopilot`` of HEARTBEAT expect bytewise encoding.

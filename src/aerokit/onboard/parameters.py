@@ -55,7 +55,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
     def __init__(self, host: ComponentHost, path: Path | None, *, bytewise: bool) -> None:
         self._host, self._path = host, path
         self._rows: dict[str, _Row] = {}
-        self._small_names: list[str] = []  # parameters that PARAM_VALUE can carry: no texts
+        self._small_names: list[str] = []  # names of the parameters that are not texts, which PARAM_VALUE can carry
         self._stored: dict[str, Any] = _read_stored(path)
         self._is_dirty = False
         self._saving: asyncio.Task[None] | None = None
@@ -99,13 +99,15 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         """
         check_name(name)
         if self._is_excluded:
-            raise InvalidArgument("a component has either parameters or the settings of a camera definition")
+            raise InvalidArgument("a component cannot have both parameters and the settings of a camera definition")
         if name in self._rows:
-            raise InvalidArgument(f"parameter {name} was added before")
+            raise InvalidArgument(f"this component already has a parameter {name}")
         if len(self._rows) >= MAX_COMPONENT_PARAMETERS:
             raise InvalidArgument(f"a component has at most {MAX_COMPONENT_PARAMETERS} parameters")
         if isinstance(default, bool) or type(default) not in _TYPES:
-            raise InvalidArgument(f"default = {default!r} of {name} is not allowed: an int, a float or a str")
+            raise InvalidArgument(
+                f"default = {default!r} of {name} is not allowed: it must be an int, a float or a str"
+            )
         metadata = ParameterMetadata(
             name,
             short_description=description,
@@ -124,18 +126,19 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             try:
                 row.value = self._checked(row, self._stored[name])
             except InvalidArgument as error:
-                logger.warning("%s: the stored value is not used, but the default: %s", self._path, error)
+                logger.warning("%s: the default is used instead of the stored value: %s", self._path, error)
         self._rows[name] = row
         if fits_param_value(row.type):
             self._small_names.append(name)
-        # Created only for the first parameter, because the settings of a camera may need PARAM_EXT.
+        # Create the server with the first parameter, because a component without parameters may use PARAM_EXT for the
+        # settings of a camera.
         if self._param_ext_server is None:
             self._param_ext_server = TypedExtendedServer(self._host, _Store(self))
 
     def _forbid_parameters(self) -> None:
         """Accept no parameters from now on, because the settings of a camera definition use PARAM_EXT."""
         if self._rows:
-            raise InvalidArgument("a component has either parameters or the settings of a camera definition")
+            raise InvalidArgument("a component cannot have both parameters and the settings of a camera definition")
         self._is_excluded = True
 
     def set(self, name: str, value: int | float | str) -> None:
@@ -177,10 +180,11 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         if isinstance(checked, str):
             return checked
         if isinstance(checked, bytes):
-            raise InvalidArgument(f"{name} = {value!r} is not allowed: a text")
+            raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a text")
         if metadata.values and checked not in metadata.values:
             raise InvalidArgument(f"{name} = {checked:g} is not allowed: {', '.join(map(str, metadata.values))}")
-        # The allowed values are checked above, and this program may change a read-only parameter.
+        # `problem` need not check the allowed values, which are checked above, or whether the parameter is read-only:
+        # this program may change it.
         problem = metadata.replace(read_only=False, values={}).problem(checked)
         if problem is not None:
             raise InvalidArgument(problem)
@@ -201,7 +205,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         return json.dumps({**self._stored, **values}, indent=1) + "\n"
 
     async def _save(self, path: Path) -> None:
-        """Write the file until it has the last change. Uses a thread, because a memory card may need seconds."""
+        """Write the file, and again after changes during the write. Uses a thread, because memory cards are slow."""
         try:
             while self._is_dirty:
                 self._is_dirty = False
@@ -214,7 +218,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             self._saving = None
 
     async def aclose(self) -> None:
-        """Wait until the file has the last change."""
+        """Wait until the file contains the last change."""
         if self._saving is not None:
             await self._saving
 
@@ -271,7 +275,7 @@ class _Store:
 
 
 def _as_stored(limit: float | None, default: ParameterValue) -> float | None:
-    """Round a limit to 32 bits in the same way as values, so that the limit itself is an allowed value."""
+    """Round a limit to 32 bits, as values are rounded, so that the limit itself is an allowed value."""
     return to_float32(limit) if limit is not None and isinstance(default, float) else limit
 
 
@@ -301,5 +305,5 @@ def _read_stored(path: Path | None) -> dict[str, Any]:
     except ValueError as error:
         raise FileFormatError(f"{path} is not a parameter file: {error}") from None
     if not isinstance(content, dict):
-        raise FileFormatError(f"{path} is not a parameter file: it is not a JSON object")
+        raise FileFormatError(f"{path} is not a parameter file: its content is not a JSON object")
     return content

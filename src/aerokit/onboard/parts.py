@@ -42,7 +42,7 @@ class DefinedSettings(DefinedParameterServer):
 
 
 def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapter:
-    """Serve a camera."""
+    """Serve the camera protocol for the program's camera."""
     host, streams = services.host, services.streams
     adapter = CameraAdapter(camera, host, services.tasks, services.commands.call)
     if m.CameraInformation.ID in streams.builders:
@@ -70,7 +70,7 @@ async def _run(handler: AsyncHandler, command: ReceivedCommand) -> int:
 
 
 def add_gimbal(services: ComponentServices, gimbal: GimbalDriver) -> GimbalAdapter:
-    """Serve a gimbal."""
+    """Serve the gimbal protocol for the program's gimbal."""
     streams = services.streams
     if m.GimbalManagerInformation.ID in streams.builders:
         raise InvalidArgument("this component already has a gimbal: open another component for the second one")

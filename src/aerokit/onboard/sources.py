@@ -22,7 +22,7 @@ _NOT_MEASURED = 0xFFFF
 
 @checks_arguments
 class ComponentSources:
-    """Sends measurements as this component. Each call sends one message to all; make a call for each measurement."""
+    """Sends measurements as this component. Each call sends one measurement, in one message to all programs."""
 
     def __init__(self, host: ComponentHost) -> None:
         self._host = host
@@ -57,9 +57,11 @@ class ComponentSources:
             ConnectionClosed, LinkLost: the connection has ended.
         """
         if not 0 < len(distances_m) <= MAX_DISTANCES:
-            raise InvalidArgument(f"distances_m has {len(distances_m)} values, 1 to {MAX_DISTANCES} are allowed")
+            raise InvalidArgument(f"distances_m has {len(distances_m)} values; 1 to {MAX_DISTANCES} are allowed")
         if not 0 <= min_m < max_m <= 655:
-            raise InvalidArgument(f"min_m, max_m = {min_m}, {max_m} are not allowed: 0 to 655, min below max")
+            raise InvalidArgument(
+                f"min_m, max_m = {min_m}, {max_m} are not allowed: both must be 0 to 655, and min_m below max_m"
+            )
         if not 0 < increment_deg <= 360:
             raise InvalidArgument(f"increment_deg = {increment_deg} is not allowed: above 0, at most 360")
         nothing_in_range = round(max_m * 100) + 1  # defined by OBSTACLE_DISTANCE
@@ -116,7 +118,7 @@ class ComponentSources:
             if value is not None:
                 flags |= flag
         if len(callsign) > 8:
-            raise InvalidArgument(f"callsign = {callsign!r} is not allowed: at most 8 characters")
+            raise InvalidArgument(f"callsign = {callsign!r} is not allowed: it must have at most 8 characters")
         self._send(
             m.AdsbVehicle(
                 icao,
@@ -142,7 +144,8 @@ class ComponentSources:
 
         Args:
             right_deg: angle from straight down to the right, -90 to 90.
-            down_deg: angle from straight down towards the tail, -90 to 90. It is downwards in the camera's image.
+            down_deg: angle from straight down towards the tail, -90 to 90. The tail is at the bottom of the camera's
+                image.
             distance_m: distance to the beacon in metres, 0 or more.
             target_number: number of the beacon, 0 to 255.
 
@@ -158,7 +161,7 @@ class ComponentSources:
         angles = (math.radians(right_deg), math.radians(down_deg))
         kind = LandingTargetType.LIGHT_BEACON
         frame = MavFrame.BODY_FRD
-        size = (0.0, 0.0)  # unknown
+        size = (0.0, 0.0)  # The size of the target is unknown.
         self._send(m.LandingTarget(self._time_us(), target_number, frame, *angles, distance_m, *size, type=kind))
 
     def send_corrections(self, rtcm: bytes) -> None:
@@ -185,5 +188,5 @@ def _centimetres(distance_m: float | None, nothing_in_range: int) -> int:
     if distance_m is None or math.isnan(distance_m):
         return _NOT_MEASURED
     if distance_m < 0:
-        raise InvalidArgument(f"distances_m contains {distance_m}; allowed: 0 or more, or None")
+        raise InvalidArgument(f"distances_m contains {distance_m}, but each distance must be 0 or more, or None")
     return nothing_in_range if math.isinf(distance_m) else min(nothing_in_range, round(distance_m * 100))

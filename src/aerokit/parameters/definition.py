@@ -50,8 +50,9 @@ MAX_DEFINITION_SIZE, MAX_ELEMENTS = 1 << 20, 20_000
 
 
 class SettingRange(Snapshot):
-    """A restriction that an option imposes: while it is selected and ``condition`` holds, ``setting`` accepts only
-    ``options``.
+    """A restriction that an option imposes on another setting.
+
+    While the option is selected and ``condition`` holds, ``setting`` accepts only ``options``.
 
     ``condition`` has tests such as ``CAM_EXPMODE=1``, joined by AND and OR. An empty condition always holds.
     """
@@ -157,7 +158,7 @@ class CameraDefinition(Snapshot):
         )
 
     def options(self, name: str, values: Values) -> tuple[SettingOption, ...]:
-        """Return the options that a setting has now; empty if any value in its range is allowed."""
+        """Return the options that a setting has now; empty if every value in its range is allowed."""
         return self._options(name, values)[0]
 
     def _options(self, name: str, values: Values) -> tuple[tuple[SettingOption, ...], list[str]]:
@@ -171,7 +172,7 @@ class CameraDefinition(Snapshot):
                 if restriction.setting != name or not _evaluate(restriction.condition, values):
                     continue
                 allowed = restriction.options
-                if reasons:  # Several restrictions apply together.
+                if reasons:  # Another restriction applies too, so only the options that both allow remain.
                     previous_keys = {setting_key(option.value) for option in options}
                     allowed = tuple(option for option in allowed if setting_key(option.value) in previous_keys)
                 options = allowed
@@ -198,7 +199,9 @@ class CameraDefinition(Snapshot):
             raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: it can only be read")
         reasons = self.excluded_by(name, values)
         if reasons:
-            raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed now: excluded by {', '.join(reasons)}")
+            raise InvalidArgument(
+                f"{name} = {short_repr(value)} is not allowed now: the setting is excluded by {', '.join(reasons)}"
+            )
         options, restricted_by = self._options(name, values)
         if options or restricted_by:
             return _check_option(setting, value, options, restricted_by)
@@ -271,12 +274,13 @@ def _check_option(
 
 
 def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
+    """Return the value in the setting's type; raise InvalidArgument if it is out of range or between two steps."""
     number = checked_setting(setting.name, value, setting.wire_type)
     if isinstance(number, (str, bytes)):
         return number
     if setting.type == "bool":
         if number not in (0, 1):
-            raise InvalidArgument(f"{setting.name} = {short_repr(value)} is not allowed: True or False")
+            raise InvalidArgument(f"{setting.name} = {short_repr(value)} is not allowed: it must be True or False")
         return bool(number)
     low, high, step = setting.minimum, setting.maximum, setting.step
     # A value that equals a limit as a 32-bit float is allowed.
@@ -298,7 +302,9 @@ def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
 
 
 def _parse_condition(condition: str) -> list[tuple[str, str, str, str]]:
-    """Parse a condition into tests: (setting, operator, value, AND or OR with the tests before).
+    """Parse a condition into tests of the form (setting, operator, value, joiner).
+
+    The joiner, "AND" or "OR", combines a test with the result of all tests before it.
 
     Raises ValueError if the condition is malformed.
     """
@@ -330,7 +336,7 @@ def _evaluate(condition: str, values: Values) -> bool:
 
 
 def _compare(value: SettingValue, operator: str, text: str) -> bool:
-    """Evaluate one test. Texts have only the operators = and !=, and a number is never compared with a text."""
+    """Evaluate one test. Texts can be compared by = and != only; comparing a number with a text gives False."""
     if isinstance(value, (str, bytes)):
         if operator not in ("=", "!="):
             return False
@@ -338,7 +344,7 @@ def _compare(value: SettingValue, operator: str, text: str) -> bool:
     number = _number(text)
     if number is None:
         return False
-    # Not by ==, because a value that was sent as a 32-bit float differs a little from the decimal number in the file.
+    # Do not use ==, because a value sent as a 32-bit float differs a little from the decimal number in the file.
     is_equal = settings_equal(value, number)
     if operator in ("=", "!="):
         return is_equal == (operator == "=")
@@ -412,6 +418,7 @@ class _Reader:
                 )
 
     def _ranges(self, nodes: Iterable[Element]) -> Iterator[SettingRange]:
+        """Yield the valid restrictions that an option imposes on other settings."""
         for node in nodes:
             setting = node.get("parameter", "")
             wire_type = self._types.get(setting)

@@ -42,7 +42,9 @@ def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa
     if not bytewise or type is ParameterType.REAL32:
         return _FLOAT.pack(value)
     if type not in _FORMATS:
-        raise InvalidArgument(f"{value!r}: an {type.name} has eight bytes, the message has room for four")
+        raise InvalidArgument(
+            f"{value!r} cannot be sent: an {type.name} has eight bytes, but the message has room for four"
+        )
     return _FORMATS[type].pack(value).ljust(4, b"\0")
 
 
@@ -57,12 +59,12 @@ def from_bits(bits: bytes, type: ParameterType, bytewise: bool) -> int | float: 
 
 
 def to_wire(value: float, type: ParameterType, bytewise: bool) -> float:  # noqa: A002
-    """Encode a value as ``param_value``. Signalling NaNs change, see the description of this module."""
+    """Encode a value as ``param_value``. The bits of a signalling NaN change; see the description of this module."""
     return float(_FLOAT.unpack(to_bits(value, type, bytewise))[0])
 
 
 def from_wire(param_value: float, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
-    """Decode a ``param_value``. Signalling NaNs have changed, see the description of this module."""
+    """Decode a ``param_value``. The bits of a signalling NaN have changed; see the description of this module."""
     if bytewise and type in _FORMATS:
         return from_bits(_FLOAT.pack(param_value), type, bytewise)
     return _cast(param_value, type)
@@ -77,7 +79,10 @@ def value_of(message: ParamSet | ParamValue, bytewise: bool) -> int | float:
 
 
 def parameter_of(message: ParamValue, bytewise: bool) -> Parameter:
-    """Convert a PARAM_VALUE to a parameter without a default. If it is not part of a list, the index is None."""
+    """Convert a PARAM_VALUE to a parameter without a default.
+
+    The index is None if the message is not part of a list.
+    """
     index = None if message.param_index == UNKNOWN_INDEX else message.param_index
     type_ = ParameterType.from_wire(message.param_type)
     return Parameter(message.param_id, value_of(message, bytewise), type_, default=None, index=index)
@@ -116,7 +121,7 @@ class _ExactParamSet(ParamSet):
 
 
 class _ExactParamValue(ParamValue):
-    """A PARAM_VALUE of the same kind."""
+    """A PARAM_VALUE whose ``param_value`` is a signalling NaN."""
 
     bits: bytes
 
@@ -125,7 +130,7 @@ class _ExactParamValue(ParamValue):
 
 
 def _with_exact_bits(message: _M, exact_type: type[_ExactParamSet] | type[_ExactParamValue], bits: bytes) -> _M:
-    """Return the message, or a copy with the exact bits if its Python float lacks them."""
+    """Return the message, or a copy with the exact ``bits`` if encoding the message would give other bits."""
     if _FLOAT.pack(message.param_value) == bits:
         return message
     exact = exact_type(**message.to_dict())
@@ -162,7 +167,7 @@ def number_text(value: float) -> str:
 
     Raises:
         OverflowError: the number exceeds a 32-bit float.
-        ValueError: it is NaN.
+        ValueError: the number is NaN.
     """
     if isinstance(value, int):
         return str(int(value))

@@ -3,7 +3,7 @@
 Mission Planner's lines are ``NAME,VALUE``, those of MAVProxy ``NAME    VALUE``. Both formats have ``#`` comments and no
 types. QGroundControl has five columns separated by tabs: system, component, name, value, MAV_PARAM_TYPE
 (https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/parameters.html). A file with a damaged line is
-refused as a whole, because half a set of parameters is worse than none.
+refused as a whole, because half a set of parameters is worse than no parameters.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def read_parameter_file(path: str | os.PathLike[str], *, component_id: int | Non
     try:
         text = read_bounded(path).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise FileFormatError(f"{os.fspath(path)} is not a parameter file: it is not text (UTF-8)") from None
+        raise FileFormatError(f"{os.fspath(path)} is not a parameter file: its content is not text (UTF-8)") from None
     return parse_parameter_file(text, os.fspath(path), component_id=component_id)
 
 
@@ -138,7 +138,7 @@ def parameter_file_text(
         raise InvalidArgument("there are no parameters to write")
     lines: list[str] = []
     for comment in comments:
-        lines += [f"# {line}".rstrip() for line in comment.splitlines() or [""]]  # An empty comment is an empty line.
+        lines += [f"# {line}".rstrip() for line in comment.splitlines() or [""]]  # An empty comment becomes "#".
     if format == "qgroundcontrol":
         lines += ["# Vehicle-Id Component-Id Name Value Type"]
         lines += [f"{system_id}\t{component_id}\t{name}\t{value}\t{int(kind)}" for name, value, kind in rows]
@@ -189,7 +189,7 @@ def _parse_qgroundcontrol(
 
 
 def _parse_columns(place: str, line: str) -> tuple[int, str, str, ParameterType]:
-    """Return component id, name, value as text, and type."""
+    """Split a line of a QGroundControl file into component id, name, value as text, and type."""
     fields = line.strip().split("\t")
     if len(fields) != 5 or not all(text.isascii() and text.isdigit() for text in (fields[0], fields[1], fields[4])):
         raise FileFormatError(f"{place}: {line.strip()!r} is not {_COLUMNS}")
@@ -201,7 +201,7 @@ def _parse_columns(place: str, line: str) -> tuple[int, str, str, ParameterType]
 
 
 def _select_component(requested: int | None, values: Mapping[int, object], source: str) -> int:
-    """Return the requested component; by default the autopilot, or the only component in the file."""
+    """Return the id of the requested component, by default the autopilot or the only component in the file."""
     if requested is not None and requested in values:
         return requested
     if requested is None and _AUTOPILOT in values:
@@ -225,7 +225,7 @@ def _add_value(values: dict[str, int | float], place: str, name: str, text: str,
         raise FileFormatError(f"{place}: {error}") from None
     if name in values:
         raise FileFormatError(f"{place}: {name} appears a second time")
-    values[name] = checked if kind.is_integer else number
+    values[name] = checked if kind.is_integer else number  # A float keeps all its digits, as in the file.
 
 
 def _directive_hint(fields: list[str]) -> str:

@@ -75,13 +75,13 @@ class ParameterMetadata(Snapshot):
         return f"{value:g} {self.unit}".rstrip()
 
     def problem(self, value: float) -> str | None:
-        """Explain why a value is not recommended, or return None."""
+        """Return the reason why a value is not recommended; None if it is recommended."""
         if self.read_only:
             return f"{self.name} can only be read"
         low, high = self.minimum, self.maximum
         is_inside = (low is None or value >= low) and (high is None or value <= high)
         has_range = low is not None or high is not None
-        # Beside a range or bits, the documented values are only examples.
+        # If a range or bits are documented too, the documented values are only examples.
         allows_other_values = has_range or not self.values or bool(self.bitmask)
         if value in self.values or (is_inside and allows_other_values):
             return None
@@ -96,8 +96,9 @@ class ParameterMetadata(Snapshot):
 
 
 class Metadata(Mapping[str, ParameterMetadata]):
-    """Maps names to :class:`ParameterMetadata`, for one vehicle type and version. If a name occurs twice, the first
-    counts.
+    """Maps names to :class:`ParameterMetadata`, for one vehicle type and version.
+
+    If a name occurs twice, the first definition counts.
     """
 
     __slots__ = ("_by_name",)
@@ -168,6 +169,7 @@ _BITS = range(64)
 
 
 def _parse(data: bytes) -> list[ParameterMetadata]:
+    """Parse a file of either autopilot, XML or JSON."""
     if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
         root = DefusedXml.fromstring(data, forbid_dtd=True)
         if root.tag == "paramfile":
@@ -177,7 +179,7 @@ def _parse(data: bytes) -> list[ParameterMetadata]:
         raise ValueError(f"its root element is <{root.tag}>")
     content = json.loads(data.decode("utf-8-sig"))
     if not isinstance(content, dict):
-        raise ValueError("it is not a JSON object")
+        raise ValueError("its content is not a JSON object")
     if isinstance(content.get("parameters"), list):
         return [_px4_entry(entry) for entry in content["parameters"]]
     return list(_ardupilot_json(content))
@@ -209,7 +211,7 @@ def _ardupilot_xml(root: Element) -> Iterator[ParameterMetadata]:
 
 def _ardupilot_json(content: Mapping[str, Any]) -> Iterator[ParameterMetadata]:
     for group, parameters in content.items():
-        if group == "json":  # the format version
+        if group == "json":  # This entry is the version of the format.
             continue
         for name, fields in parameters.items():
             limits = fields.get("Range", {})

@@ -54,7 +54,10 @@ _CODE_OF = {
 
 
 class PackHeader(NamedTuple):
-    """Header of the file. ``total`` is the number of the vehicle's parameters; in an upload, the file size in bytes."""
+    """Header of the file.
+
+    ``total`` is the number of the vehicle's parameters in a downloaded file, and the file size in bytes in an upload.
+    """
 
     magic: int
     parameters: int
@@ -62,7 +65,10 @@ class PackHeader(NamedTuple):
 
 
 class PackEntry(NamedTuple):
-    """One parameter in the file. ``default`` is None if it is not included; ``end`` is the position after the entry."""
+    """One parameter in the file.
+
+    ``default`` is None if the file does not include it; ``end`` is the position after the entry.
+    """
 
     name: bytes
     type: ParameterType
@@ -83,20 +89,20 @@ def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
     """
     magic, count, total = read_header(data)
     if magic not in (MAGIC, _MAGIC_WITH_DEFAULTS) or count > total:
-        raise RemoteProtocolError(f"not a param.pck: its header is {magic:#06x}, {count} of {total}")
+        raise RemoteProtocolError(f"the file is not a param.pck: its header is {magic:#06x}, {count} of {total}")
     parameters = list(_parameters(data, magic == _MAGIC_WITH_DEFAULTS, start))
     if len(parameters) != count:
-        raise RemoteProtocolError(f"param.pck has {len(parameters)} parameters, its header says {count}")
+        raise RemoteProtocolError(f"param.pck has {len(parameters)} parameters, but its header says {count}")
     if len({parameter.name for parameter in parameters}) != count:
-        raise RemoteProtocolError("param.pck contains a name twice")
+        raise RemoteProtocolError("param.pck contains the same name twice")
     return ParameterTable(parameters)
 
 
 def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -> bytes:
     """Encode a file to write to ``@PARAM/param.pck``, in the given order.
 
-    The vehicle applies the parameters when the file is closed. It silently skips unknown and read-only parameters, so
-    read back the values that you have written.
+    The vehicle applies the parameters when the file is closed. The vehicle silently skips unknown and read-only
+    parameters, so read back the values that you have written.
 
     Raises:
         InvalidArgument: a name or value does not fit (INT32 is the widest type), or the file exceeds 65,535 bytes,
@@ -111,7 +117,7 @@ def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -
         previous_name = name
     length = HEADER.size + len(body)
     if length > _MAX_SIZE:
-        raise InvalidArgument(f"{len(rows)} parameters need {length} bytes, at most {_MAX_SIZE} are possible")
+        raise InvalidArgument(f"{len(rows)} parameters need {length} bytes; at most {_MAX_SIZE} are possible")
     return HEADER.pack(MAGIC, len(rows), length) + bytes(body)
 
 
@@ -126,9 +132,10 @@ def pack_for_download(
 ) -> bytes:
     """Encode ``@PARAM/param.pck`` for these parameters, without validating their values.
 
-    ``block_size`` is the number of data bytes per read. ``count`` 0 means all parameters from ``start`` on. PX4 keeps a
-    value and its default in the same block. ArduPilot (``whole_defaults=False``) may put them into different blocks,
-    but splits neither. InvalidArgument is raised if ``start`` is beyond the list.
+    ``block_size`` is the number of data bytes per read. ``count`` 0 means all parameters from ``start`` on. No block
+    boundary splits a value or a default. PX4 keeps a value and its default in the same block; ArduPilot
+    (``whole_defaults=False``) may put them into different blocks. InvalidArgument is raised if ``start`` is beyond the
+    list.
     """
     rows = list(_rows(parameters))
     if not 0 <= start < len(rows):
@@ -146,7 +153,7 @@ def pack_for_download(
         unsplit_size = _CODES[code][1].size * (len(values) if whole_defaults else 1)
         size_in_next_block = (len(file) + len(entry)) % block_size
         if 0 < size_in_next_block < unsplit_size:
-            file += bytes(unsplit_size - size_in_next_block)  # padding
+            file += bytes(unsplit_size - size_in_next_block)  # These zeros move the value into the next block.
         file += entry
         previous_name = name
     return bytes(file)
@@ -166,7 +173,7 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
     ``previous_name`` is the name in the entry before, empty for the first entry.
 
     Raises:
-        RemoteProtocolError: there is no entry: the type or flags are undefined, or the name is too long.
+        RemoteProtocolError: the data is not an entry: the type or flags are undefined, or the name is too long.
     """
     code, flags = data[position] & 0x0F, data[position] & 0xF0
     if code not in _CODES or flags & ~_HAS_DEFAULT:
@@ -233,7 +240,8 @@ def _entry(name: bytes, previous_name: bytes, code: int, *values: float) -> byte
 
 
 def _common_length(name: bytes, previous_name: bytes) -> int:
-    # A name must have at least one character that it does not share with the previous name.
+    """Return how many characters at the beginning of the two names are equal."""
+    # The last character is not compared, because an entry must contain at least one character of its name.
     common = 0
     for char, previous_char in zip(name[:-1], previous_name):  # noqa: B905 - the shorter one ends it
         if char != previous_char:
@@ -253,8 +261,8 @@ def px4_hash(table: ParameterTable, volatile: Container[str] = ()) -> int:
 
     The hash is a CRC-32 without inversions over the name and the four value bytes of each parameter, sorted by name.
     PX4 ignores volatile parameters, which it changes itself. Pass their names as ``volatile``
-    (:attr:`ParameterMetadata.volatile <aerokit.parameters.ParameterMetadata>`), otherwise the result differs. Because
-    the names may be unknown, a cache should store the hash that the vehicle has reported.
+    (:attr:`ParameterMetadata.volatile <aerokit.parameters.ParameterMetadata>`), otherwise the result differs. If these
+    names are unknown, use the hash that the vehicle has reported.
     """
     data = bytearray()
     for name in sorted(table):

@@ -27,7 +27,7 @@ _INTEGER_BITS = {1: 8, 2: 8, 3: 16, 4: 16, 5: 32, 6: 32, 7: 64, 8: 64}
 
 
 class ParameterType(IntEnum):
-    """MAV_PARAM_TYPE (https://mavlink.io/en/messages/common.html#MAV_PARAM_TYPE).
+    """Type of a parameter: MAV_PARAM_TYPE (https://mavlink.io/en/messages/common.html#MAV_PARAM_TYPE).
 
     ArduPilot uses INT8, INT16, INT32 and REAL32, PX4 INT32 and REAL32; other components may use all of them.
     """
@@ -64,14 +64,14 @@ class ParameterType(IntEnum):
 
     @property
     def minimum(self) -> int | float:
-        """The minimum of the type."""
+        """The lowest value that the type can hold."""
         if not self.is_integer:
             return -self.maximum
         return -(1 << (_INTEGER_BITS[self] - 1)) if self.is_signed else 0
 
     @property
     def maximum(self) -> int | float:
-        """The maximum of the type."""
+        """The highest value that the type can hold."""
         if self.is_integer:
             value_bits = _INTEGER_BITS[self] - (1 if self.is_signed else 0)
             return (1 << value_bits) - 1
@@ -82,7 +82,7 @@ class Parameter(Snapshot):
     """One parameter of a vehicle, as last reported.
 
     ``value`` is an ``int`` for integer types, else a ``float`` with 32-bit precision. ``default`` is None if unknown;
-    only MAVFTP reports it. ``index`` is the index in the vehicle's list, or None if not reported. Values are not
+    only MAVFTP reports defaults. ``index`` is the index in the vehicle's list, or None if not reported. Values are not
     checked: a vehicle may report NaN.
     """
 
@@ -108,10 +108,12 @@ def check_name(name: str) -> str:
         raise InvalidArgument(f"parameter name = {short_repr(name)} is not a string")
     if not 0 < len(name) <= NAME_LENGTH:
         raise InvalidArgument(
-            f"parameter name = {short_repr(name)} has {len(name)} characters, 1 to {NAME_LENGTH} are possible"
+            f"parameter name = {short_repr(name)} has {len(name)} characters; 1 to {NAME_LENGTH} are possible"
         )
     if not all("!" <= character <= "~" for character in name):
-        raise InvalidArgument(f"parameter name = {short_repr(name)}: only ASCII without spaces is possible")
+        raise InvalidArgument(
+            f"parameter name = {short_repr(name)} is not allowed: it must be printable ASCII without spaces"
+        )
     return name
 
 
@@ -238,18 +240,20 @@ def checked_setting(name: str, value: object, type: int) -> SettingValue:  # noq
     """
     if type in _STRUCTS:
         if isinstance(value, (str, bytes, bytearray)):
-            raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: a number")
+            raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: it must be a number")
         return checked_value(name, value, ParameterType(type))  # type: ignore[arg-type]  # checked there
     if not isinstance(value, (str, bytes, bytearray)):
-        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: a text or bytes")
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: it must be a text or bytes")
     try:
         data = value.encode() if isinstance(value, str) else bytes(value)
     except UnicodeEncodeError:
         raise InvalidArgument(f"{name} = {short_repr(value)} has characters that cannot be encoded") from None
     if len(data) > MAX_VALUE_SIZE:
-        raise InvalidArgument(f"{name} = {short_repr(value)} has {len(data)} bytes, at most {MAX_VALUE_SIZE} fit")
+        raise InvalidArgument(
+            f"{name} = {short_repr(value)} has {len(data)} bytes; at most {MAX_VALUE_SIZE} fit into the message"
+        )
     if data.endswith(b"\0"):
-        raise InvalidArgument(f"{name} = {short_repr(value)}: zeros at its end would be lost")
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: zeros at its end would be lost")
     return setting_value(data, type)
 
 

@@ -69,7 +69,7 @@ _COPTER_CENTI = (
     "PILOT_TKOFF_ALT>PILOT_TKO_ALT_M PHLD_BRAKE_ANGLE>PHLD_BRK_ANGLE AVOID_ANGLE_MAX>AVOID_ANG_MAX"
 )
 
-# Version 4.7: vehicle types, divisor from old to new units, and ``OLD>NEW`` pairs.
+# Renames in version 4.7. Each entry has the vehicle types, the divisor from old to new units, and ``OLD>NEW`` pairs.
 GROUPS: tuple[tuple[tuple[str, ...], int, str], ...] = (
     (_ALL, 1, "SYSID_THISMAV>MAV_SYSID SYSID_MYGCS>MAV_GCS_SYSID TELEM_DELAY>MAV_TELEM_DELAY"),
     (_ALL, 1, "ARMING_CHECK>ARMING_SKIPCHK EK3_MAX_FLOW>EK3_FLOW_MAX"),
@@ -124,8 +124,9 @@ _OLDER_COPTER, _OLDER_PLANE, _ROVER = ("Copter",), ("Plane",), ("Rover",)
 
 
 def _moved(old: str, new: str, names: str) -> str:
-    """Make pairs from names by adding prefixes: ``TYPE`` becomes ``RNGFND_TYPE>RNGFND1_TYPE``. Also accepts pairs
-    ``A>B``.
+    """Make pairs from names by adding prefixes: ``TYPE`` becomes ``RNGFND_TYPE>RNGFND1_TYPE``.
+
+    The names may also be pairs such as ``A>B``.
     """
     halves = (name.partition(">") for name in names.split())
     return " ".join(f"{old}{old_name}>{new}{new_name or old_name}" for old_name, _, new_name in halves)
@@ -146,7 +147,8 @@ _OLDER_LOITER = "SPEED>SPEED JERK>BRK_JERK MAXA>ACC_MAX MINA>BRK_ACCEL"
 
 _IGNORED_SECTORS = " ".join(f"IGN_{name}{number}" for name in ("ANG", "WID") for number in range(1, 5))
 
-# Version of the new name, vehicle types, divisor from old to new units, and ``OLD>NEW`` pairs.
+# Renames before 4.7. Each entry has the first version with the new names, the vehicle types, the divisor from old to
+# new units, and ``OLD>NEW`` pairs.
 OLDER: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ("3.4", _OLDER_COPTER, 1, _moved("STB_", "ATC_ANG_", "RLL_P PIT_P YAW_P")),
     ("3.4", _OLDER_COPTER, 1, "MOT_THST_BAT_MAX>MOT_BAT_VOLT_MAX MOT_THST_BAT_MIN>MOT_BAT_VOLT_MIN"),
@@ -236,8 +238,8 @@ OLDER: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ("4.6", _OLDER_ALL, 1, "GPS_CAN_NODEID1>GPS1_CAN_NODEID GPS_CAN_NODEID2>GPS2_CAN_NODEID"),
 )
 
-# Renames that are applied only from old to new names, in the same format. The old name still exists on another vehicle
-# type, where it has another meaning.
+# Renames that are applied only from old to new names, in the format of `OLDER`. The old name still exists on another
+# vehicle type, where it has another meaning.
 ONE_WAY: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ("3.4", _OLDER_COPTER, 1000, "THR_MIN>MOT_SPIN_MIN"),
     ("3.3", _ROVER, 1, "THR_MIN>MOT_THR_MIN THR_MAX>MOT_THR_MAX"),

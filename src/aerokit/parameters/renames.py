@@ -33,7 +33,7 @@ class ParameterRenamedWarning(UserWarning):
 class Rename(Snapshot):
     """A renamed parameter.
 
-    ``divisor`` converts old values to new values: 100 for centimetres that became metres. ``is_inverted`` is True for
+    Old values are divided by ``divisor``: 100 for centimetres that became metres. ``is_inverted`` is True for
     ARMING_CHECK (checks to make, 1 for all) and ARMING_SKIPCHK (checks to skip). ``vehicles`` are the vehicle types
     that have the parameter. ``other_new`` are further names in new units, ``other_old`` further names in old units.
     ``since`` is the ArduPilot version that introduced the new name.
@@ -50,17 +50,17 @@ class Rename(Snapshot):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All names, newest first."""
+        """All names of the parameter, newest first."""
         return (self.new, *self.other_new, *self.old_names)
 
     @property
     def old_names(self) -> tuple[str, ...]:
-        """All names in old units."""
+        """All names whose values are in old units."""
         return (self.old, *self.other_old)
 
     @property
     def factor(self) -> float:
-        """Conversion factor: new value = old value × factor. Meaningless if ``is_inverted``."""
+        """Conversion factor: new value = old value × factor. The factor does not apply if ``is_inverted``."""
         return 1 / self.divisor
 
     def to_new(self, value: float) -> int | float:
@@ -149,7 +149,7 @@ def replacement_of(name: str) -> str:
 def resolve_rename(name: str, known: Container[str]) -> Renamed | None:
     """Find the name of parameter ``name`` on a vehicle whose parameters have the ``known`` names.
 
-    None if ``name`` itself is known, or if no other name of the parameter is known.
+    Returns None if ``name`` itself is known, or if no other name of the parameter is known.
     """
     if name in known:
         return None
@@ -167,8 +167,9 @@ def translate_values(
 ) -> tuple[dict[str, int | float], tuple[Renamed, ...]]:
     """Convert the values of a file or table to the names and units of a vehicle with the ``known`` names.
 
-    Names of parameters that the vehicle does not have are kept. A value under the vehicle's own name takes precedence.
-    ``types`` are the vehicle's types, for rounding. The second result lists the converted parameters.
+    Names of parameters that the vehicle does not have are kept. If ``values`` also has the vehicle's own name of a
+    parameter, the value under that name is used. ``types`` are the vehicle's types, for rounding. The second result
+    lists the converted parameters.
     """
     translated: dict[str, int | float] = {}
     renamed: list[Renamed] = []
@@ -186,7 +187,7 @@ def translate_values(
 
 
 def _scaled(value: float, scale: Callable[[Decimal], Decimal]) -> float:
-    # Computed in decimal, with the digits that a 32-bit float has.
+    # Compute with decimal numbers, and only with the digits that a 32-bit float has.
     try:
         return float(scale(Decimal(number_text(value))))
     except (ArithmeticError, ValueError):  # The value is infinite, NaN or beyond 32 bits, which no vehicle accepts.

@@ -82,9 +82,9 @@ class ParameterTable(Mapping[str, Parameter]):
         return ParameterTable(parameter for parameter in known if parameter.is_changed)
 
     def updated_with(self, parameters: Iterable[Parameter]) -> ParameterTable:
-        """Return a copy with these parameters: known ones are replaced, new ones appended.
+        """Return a copy with these parameters: known parameters are replaced, new ones appended.
 
-        If a default or an index is None in the update, the known one is kept.
+        If the default or the index of an update is None, the known one is kept.
         """
         merged = dict(self._by_name)
         for new in parameters:
@@ -129,7 +129,7 @@ ParameterValues = Mapping[str, "int | float"] | Mapping[str, Parameter]
 
 
 class ParameterDifference(Snapshot):
-    """A parameter that differs; a value is None where the parameter is missing."""
+    """A parameter whose values differ. ``before`` or ``after`` is None if the parameter is missing there."""
 
     name: str
     before: int | float | None

@@ -132,7 +132,7 @@ class ComponentParameters(TwinOf["AsyncComponentParameters"]):
         return self.aio.__len__()
 
     def aclose(self) -> None:
-        """Wait until the file has the last change."""
+        """Wait until the file contains the last change."""
         self._loop.run(self.aio.aclose)
 
     def json(self) -> bytes:
@@ -165,14 +165,16 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
         """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
         To refuse a list, the function returns False or a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes
-        the result INVALID and a status text. It may be a coroutine function. An empty list is a request to clear the
-        list.
+        the result INVALID and a status text. The function may be a coroutine function. An empty list is a request to
+        clear the list.
         """
         return self._loop.call(self.aio.on_upload, function)
 
     def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
-        """Decorator: ``function(index)`` continues the mission at an item. Requests to do so are refused if it returns
-        False or raises, and without such a function.
+        """Decorator: ``function(index)`` continues the mission at an item.
+
+        Requests to change the current item are refused if the function returns False or raises, or if there is no such
+        function.
         """
         return self._loop.call(self.aio.on_set_current, function)
 
@@ -195,7 +197,7 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
 
 
 class ComponentSources(TwinOf["AsyncComponentSources"]):
-    """Sends measurements as this component. Each call sends one message to all; make a call for each measurement."""
+    """Sends measurements as this component. Each call sends one measurement, in one message to all programs."""
 
     def send_obstacles(
         self,
@@ -287,7 +289,8 @@ class ComponentSources(TwinOf["AsyncComponentSources"]):
 
         Args:
             right_deg: angle from straight down to the right, -90 to 90.
-            down_deg: angle from straight down towards the tail, -90 to 90. It is downwards in the camera's image.
+            down_deg: angle from straight down towards the tail, -90 to 90. The tail is at the bottom of the camera's
+                image.
             distance_m: distance to the beacon in metres, 0 or more.
             target_number: number of the beacon, 0 to 255.
 
@@ -376,7 +379,7 @@ class OnboardComponent(ComponentTwin):
         """Send an event to all programs (EVENT). A receiver that missed the event can request it again.
 
         Args:
-            event_id: id in the component's event metadata, ``component_id << 24`` plus a number.
+            event_id: id in the component's event metadata: ``component_id << 24`` plus the number of the event.
             arguments: at most 40 bytes.
             severity: MAV_SEVERITY, 0 to 7.
 
@@ -396,7 +399,7 @@ class OnboardComponent(ComponentTwin):
             writable: True if any sender may write, rename and remove files in the directory.
 
         Raises:
-            InvalidArgument: there is no such directory, or the component already serves one.
+            InvalidArgument: there is no such directory, or the component already serves a directory.
         """
         self._loop.call(self.aio.serve_files, directory, writable=writable)
 
@@ -417,8 +420,9 @@ class OnboardComponent(ComponentTwin):
 
     @cached_property
     def missions(self) -> ComponentMissions:
-        """Missions, fences and rally points that other programs upload and download. They are served after the first
-        access.
+        """Missions, fences and rally points that other programs upload and download.
+
+        The component serves them from the first access to this property on.
         """
         return ComponentMissions(self._loop, self._loop.call(lambda: self.aio.missions))
 
@@ -484,9 +488,9 @@ class OnboardComponent(ComponentTwin):
         """Answer ARM_AUTHORIZATION_REQUEST (https://mavlink.io/en/services/arm_authorization.html).
 
         Args:
-            authorize: function or coroutine function, called with the vehicle's system id. It returns the number of
-                seconds for which arming is allowed, at most 255. An exception denies arming; its text is sent as a
-                status text. To give a reason, return a :class:`~aerokit.onboard.CommandResult` with a
+            authorize: function or coroutine function, called with the vehicle's system id. The function returns the
+                number of seconds for which arming is allowed, at most 255. An exception denies arming, and its text is
+                sent as a status text. To give a reason, return a :class:`~aerokit.onboard.CommandResult` with a
                 MAV_ARM_AUTH_DENIED_REASON as ``detail``.
 
         Raises:
@@ -544,8 +548,8 @@ def component(
         type: MAV_TYPE of the heartbeat: ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH, GRIPPER …
         autopilot: MAV_AUTOPILOT of the heartbeat; INVALID for everything that is not a flight controller.
         identity: vendor, model and versions that the component reports.
-        parameters_file: JSON file that stores the parameters; it is replaced atomically after each change. None:
-            parameters are not stored.
+        parameters_file: JSON file that stores the parameters; the file is replaced atomically after each change. With
+            None, parameters are not stored.
         bytewise: True to encode integers in PARAM_VALUE bytewise, as PX4 does; False to cast them to float, as
             ArduPilot does. The component's capabilities announce the encoding. Clients that decide by the field
             ``autopilot`` of HEARTBEAT expect bytewise encoding.

@@ -1016,7 +1016,7 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
         return self.aio.is_running
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
-        """Set new rates; they are sent at the next tick, and repeated until ``valid_for_s`` has passed.
+        """Set new rates. They are sent at the next tick, and repeated until ``valid_for_s`` seconds have passed.
 
         Args:
             pitch_deg_s: degrees per second, −720 to 720; positive is up.
@@ -1030,7 +1030,7 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
         self._loop.call(self.aio.set, pitch_deg_s, yaw_deg_s)
 
     def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
-        """Supply one pair of rates for ``duration_s`` seconds. Arguments and errors as for :meth:`set`."""
+        """Turn at one pair of rates for ``duration_s`` seconds. Arguments and errors are those of :meth:`set`."""
         self._loop.run(self.aio.turn, pitch_deg_s, yaw_deg_s, duration_s)
 
 
@@ -1038,15 +1038,15 @@ class Gimbal(TwinOf["AsyncGimbal"]):
     """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
     ``vehicle.gimbal`` is the first gimbal, ``vehicle.gimbals`` has all gimbals. An order returns when the gimbal
-    reports the ordered direction, and ends when another order is given. The gimbal keeps the direction while the
-    vehicle moves. If the manager requires control, an order outside a block of :meth:`control` claims it until
+    reports the ordered direction, and raises an error when another order is given. The gimbal keeps the direction while
+    the vehicle moves. If the manager requires control, an order outside a block of :meth:`control` claims control until
     :meth:`release`.
     """
 
     @cached_property
     def attitude(self) -> StateCell[GimbalAttitude]:
         """Attitude (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS).
-        It is requested from the autopilot while your program watches this cell; reading it requests nothing.
+        It is requested from the autopilot while your program watches this value; reading the value requests nothing.
         """
         return StateCell(self._loop, self.aio.attitude)
 
@@ -1142,7 +1142,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
             roll_deg: from the horizon, −360 to 360. A roll other than 0 is sent by the older mount command. The gimbal
-                then turns with the vehicle, so a yaw from north is right only at the time of the order.
+                then turns with the vehicle, so a yaw from north is correct only at the time of the order.
             frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
@@ -1243,10 +1243,10 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
             yaw_deg_s: the first rate in degrees per second, −720 to 720; positive is to the right.
-            frame: ``"earth"``: the yaw stays relative to north; ``"vehicle"``: it turns with the vehicle.
+            frame: ``"earth"``: the yaw stays relative to north; ``"vehicle"``: the gimbal turns with the vehicle.
             rate_hz: how often the latest rates are sent, 2 to 100.
-            valid_for_s: stop if no new rates are set for this time.
-            max_lag_s: stop if the event loop is blocked for this time.
+            valid_for_s: stop the gimbal if no new rates are set for this many seconds.
+            max_lag_s: stop the gimbal if the event loop is blocked for this many seconds.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
@@ -1438,8 +1438,8 @@ class Files(TwinOf["AsyncFiles"]):
         """Copy a file to this computer. The copy is written to ``<to>.part`` and renamed when it is complete.
 
         With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
-        is shorter than it. If the vehicle can compute the CRC-32 of its file, aerokit compares the CRC-32 of the copy
-        with it; if they differ, the whole file is read again. Files whose names begin with ``@`` are always read
+        is shorter than the part. If the vehicle can compute the CRC-32 of its file, aerokit compares it with that of
+        the copy; if they differ, the whole file is read again. Files whose names begin with ``@`` are always read
         completely.
 
         Raises:
@@ -1474,7 +1474,7 @@ class Files(TwinOf["AsyncFiles"]):
         """Return the CRC-32 of a file as computed by the vehicle: polynomial 0x04C11DB7, initial value 0, no final
         XOR.
 
-        That is ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF``.
+        ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF`` computes the same value.
 
         Raises:
             RemoteProtocolError: the answer is not a CRC-32.
@@ -1742,9 +1742,9 @@ class Actuators(TwinOf["AsyncActuators"]):
     def repeat_servo(self, number: int, pulse_us: int, *, count: int, period_s: float) -> None:
         """Move a servo ``count`` times to a pulse width and back to its trim (MAV_CMD_DO_REPEAT_SERVO).
 
-        ArduPilot only. Returns when ArduPilot has acknowledged and begins, because no message reports the end.
-        ArduPilot repeats one output at a time: the next order of this kind replaces the previous one. The command is
-        never sent twice, because a second one would start the cycles again.
+        ArduPilot only. Returns when ArduPilot has acknowledged the command, because no message reports the end of the
+        cycles. ArduPilot repeats one output at a time: the next order of this kind replaces the previous one. The
+        command is never sent twice, because a second one would start the cycles again.
 
         Args:
             number: output, 1 to 32, as for :meth:`set_servo`.
@@ -1770,9 +1770,9 @@ class Actuators(TwinOf["AsyncActuators"]):
         self._loop.run(self.aio.set_relay, number, on)
 
     def repeat_relay(self, number: int, *, count: int, period_s: float) -> None:
-        """Toggle a relay and back again, ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
+        """Switch a relay to its other state and back, ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
 
-        ArduPilot only. Returns when ArduPilot has acknowledged and begins. The command is never sent twice. Raises as
+        ArduPilot only. Returns when ArduPilot has acknowledged the command. The command is never sent twice. Raises as
         :meth:`repeat_servo`.
 
         Args:
@@ -1801,8 +1801,8 @@ class Actuators(TwinOf["AsyncActuators"]):
     def raise_landing_gear(self) -> None:
         """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
 
-        ArduCopter and ArduPlane only. No message reports the position of the gear. Both accept the order even if there
-        is no landing gear (LGR_ENABLE), and even while the vehicle stands on its gear.
+        ArduCopter and ArduPlane only. No message reports the position of the gear. ArduPilot accepts the order even if
+        there is no landing gear (LGR_ENABLE), and even while the vehicle stands on its gear.
 
         Raises:
             NotSupported: the firmware (PX4, Rover or Sub) does not support the command. Nothing was sent.
@@ -2046,7 +2046,7 @@ class Shell(BlockTwin["AsyncShell"]):
             line: at most 1000 bytes, without a line break.
 
         Raises:
-            InvalidArgument: the line is too long or has a line break, or the block is not open. Nothing was sent.
+            InvalidArgument: the line is too long or has a line break, or the shell is not open. Nothing was sent.
         """
         self._loop.call(self.aio.write, line)
 
@@ -2057,7 +2057,7 @@ class Shell(BlockTwin["AsyncShell"]):
             timeout: seconds; None waits without a limit.
 
         Raises:
-            InvalidArgument: the timeout is out of range, or the block is not open.
+            InvalidArgument: the timeout is out of range, or the shell is not open.
             OperationTimeout: there was no output in time.
         """
         return self._loop.run(self.aio.read, timeout=timeout)
@@ -2085,9 +2085,9 @@ class TemporaryParameters(TemporarilyTwin):
 class Transaction(TransactionTwin):
     """Several parameter writes, of which either all take effect or none.
 
-    Every write is verified; a write that fails or is clamped raises. If the block raises, aerokit restores all written
-    parameters and the exception of the block propagates. If some could not be restored,
-    :class:`aerokit.errors.RollbackFailed` names them; they are not tried again when the link returns.
+    Every write is verified; a write that fails or is clamped raises an error. If the block raises, aerokit restores all
+    written parameters, and the exception of the block propagates. :class:`aerokit.errors.RollbackFailed` names the
+    parameters that could not be restored; aerokit does not try again when the link returns.
 
     A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names the parameter.
     Other tasks of your program may write at the same time: a transaction restores the values from before its own first
@@ -2102,12 +2102,13 @@ class Transaction(TransactionTwin):
 
     @property
     def needs_reboot(self) -> tuple[str, ...]:
-        """Names of changes that take effect after a reboot; needs :meth:`Parameters.load_metadata`."""
+        """Names of the changed parameters that need a reboot; empty without :meth:`Parameters.load_metadata`."""
         return self.aio.needs_reboot
 
     def set(self, name: str, value: float) -> ParameterWrite:
-        """Set one parameter; errors as for :meth:`Parameters.set`, and VerificationFailed if the vehicle clamps the
-        value.
+        """Set one parameter; errors as for :meth:`Parameters.set`.
+
+        Raises VerificationFailed if the vehicle clamps the value.
         """
         return self._loop.run(self.aio.set, name, value)
 
@@ -2140,7 +2141,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         return self.aio.table
 
     def known(self, name: str) -> Parameter | None:
-        """Return the last known parameter of this name on the vehicle; ``table.get(name)`` without building a table."""
+        """Return the last known parameter with this name, like ``table.get(name)`` but without building a table."""
         return self.aio.known(name)
 
     @property
@@ -2181,8 +2182,8 @@ class Parameters(TwinOf["AsyncParameters"]):
             method: ``"ftp"`` reads one small file that also has the defaults (``@PARAM/param.pck``), ``"list"``
                 requests one message for each parameter, ``"auto"`` uses the file if there is one.
             refresh: download again, even if the parameters are known or cached.
-            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged, so that the next
-                program needs one request. True means the user's cache directory; or pass a path. Only PX4 has a hash.
+            cache: store the list on disk, and use it while the vehicle's parameter hash is unchanged. The next program
+                then needs only one request. True means the user's cache directory; or pass a path. Only PX4 has a hash.
                 The hash does not cover parameters that PX4 changes by itself, so these may be outdated. Off by default.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
@@ -2249,7 +2250,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         Raises:
             InvalidArgument: the name is invalid, or the value is NaN or does not fit the parameter's type.
             ParameterRejected: the vehicle has no such parameter, or keeps the previous value; see ``code``.
-            ParameterTimeout: not confirmed, but it may have been set.
+            ParameterTimeout: the vehicle did not confirm the value, but may have set it.
         """
         return self._loop.run(self.aio.set, name, value, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
@@ -2321,7 +2322,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         "aerokit" names the parameter.
 
         Raises:
-            RollbackFailed: values could not be restored; ``not_restored`` has them.
+            RollbackFailed: some values could not be restored; ``not_restored`` has them.
         """
         return TemporaryParameters(
             self._loop,
@@ -2329,8 +2330,9 @@ class Parameters(TwinOf["AsyncParameters"]):
         )
 
     def transaction(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> Transaction:
-        """Write all of several parameters, or none: ``async with vehicle.parameters.transaction() as t: await
-        t.set(…)``.
+        """Write several parameters, either all or none.
+
+        ``async with vehicle.parameters.transaction() as t: await t.set(…)``
 
         Each write is verified. If the block raises or is cancelled, or a write fails, the previous values are
         restored; see :class:`Transaction`.
@@ -2381,10 +2383,10 @@ class Parameters(TwinOf["AsyncParameters"]):
 class Calibration(CalibrationTwin):
     """The steps of a calibration: iterate with ``async for``. The last step has the ``result``.
 
-    The calibration starts with the first step. Leaving the loop in any way, or leaving the vehicle's block, cancels the
-    calibration on the vehicle. ArduPilot cannot cancel ``accelerometer``, and aerokit then logs a warning. The other
-    calibrations that a vehicle cannot cancel (level, barometer, ArduPilot's gyroscope and airspeed, PX4's ESCs) end in
-    seconds.
+    The calibration starts with the first step. Leaving the loop in any way, or leaving the vehicle's ``async with``
+    block, cancels the calibration on the vehicle. ArduPilot cannot cancel ``accelerometer``, and aerokit then logs a
+    warning. The other calibrations that a vehicle cannot cancel (level, barometer, ArduPilot's gyroscope and airspeed,
+    PX4's ESCs) end in seconds.
 
     Iterating raises:
         OperationRejected: the calibration failed, or another party cancelled it (``reasons`` has the vehicle's status
@@ -2392,7 +2394,7 @@ class Calibration(CalibrationTwin):
         NotSupported: the vehicle has no such sensor or calibration. Nothing was sent.
         CommandRejected: the vehicle refused to start.
         CommandTimeout: the vehicle did not answer.
-        OperationTimeout: the vehicle reported nothing for two minutes, or the text with the result was lost.
+        OperationTimeout: the vehicle reported nothing for two minutes, or its status text with the result was lost.
         HeartbeatTimeout: the vehicle was silent for 10 s.
         BusyError: another calibration of this vehicle is in progress. Nothing was sent.
         ConnectionClosed, LinkLost: the connection has ended.
@@ -2443,8 +2445,9 @@ class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
         return Calibration(self._loop, self._loop.call(self.aio.level))
 
     def barometer(self) -> Calibration:
-        """Calibrate the barometer: ArduPilot takes the present pressure for that of the ground, PX4 uses the GPS
-        altitude.
+        """Calibrate the barometer.
+
+        ArduPilot uses the present pressure as the pressure on the ground; PX4 uses the GPS altitude.
         """
         return Calibration(self._loop, self._loop.call(self.aio.barometer))
 
@@ -2464,10 +2467,10 @@ class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
         """Calibrate the ESCs. **Remove the propellers**, because the motors get full throttle.
 
         PX4 calibrates at once, while a person connects the battery. ArduCopter calibrates at its next boot; the last
-        step tells the person so.
+        step asks the person to reconnect the battery.
 
         Args:
-            intent: ``"propellers are removed"``.
+            intent: must be ``"propellers are removed"``, so that the motors are never started by mistake.
 
         Raises:
             InvalidArgument: the intent is another text. Nothing was sent.
@@ -2551,7 +2554,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
-            OperationTimeout: the transfer was not done within ``timeout``.
+            OperationTimeout: the transfer was not complete within ``timeout``.
         """
         return self._loop.run(
             self.aio.download,
@@ -2575,7 +2578,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
     @cached_property
     def current(self) -> StateCell[int | None]:
-        """Current item (MISSION_CURRENT); None before the start, and without a mission."""
+        """Current item (MISSION_CURRENT); None before the start of the mission, and without a mission."""
         return StateCell(self._loop, self.aio.current)
 
     @cached_property
@@ -2596,8 +2599,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def set_current(self, item: int, *, timeout: float = 5.0) -> None:
         """Set the next item. A vehicle that is flying its mission proceeds to it immediately.
 
-        Sends MAV_CMD_DO_SET_MISSION_CURRENT. PX4 does not support it, and gets MISSION_SET_CURRENT. An item without a
-        position (a DO command) is executed; ``current`` then shows the next item.
+        Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which does not support the command. An item
+        without a position (a DO command) is executed; ``current`` then shows the next item.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -2613,8 +2616,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
         a take-off as the first item. If you cancel the call, aerokit orders the vehicle to hold.
 
-        Sends MISSION_START to ArduPilot, because a mode change alone does not make it take off. Other autopilots get a
-        mode change.
+        ArduPilot gets MISSION_START, because a mode change alone does not make it take off. Other autopilots get a mode
+        change.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -2640,8 +2643,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         self._loop.run(self.aio.resume, timeout=timeout)
 
     def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Wait until the mission has been flown to its end. If it ends with a landing, wait until the vehicle has
-        landed.
+        """Wait until the mission has been flown to its end, including a landing at its end.
 
         A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
         command is sent when it fails.
@@ -2654,8 +2656,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
                 mode, or the vehicle disarmed on the way or fell. ``reasons`` has the vehicle's status texts.
             OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after it
-                descended to the ground at more than 3 m/s; or it has not moved for 60 s at a take-off or at a waypoint
-                without a hold. The last case is only detected if the items are known from an upload or a download.
+                descended to the ground at more than 3 m/s; or the vehicle has not moved for 60 s at a take-off or at a
+                waypoint without a hold (only if the items are known from an upload or a download).
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         self._loop.run(self.aio.wait_finished, timeout=timeout, max_silence_s=max_silence_s)
@@ -2745,7 +2747,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
-            OperationTimeout: the transfer was not done within ``timeout``.
+            OperationTimeout: the transfer was not complete within ``timeout``.
         """
         return self._loop.run(
             self.aio.download,
@@ -2854,7 +2856,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
-            OperationTimeout: the transfer was not done within ``timeout``.
+            OperationTimeout: the transfer was not complete within ``timeout``.
         """
         return self._loop.run(
             self.aio.download,
@@ -2881,7 +2883,7 @@ class NtripClient(BlockTwin["AsyncNtripClient"]):
     """Fetches corrections from an NTRIP caster while its ``async with`` block runs, and sends them to the vehicle.
 
     Entering returns when the caster has accepted the request. If the connection ends or is silent for 30 s, the client
-    reconnects after 1 to 30 s, as often as necessary, and logs it (logger ``aerokit``). Messages of more than 720
+    reconnects after 1 to 30 s, as often as necessary, and logs this (logger ``aerokit``). Messages of more than 720
     bytes, which GPS_RTCM_DATA cannot carry, are dropped. Leaving the block closes the connection.
 
     Entering raises:
@@ -2921,7 +2923,7 @@ class Rtk(TwinOf["AsyncRtk"]):
 
     @cached_property
     def corrections(self) -> StateCell[Corrections]:
-        """Number, bytes and bandwidth of the corrections sent. The age of this cell is the age of the last message."""
+        """Number, bytes and bandwidth of the corrections sent; their ``age`` is the time since the last message."""
         return StateCell(self._loop, self.aio.corrections)
 
     def send(self, rtcm: bytes) -> None:
@@ -2985,14 +2987,14 @@ class Camera(TwinOf["AsyncCamera"]):
 
     ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any other. A camera has its own component id
     (100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. If the capabilities
-    that the camera has reported exclude a call, aerokit refuses the call before anything is sent. Cells are polled only
-    while your program uses them.
+    that the camera has reported exclude a call, aerokit refuses the call before anything is sent. State values are
+    polled only while your program uses them.
     """
 
     @cached_property
     def mode(self) -> StateCell[str]:
         """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your program uses
-        this cell.
+        this value.
         """
         return StateCell(self._loop, self.aio.mode)
 
@@ -3008,7 +3010,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
     @cached_property
     def storage(self) -> StateCell[tuple[CameraStorage, ...]]:
-        """Storage media by number; polled every 5 s while your program uses this cell."""
+        """Storage media by number; polled every 5 s while your program uses this value."""
         return StateCell(self._loop, self.aio.storage)
 
     def set_mode(self, mode: ModeName, *, timeout: float = 5.0) -> None:
@@ -3030,7 +3032,7 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
     def load_storage(self) -> tuple[CameraStorage, ...]:
-        """Request the storage media (STORAGE_INFORMATION).
+        """Request information about the storage media (STORAGE_INFORMATION), and return it.
 
         Raises:
             OperationTimeout: the camera reported no storage, or no camera was found.
@@ -3048,8 +3050,8 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Args:
             number: number of the medium, 1 to 255.
-            timeout: seconds to wait for the answer, and after each progress report.
-            on_progress: called with the progress, 0–100 or None if unknown.
+            timeout: seconds to wait for the answer. Each progress report starts this time again.
+            on_progress: called with the progress in percent, or None if unknown.
 
         Raises:
             InvalidArgument: ``number`` is out of range. Nothing was sent.
@@ -3071,7 +3073,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
     @cached_property
     def tracking(self) -> StateCell[TrackingStatus]:
-        """The tracked point or rectangle; requested at a rate by :meth:`track_point` and :meth:`track_rectangle`."""
+        """The tracked point or rectangle. :meth:`track_point` and :meth:`track_rectangle` request it at a rate."""
         return StateCell(self._loop, self.aio.tracking)
 
     @cached_property
@@ -3125,9 +3127,8 @@ class Camera(TwinOf["AsyncCamera"]):
     def zoom_step(self, steps: int) -> None:
         """Zoom in by a number of steps, or out if the number is negative (MAV_CMD_SET_CAMERA_ZOOM).
 
-        The camera defines the size of a step.
-
-        An unanswered command is not retried, because the step could be made twice.
+        The camera defines the size of a step. An unanswered command is not retried, because the camera could make the
+        step twice.
 
         Args:
             steps: −100 to 100.
@@ -3166,9 +3167,8 @@ class Camera(TwinOf["AsyncCamera"]):
     def focus_step(self, steps: int) -> None:
         """Focus farther by a number of steps, or nearer if the number is negative (MAV_CMD_SET_CAMERA_FOCUS).
 
-        The camera defines the size of a step.
-
-        An unanswered command is not retried, because the step could be made twice. Raises as :meth:`zoom_step`.
+        The camera defines the size of a step. An unanswered command is not retried, because the camera could make the
+        step twice. Raises as :meth:`zoom_step`.
 
         Args:
             steps: −100 to 100.
@@ -3184,16 +3184,19 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.focus_at, metres)
 
     def auto_focus(self, kind: AutoFocus = "auto") -> None:
-        """Start the auto focus: ``"single"`` focuses once, ``"continuous"`` from now on, ``"auto"`` as the camera
-        chooses.
+        """Start the auto focus.
+
+        ``"single"`` focuses once, ``"continuous"`` keeps the image in focus from now on, and ``"auto"`` lets the camera
+        choose.
 
         Raises as :meth:`reset_settings`, and NotSupported if the camera cannot be focused.
         """
         self._loop.run(self.aio.auto_focus, kind)
 
     def focusing(self, speed: float = 1.0) -> CameraBlock:
-        """Move the focus for the duration of an ``async with`` block. The end of the block stops it, also under
-        cancellation.
+        """Move the focus for the duration of an ``async with`` block.
+
+        The end of the block stops the movement, also under cancellation.
 
         Entering raises the errors of :meth:`focus_step`.
 
@@ -3208,29 +3211,29 @@ class Camera(TwinOf["AsyncCamera"]):
     @cached_property
     def status(self) -> StateCell[CameraStatus]:
         """Recording and its duration, pictures taken, free storage (CAMERA_CAPTURE_STATUS). Polled every 2 s while your
-        program uses this cell, unless the camera sends it by itself.
+        program uses this value, unless the camera sends it by itself.
         """
         return StateCell(self._loop, self.aio.status)
 
     @cached_property
     def streams(self) -> StateCell[tuple[CameraStream, ...]]:
-        """Video streams by number; polled every 5 s while your program uses this cell."""
+        """Video streams by number; polled every 5 s while your program uses this value."""
         return StateCell(self._loop, self.aio.streams)
 
     @cached_property
     def thermal_range(self) -> StateCell[ThermalRange]:
-        """Coldest and hottest point of the thermal image; polled every second while your program uses this cell."""
+        """Coldest and hottest point of the thermal image; polled every second while your program uses this value."""
         return StateCell(self._loop, self.aio.thermal_range)
 
     def start_video(self, *, status_hz: float = 1.0, timeout: float = 5.0) -> None:
         """Start recording (MAV_CMD_VIDEO_START_CAPTURE); returns when the camera reports that it records.
 
-        If the camera does not report its status, as for example a camera attached to the autopilot, the call returns
-        when the camera has accepted the command.
+        If the camera does not report its status, like a camera attached to the autopilot, the call returns when the
+        camera has accepted the command.
 
         Args:
             status_hz: rate at which the camera sends its status while recording, 0 to 10.
-            timeout: seconds to wait until it records.
+            timeout: seconds to wait until the camera records.
 
         Raises:
             InvalidArgument: ``status_hz`` is out of range. Nothing was sent.
@@ -3326,11 +3329,14 @@ class Camera(TwinOf["AsyncCamera"]):
 
     @property
     def number(self) -> int | None:
-        """1 to 6 if attached to the autopilot, otherwise the component id; None until a camera is found."""
+        """Number of the camera: 1 to 6 if attached to the autopilot, otherwise its component id.
+
+        None until a camera is found.
+        """
         return self.aio.number
 
     def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
-        """Wait until the camera is found and has identified itself. Other calls include this wait.
+        """Wait until the camera is found and has identified itself. All other calls also wait for this.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
@@ -3553,7 +3559,7 @@ class Settings(TwinOf["AsyncSettings"]):
             InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
                 setting is read-only or excluded now. Nothing was set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
-            ParameterTimeout: not confirmed, but it may have been set.
+            ParameterTimeout: the component did not confirm the value, but may have set it.
         """
         return self._loop.run(self.aio.set, name, value, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
@@ -3638,7 +3644,7 @@ class Component(TwinOf["AsyncComponent"]):
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
-        """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack, like :meth:`aerokit.Vehicle.command`."""
+        """Send any MAV_CMD as COMMAND_LONG and return its COMMAND_ACK, like :meth:`aerokit.Vehicle.command`."""
         return self._loop.run(
             self.aio.command,
             command,
@@ -3687,7 +3693,7 @@ class Component(TwinOf["AsyncComponent"]):
         )
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Return a cell with the component's latest message of a type, like :meth:`aerokit.Vehicle.message`."""
+        """Return the state value of the component's latest message of a type, like :meth:`aerokit.Vehicle.message`."""
         return StateCell(self._loop, self._loop.call(self.aio.message, message_type, rate_hz=rate_hz))
 
     def rate(self, message_type: type[Message], rate_hz: float) -> AbstractContextManager[None]:

@@ -201,7 +201,8 @@ async def test_impact_needs_lost_height_and_low_speed(drop_m: float, ground_spee
     """The velocity of an estimator may jump, and a fixed wing may level off."""
     async with in_the_air(20.0) as flight:
         flight.copter.faults.silent = True
-        detector, telemetry = ImpactDetector(flight.vehicle._context.session), flight.vehicle.telemetry
+        telemetry = flight.vehicle.telemetry
+        detector = ImpactDetector(telemetry)
         here = place_of(flight)
         for sink_m_s in [*[0.0] * 10, 4.0, 8.0, 8.0, *[0.0] * 5]:
             here = here.offset(up_m=-drop_m / 3 if sink_m_s else 0.0)

@@ -253,7 +253,7 @@ async def test_oversized_write_is_refused(grounded: Flight, monkeypatch: pytest.
         yield ack(request)
 
     serve(grounded, answer)
-    with pytest.raises(InvalidArgument, match="data of 11 bytes is not allowed: at most 10"):
+    with pytest.raises(InvalidArgument, match="data of 11 bytes is not allowed: it must have at most 10"):
         await grounded.vehicle.files.write("/a", bytes(11))
     assert asked == []
     await grounded.vehicle.files.write("/a", bytes(10), verify=False)

@@ -332,7 +332,7 @@ async def test_px4_retract_and_look_at_system_are_not_supported() -> None:
 async def test_control_is_released_after_silence() -> None:
     gimbal = SimulatedGimbal()
     async with with_gimbals(gimbal) as flight:
-        with pytest.raises(OperationTimeout, match="not sent yet, because the vehicle is silent"):
+        with pytest.raises(OperationTimeout, match="the command was not sent yet, because the vehicle is silent"):
             async with flight.vehicle.gimbal.control():
                 flight.copter.faults.silent = True
                 await anyio.sleep(4.0)

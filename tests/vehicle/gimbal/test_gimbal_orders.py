@@ -92,7 +92,7 @@ async def test_unreachable_angle_timeout_reports_attitude() -> None:
     async with with_gimbals(SimulatedGimbal(pitch_deg=(-45.0, 10.0))) as flight:
         with pytest.raises(OperationTimeout) as caught:
             await flight.vehicle.gimbal.point(-80.0, 0.0, timeout=4.0)
-        assert "not reached within 4 s: it points to pitch -45.0" in str(caught.value)
+        assert "not reached within 4 s: the gimbal points to pitch -45.0" in str(caught.value)
         assert "expected pitch -80.0, yaw from north 0.0" in str(caught.value)
 
 
@@ -101,7 +101,7 @@ async def test_timeout_reports_device_errors() -> None:
         status = m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 16)
         copter = flight.copter
         copter.every(0.2, lambda: copter.send(status, None, (1, 154)))
-        with pytest.raises(OperationTimeout, match="it reports POWER_ERROR"):
+        with pytest.raises(OperationTimeout, match="its failures are POWER_ERROR"):
             await flight.vehicle.gimbal.point(-30.0, 0.0, timeout=3.0)
 
 

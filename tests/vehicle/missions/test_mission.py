@@ -269,9 +269,9 @@ async def test_newer_order_ends_wait_finished(opened: Any) -> None:
 
 async def test_wait_finished_without_start_is_rejected() -> None:
     async with armed(open_flight) as flight:
-        with pytest.raises(OperationRejected, match="is not flying its mission, it is in GUIDED"):
+        with pytest.raises(OperationRejected, match="is not flying its mission but is in GUIDED"):
             await flight.vehicle.mission.wait_finished(timeout=20)
-        with pytest.raises(OperationRejected, match="is not flying its mission, it is in GUIDED; nothing was sent"):
+        with pytest.raises(OperationRejected, match="is not flying its mission but is in GUIDED; nothing was sent"):
             await flight.vehicle.mission.pause()
 
 

@@ -179,7 +179,7 @@ async def test_rejected_upload_names_item_and_remains(opened: Any, method: Any) 
         assert (caught.value.item, caught.value.result) == (17, Result.UNSUPPORTED)
         keeps = opened is open_px4
         assert ("still has its previous items" in str(caught.value)) == keeps
-        assert ("items 0 to 16 are new now, and later items, if it has any, are old" in str(caught.value)) != keeps
+        assert ("items 0 to 16 are new now, and all later items are old" in str(caught.value)) != keeps
         assert holds(flight, long_mission(30)) == keeps
         await flight.vehicle.mission.upload(long_mission(30))  # it was not recorded as uploaded
         assert holds(flight, long_mission(30))

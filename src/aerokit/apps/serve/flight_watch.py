@@ -52,7 +52,7 @@ class FlightWatch:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
-        self._impact = ImpactDetector(vehicle._session)
+        self._impact = ImpactDetector(vehicle.telemetry)
         self._crash: dict[str, Any] | None = None
         self._fast_at, self._fast_m_s = -math.inf, 0.0
         self._is_over = False
@@ -201,7 +201,7 @@ class FlightWatch:
 
     def _reset(self) -> None:
         self._forget_impact()
-        self._impact = ImpactDetector(self._vehicle._session)
+        self._impact = ImpactDetector(self._vehicle.telemetry)
 
     def _now(self) -> float:
         return self._vehicle.connection.now()

@@ -32,10 +32,10 @@ EscIntent = Literal["propellers are removed"]
 class Calibration(AsyncIterator["CalibrationStep"]):
     """The steps of a calibration: iterate with ``async for``. The last step has the ``result``.
 
-    The calibration starts with the first step. Leaving the loop in any way, or leaving the vehicle's block, cancels the
-    calibration on the vehicle. ArduPilot cannot cancel ``accelerometer``, and aerokit then logs a warning. The other
-    calibrations that a vehicle cannot cancel (level, barometer, ArduPilot's gyroscope and airspeed, PX4's ESCs) end in
-    seconds.
+    The calibration starts with the first step. Leaving the loop in any way, or leaving the vehicle's ``async with``
+    block, cancels the calibration on the vehicle. ArduPilot cannot cancel ``accelerometer``, and aerokit then logs a
+    warning. The other calibrations that a vehicle cannot cancel (level, barometer, ArduPilot's gyroscope and airspeed,
+    PX4's ESCs) end in seconds.
 
     Iterating raises:
         OperationRejected: the calibration failed, or another party cancelled it (``reasons`` has the vehicle's status
@@ -43,7 +43,7 @@ class Calibration(AsyncIterator["CalibrationStep"]):
         NotSupported: the vehicle has no such sensor or calibration. Nothing was sent.
         CommandRejected: the vehicle refused to start.
         CommandTimeout: the vehicle did not answer.
-        OperationTimeout: the vehicle reported nothing for two minutes, or the text with the result was lost.
+        OperationTimeout: the vehicle reported nothing for two minutes, or its status text with the result was lost.
         HeartbeatTimeout: the vehicle was silent for 10 s.
         BusyError: another calibration of this vehicle is in progress. Nothing was sent.
         ConnectionClosed, LinkLost: the connection has ended.
@@ -63,7 +63,7 @@ class Calibration(AsyncIterator["CalibrationStep"]):
         self._loop = asyncio.get_running_loop()  # for `__del__`, which may run on another thread
         try:
             return await self._steps.__anext__()
-        except BaseException:  # The steps have ended, failed or were cancelled; a run that has ended ignores `abandon`.
+        except BaseException:  # No step follows. `abandon` does nothing if the calibration has ended on the vehicle.
             self._is_over = True
             self._run.abandon()
             raise
@@ -136,8 +136,9 @@ class CalibrationControl:
         return self._start("level", _acknowledged("place the vehicle level and keep it still"), param=5, value=2)
 
     def barometer(self) -> Calibration:
-        """Calibrate the barometer: ArduPilot takes the present pressure for that of the ground, PX4 uses the GPS
-        altitude.
+        """Calibrate the barometer.
+
+        ArduPilot uses the present pressure as the pressure on the ground; PX4 uses the GPS altitude.
         """
         return self._start("barometer", _acknowledged("shelter the vehicle from wind"), param=3)
 
@@ -157,10 +158,10 @@ class CalibrationControl:
         """Calibrate the ESCs. **Remove the propellers**, because the motors get full throttle.
 
         PX4 calibrates at once, while a person connects the battery. ArduCopter calibrates at its next boot; the last
-        step tells the person so.
+        step asks the person to reconnect the battery.
 
         Args:
-            intent: ``"propellers are removed"``.
+            intent: must be ``"propellers are removed"``, so that the motors are never started by mistake.
 
         Raises:
             InvalidArgument: the intent is another text. Nothing was sent.
@@ -184,7 +185,7 @@ class CalibrationControl:
             px4: procedure for PX4.
             param: number of the parameter of MAV_CMD_PREFLIGHT_CALIBRATION that starts this calibration; 0 if the
                 procedure does not need it.
-            value: value of this parameter; those before are 0.
+            value: value of this parameter. All parameters before it are 0.
         """
         run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
         is_px4 = self._context.session.autopilot.calibration_protocol == "texts"

@@ -48,7 +48,7 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
-    calibrating_at = math.inf  # when the vehicle last reported that it calibrates
+    calibrating_at = math.inf  # when the vehicle last reported that it calibrates; infinite if it never did
     with ExitStack() as cleanup:
 
         def on_text(text: str) -> None:
@@ -88,7 +88,7 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
 
 
 def _step_after(step: CalibrationStep, report: CalibrationReport) -> CalibrationStep:
-    """Return the step that a report of PX4 leads to."""
+    """Return the step that follows ``step`` after a report of PX4."""
     if report.kind == "progress":
         return step.replace(progress=report.progress)
     if report.kind == "pending":
@@ -133,7 +133,7 @@ async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[Calib
         await run.parameters().set("ESC_CALIBRATION", 3)
     except ParameterRejected:  # The vehicle refused, so there is nothing to restore.
         raise
-    except BaseException:  # Also if the call was cancelled: the value may have arrived, unconfirmed.
+    except BaseException:  # The vehicle may have set the value, although the call failed or was cancelled.
         await _restore(run, "ESC_CALIBRATION", old_value)
         raise
     finally:
@@ -148,7 +148,7 @@ async def _restore(run: CalibrationRun, name: str, value: float) -> None:
             await run.parameters().set(name, value)
             return
     logger.warning(
-        "%s was left early; perhaps %s was not restored to %g: set it, or the motors get full throttle at boot",
+        "%s was left early, and %s may not have been restored to %g: set it, or the motors get full throttle at boot",
         run.call_name,
         name,
         value,
@@ -166,8 +166,8 @@ async def _read_parameter(run: CalibrationRun, name: str) -> float:
 async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
     """ArduPilot: yield the progress of all compasses, and accept the result if all have succeeded."""
     await run.begin((MavCmd.DO_CANCEL_MAG_CAL, 0))
-    percents: dict[int, int] = {}  # progress by compass
-    reports: dict[int, MagCalReport] = {}  # result by compass
+    percents: dict[int, int] = {}  # progress in percent by number of the compass
+    reports: dict[int, MagCalReport] = {}  # final report by number of the compass
     has_changed = False
     compass_mask = 0  # Bit i is set if compass i is being calibrated.
 
@@ -236,8 +236,8 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
 
     with ExitStack() as cleanup:
         await run.start(*params)
-        # The handler is attached only now: until this calibration starts, ArduPilot broadcasts the result of an earlier
-        # one.
+        # Attach the handler only now, because ArduPilot broadcasts the result of an earlier calibration until this one
+        # starts.
         cleanup.callback(run.session.connection.bus.attach(CommandLong, on_request, system_id=run.session.system_id))
         while True:
             await run.wait(lambda: requests)
@@ -251,12 +251,12 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
                 raise run.failure("the calibration failed; keep the vehicle still in each pose")
             if request in POSES:
                 pose = POSES[AccelcalVehiclePos(request)]
-                remaining = tuple(POSES.values())[request - 1 :]
+                remaining = tuple(POSES.values())[request - 1 :]  # ArduPilot requests the poses 1 to 6 in this order.
                 text = f"place the vehicle {pose.value}, keep it still, then continue"
                 yield run.step((request - 1) / len(POSES), text, pose, remaining, needs_confirmation=True)
                 await run.command(MavCmd.ACCELCAL_VEHICLE_POS, request)
                 confirmed, confirmed_at = request, now()
-                requests.clear()  # Until the confirmation, ArduPilot has repeated its request.
+                requests.clear()  # ArduPilot repeated the request until it received the confirmation.
 
 
 MIN_CHANNELS, MIN_TRAVEL_US = 4, 300
@@ -271,19 +271,19 @@ RESULTS_OF_RC_COMMAND = (MavResult.UNSUPPORTED,)
 async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
     """ArduPilot and PX4: measure the travel of each channel in RC_CHANNELS, and write RCn_MIN, RCn_MAX and RCn_TRIM."""
     run.check_ready()
-    cell = run.session.telemetry.cells["rc_channels"]
+    channels = run.session.telemetry.cells["rc_channels"]
     lows: dict[int, int] = {}
     highs: dict[int, int] = {}
     with ExitStack() as cleanup:
         cleanup.enter_context(run.session.streaming("rc_channels"))
-        previous_update = cell.updated_at
+        previous_update = channels.updated_at
         await run.wait(
-            lambda: cell.updated_at > previous_update,
+            lambda: channels.updated_at > previous_update,
             CHANNELS_TIMEOUT_S,
             "no RC_CHANNELS was received: is a receiver connected?",
         )
-        if not _pulses(cell.latest):
-            raise run.failure("the receiver reports no channels: is the transmitter on? nothing was sent")
+        if not _pulses(channels.latest):
+            raise run.failure("the receiver reports no channels; switch the transmitter on; nothing was sent")
         await run.begin(CANCEL_ALL)
         await run.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 1, accepts=RESULTS_OF_RC_COMMAND)
 
@@ -292,21 +292,24 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
                 lows[number] = min(pulse, lows.get(number, pulse))
                 highs[number] = max(pulse, highs.get(number, pulse))
 
-        cleanup.callback(cell.observe(lambda _, value: on_channels(value), every_arrival=True))
-        # Execution continues behind each `yield` when the person has confirmed the step.
+        cleanup.callback(channels.observe(lambda _, value: on_channels(value), every_arrival=True))
+        # Each `yield` returns when the person has confirmed the step.
         yield run.step(0.0, "move all sticks and switches to all their ends, then continue", needs_confirmation=True)
         yield run.step(
             0.5, "centre the sticks, with the throttle at its lowest, then continue", needs_confirmation=True
         )
-        trims = _pulses(cell.latest)
+        trims = _pulses(channels.latest)
     moved = [number for number in lows if highs[number] - lows[number] >= MIN_TRAVEL_US]
     if len(moved) < MIN_CHANNELS:
         raise run.failure(f"only {len(moved)} channels moved by {MIN_TRAVEL_US} µs or more; nothing was written")
     values: dict[str, float] = {}
     for number in moved:
-        low, high, trim = lows[number], highs[number], trims.get(number, 0)
+        low, high, trim = lows[number], highs[number], trims.get(number, 0)  # A missing trim fails the next check.
         if not LOWEST_US <= low <= trim <= high <= HIGHEST_US or not low < MIDDLE_US < high:
-            raise run.failure(f"channel {number} ranges from {low} to {high} µs, centre {trim}; nothing was written")
+            raise run.failure(
+                f"channel {number} ranges from {low} to {high} µs with a centre of {trim} µs, which is implausible;"
+                " nothing was written"
+            )
         values |= {f"RC{number}_MIN": low, f"RC{number}_MAX": high, f"RC{number}_TRIM": trim}
     async with run.parameters().transaction() as transaction:
         await transaction.set_many(values)

@@ -46,7 +46,7 @@ CONFIRM_POLL_INTERVAL_S = 0.1
 
 
 class CalibrationRun:
-    """One calibration. It counts as running from its first command until ``finish`` or a confirmed cancellation."""
+    """One calibration, which counts as running from its first command until ``finish`` or a confirmed cancellation."""
 
     def __init__(
         self, context: VehicleContext, sensor: str, runs: list[CalibrationRun], parameters: Callable[[], Parameters]
@@ -55,13 +55,13 @@ class CalibrationRun:
         self.session: VehicleSession = context.session
         self.sensor: str = sensor
         self.parameters: Callable[[], Parameters] = parameters
-        self.call_name: str = f"calibrate.{sensor}"  # for error texts
+        self.call_name: str = f"calibrate.{sensor}"  # how error texts name the call
         self._runs = runs  # all runs of this vehicle that may be in progress
         self.step: partial[CalibrationStep] = partial(CalibrationStep, sensor)
         self._cancel_command: tuple[float, ...] | None = None  # MAV_CMD and its parameters
-        self._why_not_cancelled = ""
+        self._cannot_cancel_reason = ""
         self._started_at = math.inf
-        self._cancelled_at: float | None = None
+        self._cancel_sent_at: float | None = None
         self._cancel_order_stack = ExitStack()
         self._sent_cancel: SentCommand | None = None
         self._has_rebooted = self._is_abandoned = False
@@ -80,22 +80,22 @@ class CalibrationRun:
             )
         self.session.check_disarmed(self.call_name, is_current=self.context.arbiter.is_state_recent)
 
-    async def begin(self, cancel: tuple[float, ...] | None, why_not_cancelled: str = "") -> None:
+    async def begin(self, cancel: tuple[float, ...] | None, cannot_cancel_reason: str = "") -> None:
         """Wait until no other calibration is being cancelled, then register this calibration as running.
 
         Args:
             cancel: the command that cancels the calibration, with its parameters; None if there is no such command.
-            why_not_cancelled: text for the user about a calibration that cannot be cancelled.
+            cannot_cancel_reason: tells the user why this calibration cannot be cancelled; empty if it can.
         """
         self.check_ready()
-        # When an iterator is deleted, its run is abandoned only in the next iteration of the event loop.
+        # The run of a deleted iterator is abandoned only in the next iteration of the event loop, so wait for that.
         await anyio.lowlevel.checkpoint()
         for run in tuple(self._runs):
             if not run._is_abandoned:
                 raise BusyError(f"{self.call_name}: {run.call_name} is in progress; nothing was sent")
             await run.wait_cancelled()
-        self.check_ready()
-        self._cancel_command, self._why_not_cancelled = cancel, why_not_cancelled
+        self.check_ready()  # The vehicle may have been armed during the wait.
+        self._cancel_command, self._cannot_cancel_reason = cancel, cannot_cancel_reason
         self._started_at = self.session.connection.now()
         self._runs.append(self)
         self.context.on_finish.append(self.abandon)
@@ -111,7 +111,7 @@ class CalibrationRun:
                 raise
 
     async def start(self, *params: float, command: int = MavCmd.PREFLIGHT_CALIBRATION) -> None:
-        """Send the command that starts the calibration. After a refusal, the calibration is not running."""
+        """Send the command that starts the calibration. If the vehicle refuses, the calibration is not running."""
         try:
             await self.command(command, *params)
         except CommandRejected:
@@ -143,8 +143,8 @@ class CalibrationRun:
         if not self.is_running or self._is_abandoned:
             return
         self._is_abandoned = True
-        if self._why_not_cancelled:
-            logger.warning("%s was left early: %s", self.call_name, self._why_not_cancelled)
+        if self._cannot_cancel_reason:
+            logger.warning("%s was left early: %s", self.call_name, self._cannot_cancel_reason)
         if self._cancel_command is None or self._has_rebooted or self.session.is_closed:
             self.finish()
             return
@@ -165,8 +165,8 @@ class CalibrationRun:
         """
         with anyio.move_on_after(MAX_CANCEL_ATTEMPTS * CANCEL_INTERVAL_S):
             await self._ended.wait()
-        if self._why_not_cancelled:
-            raise NotSupported(f"{self.call_name}: {self._why_not_cancelled}")
+        if self._cannot_cancel_reason:
+            raise NotSupported(f"{self.call_name}: {self._cannot_cancel_reason}")
         if not self._ended.is_set():
             raise OperationTimeout(
                 f"{self.call_name}: the vehicle did not confirm the cancellation; {self.session.describe_link()}"
@@ -175,7 +175,7 @@ class CalibrationRun:
     def _send_cancel(self, command: float, *params: float) -> None:
         # Callers send the cancel command only while the vehicle's state is known. Sending it again has no further
         # effect.
-        self._cancelled_at = self.session.connection.now()
+        self._cancel_sent_at = self.session.connection.now()
         self.session.commands.send_unconfirmed(int(command), *params)
 
     async def _confirm_cancel(self) -> None:
@@ -185,15 +185,15 @@ class CalibrationRun:
         assert self._cancel_command is not None
         try:
             for _ in range(MAX_CANCEL_ATTEMPTS):
-                if self._cancelled_at is not None:
+                if self._cancel_sent_at is not None:
                     with anyio.move_on_after(CANCEL_INTERVAL_S):
                         while not self._is_cancelled(self._cancel_command[0]):  # noqa: ASYNC110
                             await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
                         return
-                await self.session.wait_for_heartbeat(self._cancelled_at)
+                await self.session.wait_for_heartbeat(self._cancel_sent_at)
                 is_taken_over = self._sent_cancel is not None and bool(self._sent_cancel.end)
                 if self._has_rebooted or is_taken_over:
-                    return
+                    return  # A reboot has ended the calibration, or another party must not be disturbed.
                 if self.context.arbiter.is_state_recent:
                     self._send_cancel(*self._cancel_command)
             logger.warning("%s: the vehicle did not confirm the cancellation", self.call_name)
@@ -209,12 +209,12 @@ class CalibrationRun:
         """
         if self._has_rebooted:
             return True
-        assert self._cancelled_at is not None
+        assert self._cancel_sent_at is not None
         # PX4 is cancelled by PREFLIGHT_CALIBRATION with zeros, ArduPilot by commands of their own.
         if cancel_command != MavCmd.PREFLIGHT_CALIBRATION:
-            return self.session.commands.accepted_at(int(cancel_command)) >= self._cancelled_at
+            return self.session.commands.accepted_at(int(cancel_command)) >= self._cancel_sent_at
         status = self.session.telemetry.system_status
-        return status.updated_at > self._cancelled_at and status.latest != MavState.CALIBRATING
+        return status.updated_at > self._cancel_sent_at and status.latest != MavState.CALIBRATING
 
     # --------------------------------------------------------------------------------------- steps
 
@@ -224,7 +224,7 @@ class CalibrationRun:
         timeout: float = REPORT_TIMEOUT_S,
         timeout_text: str = "the vehicle reported nothing about the calibration",
     ) -> None:
-        """Wait for the vehicle's next report. Raises as `await_progress`."""
+        """Wait until ``is_ready`` returns a true value. Raises as `await_progress`."""
         await await_progress(
             self.session,
             self.call_name,

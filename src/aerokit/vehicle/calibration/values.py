@@ -95,7 +95,7 @@ _FORMATS = {
 
 
 class CalibrationReport(Snapshot):
-    """One ``[cal]`` text of PX4. ``kind`` is a key of ``_FORMATS``, or ``"text"``; ``text`` lacks ``[cal]``."""
+    """One ``[cal]`` text of PX4. ``kind`` is a key of ``_FORMATS``, or ``"text"``; ``text`` is without ``[cal]``."""
 
     kind: str
     text: str
@@ -112,7 +112,7 @@ def parse_report(status_text: str) -> CalibrationReport | None:
         if match := re.fullmatch(pattern, text):
             groups = match.groupdict()
             progress = int(groups["percent"]) / 100 if "percent" in groups else None
-            if progress is not None and progress > 1:  # a damaged text
+            if progress is not None and progress > 1:  # The text is damaged.
                 return None
             poses = tuple(SIDES[side] for side in groups.get("sides", "").split())
             return CalibrationReport(kind, text, progress, poses)

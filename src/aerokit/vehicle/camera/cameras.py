@@ -38,8 +38,8 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
 
     ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any other. A camera has its own component id
     (100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. If the capabilities
-    that the camera has reported exclude a call, aerokit refuses the call before anything is sent. Cells are polled only
-    while your program uses them.
+    that the camera has reported exclude a call, aerokit refuses the call before anything is sent. State values are
+    polled only while your program uses them.
     """
 
     def __init__(self, link: CameraLink) -> None:
@@ -53,11 +53,14 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
 
     @property
     def number(self) -> int | None:
-        """1 to 6 if attached to the autopilot, otherwise the component id; None until a camera is found."""
+        """Number of the camera: 1 to 6 if attached to the autopilot, otherwise its component id.
+
+        None until a camera is found.
+        """
         return self._link.number
 
     async def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
-        """Wait until the camera is found and has identified itself. Other calls include this wait.
+        """Wait until the camera is found and has identified itself. All other calls also wait for this.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
@@ -134,11 +137,11 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             if status is None:
                 raise self._link.timeout_error("did not report how many pictures it has taken")
             count = status.image_count
-            missing_in_succession = 0
+            consecutive_missing = 0
             available = 1 if self._link.is_autopilot_attached else MAX_CAPTURES
             for index in range(max(0, count - available), count):
-                missing_in_succession = 0 if await self._log.fetch(index) else missing_in_succession + 1
-                if missing_in_succession == MAX_CONSECUTIVE_MISSING:
+                consecutive_missing = 0 if await self._log.fetch(index) else consecutive_missing + 1
+                if consecutive_missing == MAX_CONSECUTIVE_MISSING:
                     break
             return self.captures()
         not_reported = "how many pictures it has taken" if count is None else f"all of its {count} pictures"
@@ -184,7 +187,7 @@ class Cameras:
         self._early: list[tuple[int, Any]] = []
         self._first_link = CameraLink(context, components.component, None, on_bound=self._on_first_bound)
         self._first = Camera(self._first_link)
-        # True once `first` has returned `_first`: from then on it always returns the same object.
+        # True once `first` has returned `_first`. From then on, `first` always returns this object.
         self._is_first_in_use = False
         session.register_cell(self.cell)
         bus = session.connection.bus
@@ -195,7 +198,7 @@ class Cameras:
             (m.CameraImageCaptured, lambda message: self._on_capture(message, message.camera_id or 1)),
             (m.CameraTrigger, lambda message: self._on_capture(message, 1)),
         ):
-            if bus.dialect.get(message_type.ID) is not None:
+            if bus.dialect.get(message_type.ID) is not None:  # The user's dialect may lack a message.
                 session.at_close(bus.attach(message_type, callback, system_id=session.system_id))
         for (system_id, _), heartbeat in tuple(session.connection.heartbeats.items()):
             if system_id == session.system_id:
@@ -217,7 +220,7 @@ class Cameras:
         """Return the camera with this number, always the same object, even before the camera is discovered."""
         if number not in AUTOPILOT_CAMERA_IDS and not 7 <= number <= 255:
             raise InvalidArgument(
-                f"number = {number} is not allowed: 1 to 6 if attached to the autopilot, or a component id up to 255"
+                f"number = {number} is not allowed: 1 to 6 (attached to the autopilot) or 7 to 255 (component id)"
             )
         if number not in self._cameras:
             if number == self._first_link.number:
@@ -233,44 +236,44 @@ class Cameras:
             self._record(heartbeat, frame.component_id)
 
     def _on_information(self, message: m.CameraInformation) -> None:
-        # Without a device id, ArduPilot tells its cameras apart by lens_id, from 0 (AP_Camera_Backend.cpp).
+        # ArduPilot does not set camera_device_id but lens_id, which is 0 for its first camera (AP_Camera_Backend.cpp).
         self._record(message, message.camera_device_id or message.lens_id + 1)
 
     def _on_first_bound(self, number: int) -> None:
         # `at` may have created another object for the same camera. Only one of the two publishes its events.
         self._first_link.is_muted = number in self._cameras
 
-    def _on_capture(self, message: Any, device: int) -> None:
+    def _on_capture(self, message: Any, device_id: int) -> None:
         """Create the camera object if needed, so that its capture log also gets this first capture."""
-        number = self._record(message, device)
+        number = self._record(message, device_id)
         if number in (0, self._first_link.number, *self._cameras):
-            return  # not a camera, or its object already listens to this message
+            return  # The sender is not a camera, or the camera's object receives this message itself.
         if self._first_link.number is None:
             if not self._early:
                 self._first_link.call_later(DISCOVERY_TIMEOUT_S, self._process_early)
-            del self._early[MAX_EARLY_CAPTURES:]
+            del self._early[MAX_EARLY_CAPTURES:]  # Beyond the limit, a new capture replaces the last one.
             self._early.append((number, message))
         else:
             self.at(number)._log.record(message)
 
     def _process_early(self) -> None:
-        # No camera with its own component id was discovered, so the first camera is one attached to the autopilot.
+        # No camera with its own component id was discovered, so the first camera is attached to the autopilot.
         early, self._early = self._early, []
         self._first_link.bind(early[0][0])
         for number, message in early:
             self.at(number)._log.record(message)
 
-    def _record(self, message: Any, device: int) -> int:
-        """Add the camera to the cell of cameras; return its number, or 0 if the message is not of a camera.
+    def _record(self, message: Any, device_id: int) -> int:
+        """Add the camera to the state value `cell`; return its number, or 0 if the message is not from a camera.
 
-        The number is ``device`` in a message of the autopilot, otherwise the component id of the sender.
+        The number is ``device_id`` if the autopilot is the sender, otherwise the component id of the sender.
         """
         frame = message.received_frame
         if frame is None:
             return 0
         is_from_autopilot = frame.component_id == self._session.component_id
-        number = device if is_from_autopilot else frame.component_id
-        # The numbers 1 to 6 belong to the autopilot's cameras, and no others do.
+        number = device_id if is_from_autopilot else frame.component_id
+        # Cameras of the autopilot have the numbers 1 to 6; all other cameras have their component ids.
         if (number in AUTOPILOT_CAMERA_IDS) != is_from_autopilot or number == 0:
             return 0
         numbers = self.cell.latest or ()

@@ -33,7 +33,7 @@ __all__ = ["Capture", "captures_csv", "geotag_file", "geotagged", "write_capture
 
 Quaternion = tuple[float, float, float, float]
 
-# Time stamps below this (the year 1990) are not UTC: they count from the boot of the vehicle.
+# Time stamps below this (the year 1990) are not UTC, but the time since the vehicle was started.
 SECONDS_IN_1990 = 631_152_000
 
 # End of the year 9999, the last year that datetime can represent.
@@ -42,7 +42,7 @@ MAX_UTC_S = 253_402_300_799
 # CAMERA_FEEDBACK counts pictures in 16 bits.
 FEEDBACK_INDEX_RANGE = 1 << 16
 
-# Sine of the pitch beyond which roll and yaw turn about the same axis (gimbal lock).
+# If the sine of the pitch exceeds this, roll and yaw turn about the same axis (gimbal lock).
 MAX_PITCH_SINE = 0.99999
 
 
@@ -93,7 +93,7 @@ def from_image(message: CameraImageCaptured, camera: int, received_at: float) ->
 
 
 def from_feedback(message: CameraFeedback, camera: int, received_at: float) -> Capture:
-    """Decode ArduPilot's CAMERA_FEEDBACK, which counts from 1."""
+    """Decode ArduPilot's CAMERA_FEEDBACK, which counts pictures from 1."""
     roll, pitch, yaw = _angles(message.roll, message.pitch, message.yaw)
     return Capture(
         camera=camera,
@@ -111,7 +111,7 @@ def from_feedback(message: CameraFeedback, camera: int, received_at: float) -> C
 
 
 def from_trigger(message: CameraTrigger, camera: int, received_at: float, telemetry: Telemetry) -> Capture:
-    """Decode PX4's CAMERA_TRIGGER. It has no position, so position and attitude of the vehicle are used."""
+    """Decode PX4's CAMERA_TRIGGER. The message has no position, so the vehicle's position and attitude are used."""
     position, attitude = telemetry.position.latest, telemetry.attitude.latest
     roll: float | None = None
     pitch: float | None = None
@@ -161,7 +161,7 @@ def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
     length = math.sqrt(sum(value * value for value in quaternion))
     w, x, y, z = (value / length for value in quaternion)
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
-    if abs(sine) > MAX_PITCH_SINE:  # Roll and yaw turn about the same axis, so the whole turn counts as yaw.
+    if abs(sine) > MAX_PITCH_SINE:  # gimbal lock: the whole turn about the common axis counts as yaw
         roll, yaw = 0.0, -2 * math.copysign(1, sine) * math.atan2(x, w)
     else:
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -174,7 +174,7 @@ def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
 
 
 def _round(degrees: float) -> float:
-    # Degrees from 32-bit floats have no more exact digits; adding 0.0 turns -0.0 into 0.0.
+    # Degrees from 32-bit floats have only three exact decimals. Adding 0.0 turns -0.0 into 0.0.
     return round(degrees, 3) + 0.0
 
 
@@ -194,7 +194,8 @@ DATE_TIME_ORIGINAL, OFFSET_TIME_ORIGINAL, CAMERA_ELEVATION_ANGLE = 0x9003, 0x901
 def captures_csv(captures: Iterable[Capture]) -> str:
     """Format captures as CSV: a header line, then a line for each capture. Unknown values are empty fields.
 
-    ``file`` is the last part of the URL, ``taken_at`` is UTC in ISO 8601, angles are in degrees from horizon and north.
+    ``file`` is the last part of the URL and ``taken_at`` is UTC in ISO 8601. Angles are in degrees: roll and pitch from
+    the horizon, yaw from north.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -239,13 +240,13 @@ def geotagged(jpeg: bytes, capture: Capture) -> bytes:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # Pillow only warns when it drops tags that it cannot parse.
-            exif.load(old_exif[4:])  # without the marker and the length
+            exif.load(old_exif[4:])  # The marker and the length (4 bytes) are left out.
             exif.get_ifd(EXIF_IFD).update(_exif_tags(capture))
             exif.get_ifd(GPS_IFD).update(_gps_tags(capture))
             body: bytes = exif.tobytes()
     except Exception as error:  # Pillow raises many types for malformed EXIF.
         raise FileFormatError(f"cannot read the EXIF of this picture: {error}") from error
-    if not body.startswith(EXIF_HEADER):
+    if not body.startswith(EXIF_HEADER):  # The segment needs the header, whether or not Pillow has written it.
         body = EXIF_HEADER + body
     if len(body) > MAX_SEGMENT_SIZE:
         raise FileFormatError(
@@ -281,19 +282,22 @@ def geotag_file(path: str | os.PathLike[str], capture: Capture, *, to: str | os.
 def _split(jpeg: bytes) -> tuple[list[bytes], bytes]:
     """Return the segments in front of the image data, and the image data."""
     if jpeg[:3] != bytes((0xFF, START, 0xFF)):
-        raise FileFormatError("not a JPEG: the bytes do not begin with its marker (FF D8 FF)")
+        raise FileFormatError("the picture is not a JPEG: its bytes do not begin with FF D8 FF")
     segments = list(_segments(jpeg))
     return segments, jpeg[2 + sum(map(len, segments)) :]
 
 
 def _segments(jpeg: bytes) -> Iterator[bytes]:
-    """Yield each segment before the image data: FF, marker, length in 2 bytes, content. The length includes these 2."""
+    """Yield each segment before the image data: FF, marker, length (2 bytes), content.
+
+    The length includes its own 2 bytes.
+    """
     start = 2
     while jpeg[start + 1 : start + 2] != bytes((SCAN,)):
         length = int.from_bytes(jpeg[start + 2 : start + 4], "big")
         segment = jpeg[start : start + 2 + length]
         if segment[:1] != b"\xff" or length < 2 or len(segment) < 2 + length:
-            raise FileFormatError("incomplete JPEG: it ends before the image data")
+            raise FileFormatError("the JPEG is incomplete: it ends before the image data")
         yield segment
         start += len(segment)
 
@@ -345,7 +349,7 @@ def _gps_tags(capture: Capture) -> dict[int, Any]:
 
 def _sexagesimal(degrees: float) -> tuple[float, float, float]:
     """Convert to degrees, minutes and seconds, rounded to 0.0001 seconds (some millimetres)."""
-    ten_thousandths = round(abs(degrees) * 3600 * 10_000)  # of a second
+    ten_thousandths = round(abs(degrees) * 3600 * 10_000)  # the angle in units of 1/10,000 arc second
     total_minutes, rest = divmod(ten_thousandths, 60 * 10_000)
     whole_degrees, minutes = divmod(total_minutes, 60)
     return float(whole_degrees), float(minutes), rest / 10_000
@@ -354,7 +358,7 @@ def _sexagesimal(degrees: float) -> tuple[float, float, float]:
 def _time_of(capture: Capture) -> datetime | None:
     if capture.taken_at is None or not 0 <= capture.taken_at < MAX_UTC_S:
         return None
-    # Rounded down to milliseconds: rounding up could reach the next second, and EXIF stores whole seconds.
+    # Round down to milliseconds. EXIF stores whole seconds, and rounding up could reach the next second.
     return datetime.fromtimestamp(math.floor(capture.taken_at * 1000) / 1000, timezone.utc)
 
 

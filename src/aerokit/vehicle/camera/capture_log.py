@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 
 MAX_CAPTURES = 20_000
 FETCH_ATTEMPTS, REQUEST_TIMEOUT_S = 12, 1.0
-# Maximum seconds after CAMERA_TRIGGER in which PX4 may send CAMERA_IMAGE_CAPTURED, which has the position.
+# PX4 may send CAMERA_IMAGE_CAPTURED, which has the position, up to this many seconds after CAMERA_TRIGGER.
 TRIGGER_GRACE_S = 0.3
-# Messages of two types with the same index within this time report the same picture.
+# Two messages of different types with the same index report the same picture if they arrive within this time.
 DUPLICATE_WINDOW_S = 10.0
-# If a status is older than the newest by less than this, it arrived out of order; by more, the camera has restarted.
+# A status that is older than the newest one by less than this arrived late. If it is older, the camera has restarted.
 REORDER_WINDOW_MS = 5000
-# Maximum difference between an index and the reported count. If it is larger, the count does not follow the standard.
+# If an index exceeds the reported count by more than this, the camera's count does not follow the standard.
 MAX_COUNT_LEAD = 100
-# A larger jump of the index counts as corrupt until a second picture confirms it.
+# If the index rises by more than this, it counts as corrupt until the next picture confirms it.
 MAX_INDEX_GAP = 1000
 # If an index is lower than the previous one by more than this, the 16-bit counter of CAMERA_FEEDBACK has wrapped.
 HALF_RANGE = FEEDBACK_INDEX_RANGE // 2
@@ -58,7 +58,7 @@ class _Entry:
             self.utc_us, self.boot_us = (stamp, 0) if is_utc else (0, stamp)
 
     def reports_same_picture(self, other: _Entry) -> bool:
-        if self.kind is not other.kind:  # PX4 reports each picture by two messages in quick succession.
+        if self.kind is not other.kind:  # PX4 reports one picture by two messages in quick succession.
             return abs(self.capture.received_at - other.capture.received_at) <= DUPLICATE_WINDOW_S
         if self.utc_us and other.utc_us:
             return self.utc_us == other.utc_us
@@ -67,14 +67,16 @@ class _Entry:
         return self.capture.place == other.capture.place
 
     def was_taken_later(self, other: _Entry) -> bool:
-        """Return True if the time stamps show that this picture is later; False also if they cannot be compared."""
+        """Return True if the time stamps show that this picture is later. Returns False if they cannot be compared."""
         if self.utc_us and other.utc_us:
             return self.utc_us > other.utc_us
         return bool(self.boot_us and other.boot_us) and self.boot_us > other.boot_us
 
 
 class CaptureLog:
-    """Captures by index. Of the two messages that PX4 sends for a picture, the message with the position is kept.
+    """Stores the captures of one camera by index.
+
+    PX4 sends two messages for each picture; the log keeps the message with the position.
 
     When the camera counts from 0 again, after a restart or formatting, the log resets itself.
     """
@@ -83,16 +85,15 @@ class CaptureLog:
         self._link = link
         self._by_index: dict[int, _Entry] = {}
         self._requested: set[int] = set()
-        # The entry with the highest plausible index, the last one far above it, and the last failed picture.
-        self._highest: _Entry | None = None
-        self._outlier: _Entry | None = None
-        self._failed: _Entry | None = None
-        # Number of pictures, from CAMERA_CAPTURE_STATUS and indices. It is used once the camera has reported a number.
+        self._highest: _Entry | None = None  # the entry with the highest plausible index
+        self._outlier: _Entry | None = None  # the last entry, if its index is too far above `_highest`
+        self._failed: _Entry | None = None  # the last failed picture
+        # Number of pictures, from CAMERA_CAPTURE_STATUS and indices. Not used until the camera has reported a number.
         self._count, self._is_count_used = 0, False
         self._count_boot_ms = 0
-        # Loop time of the last reset: earlier captures belong to another log.
+        # Time of the event loop at the last reset. Captures from before the reset do not belong to this log.
         self.reset_at: float = -math.inf
-        # True if the camera sends CAMERA_IMAGE_CAPTURED, which makes CAMERA_TRIGGER superfluous.
+        # True if the camera sends CAMERA_IMAGE_CAPTURED; CAMERA_TRIGGER is then ignored.
         self._has_images = False
         self.cell: StateCell[Capture] = link.new_cell(
             "camera.capture", "CAMERA_IMAGE_CAPTURED, CAMERA_FEEDBACK or CAMERA_TRIGGER"
@@ -124,8 +125,8 @@ class CaptureLog:
         return None if entry is None else entry.capture
 
     async def _request(self, index: int) -> bool:
-        """Request the capture once; return True if the camera answers that it has no such capture, or only newer
-        captures.
+        """Request the capture once. Returns True if another request is pointless, because the camera answers that it
+        does not have this capture.
         """
         request = self._link.requests.request
         try:
@@ -137,7 +138,7 @@ class CaptureLog:
                     timeout=REQUEST_TIMEOUT_S,
                 )
                 return False
-            newest = await request(
+            newest = await request(  # The autopilot stores only its newest capture.
                 m.CameraFeedback,
                 where=lambda message: message.cam_idx + 1 == self._link.number,
                 timeout=REQUEST_TIMEOUT_S,
@@ -162,7 +163,7 @@ class CaptureLog:
         number = message.cam_idx + 1
         highest = self._highest
         has_wrapped = highest is not None and highest.capture.index > HALF_RANGE
-        # ArduPilot sends all zeros before the first picture.
+        # Before the first picture, ArduPilot sends a message of zeros, which is not a capture.
         if (message.img_idx > 0 or has_wrapped) and number == self._link.number:
             self._add(message, from_feedback(message, number, self._link.now()))
 
@@ -178,7 +179,7 @@ class CaptureLog:
     def _on_status(self, message: m.CameraCaptureStatus) -> None:
         boot_ms, count = message.time_boot_ms, message.image_count
         if 0 < self._count_boot_ms - boot_ms < REORDER_WINDOW_MS:
-            return
+            return  # This status is older than the newest one, and arrived late.
         self._count_boot_ms = boot_ms
         if count < self._count:  # The camera counts from 0 again.
             self._reset()
@@ -192,9 +193,13 @@ class CaptureLog:
         self.reset_at = self._link.now()
 
     def _shows_reset(self, entry: _Entry, previous: _Entry | None) -> bool:
-        """Return True if the camera counts from 0 again. ``previous`` is the stored entry with the same index."""
+        """Return True if this entry shows that the camera counts from 0 again.
+
+        ``previous`` is the stored entry with the same index.
+        """
         if previous is not None and previous.capture.success is not False:
-            return not entry.reports_same_picture(previous)
+            return not entry.reports_same_picture(previous)  # Two successful pictures cannot have the same index.
+        # A lower index shows a reset, unless the capture was requested or arrived late.
         index, highest = entry.capture.index, self._highest
         if highest is None or index >= highest.capture.index or index in self._requested:
             return False
@@ -211,20 +216,20 @@ class CaptureLog:
             self._reset()
             previous = None
         is_new = previous is None or previous.capture.success is False
-        # A repeated message, or CAMERA_TRIGGER after the message with the position, has nothing to add.
+        # Repeated messages add nothing, and CAMERA_TRIGGER adds nothing to CAMERA_IMAGE_CAPTURED.
         if previous is not None and not is_new and previous.kind in (entry.kind, m.CameraImageCaptured):
             return
         self._store(entry)
         self._update_highest(entry)
         if isinstance(message, m.CameraImageCaptured):
             self._count_boot_ms = message.time_boot_ms
-        # Only the count of a camera that follows the standard is used.
+        # If the index is far above the count, the camera does not count as the standard says: leave the count as it is.
         if self._is_count_used and capture.index <= self._count + MAX_COUNT_LEAD:
             self._count = max(self._count, capture.index)
         self._publish(message, capture, is_new=is_new)
 
     def _update_highest(self, entry: _Entry) -> None:
-        # An index far ahead may be corrupt, so it counts only when the next picture confirms it.
+        # An index far above the highest one may be corrupt, so it counts only when the next picture confirms it.
         index, highest, outlier = entry.capture.index, self._highest, self._outlier
         self._outlier = None
         if highest is None or 0 <= index - highest.capture.index <= MAX_INDEX_GAP:
@@ -247,7 +252,7 @@ class CaptureLog:
         self._publish(message, entry.capture, is_new=True)
 
     def _store(self, entry: _Entry) -> None:
-        # Removed before it is stored, so that the dictionary has the newest entry last, and the oldest can be dropped.
+        # Remove the index first: the dictionary then has the newest entry last, so that the oldest can be dropped.
         self._by_index.pop(entry.capture.index, None)
         self._by_index[entry.capture.index] = entry
         if len(self._by_index) > MAX_CAPTURES:
@@ -283,7 +288,7 @@ class CaptureQueue:
         return self._queue.popleft() if self._queue else None
 
     async def wait(self, seconds: float) -> bool:
-        """Wait for a capture; False if none arrives in time."""
+        """Wait for a capture; return False if none arrives in time."""
         with anyio.move_on_after(seconds):
             while not self._queue:
                 self._cell._raise_if_closed()

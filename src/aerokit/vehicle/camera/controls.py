@@ -53,9 +53,8 @@ class LensMixin(CameraMixin):
     async def zoom_step(self, steps: int) -> None:
         """Zoom in by a number of steps, or out if the number is negative (MAV_CMD_SET_CAMERA_ZOOM).
 
-        The camera defines the size of a step.
-
-        An unanswered command is not retried, because the step could be made twice.
+        The camera defines the size of a step. An unanswered command is not retried, because the camera could make the
+        step twice.
 
         Args:
             steps: −100 to 100.
@@ -98,9 +97,8 @@ class LensMixin(CameraMixin):
     async def focus_step(self, steps: int) -> None:
         """Focus farther by a number of steps, or nearer if the number is negative (MAV_CMD_SET_CAMERA_FOCUS).
 
-        The camera defines the size of a step.
-
-        An unanswered command is not retried, because the step could be made twice. Raises as :meth:`zoom_step`.
+        The camera defines the size of a step. An unanswered command is not retried, because the camera could make the
+        step twice. Raises as :meth:`zoom_step`.
 
         Args:
             steps: −100 to 100.
@@ -119,16 +117,19 @@ class LensMixin(CameraMixin):
         await self._set("focus_at", HAS_FOCUS, FOCUS, SetFocusType.METERS, metres)
 
     async def auto_focus(self, kind: AutoFocus = "auto") -> None:
-        """Start the auto focus: ``"single"`` focuses once, ``"continuous"`` from now on, ``"auto"`` as the camera
-        chooses.
+        """Start the auto focus.
+
+        ``"single"`` focuses once, ``"continuous"`` keeps the image in focus from now on, and ``"auto"`` lets the camera
+        choose.
 
         Raises as :meth:`reset_settings`, and NotSupported if the camera cannot be focused.
         """
         await self._set("auto_focus", HAS_FOCUS, FOCUS, AUTO_FOCUS_TYPES[kind], 0)
 
     def focusing(self, speed: float = 1.0) -> CameraBlock:
-        """Move the focus for the duration of an ``async with`` block. The end of the block stops it, also under
-        cancellation.
+        """Move the focus for the duration of an ``async with`` block.
+
+        The end of the block stops the movement, also under cancellation.
 
         Entering raises the errors of :meth:`focus_step`.
 
@@ -149,6 +150,7 @@ class LensMixin(CameraMixin):
             await self._link.command(command, kind, value, self._link.device, order=order, attempts=attempts)
 
     def _continuous(self, action: str, capability: str, command: int, kind: int, speed: float) -> CameraBlock:
+        """Return a block that starts a zoom or focus movement and stops the movement at its end."""
         link = self._link
         return CameraBlock(
             link,
@@ -169,7 +171,7 @@ class TrackingMixin(CameraMixin):
     def __init__(self, link: CameraLink) -> None:
         super().__init__(link)
         self.tracking: StateCell[TrackingStatus] = link.new_cell("camera.tracking", "CAMERA_TRACKING_IMAGE_STATUS")
-        """The tracked point or rectangle; requested at a rate by :meth:`track_point` and :meth:`track_rectangle`."""
+        """The tracked point or rectangle. :meth:`track_point` and :meth:`track_rectangle` request it at a rate."""
         self.tracked_place: StateCell[TrackedPlace] = link.new_cell(
             "camera.tracked_place", "CAMERA_TRACKING_GEO_STATUS"
         )
@@ -279,7 +281,7 @@ class StorageMixin(CameraMixin):
         super().__init__(link)
         self.mode: StateCell[str] = link.polled_cell("camera.mode", m.CameraSettings, SETTINGS_POLL_INTERVAL_S)
         """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your program uses
-        this cell.
+        this value.
         """
         self.zoom_percent: StateCell[float | None] = link.polled_cell(
             "camera.zoom_percent", m.CameraSettings, SETTINGS_POLL_INTERVAL_S
@@ -292,7 +294,7 @@ class StorageMixin(CameraMixin):
         self.storage: StateCell[tuple[CameraStorage, ...]] = link.polled_cell(
             "camera.storage", m.StorageInformation, STORAGE_POLL_INTERVAL_S
         )
-        """Storage media by number; polled every 5 s while your program uses this cell."""
+        """Storage media by number; polled every 5 s while your program uses this value."""
         self._media: dict[int, CameraStorage] = {}
         link.listen(m.CameraSettings, self._on_settings)
         link.listen(m.StorageInformation, self._on_storage)
@@ -328,10 +330,10 @@ class StorageMixin(CameraMixin):
                     await anyio.sleep(MODE_POLL_INTERVAL_S)
             return
         outcome = f"reports {reported}" if reported else "reports no mode"
-        raise self._link.timeout_error(f"accepted {mode}, but {outcome} after {timeout:g} s")
+        raise self._link.timeout_error(f"accepted the mode {mode}, but {outcome} after {timeout:g} s")
 
     async def load_storage(self) -> tuple[CameraStorage, ...]:
-        """Request the storage media (STORAGE_INFORMATION).
+        """Request information about the storage media (STORAGE_INFORMATION), and return it.
 
         Raises:
             OperationTimeout: the camera reported no storage, or no camera was found.
@@ -352,8 +354,8 @@ class StorageMixin(CameraMixin):
 
         Args:
             number: number of the medium, 1 to 255.
-            timeout: seconds to wait for the answer, and after each progress report.
-            on_progress: called with the progress, 0–100 or None if unknown.
+            timeout: seconds to wait for the answer. Each progress report starts this time again.
+            on_progress: called with the progress in percent, or None if unknown.
 
         Raises:
             InvalidArgument: ``number`` is out of range. Nothing was sent.
@@ -363,7 +365,7 @@ class StorageMixin(CameraMixin):
         """
         check_range("number", number, 1, 255)
         await self._link.identify()
-        # The second 1 also resets the image log of the camera.
+        # param2 = 1 formats the medium, param3 = 1 also resets the image log of the camera.
         await self._link.command(
             MavCmd.STORAGE_FORMAT, number, 1, 1, attempts=1, progress_timeout=timeout, on_progress=on_progress
         )

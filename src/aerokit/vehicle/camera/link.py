@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # A camera with a component id sends a HEARTBEAT within this time.
 DISCOVERY_TIMEOUT_S = 2.5
 
-# After more seconds than this without a heartbeat, another camera may use the component id.
+# If a camera sends no heartbeat for more seconds than this, another camera may be using its component id.
 MAX_SILENCE_S = 5.0
 
 
@@ -62,12 +62,12 @@ class CameraLink(CameraOrders):
         self._is_polling = False
         # Messages that the camera refused to send.
         self.unavailable: set[type[Message]] = set()
-        # Callbacks for when the camera's log of captures was cleared.
+        # Called when the camera's log of captures was cleared.
         self.on_cleared: list[Callable[[], None]] = []
         self._identifying = anyio.Lock()
         self._is_bound = anyio.Event()
         self._heartbeat_at = -math.inf
-        # True after a silence, until the camera has identified itself again: another camera may use this id now.
+        # True after a silence of the camera until it has identified itself again. Another camera may use its id now.
         self._was_silent = False
         self._session.on_reboot.append(self._on_reboot)
         self.information: StateCell[CameraInformation] = self.new_cell("camera.information", "CAMERA_INFORMATION")
@@ -132,14 +132,15 @@ class CameraLink(CameraOrders):
             self._attach(message_type, callback)
 
     def start_polling(self) -> None:
-        """Start polling cells in the background. Call it on the event loop's thread."""
+        """Start polling state values in the background. Must be called on the event loop's thread."""
         if not self._is_polling:
             self._is_polling = True
             self._session.background.start(self.requests.run, "aerokit camera")
 
     async def identify(self) -> CameraInformation | None:
-        """Find the camera and request its information once. None: a camera attached to the autopilot sends no
-        information.
+        """Find the camera and request its information, unless it is known.
+
+        Returns None for a camera attached to the autopilot that sends no information.
         """
         if self._needs_information():
             async with self._identifying:
@@ -154,7 +155,8 @@ class CameraLink(CameraOrders):
         return not self.information.is_known or self._was_silent
 
     async def _find_first_camera(self) -> None:
-        # A camera with its own component id takes precedence over one attached to the autopilot.
+        # A camera with its own component id takes precedence over one attached to the autopilot, so give it time to
+        # send a heartbeat.
         connected_for_s = self.now() - self._session.transfers.began_at
         with anyio.move_on_after(max(0.0, DISCOVERY_TIMEOUT_S - connected_for_s)):
             await self._is_bound.wait()
@@ -165,14 +167,14 @@ class CameraLink(CameraOrders):
         try:
             await self.requests.request(m.CameraInformation, self.device, where=self._is_from_this_camera)
         except CommandRejected:
-            # The autopilot need not have information about its camera, and information received before stays valid.
+            # The autopilot may have no information about its camera. Information that was received before stays valid.
             if not self.is_autopilot_attached and not self.information.is_known:
                 raise
         if not self.information.is_known and not self.is_autopilot_attached:
             raise self.timeout_error("did not identify itself")
 
     async def require_capability(self, action: str, *capabilities: str) -> None:
-        """Raise NotSupported if the camera reports its capabilities, but none of these."""
+        """Raise NotSupported if the camera reports its capabilities and has none of ``capabilities``."""
         information = await self.identify()
         if self.is_trigger and "capture_image" not in capabilities:
             raise NotSupported(
@@ -213,7 +215,7 @@ class CameraLink(CameraOrders):
         return cell
 
     def polled_cell(self, name: str, message_type: type[Message], period_s: float) -> StateCell[Any]:
-        """Create a cell whose message is polled while the program uses the cell."""
+        """Create a state value whose message is polled while the program uses the value."""
         cell = self.new_cell(name, message_type.NAME)
         self.requests.poll_for(cell, message_type, period_s)
         return cell
@@ -240,8 +242,8 @@ class CameraLink(CameraOrders):
             self._session.at_close(bus.attach(message_type, on_message, system_id=self._session.system_id))
 
     def _is_from_this_camera(self, message: Any) -> bool:
-        # Each type has only one or two of these fields. Firmware that does not set a field sends 0, which stands for
-        # its first camera.
+        # Each message type has only one or two of these fields. A field that the firmware does not set is 0; the
+        # message is then from the first camera.
         if not self.is_autopilot_attached:
             return True
         number_from_1 = getattr(message, "camera_device_id", 0) or getattr(message, "camera_id", 0)
@@ -283,7 +285,7 @@ class CameraMixin:
 
 
 class ActiveOperation:
-    """An operation of a camera that must be stopped when its block, or the block of the vehicle, ends."""
+    """An operation of a camera that must be stopped at the end of its own block or of the vehicle's block."""
 
     def __init__(self, link: CameraLink, subject: str, stop_command: Callable[[], tuple[float, ...]]) -> None:
         self._link, self._stop_command = link, stop_command
@@ -296,7 +298,8 @@ class ActiveOperation:
         stopped.
         """
         is_surely_not_started = error is not None and (
-            not self.order.may_move or isinstance(error, CommandRejected)  # nothing was sent, or the camera refused
+            # Nothing was sent, or the camera refused.
+            not self.order.may_move or isinstance(error, CommandRejected)
         )
         if is_surely_not_started:
             self.order.withdraw()
@@ -319,7 +322,7 @@ class ActiveOperation:
             await self._link.end_operation(self.order, int(command), *params, is_awaited=is_awaited)
 
     def _finish(self) -> None:
-        # The block of the vehicle ends: there is no time to wait for an answer.
+        # The vehicle's `async with` block ends, so there is no time to wait for an answer.
         is_active = self.order.may_move and self.order.is_newest
         self.discard()
         if is_active:

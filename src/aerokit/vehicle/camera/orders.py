@@ -59,7 +59,7 @@ class CameraOrders:
     _context: VehicleContext
     _session: VehicleSession
     _component: Component | None
-    # 1 to 6 if attached to the autopilot, otherwise the component id; None until bound.
+    # Number of the camera: 1 to 6 if attached to the autopilot, otherwise its component id; None until bound.
     number: int | None
 
     @property
@@ -86,7 +86,7 @@ class CameraOrders:
 
     @property
     def on_finish(self) -> list[Callable[[], None]]:
-        """Called when the block of the vehicle ends. A callback may send messages, but must not wait."""
+        """Callbacks for the end of the vehicle's block. They may send messages, but must not wait."""
         return self._context.on_finish
 
     def topic(self, subject: str) -> Topic:
@@ -119,7 +119,7 @@ class CameraOrders:
         if order is not None and not order.is_newest:
             raise CommandTimeout(f"{command_name(command)} was not sent: {SUPERSEDED}")
         if order is not None and not self._session.is_closed:
-            order.may_move = True  # From here on, the camera may execute it.
+            order.may_move = True  # From here on, the camera may execute the order.
         session, started_at = self._session, self._session.connection.now()
         arbiter = self._context.arbiter
         with arbiter.auxiliary_order(order) as sent_order, arbiter.sending(sent_order) as sent:
@@ -152,7 +152,7 @@ class CameraOrders:
                 return
             except CommandTimeout as error:
                 worked = await had_effect() if order.is_newest else None
-                if not order.is_newest:  # It may have been superseded while the camera was asked.
+                if not order.is_newest:  # A newer order may have been given while the camera was asked.
                     raise CommandTimeout(f"{error}; not sent again: {SUPERSEDED}") from None
                 if worked:
                     return
@@ -176,7 +176,7 @@ class CameraOrders:
         answered, errors = anyio.Event(), []
 
         async def confirm() -> None:
-            # `is_sent`: the first transmission is that of `send_now` below.
+            # `is_sent=True`: `send_now` below makes the first transmission.
             try:
                 if order.is_newest:
                     await self.command(command, *params, order=order, is_sent=True)
@@ -195,13 +195,13 @@ class CameraOrders:
             raise errors[0]
 
 
-# A cell is polled for this long after the program has read it.
+# A state value is polled for this many seconds after the program has read it.
 INTEREST_TIMEOUT_S = 10.0
 
 POLL_INTERVAL_S = 1.0
 
-# Commands that requested a message before MAV_CMD_REQUEST_MESSAGE existed, and their parameters. The first parameter
-# of NUMBERED_MESSAGES selects the item.
+# Commands that requested a message before MAV_CMD_REQUEST_MESSAGE existed, and their parameters. In a request for one
+# of NUMBERED_MESSAGES, the first parameter is the number of the item.
 LEGACY_REQUESTS: dict[type[Message], tuple[int, tuple[float, ...]]] = {
     m.CameraInformation: (MavCmd.REQUEST_CAMERA_INFORMATION, (1,)),
     m.CameraSettings: (MavCmd.REQUEST_CAMERA_SETTINGS, (1,)),
@@ -219,19 +219,19 @@ NUMBERED_MESSAGES = (
     m.VideoStreamStatus,
 )
 
-# Results that are final until the next reboot. Other results are temporary.
+# After these results, a message is not requested again before the next reboot. Other results are temporary.
 UNSUPPORTED = (MavResult.UNSUPPORTED, MavResult.DENIED)
 
-# ArduPilot answers FAILED if it does not support a message, other firmware if it cannot send the message now. Such a
-# message is therefore polled, but rarely.
+# FAILED means that the message is not supported (ArduPilot), or that it cannot be sent now (other firmware). A message
+# for which FAILED was answered is therefore polled rarely.
 MAYBE_UNSUPPORTED = (*UNSUPPORTED, MavResult.FAILED)
 DOUBTFUL_POLL_INTERVAL_S = 60.0
 
 
 class _PolledCell:
-    """Poll state of one cell, and whether the program reads or watches the cell.
+    """A state value whose message is requested while the program reads or watches the value.
 
-    As the ``Feed`` of the cell, it has `pending`, `catch_up` and `watchers_changed`, which the cell calls.
+    The state value calls `pending`, `catch_up` and `watchers_changed` of this object, which is its ``Feed``.
     """
 
     def __init__(
@@ -245,8 +245,8 @@ class _PolledCell:
 
     @property
     def pending(self) -> bool:
-        # The cell reads this property on every access, so the program is using the cell now. False: there is never an
-        # undecoded message.
+        # The state value reads this property on every access, so the program is using it now. The result is always
+        # False, because no message waits to be decoded.
         self.read_at = self._now()
         return False
 
@@ -265,7 +265,7 @@ class _PolledCell:
 
 
 class MessageRequests:
-    """Requests messages from one camera, by MAV_CMD_REQUEST_MESSAGE or the older commands, and polls cells."""
+    """Requests messages from one camera, by MAV_CMD_REQUEST_MESSAGE or the older commands, and polls state values."""
 
     def __init__(self, link: CameraOrders) -> None:
         self._link = link
@@ -279,8 +279,9 @@ class MessageRequests:
         where: Callable[[MessageT], bool] = lambda _: True,
         timeout: float = 3.0,
     ) -> MessageT | None:
-        """Request one message; return None if it does not arrive in time. CommandRejected: the camera does not support
-        it.
+        """Request one message; return None if it does not arrive in time.
+
+        Raises CommandRejected if the camera does not support the message.
         """
         refusal: CommandRejected | None = None
         if message_type not in self._legacy_types:
@@ -296,7 +297,7 @@ class MessageRequests:
         try:
             answer = await self._request_legacy(message_type, params, where, timeout)
         except CommandRejected as error:
-            raise refusal or error from None
+            raise refusal or error from None  # Prefer the refusal of the standard request.
         self._legacy_types.add(message_type)
         return answer
 
@@ -320,7 +321,7 @@ class MessageRequests:
         return None
 
     def poll_for(self, cell: StateCell[Any], message_type: type[Message], period_s: float) -> None:
-        """Poll the message of a cell every ``period_s`` seconds while the program uses the cell."""
+        """Poll the message of a state value every ``period_s`` seconds while the program uses the value."""
         self._polled.append(_PolledCell(self._link.now, cell, message_type, period_s))
 
     def forget_refusals(self) -> None:

@@ -27,12 +27,12 @@ TRIGGER, TRIGGER_INTERVAL = MavCmd.DO_TRIGGER_CONTROL, MavCmd.DO_SET_CAM_TRIGG_I
 CHECK_INTERVAL_S, STATUS_TIMEOUT_S = 1.0, 2.0
 # Number of status requests before an order, for a camera that has answered such a request before, and for all others.
 STATUS_ATTEMPTS, FIRST_STATUS_ATTEMPTS = 8, 3
-# A series has failed after this many status checks in a row that showed no new capture.
+# A series has failed if this many successive status checks have shown no new capture.
 MAX_SILENT_CHECKS = 6
 # An index counts as plausible if the camera has taken at most twice as many pictures since the newest capture as its
 # interval allows, plus this many.
 MAX_EXTRA_CAPTURES = 10
-# After this many unanswered requests in a row, the remaining gap is skipped.
+# If this many successive requests for missing captures are unanswered, the remaining gap is skipped.
 MAX_UNANSWERED = 3
 
 
@@ -42,10 +42,10 @@ class Shutter:
     def __init__(self, link: CameraLink, log: CaptureLog) -> None:
         self.link: CameraLink = link
         self.log: CaptureLog = log
-        self._sequence_number = 0  # of the last ordered photo
+        self._sequence_number = 0  # sequence number of the photo that was ordered last
         self._lock = anyio.Lock()
-        # Whether the camera has ever sent CAMERA_CAPTURE_STATUS, and whether all requests of an order were in vain.
-        self._reports_status = self._has_no_status = False
+        self._reports_status = False  # True once the camera has sent CAMERA_CAPTURE_STATUS
+        self._never_answered = False  # True if all requests for CAMERA_CAPTURE_STATUS of an order were unanswered
 
     async def status(self, timeout: float = CHECK_INTERVAL_S) -> CameraStatus | None:
         """Request CAMERA_CAPTURE_STATUS; None if the camera does not send it."""
@@ -57,12 +57,12 @@ class Shutter:
 
     async def reliable_status(self) -> CameraStatus | None:
         """Request the status repeatedly, because it decides whether an order was executed and may be sent again."""
-        first_attempts = 1 if self._has_no_status else FIRST_STATUS_ATTEMPTS
+        first_attempts = 1 if self._never_answered else FIRST_STATUS_ATTEMPTS
         for _ in range(STATUS_ATTEMPTS if self._reports_status else first_attempts):
             status = await self.status(STATUS_TIMEOUT_S)
             if status is not None or self.link.is_trigger or m.CameraCaptureStatus in self.link.unavailable:
                 return status
-        self._has_no_status = not self._reports_status
+        self._never_answered = not self._reports_status
         return None
 
     async def take_photo(self, timeout: float) -> Capture:
@@ -76,7 +76,7 @@ class Shutter:
                 attempts, error = 1, await self.order_photo(before)
                 while True:
                     while capture := new_captures.pop():
-                        # The camera may use the index of a failed picture again.
+                        # An unknown low index belongs to a new picture: indices of failed pictures may be used again.
                         is_old = before is not None and capture.index < before.image_count
                         if not is_old or capture.index not in known_indices:
                             return self._checked(capture)
@@ -89,7 +89,7 @@ class Shutter:
                     missed = await self._fetch_missed(before, status, known_indices, is_accepted=error is None)
                     if missed is not None:
                         return self._checked(missed)
-                    # If a series was started or stopped meanwhile, the number of pictures proves nothing.
+                    # The pictures of a series that was started or stopped meanwhile may have changed the image count.
                     is_series_unchanged = self.link.latest_order("series") is series
                     was_lost = error is not None and is_series_unchanged and _has_taken_none(before, status)
                     if was_lost and attempts < MAX_ORDER_ATTEMPTS:
@@ -182,18 +182,18 @@ class PhotoInterval:
         self._link, self._log = shutter.link, shutter.log
         self._new_captures = CaptureQueue(self._log.cell)
         # Index of the capture to deliver next.
-        self._next: int | None = None
-        # `reset_at` of the log that the indices belong to.
+        self._next_index: int | None = None
+        # Value of the log's `reset_at` to which `_next_index` belongs. After a reset, the camera counts from 0 again.
         self._known_reset_at = self._log.reset_at
         self._possible_first: Capture | None = None
         # True if no status was available, so that the index of the first capture counts as the start.
         self._is_start_guessed = False
         # The highest plausible index so far, and when it was received.
-        self._newest = 0
+        self._newest_index = 0
         self._newest_at = 0.0
-        # Number of requests in a row that the camera did not answer.
+        # Number of successive requests that the camera did not answer.
         self._unanswered = 0
-        # Received captures that were not delivered yet: by index, and those that failed.
+        # Received captures that were not delivered yet: the successful ones by index, and the failed ones.
         self._waiting: dict[int, Capture] = {}
         self._failed: list[Capture] = []
         self._delivered = 0
@@ -220,8 +220,8 @@ class PhotoInterval:
 
     async def _begin(self, operation: ActiveOperation) -> None:
         before = await self._shutter.reliable_status()
-        self._next = None if before is None else before.image_count
-        self._newest, self._newest_at = (self._next or 0) - 1, self._link.now()
+        self._next_index = None if before is None else before.image_count
+        self._newest_index, self._newest_at = (self._next_index or 0) - 1, self._link.now()
         self._known_reset_at = self._log.reset_at
         self._new_captures.__enter__()
         await self._shutter.start_series(operation.order, self._seconds, self._count, before)
@@ -253,13 +253,13 @@ class PhotoInterval:
             if self._failed:
                 self._delivered += 1
                 return self._failed.pop(0)
-            if self._next is not None and self._next in self._waiting:
-                capture = self._waiting.pop(self._next)
+            if self._next_index is not None and self._next_index in self._waiting:
+                capture = self._waiting.pop(self._next_index)
                 self._unanswered = 0
-                self._next += 1
+                self._next_index += 1
                 self._delivered += 1
                 return capture
-            if self._waiting and self._next is not None:
+            if self._waiting and self._next_index is not None:
                 await self._fetch_missing()
                 continue
             if await self._new_captures.wait(max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S):
@@ -269,39 +269,43 @@ class PhotoInterval:
             await self._check_silence(silent_checks)
 
     def _first_after_reset(self, capture: Capture) -> Capture | None:
-        """Return the first capture after the camera began to count from 0 again, once the second one is received.
+        """Return the first capture since the camera began to count from 0 again, once the next capture has arrived.
 
-        Two successive indices show this; a single index could be corrupt.
+        Only two successive low indices show a reset, because a single index could be corrupt.
         """
         previous, self._possible_first = self._possible_first, None
-        if self._log.reset_at > self._known_reset_at and self._next is not None and capture.index < self._next:
+        if (
+            self._log.reset_at > self._known_reset_at
+            and self._next_index is not None
+            and capture.index < self._next_index
+        ):
             self._possible_first = capture
             if previous is not None and capture.index == previous.index + 1:
                 return previous
         return None
 
     def _collect(self) -> None:
-        """Sort the received captures into those to deliver and those that failed, and drop implausible indices."""
+        """Move the received captures to `_waiting` or, if they failed, to `_failed`; drop implausible indices."""
         while capture := self._new_captures.pop():
             first = self._first_after_reset(capture)
             if first is not None:  # The series goes on with the new indices.
                 self._known_reset_at = self._log.reset_at
-                self._next, self._is_start_guessed = first.index, False
-                self._newest, self._newest_at = first.index, self._link.now()
+                self._next_index, self._is_start_guessed = first.index, False
+                self._newest_index, self._newest_at = first.index, self._link.now()
                 self._waiting = {first.index: first}
             # Without a status, the first capture determines the start, unless a later one shows that it was corrupt.
-            if self._next is None or self._contradicts_guess(capture.index):
-                self._next, self._is_start_guessed = capture.index, self._next is None
-                self._newest = capture.index - 1
+            if self._next_index is None or self._contradicts_guess(capture.index):
+                self._next_index, self._is_start_guessed = capture.index, self._next_index is None
+                self._newest_index = capture.index - 1
             if not self._is_plausible(capture.index):
                 continue
-            if capture.success is False:  # A later picture may have the same index.
+            if capture.success is False:  # Not stored by index, because a later picture may have the same index.
                 self._failed.append(capture)
-            elif capture.index >= self._next:
+            elif capture.index >= self._next_index:
                 self._waiting[capture.index] = capture
-                if capture.index > self._newest:
+                if capture.index > self._newest_index:
                     self._is_start_guessed = self._is_start_guessed and not self._delivered
-                    self._newest, self._newest_at = capture.index, self._link.now()
+                    self._newest_index, self._newest_at = capture.index, self._link.now()
 
     def _max_new_captures(self) -> float:
         """Upper limit of the number of pictures taken since the newest capture."""
@@ -309,37 +313,44 @@ class PhotoInterval:
 
     def _is_plausible(self, index: int) -> bool:
         """Return True if the series can have reached this index by now. An index far ahead is corrupt."""
-        return index <= self._newest + self._max_new_captures()
+        return index <= self._newest_index + self._max_new_captures()
 
     def _contradicts_guess(self, index: int) -> bool:
         """Return True if this index is so far below the first index that the first index must have been corrupt."""
-        return self._is_start_guessed and self._next is not None and index < self._next - self._max_new_captures()
+        return (
+            self._is_start_guessed
+            and self._next_index is not None
+            and index < self._next_index - self._max_new_captures()
+        )
 
     async def _fetch_missing(self) -> None:
-        """Request the next capture; if it does not arrive, count it as missed and go on behind it or behind the gap."""
-        assert self._next is not None
+        """Request the next capture; if it does not arrive, count it as missed.
+
+        After too many unanswered requests, all captures up to the next received one count as missed.
+        """
+        assert self._next_index is not None
         capture = None
         if not self._link.is_trigger and self._unanswered < MAX_UNANSWERED:
-            capture = await self._log.fetch(self._next)
+            capture = await self._log.fetch(self._next_index)
         self._collect()
         if capture is not None:
             self._unanswered = 0
             if capture.success is False:
-                self._next += 1
+                self._next_index += 1
             else:
-                self._waiting[self._next] = capture
-        elif self._next not in self._waiting:
+                self._waiting[self._next_index] = capture
+        elif self._next_index not in self._waiting:
             self._unanswered += 1
             can_fetch = not self._link.is_trigger and self._unanswered <= MAX_UNANSWERED
-            following = self._next + 1 if can_fetch or not self._waiting else min(self._waiting)
-            self._missed += following - self._next
-            self._next = following
+            following = self._next_index + 1 if can_fetch or not self._waiting else min(self._waiting)
+            self._missed += following - self._next_index
+            self._next_index = following
 
     async def _check_silence(self, silent_checks: int) -> None:
         """Request missed captures, or raise the error if the camera has ended the series or reports nothing more."""
         status = await self._shutter.status(2.0 * CHECK_INTERVAL_S)
         self._collect()
-        is_ahead = status is not None and self._next is not None and status.image_count > self._next
+        is_ahead = status is not None and self._next_index is not None and status.image_count > self._next_index
         if status is not None and is_ahead and self._is_plausible(status.image_count - 1):
             await self._fetch_missing()
         elif status is not None and not (status.is_in_series or status.is_capturing or self._waiting or self._failed):

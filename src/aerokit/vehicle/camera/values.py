@@ -184,7 +184,7 @@ class ThermalRange(Snapshot):
 # A position closer to 0, 0 than this means that the vehicle did not know its position.
 MIN_COORDINATE_DEG = 0.01
 
-# Values of CAMERA_CAPTURE_STATUS.image_status.
+# Values of CAMERA_CAPTURE_STATUS.image_status while a picture is being taken, and while a series runs.
 CAPTURING, SERIES = (1, 3), (2, 3)
 
 T = TypeVar("T", float, int)

@@ -42,15 +42,15 @@ class VideoMixin(CameraMixin):
             "camera.status", m.CameraCaptureStatus, STATUS_POLL_INTERVAL_S
         )
         """Recording and its duration, pictures taken, free storage (CAMERA_CAPTURE_STATUS). Polled every 2 s while your
-        program uses this cell, unless the camera sends it by itself."""
+        program uses this value, unless the camera sends it by itself."""
         self.streams: StateCell[tuple[CameraStream, ...]] = link.polled_cell(
             "camera.streams", m.VideoStreamInformation, STREAMS_POLL_INTERVAL_S
         )
-        """Video streams by number; polled every 5 s while your program uses this cell."""
+        """Video streams by number; polled every 5 s while your program uses this value."""
         self.thermal_range: StateCell[ThermalRange] = link.polled_cell(
             "camera.thermal_range", m.CameraThermalRange, THERMAL_POLL_INTERVAL_S
         )
-        """Coldest and hottest point of the thermal image; polled every second while your program uses this cell."""
+        """Coldest and hottest point of the thermal image; polled every second while your program uses this value."""
         self._streams: dict[int, CameraStream] = {}
         link.listen(m.CameraCaptureStatus, lambda message: link.set_cell(self.status, status_of(message), message))
         link.listen(m.VideoStreamInformation, self._on_stream)
@@ -63,12 +63,12 @@ class VideoMixin(CameraMixin):
     async def start_video(self, *, status_hz: float = 1.0, timeout: float = 5.0) -> None:
         """Start recording (MAV_CMD_VIDEO_START_CAPTURE); returns when the camera reports that it records.
 
-        If the camera does not report its status, as for example a camera attached to the autopilot, the call returns
-        when the camera has accepted the command.
+        If the camera does not report its status, like a camera attached to the autopilot, the call returns when the
+        camera has accepted the command.
 
         Args:
             status_hz: rate at which the camera sends its status while recording, 0 to 10.
-            timeout: seconds to wait until it records.
+            timeout: seconds to wait until the camera records.
 
         Raises:
             InvalidArgument: ``status_hz`` is out of range. Nothing was sent.
@@ -132,7 +132,10 @@ class VideoMixin(CameraMixin):
         return None if message is None else message.video_status == 1
 
     async def _wait_recording(self, timeout: float, *, starts: bool) -> None:
-        """Wait until the camera reports that recording has started or stopped; return at once if it reports nothing."""
+        """Wait until the camera reports that recording has started or stopped.
+
+        Returns at once if the camera does not report its status.
+        """
         with anyio.move_on_after(timeout):
             is_recording = await self._is_recording()
             if is_recording is not None and is_recording is not starts:
@@ -151,7 +154,7 @@ class VideoMixin(CameraMixin):
         """
         await self._link.require_capability("load_streams", "has_video_stream")
         first = await self._link.request(m.VideoStreamInformation, 0)  # 0 requests all streams.
-        if first is None:
+        if first is None:  # The camera may only answer requests for a single stream.
             first = await self._link.request(m.VideoStreamInformation, 1)
         if first is None or not self._streams:
             raise self._link.timeout_error("reported no video stream")
@@ -192,9 +195,9 @@ class VideoMixin(CameraMixin):
             stream: number of the stream, 1 to 255.
         """
         check_range("stream", stream, 1, 255)
-        for available in await self.load_streams():
-            if available.number != stream and available.is_running:
-                await self.stop_streaming(available.number)
+        for camera_stream in await self.load_streams():
+            if camera_stream.number != stream and camera_stream.is_running:
+                await self.stop_streaming(camera_stream.number)
         await self.start_streaming(stream)
 
     async def _send_stream_command(self, action: str, command: int, stream: int) -> None:

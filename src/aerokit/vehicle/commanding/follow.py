@@ -173,7 +173,7 @@ class FollowStream(SteeringStream[TargetState]):
         self._target, self._tracker = target, FollowedTarget(target, self._now)
         self._encode_position = SetpointEncoder(context).position
         self._place, self._max_distance_m = place, max_distance_m
-        self._impact = ImpactDetector(context.session)
+        self._impact = ImpactDetector(context.session.telemetry)
         self._reading: Cancellation | None = None
         self._end_reason = ""
         self._bearing_deg = self._course_deg = self._own_altitude_m = 0.0

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from aerokit.vehicle.session.session import VehicleSession
+    from aerokit.vehicle.state.telemetry import Telemetry
 
 SETTLING_S, SETTLED_M_S = 0.5, 2.0
 """A vehicle on the ground moves up or down slower than this for at least this time, even on a ship. A vehicle whose
@@ -53,8 +54,8 @@ class ImpactDetector:
     Its height must have decreased, and it must not fly on.
     """
 
-    def __init__(self, session: VehicleSession) -> None:
-        self._session = session
+    def __init__(self, telemetry: Telemetry) -> None:
+        self._telemetry = telemetry
         self._updated_at = self._sank_fast_at = -math.inf
         self._max_sink_m_s = 0.0
         # Sink rate before the impact, and height of the place of the impact.
@@ -66,7 +67,7 @@ class ImpactDetector:
 
     def update(self) -> None:
         """Process the vehicle's last reported velocity."""
-        cell = self._session.telemetry.velocity
+        cell = self._telemetry.velocity
         velocity = cell.latest
         if velocity is None or cell.updated_at == self._updated_at:
             return
@@ -81,8 +82,8 @@ class ImpactDetector:
             self._sank_fast_at = cell.updated_at
         elif abs(velocity.down_m_s) < STILL_M_S and cell.updated_at - self._sank_fast_at <= max_stop_s:
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
-                self._impact_m_s, self._impact_height_m = self._max_sink_m_s, height_above_home(self._session.telemetry)
-        elif _has_changed(self._impact_height_m, height_above_home(self._session.telemetry), IMPACT_HEIGHT_M):
+                self._impact_m_s, self._impact_height_m = self._max_sink_m_s, height_above_home(self._telemetry)
+        elif _has_changed(self._impact_height_m, height_above_home(self._telemetry), IMPACT_HEIGHT_M):
             self._impact_m_s = self._impact_height_m = None
         if velocity.down_m_s < STILL_M_S and cell.updated_at - self._sank_fast_at > max_stop_s:
             self._top_m = height_m
@@ -96,8 +97,8 @@ class ImpactDetector:
         return f"{HIT_GROUND} at {self._impact_m_s:.1f} m/s"
 
     def _current_height(self) -> float | None:
-        telemetry = self._session.telemetry
-        return height_above_home(telemetry) if telemetry.position.age <= POSITION_MAX_AGE_S else None
+        is_recent = self._telemetry.position.age <= POSITION_MAX_AGE_S
+        return height_above_home(self._telemetry) if is_recent else None
 
 
 class GroundCheck:
@@ -108,7 +109,7 @@ class GroundCheck:
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
-        self._impact = ImpactDetector(session)
+        self._impact = ImpactDetector(session.telemetry)
         # Time and height of the report that the vehicle is on the ground.
         self._reported_at: float | None = None
         self._reported_height_m: float | None = None

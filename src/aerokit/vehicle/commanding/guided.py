@@ -227,7 +227,7 @@ class SetpointStream(SteeringStream[SetpointT]):
         self._repeats_left, self._sent_at = INITIAL_REPEATS, -math.inf
         self._stall = StallDetector(context.session)
         if isinstance(initial, BRAKED_BY_AUTOPILOT):
-            self._impact = ImpactDetector(context.session)
+            self._impact = ImpactDetector(context.session.telemetry)
 
     def set(self, setpoint: SetpointT) -> None:
         """Replace the set-point; it is sent at the next tick and resent until ``valid_for_s`` has passed.

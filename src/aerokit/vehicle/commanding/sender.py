@@ -248,7 +248,7 @@ class OrderSender:
 
     def impact_failure(self, order: Order) -> Callable[[], str]:
         """Return a function that returns a clause once the vehicle has hit the ground during the newest order."""
-        detector = ImpactDetector(self._session)
+        detector = ImpactDetector(self._session.telemetry)
 
         def failure_reason() -> str:
             detector.update()

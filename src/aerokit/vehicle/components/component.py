@@ -216,7 +216,7 @@ class Component(ReadOnly):
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
-        """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack, like :meth:`aerokit.Vehicle.command`."""
+        """Send any MAV_CMD as COMMAND_LONG and return its COMMAND_ACK, like :meth:`aerokit.Vehicle.command`."""
         return await self._sender.send_raw(
             self._session.commands.send_long,
             command,
@@ -252,7 +252,6 @@ class Component(ReadOnly):
             refusal: CommandRejected | None = None
             with anyio.move_on_after(timeout):
                 for _ in range(REQUEST_ATTEMPTS):
-                    # After a refusal, only messages that have already arrived count.
                     try:
                         await self._session.commands.send_long(
                             MavCmd.REQUEST_MESSAGE,
@@ -265,6 +264,7 @@ class Component(ReadOnly):
                         pass
                     except CommandRejected as error:
                         refusal = error
+                    # After a refusal, return the message if it has already arrived, but do not wait for it.
                     with anyio.move_on_after(ATTEMPT_TIMEOUT_S if refusal is None else 0):
                         async for answer in answers:
                             if where is None or where(answer):
@@ -290,7 +290,7 @@ class Component(ReadOnly):
         return self._session.subscriber.subscribe(types, capacity, overflow, rate_hz)
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Return a cell with the component's latest message of a type, like :meth:`aerokit.Vehicle.message`."""
+        """Return the state value of the component's latest message of a type, like :meth:`aerokit.Vehicle.message`."""
         return self._session.subscriber.cell(message_type, rate_hz)
 
     @contextmanager
@@ -330,7 +330,7 @@ async def _general_uri(component: Component, timeout: float) -> str:
     """Return the address of the general metadata, from COMPONENT_METADATA or the older COMPONENT_INFORMATION."""
     try:
         return (await component.request(m.ComponentMetadata, timeout=timeout)).uri
-    except CommandRejected:  # perhaps older firmware
+    except CommandRejected:  # The component may only support COMPONENT_INFORMATION.
         pass
     except OperationTimeout as error:
         raise NotSupported(f"component {component.component_id} reports no metadata: {error}") from None
@@ -378,7 +378,7 @@ class Components:
         bus = session.connection.bus
         session.at_close(bus.attach(m.Heartbeat, self._on_heartbeat, system_id=session.system_id))
         for message_type, field, kind in DEVICE_MESSAGES:
-            if bus.dialect.get(message_type.ID) is not None:
+            if bus.dialect.get(message_type.ID) is not None:  # The user's dialect may lack a message.
                 session.at_close(bus.attach(message_type, self._listener(field, kind), system_id=session.system_id))
         for (system_id, _), heartbeat in session.connection.heartbeats.items():
             if system_id == session.system_id:

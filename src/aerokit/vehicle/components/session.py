@@ -64,7 +64,7 @@ class ComponentSession:
             session.connection,
             session.system_id,
             component_id,
-            autopilot=Autopilot(session.vehicle_type),
+            autopilot=Autopilot(session.vehicle_type),  # The autopilot's special rules do not apply to a component.
             version=version,
             background=session.background,
             describe=self.describe_link,
@@ -116,13 +116,13 @@ async def fetch(uri: str, files_of: Callable[[int], Files], component_id: int, i
     """Return the content of a file, at most 16 MB; errors as for `Component.fetch`."""
     match = _MAVFTP.fullmatch(uri)
     if match is not None:
-        owner = int(match[1]) if match[1] else component_id  # component that stores the file
+        owner = int(match[1]) if match[1] else component_id  # id of the component that stores the file
         if not 1 <= owner <= 255:
-            raise InvalidArgument(f"uri = {short_repr(uri)} is not allowed: component ids are 1 to 255")
+            raise InvalidArgument(f"uri = {short_repr(uri)} is not allowed: its component id must be 1 to 255")
         return await _read_limited(files_of(owner), unquote(match[2]), idle_timeout_s)
     if uri.lower().startswith(WEB_SCHEMES):
         return await _WebDownload(uri, idle_timeout_s).content()
-    raise InvalidArgument(f"uri = {short_repr(uri)} is not allowed: mftp://…, http://… or https://…")
+    raise InvalidArgument(f"uri = {short_repr(uri)} is not allowed: it must begin with mftp://, http:// or https://")
 
 
 async def _read_limited(files: Files, path: str, idle_timeout_s: float) -> bytes:
@@ -134,7 +134,7 @@ async def _read_limited(files: Files, path: str, idle_timeout_s: float) -> bytes
                 scope.cancel()
 
         return await files.read(path, idle_timeout_s=idle_timeout_s, on_progress=check_size)
-    raise file_too_large(path)
+    raise file_too_large(path)  # `check_size` has cancelled the download.
 
 
 class _WebDownload:
@@ -213,10 +213,10 @@ class _WebDownload:
                     content += block
                     if len(content) > MAX_FILE_SIZE:
                         raise file_too_large(self._uri)
-                if answer.length:  # bytes that Content-Length announced but that did not arrive
+                if answer.length:  # Not all bytes that Content-Length announced have arrived.
                     raise OSError(f"{answer.length} bytes are missing")
                 return bytes(content)
-        except (InvalidArgument, FileFormatError):  # Both are ValueErrors, and must not be caught below.
+        except (InvalidArgument, FileFormatError):  # Both are ValueErrors. The next clause must not catch them.
             raise
         except (OSError, HTTPException, ValueError) as error:
             # urllib wraps a time-out of the connection in a URLError, as its `reason`.

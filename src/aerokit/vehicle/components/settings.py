@@ -231,7 +231,7 @@ class Settings:
             InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
                 setting is read-only or excluded now. Nothing was set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
-            ParameterTimeout: not confirmed, but it may have been set.
+            ParameterTimeout: the component did not confirm the value, but may have set it.
         """
         check_name(name)
         with self._transfers.limit(timeout):
@@ -258,7 +258,7 @@ class Settings:
         """
         definition, name = self._definition, defined.name
         assert definition is not None
-        # A value that is never allowed is refused before anything is sent.
+        # Refuse a value that is never allowed before anything is sent.
         definition.checked(name, value, self._values())
         to_read = [
             setting for setting in definition.dependencies(name) if self._must_be_read(definition.settings[setting])
@@ -268,8 +268,8 @@ class Settings:
         answers = await self._read(to_read, idle_timeout_s) if to_read else {}
         self._missing |= {read for read, answer in answers.items() if isinstance(answer, ParameterRejected)}
         if name in answers:
-            _setting_or_raise(answers[name])  # The component may not have this setting.
-        # Checked again, because the values that were just read may exclude the setting or restrict it.
+            _setting_or_raise(answers[name])  # Raise an error if the component does not have this setting.
+        # Check the value again, because the values that were just read may exclude or restrict this setting.
         checked_value = definition.checked(name, value, self._values())
         known = self._known.get(name)
         kind = defined.wire_type if known is None else known.type
@@ -321,7 +321,7 @@ class Settings:
         return not was_read and not setting.write_only
 
     def _with_definition(self, setting: Setting) -> Setting:
-        """Return the setting with its value in the type that the definition has, if there is one."""
+        """Return the setting with its value converted to the type in the definition, if there is one."""
         defined = None if self._definition is None else self._definition.settings.get(setting.name)
         return setting if defined is None else setting.replace(value=defined.convert(setting.value))
 
@@ -339,7 +339,7 @@ class Settings:
         """Add a received setting to the table, and publish a change."""
         old = self._known.get(setting.name)
         if not setting.name or (old is None and len(self._known) >= MAX_PARAMETERS):
-            return
+            return  # A faulty component may send empty names, or new names without end.
         if setting.index is None and old is not None:  # PARAM_EXT_ACK has no index.
             setting = setting.replace(index=old.index)
         new = self._known[setting.name] = self._with_definition(setting)

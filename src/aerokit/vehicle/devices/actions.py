@@ -38,7 +38,7 @@ INJECT_FAILURE = SimpleOrder(
     (Argument("unit", 0, 255), Argument("kind", 0, 255), Argument("instance", 0, 16)),
 )
 TUNE = re.compile(r"[A-Ga-gLlMmNnOoPpSsTt0-9#+.<>\- ]+")
-"""Characters of QBASIC 1.1's PLAY statement, whose notes ArduPilot and PX4 can play."""
+"""Characters allowed in a tune: those of QBASIC 1.1's PLAY statement, which ArduPilot and PX4 understand."""
 TUNE_PART, MAX_TUNE = 30, 230
 MAX_TEXT_BYTES = 1000
 
@@ -106,7 +106,8 @@ class DeviceActions(VehicleBase):
         """
         if not 1 <= len(tune) <= MAX_TUNE or not TUNE.fullmatch(tune):
             raise InvalidArgument(
-                f"tune = {short_repr(tune)} is not allowed: 1 to {MAX_TUNE} characters of QBASIC's PLAY statement"
+                f"tune = {short_repr(tune)} is not allowed: it must be 1 to {MAX_TUNE} characters of QBASIC's"
+                " PLAY statement"
             )
         tune1, tune2 = tune[:TUNE_PART], tune[TUNE_PART:]  # the two fields of the message
         self._session.send(PlayTune(self.system_id, self.component_id, tune1, tune2))
@@ -126,13 +127,13 @@ class DeviceActions(VehicleBase):
         """
         data = text.encode()
         if not 1 <= len(data) <= MAX_TEXT_BYTES:
-            raise InvalidArgument(f"text has {len(data)} bytes, allowed are 1 to {MAX_TEXT_BYTES}")
-        self._last_text_id = self._last_text_id % 0xFFFF + 1  # 1 to 65535
-        text_id = 0 if len(data) <= CHUNK_LENGTH else self._last_text_id  # 0: the text has only one chunk.
+            raise InvalidArgument(f"text has {len(data)} bytes; 1 to {MAX_TEXT_BYTES} are allowed")
+        self._last_text_id = self._last_text_id % 0xFFFF + 1  # a number from 1 to 65535
+        text_id = 0 if len(data) <= CHUNK_LENGTH else self._last_text_id  # 0 means that the text has only one chunk.
         for chunk_number, chunk in enumerate(_chunks(text)):
             self._session.send(Statustext(MavSeverity[severity.upper()], chunk, text_id, chunk_number))
 
-    _last_text_id = 0  # initial value for each vehicle
+    _last_text_id = 0  # Each vehicle begins with this value.
 
     async def inject_failure(
         self, unit: FailingUnit, kind: FailureKind, *, instance: int = 0, intent: FailureIntent

@@ -95,9 +95,9 @@ class Actuators(ReadOnly):
     async def repeat_servo(self, number: int, pulse_us: int, *, count: int, period_s: float) -> None:
         """Move a servo ``count`` times to a pulse width and back to its trim (MAV_CMD_DO_REPEAT_SERVO).
 
-        ArduPilot only. Returns when ArduPilot has acknowledged and begins, because no message reports the end.
-        ArduPilot repeats one output at a time: the next order of this kind replaces the previous one. The command is
-        never sent twice, because a second one would start the cycles again.
+        ArduPilot only. Returns when ArduPilot has acknowledged the command, because no message reports the end of the
+        cycles. ArduPilot repeats one output at a time: the next order of this kind replaces the previous one. The
+        command is never sent twice, because a second one would start the cycles again.
 
         Args:
             number: output, 1 to 32, as for :meth:`set_servo`.
@@ -123,9 +123,9 @@ class Actuators(ReadOnly):
         await SET_RELAY.send(self._context, number, on, topic=("relay", number))
 
     async def repeat_relay(self, number: int, *, count: int, period_s: float) -> None:
-        """Toggle a relay and back again, ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
+        """Switch a relay to its other state and back, ``count`` times (MAV_CMD_DO_REPEAT_RELAY).
 
-        ArduPilot only. Returns when ArduPilot has acknowledged and begins. The command is never sent twice. Raises as
+        ArduPilot only. Returns when ArduPilot has acknowledged the command. The command is never sent twice. Raises as
         :meth:`repeat_servo`.
 
         Args:
@@ -151,7 +151,7 @@ class Actuators(ReadOnly):
             values: one to six values, −1 to 1; None leaves an actuator as it is.
         """
         if not 1 <= len(values) <= ACTUATORS or all(value is None for value in values):
-            raise InvalidArgument(f"values = {values!r} is not allowed: one to {ACTUATORS} values, not all None")
+            raise InvalidArgument(f"values = {values!r} is not allowed: pass 1 to {ACTUATORS} values, not all None")
         for value in values:
             if value is not None:
                 check_range("values", value, -1, 1)
@@ -163,8 +163,8 @@ class Actuators(ReadOnly):
     async def raise_landing_gear(self) -> None:
         """Retract the landing gear (MAV_CMD_AIRFRAME_CONFIGURATION); returns at the acknowledgement.
 
-        ArduCopter and ArduPlane only. No message reports the position of the gear. Both accept the order even if there
-        is no landing gear (LGR_ENABLE), and even while the vehicle stands on its gear.
+        ArduCopter and ArduPlane only. No message reports the position of the gear. ArduPilot accepts the order even if
+        there is no landing gear (LGR_ENABLE), and even while the vehicle stands on its gear.
 
         Raises:
             NotSupported: the firmware (PX4, Rover or Sub) does not support the command. Nothing was sent.
@@ -254,10 +254,10 @@ class Actuators(ReadOnly):
                 describe=lambda: "the vehicle still reports armed",
                 timeout=TEST_END_TIMEOUT_S,
             )
-        except CommandRejected:  # The motor does not turn.
+        except CommandRejected:  # The motor does not turn, so it need not be stopped.
             raise
         except BaseException:
-            # After the end of the test, no stop command is sent, because it would start another test, which arms the
+            # Send the stop command only while the test runs. Afterwards it would start another test, which arms the
             # motors.
             is_spinning = session.connection.now() < spins_until
             if is_spinning and order.is_newest and arbiter.is_state_recent and session.connection.is_open:

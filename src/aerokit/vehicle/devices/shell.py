@@ -52,7 +52,7 @@ class Shell(ReadOnly):
         self._output.__enter__()
         self._is_open = True
         try:
-            await self.run("", timeout=OPEN_TIMEOUT_S)
+            await self.run("", timeout=OPEN_TIMEOUT_S)  # An empty command makes the shell show its prompt.
         except BaseException:
             self._close()
             raise
@@ -75,12 +75,12 @@ class Shell(ReadOnly):
             line: at most 1000 bytes, without a line break.
 
         Raises:
-            InvalidArgument: the line is too long or has a line break, or the block is not open. Nothing was sent.
+            InvalidArgument: the line is too long or has a line break, or the shell is not open. Nothing was sent.
         """
         data = line.encode()
         if len(data) > MAX_LINE or "\n" in line or "\r" in line:
             raise InvalidArgument(
-                f"line of {len(data)} bytes is not allowed: at most {MAX_LINE} bytes, without a line break"
+                f"line of {len(data)} bytes is not allowed: it must have at most {MAX_LINE} bytes, and no line break"
             )
         if not self._is_open:
             raise InvalidArgument("the shell is not open: write to it inside its `async with` block")
@@ -101,7 +101,7 @@ class Shell(ReadOnly):
             timeout: seconds; None waits without a limit.
 
         Raises:
-            InvalidArgument: the timeout is out of range, or the block is not open.
+            InvalidArgument: the timeout is out of range, or the shell is not open.
             OperationTimeout: there was no output in time.
         """
         if timeout is not None:
@@ -127,7 +127,7 @@ class Shell(ReadOnly):
         """
         check_range("timeout", timeout, 0, 1e6, above=True)
         while self._output.get_nowait() is not None:
-            pass
+            pass  # Discard earlier output.
         self.write(command)
         now = self._session.connection.now
         deadline, text = now() + timeout, ""

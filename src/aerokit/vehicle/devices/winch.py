@@ -174,6 +174,7 @@ class Winch(ReadOnly):
         timeout: float = 5.0,
         order: Order | None = None,
     ) -> None:
+        """Send an order. With ``is_done``, wait until this function returns True for a WINCH_STATUS."""
         self._check_supported(action)
         params = (self._number, action, length_m, rate_m_s)
         effect = None if is_done is None else Effect("WinchStatus", is_done)

@@ -52,6 +52,8 @@ class FileChannel:
             transfers.component_id,
             source_system=connection.source_system,
             source_component=connection.source_component,
+            # Successive programs should begin with different numbers: a server repeats its last reply if a request has
+            # the same number as the request before it.
             first_sequence=int(transfers.began_at * 1000.0),
         )
         self._lock = asyncio.Lock()
@@ -76,7 +78,7 @@ class FileChannel:
                     for session in tuple(self._closing):
                         await self._finish_closing(session, idle_timeout_s)
                     yield
-        except OperationTimeout:  # a TimeoutError from inside the operation
+        except OperationTimeout:  # This TimeoutError is from inside the operation, not from `fail_after`.
             raise
         except TimeoutError:
             raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
@@ -110,7 +112,7 @@ class FileChannel:
         *,
         idle_timeout_s: float,
     ) -> T:
-        """Open a file, use it and close it, within an operation. Repeat this if the vehicle closes it meanwhile."""
+        """Open a file, use it and close it, within an operation. If the vehicle closes the file early, start again."""
         for attempt in range(1, MAX_OPEN_ATTEMPTS + 1):
             file = await self._open(opcode, path, idle_timeout_s)
             try:
@@ -119,7 +121,7 @@ class FileChannel:
                 await self._close(file.session, path, idle_timeout_s)
                 if attempt == MAX_OPEN_ATTEMPTS:
                     raise
-            except (OperationTimeout, ConnectionClosed, LinkError):  # The vehicle would not answer now.
+            except (OperationTimeout, ConnectionClosed, LinkError):  # Do not wait: the vehicle is not answering.
                 self._close_soon(file.session, path)
                 raise
             except Exception:
@@ -131,7 +133,7 @@ class FileChannel:
                 raise
             else:
                 if opcode == MavFtpOpcode.OPENFILERO:
-                    self._close_soon(file.session, path)  # the caller has its data and need not wait
+                    self._close_soon(file.session, path)  # The caller has its data and need not wait.
                 else:
                     await self._close(file.session, path, idle_timeout_s)
                 return result
@@ -146,7 +148,7 @@ class FileChannel:
                 reply = await self.transfers.run(request)
             except FileError as error:
                 if may_be_own_session and request.attempts > 1 and error.code in SESSION_IN_USE:
-                    # If the reply to the first request was lost, the session in the way may be that of this file.
+                    # If the reply to the first request was lost, that request may have opened the session in the way.
                     may_be_own_session = False
                     for session in self._possible_sessions(request):
                         await self._close(session, path, idle_timeout_s)
@@ -167,6 +169,7 @@ class FileChannel:
     def _session_request(
         self, opcode: MavFtpOpcode, path: str, session: int, idle_timeout_s: float, *, is_sent: bool = False
     ) -> FtpRequest:
+        """Create a request that opens or closes the session of a file."""
         return FtpRequest(
             self.client,
             opcode,
@@ -179,7 +182,7 @@ class FileChannel:
         )
 
     def _possible_sessions(self, request: FtpRequest) -> tuple[int, ...]:
-        """Ids that the session of a file may have if the reply to opening the file was lost."""
+        """Return the ids that the session of a file may have if the reply to opening the file was lost."""
         return (request.session,) if self.transfers.autopilot.accepts_ftp_session_ids else (request.session, 0)
 
     async def _close(self, session: int, path: str, idle_timeout_s: float) -> None:
@@ -256,6 +259,7 @@ class LogChannel:
         timeout: float | None,
         on_progress: OnProgress,
     ) -> None:
+        """Request ``size`` bytes of a log as one operation, and write them to ``into``."""
         transfers = self._transfers
         exchange = LogDownload(
             transfers.system_id,
@@ -277,7 +281,7 @@ class LogChannel:
         timeout: float | None,
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
-        """Wait for the previous operation. If this operation does not complete, stop the vehicle from sending."""
+        """Run one operation after the previous one has ended. If it fails, tell the vehicle to stop sending."""
         try:
             with anyio.fail_after(timeout):
                 async with self._lock:
@@ -288,7 +292,7 @@ class LogChannel:
                     except BaseException:
                         self._end()
                         raise
-        except OperationTimeout:  # a TimeoutError from inside the operation
+        except OperationTimeout:  # This TimeoutError is from inside the operation, not from `fail_after`.
             raise
         except TimeoutError:
             raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None

@@ -102,8 +102,8 @@ class Files:
         """Copy a file to this computer. The copy is written to ``<to>.part`` and renamed when it is complete.
 
         With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
-        is shorter than it. If the vehicle can compute the CRC-32 of its file, aerokit compares the CRC-32 of the copy
-        with it; if they differ, the whole file is read again. Files whose names begin with ``@`` are always read
+        is shorter than the part. If the vehicle can compute the CRC-32 of its file, aerokit compares it with that of
+        the copy; if they differ, the whole file is read again. Files whose names begin with ``@`` are always read
         completely.
 
         Raises:
@@ -141,11 +141,11 @@ class Files:
                     entry = _parse_entry(text)
                     if entry is not None:
                         entries[entry.name] = entry
-                offset += len(texts) or 1  # Skip a name that is too long for a message.
+                offset += len(texts) or 1  # An empty reply: the next name is too long for a message, so skip it.
                 empty_replies = empty_replies + 1 if len(entries) == count_before else 0
                 if empty_replies > MAX_EMPTY_REPLIES or offset > MAX_ENTRIES:
                     raise RemoteProtocolError(
-                        f"list {path}: the vehicle's listing does not end, it has reached entry {offset}"
+                        f"list {path}: the vehicle's listing does not end; the last entry was number {offset}"
                     )
         return tuple(entries.values())
 
@@ -153,7 +153,7 @@ class Files:
         """Return the CRC-32 of a file as computed by the vehicle: polynomial 0x04C11DB7, initial value 0, no final
         XOR.
 
-        That is ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF``.
+        ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF`` computes the same value.
 
         Raises:
             RemoteProtocolError: the answer is not a CRC-32.
@@ -183,7 +183,7 @@ class Files:
         path_bytes(path)
         data = bytes(data)
         if len(data) > MAX_FILE_SIZE:
-            raise InvalidArgument(f"data of {len(data)} bytes is not allowed: at most {MAX_FILE_SIZE}")
+            raise InvalidArgument(f"data of {len(data)} bytes is not allowed: it must have at most {MAX_FILE_SIZE}")
         channel = self._channel
         async with channel.operation(
             f"write {path}",
@@ -256,8 +256,8 @@ class Files:
         data = path_bytes(path) + b"\0" + path_bytes(new_path) + b"\0"
         if len(data) > DATA_SIZE:
             raise InvalidArgument(
-                f"path = {path!r} and new_path = {new_path!r} are not allowed together: {len(data) - 2} bytes,"
-                f" one message holds {DATA_SIZE - 2}"
+                f"path = {path!r} and new_path = {new_path!r} are not allowed together: they have"
+                f" {len(data) - 2} bytes, but one message holds {DATA_SIZE - 2}"
             )
         await self._request(MavFtpOpcode.RENAME, path, idle_timeout_s, timeout, data=data)
 
@@ -271,7 +271,8 @@ class Files:
         offset: int = 0,
         data: bytes | None = None,
     ) -> FtpMessage:
-        path_bytes(path)
+        """Send a request with a single reply, as one operation."""
+        path_bytes(path)  # Raises InvalidArgument before anything is sent.
         async with self._channel.operation(path, timeout=timeout, idle_timeout_s=idle_timeout_s):
             return await self._channel.request(opcode, path, idle_timeout_s=idle_timeout_s, offset=offset, data=data)
 
@@ -298,11 +299,10 @@ class Files:
         channel = self._channel
 
         async def read_file(file: RemoteFile) -> None:
-            if file.size < into.start:  # shorter than what an interrupted download has already read
+            if file.size < into.start:  # The file is shorter than what an interrupted download has already read.
                 raise _ShorterError
-            if file.size < into.position and not is_virtual(
-                path
-            ):  # The vehicle had closed it, and it was opened again.
+            # A file that the vehicle closes during the read is opened again, so its size may have changed.
+            if file.size < into.position and not is_virtual(path):
                 raise RemoteProtocolError(f"read {path}: the file became shorter during the read")
             transfer = FtpDownload(
                 channel.client,
@@ -335,7 +335,7 @@ class Files:
             await self._fetch(path, into, idle_timeout_s, timeout, on_progress)
 
     async def _has_same_crc(self, path: str, part: PartFile, idle_timeout_s: float, timeout: float | None) -> bool:
-        """Return True if the local copy has the CRC-32 of the vehicle's file, or the vehicle cannot compute it."""
+        """Return True if the copy and the vehicle's file have the same CRC-32, or the vehicle cannot compute it."""
         try:
             vehicle_crc = await self.crc32(path, idle_timeout_s=idle_timeout_s, timeout=timeout)
         except FileError as error:
@@ -359,7 +359,10 @@ class Files:
         await self._transfers.run(transfer)
 
     async def _verify(self, path: str, data: bytes, idle_timeout_s: float) -> None:
-        """Raise VerificationFailed if the vehicle computes another CRC-32 for its file. Do nothing if it cannot."""
+        """Raise VerificationFailed if the vehicle computes another CRC-32 for its file.
+
+        Does nothing if the vehicle cannot compute it.
+        """
         own_crc = _crc32(data)
         try:
             reply = await self._channel.request(MavFtpOpcode.CALCFILECRC, path, idle_timeout_s=idle_timeout_s)
@@ -370,7 +373,9 @@ class Files:
         vehicle_crc = _crc32_in(path, reply)
         if vehicle_crc != own_crc:
             difference = f"CRC-32 0x{vehicle_crc:08x} on the vehicle, 0x{own_crc:08x} here"
-            raise VerificationFailed(f"{path} was written, but has other content", differences=(difference,))
+            raise VerificationFailed(
+                f"{path} was written, but has other content on the vehicle", differences=(difference,)
+            )
 
 
 class _ShorterError(Exception):
@@ -382,7 +387,7 @@ def _content_of(source: str | os.PathLike[str]) -> bytes:
 
 
 def _parse_entry(text: bytes) -> FileEntry | None:
-    """Parse one entry of a listing; None for entries to skip."""
+    """Parse one entry of a listing; return None for an entry that is not a file or a subdirectory."""
     kind, name_and_size = text[:1], text[1:].decode("utf-8", "replace")
     name, _, size_text = name_and_size.partition("\t")
     if kind == b"D" and name_and_size not in (".", ".."):

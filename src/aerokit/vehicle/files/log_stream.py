@@ -25,9 +25,9 @@ MAGIC, HEADER_BYTES = b"ULog\x01\x12\x35", 16
 NO_MESSAGE_START = 255
 """Value of ``first_message_offset`` if no ULog message begins in a LOGGING_DATA."""
 MAX_WAITING = 8192
-"""Messages that may wait for the reader: about 2 MB."""
+"""Maximum number of messages that wait for the reader; they need about 2 MB."""
 DROPOUT = b"\x02\x00O"
-"""Head of the ULog message that marks a gap; the duration in ms follows (2 bytes)."""
+"""Beginning of the ULog message that marks a gap; the duration in ms follows (2 bytes)."""
 
 
 class UlogAssembler:
@@ -45,12 +45,12 @@ class UlogAssembler:
         self._received_at = 0.0
 
     def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
-        """Add a message of the stream; return the data of the file that is complete now, perhaps none."""
+        """Add a message of the stream; return the next data of the file, up to the last complete ULog message."""
         gap = 0 if self._next is None else (message.sequence - self._next) % 0x10000
-        if gap >= 0x8000:  # A repetition of an earlier message, whose acknowledgement was lost.
+        if gap >= 0x8000:  # PX4 repeats an earlier message, whose acknowledgement was lost.
             return b""
         data, first_offset = bytes(message.data[: message.length]), message.first_message_offset
-        prefix = b""  # header of the file, or mark of a gap
+        prefix = b""  # the header of the file, or a ULog message that marks a gap
         if gap:
             self.lost += gap
             self._buffer.clear()
@@ -119,7 +119,8 @@ class LogStream(ReadOnly):
             await START.send(self._context)
         except BaseException as error:
             self._close()
-            if not isinstance(error, CommandRejected):  # After a refusal, the running stream may be another station's.
+            # If the vehicle refused, a running stream may belong to another station, so do not stop the stream.
+            if not isinstance(error, CommandRejected):
                 session.transfers.command_in_background(MavCmd.LOGGING_STOP)
             raise
         return self
@@ -138,7 +139,8 @@ class LogStream(ReadOnly):
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         is_stopped = False
         try:
-            if error is None:  # PX4 answers the command only when its last log message is acknowledged (logger.cpp).
+            if error is None:
+                # Before `_close`, because PX4 answers only when its last log message is acknowledged (logger.cpp).
                 await STOP.send(self._context)
                 is_stopped = True
         finally:

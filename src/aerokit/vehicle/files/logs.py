@@ -155,7 +155,8 @@ class Logs:
             growth.log_growth()
             return
         part = PartFile(to, _part_suffix(entry))
-        # The time is part of the file name's suffix. Without it, a log of another flight may have the same suffix.
+        # The time of the log is part of the file name's suffix. If the time is unknown, the part file may be of another
+        # flight, so it must not be continued.
         has_time = entry.time_utc is not None
         start = part.size if resume and has_time and part.size <= entry.size else 0
         with part.writing(start) as disk:
@@ -202,7 +203,7 @@ class Logs:
             FileTimeout: some of the old logs still exist.
         """
         async with self._channel.operation("erase logs", timeout):
-            # Identified by time and size, because a new log may get the id of an erased log.
+            # Identify logs by time and size, because a new log may get the id of an erased log.
             remaining = {(entry.time_utc, entry.size) for entry in await self._entries(IDLE_TIMEOUT_S)}
             deadline = self._transfers.connection.now() + idle_timeout_s
             while remaining:
@@ -229,8 +230,9 @@ class Logs:
     async def _locate(
         self, log: LogEntry | int, method: LogMethod, idle_timeout_s: float, timeout: float | None
     ) -> tuple[str | None, LogEntry]:
-        """Return the path of a log for MAVFTP (None: use LOG_*), and the entry. LOG_* requires an entry that is up to
-        date.
+        """Return the path of a log for MAVFTP, and the entry of the log.
+
+        If the path is None, download the log by LOG_* messages. The entry is then up to date, as they require.
         """
         prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
         if isinstance(log, LogEntry) and not prefers_messages:
@@ -240,7 +242,7 @@ class Logs:
         try:
             entry = await self._entry(log, idle_timeout_s, timeout, may_be_silent=method == "auto")
         except FileTimeout:
-            # ArduPilot does not answer LOG_* while it is armed; a log with a known entry can be read by MAVFTP.
+            # ArduPilot does not answer LOG_* messages while it is armed. MAVFTP can read a log whose entry is known.
             if not isinstance(log, LogEntry) or method != "auto":
                 raise
             path = await self._path(log, idle_timeout_s)
@@ -285,7 +287,7 @@ class Logs:
     async def _entries(
         self, idle_timeout_s: float, only_id: int | None = None, max_unanswered: int | None = None
     ) -> tuple[LogEntry, ...]:
-        """Request the list, without erased logs, which ArduPilot lists with a size of 0."""
+        """Request the list of logs. Erased logs, which ArduPilot lists with a size of 0, are left out."""
         autopilot, request_list = self._transfers.autopilot, self._channel.list
         logs: Sequence[LogMessage | ListedLog] | None = None
         if autopilot.silent_without_logs and await self._files.is_supported():
@@ -293,7 +295,7 @@ class Logs:
                 logs = await request_list(idle_timeout_s, only_id, max_unanswered=MAX_UNANSWERED_REQUESTS)
             except FileTimeout:
                 logs = await listed_logs(self._files, autopilot.log_directories, idle_timeout_s)
-                max_unanswered = None  # If `logs` is None, there are logs, so that the vehicle must answer.
+                max_unanswered = None  # If `logs` is None, the vehicle has logs and must answer.
         if logs is None:
             logs = await request_list(idle_timeout_s, only_id, max_unanswered=max_unanswered)
         return tuple(_entry_of(log) for log in logs if log.size)
@@ -302,7 +304,7 @@ class Logs:
 def _check_id(log: LogEntry | int) -> None:
     log_id = log.id if isinstance(log, LogEntry) else log
     if not isinstance(log_id, int) or not 0 <= log_id <= MAX_LOG_ID:
-        raise InvalidArgument(f"log = {log!r} is not allowed: an entry, or an id from 0 to {MAX_LOG_ID}")
+        raise InvalidArgument(f"log = {log!r} is not allowed: it must be a LogEntry, or an id from 0 to {MAX_LOG_ID}")
 
 
 def _entry_of(log: LogMessage | ListedLog) -> LogEntry:
@@ -412,6 +414,6 @@ def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry,
     entry = entries.get(number)
     if entry is None or entry.size is None:
         return None
-    may_be_larger = has_grown or number == max(entries)
+    may_be_larger = has_grown or number == max(entries)  # The vehicle may still be writing the newest log.
     has_size = entry.size >= log.size if may_be_larger else entry.size == log.size
     return f"{directory}/{entry.name}" if has_size else None

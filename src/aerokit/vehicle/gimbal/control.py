@@ -20,7 +20,7 @@ from aerokit.errors import (
 from aerokit.events import SILENT_AFTER_S, GimbalControlLost
 from aerokit.mavlink.enums import MavResult
 from aerokit.mavlink.messages import GimbalManagerStatus, Heartbeat
-from aerokit.vehicle.gimbal.device import ControlClaim
+from aerokit.vehicle.gimbal.device import ControlRequest
 from aerokit.vehicle.gimbal.orders import CONFIGURE, GimbalOrders
 
 if TYPE_CHECKING:
@@ -38,9 +38,9 @@ RELEASE_ATTEMPTS, ATTEMPT_TIMEOUT_S = 10, 0.5
 class ReleaseCommand:
     """The last command of a block, which stops or releases a gimbal. Sent at once, and retried in the background.
 
-    While the vehicle is silent, it is sent at the next HEARTBEAT. ``is_still_due`` is checked before each attempt, so
-    that the command does not undo a newer order or the control of another station. If the gimbal manager has fallen
-    silent, the command is sent once more at its next HEARTBEAT.
+    If the vehicle is silent, the command is sent at the next HEARTBEAT. ``is_still_due`` is checked before each
+    attempt, so that the command does not undo a newer order or the control of another station. If the gimbal manager
+    has fallen silent, the command is sent once more at its next HEARTBEAT.
     """
 
     def __init__(
@@ -51,13 +51,17 @@ class ReleaseCommand:
         self._target = orders.manager_id
 
     async def send_and_wait(self, description: str) -> None:
-        """Send the command and wait for the acknowledgement; raise OperationTimeout if the vehicle is silent."""
+        """Send the command, if it is still due, and wait for the acknowledgement.
+
+        Raises OperationTimeout if the vehicle is silent.
+        """
         if not self._is_still_due():
             return
         if not self._orders.context.arbiter.is_state_recent:
             self.send_soon()
             raise OperationTimeout(
-                f"{description}: not sent yet, because the vehicle is silent; it will be sent at the next HEARTBEAT;"
+                f"{description}: the command was not sent yet, because the vehicle is silent; it will be sent at the"
+                " next HEARTBEAT;"
                 f" {self._session.describe_link()}"
             )
         self._send()
@@ -83,6 +87,7 @@ class ReleaseCommand:
                 except CommandTimeout:
                     if not self._is_target_silent():
                         raise
+                    # The target did not hear the command, so repeat it when the target is back.
                     await self._wait_target_heartbeat()
                     if self._is_still_due():
                         self._send()
@@ -94,6 +99,7 @@ class ReleaseCommand:
         self._session.commands.send_unconfirmed(self._command, *self._params, component_id=self._target)
 
     async def _confirm(self) -> None:
+        """Wait for the acknowledgement of the command that was just sent; retry it while it is still due."""
         with self._orders.context.arbiter.auxiliary_order() as order:
             await self._orders.context.sender.send_long(
                 order,
@@ -125,7 +131,8 @@ class ReleaseCommand:
             detach()
 
 
-# Seconds to wait for the manager's confirmation of our control before it is requested, and seconds in total.
+# The manager's confirmation of our control is requested if it does not arrive within the first number of seconds. The
+# second number is the maximum wait in total.
 STATUS_TIMEOUT_S, CONFIRM_TIMEOUT_S = 0.5, 3.0
 
 STATUS_HZ = 1.0
@@ -153,7 +160,7 @@ class GimbalControl:
         self._orders, self._session = orders, orders.session
         self._is_primary = is_primary
         self._device: GimbalDevice | None = None
-        self._claim = ControlClaim(0, 0, is_primary=is_primary)
+        self._control_request = ControlRequest(0, 0, is_primary=is_primary)  # replaced on entry
         self._taken: GimbalTaken | None = None
         self._loss_was_raised = self._was_entered = self._is_ended = False
         self._lost = asyncio.Event()
@@ -181,7 +188,7 @@ class GimbalControl:
             OperationRejected: the block ended.
             ConnectionClosed, LinkLost: the connection ended.
         """
-        detach = self._session.connection.on_end(lambda _: self._lost.set())  # The end of the connection ends the wait.
+        detach = self._session.connection.on_end(lambda _: self._lost.set())  # Stop waiting when the connection ends.
         try:
             await self._lost.wait()
         finally:
@@ -201,7 +208,7 @@ class GimbalControl:
         if self._taken is not None:
             self._loss_was_raised = True
             taken = self._taken
-            # A new exception each time, because a raised one collects the tracebacks of all places that raise it.
+            # Create a new exception each time, because an exception that is raised again also keeps its old tracebacks.
             raise GimbalTaken(str(taken), system_id=taken.system_id, component_id=taken.component_id)
 
     async def __aenter__(self) -> Self:
@@ -209,21 +216,21 @@ class GimbalControl:
         if self._was_entered:
             raise BusyError("a GimbalControl can be entered only once: call control() again")
         if self._is_primary in orders.device.control_blocks:
-            raise BusyError(f"{orders.name}: this program is already in control of it; nothing was sent")
+            raise BusyError(f"{orders.name}: another block of this program already has control; nothing was sent")
         if not self._is_primary and not orders.rules.has_secondary:
             orders.raise_not_supported("has no secondary control")
         self._was_entered = True
-        self._claim = ControlClaim(orders.manager_id, orders.gimbal_id_param, is_primary=self._is_primary)
-        orders.registry.claims.append(self._claim)
+        self._control_request = ControlRequest(orders.manager_id, orders.gimbal_id_param, is_primary=self._is_primary)
+        orders.registry.control_requests.append(self._control_request)
         release = self._release_command()
         since = self._session.connection.now()
         try:
             await self._request_control()
             await self._await_confirmation(since)
         except (CommandRejected, NotSupported, BusyError):
-            # Control was not obtained, but an earlier block may have left the release of its control to this one.
+            # Control was not obtained, but an earlier block may have left the release of its control to this block.
             self._end()
-            if self._claim.owes_release:
+            if self._control_request.must_release:
                 release.send_soon()
             raise
         except BaseException:  # The manager may have given us control without our knowing.
@@ -238,7 +245,7 @@ class GimbalControl:
             if error is None and not self._loss_was_raised:
                 self.raise_if_taken()
             return
-        if self._is_ended:  # the vehicle's block ended before this block
+        if self._is_ended:  # The vehicle's block has ended before this block.
             return
         release = self._release_command()
         self._end()
@@ -251,7 +258,7 @@ class GimbalControl:
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary)
         try:
-            await orders.send(None, CONFIGURE, *params)  # Taking control belongs to no order.
+            await orders.send(None, CONFIGURE, *params)  # None, because the command is not part of an order.
         except CommandRejected as error:
             if error.result == MavResult.UNSUPPORTED:
                 orders.raise_not_supported("has no gimbal manager whose control could be taken")
@@ -260,13 +267,13 @@ class GimbalControl:
     async def _await_confirmation(self, since: float) -> None:
         """Wait for a GIMBAL_MANAGER_STATUS, received after ``since``, that confirms our control."""
         orders, session = self._orders, self._session
-        cell = orders.public_device.controllers
-        if orders.manager_id == session.component_id:
+        reported = orders.public_device.controllers
+        if orders.manager_id == session.component_id:  # Only the autopilot is asked for messages at a rate.
             self._detach.append(session.rates.request(GimbalManagerStatus, STATUS_HZ, is_optional=True))
 
         async def wait(seconds: float) -> None:
-            await cell.wait_until(
-                lambda controllers: self._controller_in(controllers) == orders.own_ids and cell.updated_at >= since,
+            await reported.wait_until(
+                lambda controllers: self._controller_in(controllers) == orders.own_ids and reported.updated_at >= since,
                 timeout=seconds,
                 description=f"{orders.name}: confirmation of our control",
             )
@@ -279,7 +286,7 @@ class GimbalControl:
         device = orders.device
         # Another block may have been entered during the wait, or the first gimbal may now be another one.
         if self._is_primary in device.control_blocks:
-            raise BusyError(f"{orders.name}: this program is already in control of it")
+            raise BusyError(f"{orders.name}: another block of this program already has control")
         device.control_blocks[self._is_primary], self._device = self, device
         self._detach.append(device.controllers.observe(self._on_controllers, every_arrival=True))
         orders.context.on_finish.append(self._finish)
@@ -304,15 +311,15 @@ class GimbalControl:
     def _release_command(self) -> ReleaseCommand:
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary, release=True)
-        claims = orders.registry.claims
+        requests = orders.registry.control_requests
 
         def is_still_due() -> bool:
-            return self._taken is None and self._claim.may_be_released(claims)
+            return self._taken is None and self._control_request.may_be_released(requests)
 
         return ReleaseCommand(orders, CONFIGURE, params, is_still_due)
 
     def _finish(self) -> None:
-        """Release control without waiting, because the block of the vehicle ends."""
+        """Release control without waiting, because the vehicle's block ends."""
         release = self._release_command()
         self._end()
         release.send_soon()
@@ -320,9 +327,9 @@ class GimbalControl:
     def _end(self) -> None:
         self._is_ended = True
         self._lost.set()
-        claims = self._orders.registry.claims
-        if self._claim in claims:
-            claims.remove(self._claim)
+        requests = self._orders.registry.control_requests
+        if self._control_request in requests:
+            requests.remove(self._control_request)
         if self._device is not None and self._device.control_blocks.get(self._is_primary) is self:
             del self._device.control_blocks[self._is_primary]
         if self._finish in self._orders.context.on_finish:

@@ -128,7 +128,7 @@ def _version(number: int) -> str:
 # Gimbals without their own component id are numbered from 1 to this.
 MAX_GIMBAL_NUMBER = 6
 
-# If a status is older than the newest by less than this, it arrived out of order; by more, the manager has rebooted.
+# A status that is older than the newest one by less than this arrived late. If it is older, the manager has rebooted.
 REORDER_WINDOW_MS = 5_000
 
 ATTITUDE_MESSAGES = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"
@@ -155,30 +155,29 @@ class GimbalDevice:
         self.number: int = number
         # Component id of the manager; None until known.
         self.manager_id: int | None = component_id if number else None
-        # Latest GIMBAL_DEVICE_FLAGS and GIMBAL_DEVICE_ERROR_FLAGS.
-        self.flags: int = 0
-        self.failures: int = 0
+        self.flags: int = 0  # the latest GIMBAL_DEVICE_FLAGS
+        self.failures: int = 0  # the latest GIMBAL_DEVICE_ERROR_FLAGS
         self.manager_information: GimbalManagerInformation | None = None
         self.device_information: GimbalDeviceInformation | None = None
         # Open control blocks: primary (True) and secondary (False).
         self.control_blocks: dict[bool, ControlBlock] = {}
-        # True once the program has requested the limits: orders beyond them are then refused.
+        # True once the program has requested the limits. Orders beyond the limits are then refused.
         self.checks_limits = False
-        # Reboots of the vehicle so far.
-        self.reboots: int = 0
+        self.reboots: int = 0  # number of reboots of the vehicle so far
         self.topic: Topic = ("gimbal", *self.key)
         name = f"gimbal {self.device_id}" if component_id else "gimbal"
         self.attitude: StateCell[GimbalAttitude] = context.session.connection.new_cell(
             f"{name}.attitude", ATTITUDE_MESSAGES
         )
-        if component_id in (0, context.session.component_id):  # Other gimbals send their attitude by themselves.
+        # All other gimbals send their attitude without a request.
+        if component_id in (0, context.session.component_id):
             self.attitude._feed_from(WatchedStream(self.attitude, partial(self._request_attitude, context.session)))
         self.controllers: StateCell[GimbalControllers] = context.session.connection.new_cell(
             f"{name}.controllers", "GIMBAL_MANAGER_STATUS"
         )
         # False if the program has named this gimbal, but no message from it was received.
         self.is_discovered = False
-        self.pending_orders: int = 0
+        self.pending_orders: int = 0  # number of calls that wait for an order to this gimbal
         self._manager_rank = 0
         self._status_ms = 0
         self._system_id = context.session.system_id
@@ -221,7 +220,7 @@ class GimbalDevice:
         self.flags, self.failures = message.flags, message.failure_flags
 
     def update_status(self, message: GimbalManagerStatus) -> bool:
-        """Set the controllers. Ignore a status that arrived out of order, and return False."""
+        """Set the controllers from a status. Returns False if the status is older than one that has already arrived."""
         older_by_ms = self._status_ms - message.time_boot_ms
         if 0 < older_by_ms < REORDER_WINDOW_MS:
             return False
@@ -235,7 +234,7 @@ class GimbalDevice:
         self.controllers.set(GimbalControllers(primary, secondary), self._source(message))
 
     def update_manager(self, component_id: int, rank: int, *, is_gone: bool) -> None:
-        """Record a manager. It replaces the present manager if it has a higher rank, or if the present one is gone."""
+        """Record a manager, which replaces one of a lower rank or one that is gone."""
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
         elif self.manager_id is None or rank > self._manager_rank or is_gone:
@@ -259,8 +258,8 @@ class GimbalDevice:
         return Source(self._system_id, self.component_id if frame is None else frame.component_id, message.NAME)
 
 
-class ControlClaim:
-    """The control of a gimbal that a block has requested, from its entry on.
+class ControlRequest:
+    """Control of a gimbal that an open ``gimbal.control()`` block has requested.
 
     A ``gimbal_id_param`` of 0 means all gimbals of the manager.
     """
@@ -269,20 +268,21 @@ class ControlClaim:
         self.manager_id: int = manager_id
         self.gimbal_id_param: int = gimbal_id_param
         self.is_primary: bool = is_primary
-        # True if an earlier block did not release control because of this claim. This block must release it then.
-        self.owes_release = False
+        # True if an earlier block left the release of control to this block, because both requested the same control.
+        self.must_release = False
 
-    def is_released_with(self, other: ControlClaim) -> bool:
-        """Return True if releasing one of the two claims would release the other, too."""
+    def is_released_with(self, other: ControlRequest) -> bool:
+        """Return True if one release command would release the control of both requests."""
         has_same_role = (self.manager_id, self.is_primary) == (other.manager_id, other.is_primary)
         gimbals = (self.gimbal_id_param, other.gimbal_id_param)
         return has_same_role and (gimbals[0] == gimbals[1] or 0 in gimbals)
 
-    def may_be_released(self, claims: Iterable[ControlClaim]) -> bool:
-        """Return True if no other claim would be released, too. Otherwise mark the other claims, so that their blocks
-        release control.
+    def may_be_released(self, requests: Iterable[ControlRequest]) -> bool:
+        """Return True if the release would not also take control from another block of this program.
+
+        Otherwise mark the requests of the other blocks, so that these blocks release control.
         """
-        shared = [claim for claim in claims if claim is not self and claim.is_released_with(self)]
-        for claim in shared:
-            claim.owes_release = True
+        shared = [request for request in requests if request is not self and request.is_released_with(self)]
+        for request in shared:
+            request.must_release = True
         return not shared

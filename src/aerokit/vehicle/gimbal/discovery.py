@@ -16,7 +16,7 @@ from aerokit.mavlink.messages import (
     MountStatus,
 )
 from aerokit.vehicle.commanding.order import ROI
-from aerokit.vehicle.gimbal.device import MAX_GIMBAL_NUMBER, ControlClaim, GimbalDevice
+from aerokit.vehicle.gimbal.device import MAX_GIMBAL_NUMBER, ControlRequest, GimbalDevice
 from aerokit.vehicle.state.equipment import GimbalAttitude, from_device, from_orientation, from_status
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ GIMBAL_COMPONENT_IDS = frozenset((154, *range(171, 176)))
 UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None, None)
 # A component counts as gone if it is silent for this many seconds while the autopilot is not.
 MAX_SILENCE_S = 10.0
-# Precedence of managers. A device that manages itself always has RANK_INFORMATION.
+# Precedence of managers. A device that manages itself has at least RANK_INFORMATION.
 RANK_STATUS, RANK_INFORMATION, RANK_AUTOPILOT = 1, 2, 3
 
 
@@ -41,14 +41,14 @@ class GimbalRegistry:
     def __init__(self, context: VehicleContext) -> None:
         self._context, self._session = context, context.session
         self.devices: dict[tuple[int, int], GimbalDevice] = {}
-        # Stands for the first gimbal until one is discovered. Its cells always mirror those of the first gimbal.
+        # Stands for the first gimbal until one is discovered. Its state values always mirror those of the first gimbal.
         self.placeholder: GimbalDevice = GimbalDevice(context, 0, 0)
         self.placeholder.topic = ROI
-        # Claims of this program's `gimbal.control()` blocks that have not ended.
-        self.claims: list[ControlClaim] = []
-        # Component id → loop time of the last HEARTBEAT or gimbal message.
+        # Requests of this program's `gimbal.control()` blocks that have not ended.
+        self.control_requests: list[ControlRequest] = []
+        # Maps component id to the loop time of the last HEARTBEAT or gimbal message.
         self._received_at: dict[int, float] = {}
-        # Start of the current period in which the autopilot was never silent.
+        # Start of the period in which the autopilot has never been silent.
         self._steady_since = math.inf
         context.session.on_reboot.append(self._on_reboot)
         self._listen(Heartbeat, self._record_received)
@@ -61,7 +61,7 @@ class GimbalRegistry:
 
     @property
     def first(self) -> GimbalDevice:
-        """The gimbal for programs that name no gimbal. Gimbals that are gone come after all others."""
+        """The gimbal that ``vehicle.gimbal`` stands for. Gimbals that are gone come after all others."""
         return min(self.devices.values(), key=self.sort_key, default=self.placeholder)
 
     @property
@@ -71,7 +71,7 @@ class GimbalRegistry:
         return min(reporting, key=self.sort_key, default=None)
 
     def sort_key(self, device: GimbalDevice) -> tuple[bool, tuple[int, int]]:
-        """Sort key. Gimbals that are gone come last, unless an order or a control block uses them."""
+        """Key for sorting gimbals. Those that are gone come last, unless an order or a control block uses them."""
         return (not device.is_in_use and self._is_device_gone(device), device.key)
 
     def silent_for_s(self, component_id: int) -> float:
@@ -79,14 +79,14 @@ class GimbalRegistry:
         return self._session.connection.now() - self._received_at.get(component_id, -math.inf)
 
     def _is_device_gone(self, device: GimbalDevice) -> bool:
-        # If a device sends nothing itself, the messages of its manager count.
+        # If a device sends no messages itself, use the time of its manager's messages.
         component_id = device.component_id
         if component_id not in self._received_at and device.manager_id is not None:
             component_id = device.manager_id
         return not device.is_discovered or self._is_component_gone(component_id)
 
     def _is_component_gone(self, component_id: int) -> bool:
-        """Return True if only this component is silent: during a silence of the whole vehicle, no component is gone."""
+        """Return True if this component is silent while the autopilot is not."""
         silent_since = max(self._steady_since, self._received_at.get(component_id, -math.inf))
         autopilot_received_at = self._received_at.get(self._session.component_id, -math.inf)
         return autopilot_received_at - silent_since > MAX_SILENCE_S
@@ -104,7 +104,7 @@ class GimbalRegistry:
         if device is None and len(self.devices) < MAX_GIMBALS:
             device = self.devices[key] = GimbalDevice(self._context, *key)
             if component_id == self._session.component_id and number == 1:
-                device.topic = ROI  # the vehicle's region of interest moves this gimbal
+                device.topic = ROI  # The vehicle's region of interest moves this gimbal.
         return device
 
     def _listen(self, message_type: type[Message], callback: Callable[[Any], None]) -> None:
@@ -113,6 +113,7 @@ class GimbalRegistry:
             self._session.at_close(bus.attach(message_type, callback, system_id=self._session.system_id))
 
     def _record_received(self, message: Message) -> None:
+        """Record when the sender was last received, and when the autopilot's last silence ended."""
         frame = message.received_frame
         if frame is None:
             return
@@ -122,12 +123,15 @@ class GimbalRegistry:
         self._received_at[frame.component_id] = self._session.connection.now()
 
     def _device_of(self, message: Message, device_id: int) -> GimbalDevice | None:
-        """Return the device of a message: the sender (id 0), or a gimbal attached to it (1 to 6); else None."""
+        """Return the gimbal that a message is about: the sender itself, or a gimbal attached to the sender (1 to 6).
+
+        Returns None if the message is about another component, or if there are too many gimbals.
+        """
         self._record_received(message)
         frame = message.received_frame
         component_id = self._session.component_id if frame is None else frame.component_id
         if device_id > MAX_GIMBAL_NUMBER and device_id != component_id:
-            return None  # about another component
+            return None  # The message is about another component.
         has_own_id = component_id > MAX_GIMBAL_NUMBER and component_id != self._session.component_id
         is_sender = device_id > MAX_GIMBAL_NUMBER or (device_id == 0 and has_own_id)
         number = 0 if is_sender else device_id or 1  # Older autopilots send 0 for their gimbal.
@@ -147,7 +151,7 @@ class GimbalRegistry:
         if all(map(math.isfinite, message.q)):
             attitude = from_device(message, self._heading())
         device.set_attitude(message, attitude)
-        if device is self.reporting:
+        if device is self.reporting:  # This is the first gimbal that reports its attitude.
             self.placeholder.update_flags(message)
             self.placeholder.set_attitude(message, attitude)
 
@@ -168,7 +172,7 @@ class GimbalRegistry:
     def _managed_device(
         self, message: GimbalManagerStatus | GimbalManagerInformation, device_id: int
     ) -> GimbalDevice | None:
-        """Return the gimbal that a manager's message is about; None unless the sender is its chosen manager."""
+        """Return the gimbal that a manager's message is about; None unless orders to this gimbal go to the sender."""
         frame = message.received_frame
         if frame is None:
             return None
@@ -188,7 +192,7 @@ class GimbalRegistry:
         return device if device.manager_id == sender else None
 
     def _device_with_own_id(self, device_id: int, *, may_be_new: bool) -> GimbalDevice | None:
-        # A GIMBAL_MANAGER_STATUS may name a device that does not exist. GIMBAL_MANAGER_INFORMATION does not.
+        # GIMBAL_MANAGER_STATUS may name a device that does not exist; GIMBAL_MANAGER_INFORMATION names existing ones.
         key = (device_id, 0)
         if key in self.devices or (may_be_new and device_id in GIMBAL_COMPONENT_IDS):
             return self._marked_discovered(self.device(*key))

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Gimbal", "Gimbals"]
 
-# An older position of another vehicle is not used.
+# Maximum age of another vehicle's position. An older position is not used.
 POSITION_MAX_AGE_S = 5.0
 
 
@@ -61,7 +61,7 @@ class _SystemTracker:
             self._detach()
 
     def direction(self) -> Angles | None:
-        """Direction from the vehicle; None while unknown."""
+        """Direction from the vehicle to the other system; None while unknown."""
         if self._position is None or self._context.session.connection.now() - self._received_at > POSITION_MAX_AGE_S:
             return None
         return direction_to(self._context, self._position)
@@ -106,7 +106,7 @@ class RoiMixin(GimbalMixin):
         aim = AngleTarget(
             lambda: direction_to(self._context, target),
             tolerance_deg,
-            "the vehicle does not report its position, or not the height difference to the target",
+            "the vehicle's position, or the height difference to the target, is unknown",
         )
         with attitude_stream(orders), self._session.streaming("position"):
             since = self._now()
@@ -134,7 +134,7 @@ class RoiMixin(GimbalMixin):
 
         Otherwise raises as :meth:`neutral`.
         """
-        if isinstance(system_id, bool):  # Otherwise True would count as system 1.
+        if isinstance(system_id, bool):  # True would otherwise mean system 1.
             raise InvalidArgument(f"system_id = {system_id} is not allowed: 1 to 255")
         check_range("system_id", system_id, 1, 255)
         check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
@@ -177,8 +177,8 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
     """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
     ``vehicle.gimbal`` is the first gimbal, ``vehicle.gimbals`` has all gimbals. An order returns when the gimbal
-    reports the ordered direction, and ends when another order is given. The gimbal keeps the direction while the
-    vehicle moves. If the manager requires control, an order outside a block of :meth:`control` claims it until
+    reports the ordered direction, and raises an error when another order is given. The gimbal keeps the direction while
+    the vehicle moves. If the manager requires control, an order outside a block of :meth:`control` claims control until
     :meth:`release`.
     """
 
@@ -202,7 +202,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         except (CommandRejected, CommandTimeout) as error:
             failure = error
         device = orders.device
-        if failure is None or device.component_id:
+        if failure is None or device.component_id:  # If no manager answered, only a discovered gimbal can be asked.
             has_own_id = device.component_id != 0 and device.number == 0
             target = device.component_id if has_own_id else manager_id
             try:
@@ -216,7 +216,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         messages = (device.manager_information, device.device_information)
         if messages == (None, None):
             raise failure or CommandTimeout(
-                f"{orders.name}: it accepted the request for information, but sent none;"
+                f"{orders.name}: the request for information was accepted, but no information was received;"
                 f" {self._session.describe_link()}"
             )
         device.checks_limits = True
@@ -245,10 +245,10 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
             yaw_deg_s: the first rate in degrees per second, −720 to 720; positive is to the right.
-            frame: ``"earth"``: the yaw stays relative to north; ``"vehicle"``: it turns with the vehicle.
+            frame: ``"earth"``: the yaw stays relative to north; ``"vehicle"``: the gimbal turns with the vehicle.
             rate_hz: how often the latest rates are sent, 2 to 100.
-            valid_for_s: stop if no new rates are set for this time.
-            max_lag_s: stop if the event loop is blocked for this time.
+            valid_for_s: stop the gimbal if no new rates are set for this many seconds.
+            max_lag_s: stop the gimbal if the event loop is blocked for this many seconds.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
@@ -315,7 +315,8 @@ class Gimbals:
         session = self._context.session
         deadline = session.connection.now() + timeout
         with anyio.move_on_after(timeout):
-            with suppress(CommandRejected, CommandTimeout):  # Other components than the autopilot may still answer.
+            # One component may refuse, although others send the message.
+            with suppress(CommandRejected, CommandTimeout):
                 await session.commands.send_long(
                     MavCmd.REQUEST_MESSAGE,
                     GimbalManagerInformation.ID,

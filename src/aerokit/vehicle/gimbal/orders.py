@@ -58,7 +58,7 @@ class GimbalOrders:
 
     @property
     def public_device(self) -> GimbalDevice:
-        """The device whose cells are public. For the first gimbal this is always the same object."""
+        """The device whose state values are public. For the first gimbal, it is always the same object."""
         return self.registry.placeholder if self._device is None else self._device
 
     @property
@@ -115,7 +115,7 @@ class GimbalOrders:
     async def send_claiming_control(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
         """Send a command. If the manager denies it because we are not in control, claim control and send it again."""
         self.raise_if_taken()
-        self.claim_if_denied(command)
+        self.claim_if_denied(command)  # An earlier command may have been denied.
         try:
             await send()
         except CommandRejected:
@@ -159,7 +159,10 @@ class GimbalOrders:
             await send()
 
     async def send_mount_mode(self, order: Order, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> bool:
-        """Send DO_MOUNT_CONTROL. Older firmware gets the mode by MOUNT_CONFIGURE instead; return False then."""
+        """Send DO_MOUNT_CONTROL, or MOUNT_CONFIGURE to older firmware.
+
+        Returns False if MOUNT_CONFIGURE was sent, which contains the mode but no angles.
+        """
         if not self.session.commands.is_unsupported(MOUNT, self.manager_id):
             try:
                 await self.send(order, MOUNT, pitch, roll, yaw, 0, 0, 0, mode)
@@ -175,7 +178,7 @@ class GimbalOrders:
         return False
 
     async def send_mount_angles(self, order: Order, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
-        """Send mount angles. The mount turns with the vehicle, so a yaw from north is right only at this moment."""
+        """Send mount angles. The mount turns with the vehicle, so a yaw from north is only correct when it is sent."""
         attitude = self.session.telemetry.attitude.latest
         heading = 0.0 if attitude is None else attitude.yaw_deg
         yaw_from_nose = yaw if from_nose else math.remainder(yaw - heading, 360.0)
@@ -207,7 +210,7 @@ class GimbalOrders:
         )
 
     async def wait_for(self, value: Callable[[], object], message_type: type[Message], within_s: float) -> None:
-        """Wait until ``value()``, checked at each message of this type, is not None; at most ``within_s`` seconds."""
+        """Wait until ``value()`` is not None, at most ``within_s`` seconds. Each message of the type causes a check."""
         done = asyncio.Event()
 
         def check(_: Message) -> None:
@@ -235,14 +238,20 @@ class GimbalOrders:
         return self.manager_id
 
     def control_params(self, *, is_primary: bool, release: bool = False) -> tuple[float, ...]:
-        """Parameters that claim or release control. They have our ids, because PX4 takes -2 ("sender") for itself."""
+        """Return the parameters that claim or release control.
+
+        They contain our ids, because PX4 takes the value -2 ("the sender") for PX4 itself.
+        """
         controller = (RELEASE, RELEASE) if release else self.own_ids
         unchanged = (UNCHANGED, UNCHANGED)
         primary, secondary = (controller, unchanged) if is_primary else (unchanged, controller)
         return (*primary, *secondary, 0, 0, self.gimbal_id_param)
 
     def claim_if_denied(self, command: int) -> bool:
-        """Claim control if the manager denied this command because we are not in control; return True if claimed."""
+        """Claim control if the manager denied this command because we are not in control.
+
+        Returns True if control was claimed.
+        """
         commands, manager_id = self.session.commands, self.manager_id
         if self.device.control_blocks or commands.last_result(command, manager_id) != MavResult.DENIED:
             return False
@@ -259,7 +268,10 @@ class GimbalOrders:
             await self.send(order, CONFIGURE, *self._primary_params((RELEASE, RELEASE)))
 
     def _primary_params(self, controller: tuple[int, int]) -> tuple[float, ...]:
-        """Parameters that set the primary controller. All others are 0 for the first gimbal of an autopilot."""
+        """Return the parameters that set the primary controller.
+
+        For the first gimbal of an autopilot, only two are returned, so that all others are sent as 0.
+        """
         if self.gimbal_id_param == 0:
             return controller
         return (*controller, UNCHANGED, UNCHANGED, 0, 0, self.gimbal_id_param)
@@ -290,12 +302,12 @@ class GimbalMixin:
     def __init__(self, context: VehicleContext, registry: GimbalRegistry, device: GimbalDevice | None) -> None:
         self._orders = GimbalOrders(context, registry, device)
         self._context, self._session = context, context.session
-        device_with_cells = self._orders.public_device
-        self.attitude: StateCell[GimbalAttitude] = device_with_cells.attitude
+        public_device = self._orders.public_device
+        self.attitude: StateCell[GimbalAttitude] = public_device.attitude
         """Attitude (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS).
-        It is requested from the autopilot while your program watches this cell; reading it requests nothing.
+        It is requested from the autopilot while your program watches this value; reading the value requests nothing.
         """
-        self.controllers: StateCell[GimbalControllers] = device_with_cells.controllers
+        self.controllers: StateCell[GimbalControllers] = public_device.controllers
         """Stations in control, as reported by the manager (GIMBAL_MANAGER_STATUS)."""
 
     @property

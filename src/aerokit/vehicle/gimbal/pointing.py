@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 # times a second.
 STILL_S, STILL_DEG = 0.4, 0.5
 
-# Pitch, roll, yaw from north, yaw from the nose. None: any angle is right.
+# Pitch, roll, yaw from north, yaw from the nose. None means that any angle is accepted.
 Angles = tuple[float | None, float | None, float | None, float | None]
 
 
@@ -49,7 +49,7 @@ class AngleTarget:
         return targets is not None and all(map(self._is_near, _angles_of(device.attitude.value), targets))
 
     def _is_near(self, angle: float | None, target: float | None) -> bool:
-        if target is None:  # Any angle is right.
+        if target is None:  # Any angle is accepted.
             return True
         return angle is not None and abs(math.remainder(angle - target, 360)) <= self._tolerance_deg
 
@@ -76,6 +76,7 @@ class RestTarget:
         if self._has_moved((pitch, roll, yaw)):
             self._last_angles, self._moved_at = (pitch, roll, yaw), updated_at
             return False
+        # A gimbal that is level and straight ahead counts as neutral, even if it does not report the flag.
         is_ahead = self._or_ahead and abs(pitch) <= 2 * STILL_DEG and abs(yaw) <= 2 * STILL_DEG
         return updated_at - self._moved_at >= STILL_S and bool(device.flags & self._flag or is_ahead)
 
@@ -86,13 +87,14 @@ class RestTarget:
         return any(abs(turn) > STILL_DEG for turn in turns)
 
     def describe(self) -> str:
-        return "it has not reported that it rests there"
+        return "and has not reported that it rests in this position"
 
 
 @contextmanager
 def attitude_stream(orders: GimbalOrders) -> Iterator[None]:
-    """Request the attitude from the autopilot during a block. Gimbals with their own component id send it by
-    themselves.
+    """Request the attitude from the autopilot during a block.
+
+    Gimbals with their own component id send their attitude without a request.
     """
     if orders.device.component_id not in (0, orders.session.component_id):
         yield
@@ -116,8 +118,8 @@ async def wait_until_there(
     """Wait until an attitude newer than ``since`` shows that the target is reached; errors as for `Gimbal.point`."""
     session, checked_at = orders.session, since
     deadline, reboots = session.connection.now() + timeout, orders.public_device.reboots
-    cells = (orders.public_device.attitude, orders.attitude_source.attitude, orders.device.controllers)
-    with orders.device.in_use(), ChangeSignal(session, *cells, every_arrival=True) as changes:
+    watched = (orders.public_device.attitude, orders.attitude_source.attitude, orders.device.controllers)
+    with orders.device.in_use(), ChangeSignal(session, *watched, every_arrival=True) as changes:
         while True:
             source = orders.attitude_source
             session.connection.raise_if_ended()
@@ -134,7 +136,7 @@ async def wait_until_there(
             remaining_s = deadline - session.connection.now()
             if remaining_s <= 0:
                 raise OperationTimeout(
-                    f"{description}: not reached within {timeout:g} s: {_describe_state(orders, since)},"
+                    f"{description}: the target was not reached within {timeout:g} s: {_describe_state(orders, since)},"
                     f" {target.describe()}; {session.describe_link()}"
                 )
             await changes.next(min(POLL_INTERVAL_S, remaining_s))
@@ -142,14 +144,14 @@ async def wait_until_there(
 
 def _describe_state(orders: GimbalOrders, since: float) -> str:
     source, device = orders.attitude_source, orders.device
-    cell = source.attitude
-    if not cell.is_known:
-        return f"the gimbal does not report its attitude (no {cell.waits_for})"
-    text = f"it points to {_format_angles(_angles_of(cell.value))}"
-    if cell.updated_at <= since:
-        text += f", reported {cell.age:.1f} s ago, before the order"
+    attitude = source.attitude
+    if not attitude.is_known:
+        return f"the gimbal does not report its attitude (no {attitude.waits_for})"
+    text = f"the gimbal points to {_format_angles(_angles_of(attitude.value))}"
+    if attitude.updated_at <= since:
+        text += f", reported {attitude.age:.1f} s ago, before the order"
     if device.failures:
-        text += f", it reports {device.describe_failures()}"
+        text += f", its failures are {device.describe_failures()}"
     if device.manager_information is not None:
         limits = information_of(device.device_id, orders.manager_id, device.manager_information, device=None)
         text += f", its limits are pitch {_format_limits(limits.pitch_deg)}, yaw {_format_limits(limits.yaw_deg)}"
@@ -178,7 +180,7 @@ MIN_BEARING_DISTANCE_M = 1.0
 
 
 def ordered_angles(pitch: float, yaw: float, roll: float | None, *, from_nose: bool) -> Angles:
-    """Return the angles of an order. The yaw is None when pointing straight down or up: any yaw is right then."""
+    """Return the angles of an order. The yaw is None if the gimbal points straight down or up: any yaw is accepted."""
     is_vertical = abs(pitch) > MAX_PITCH_FOR_YAW_DEG
     from_north_deg = None if from_nose or is_vertical else yaw
     from_nose_deg = yaw if from_nose and not is_vertical else None
@@ -186,10 +188,10 @@ def ordered_angles(pitch: float, yaw: float, roll: float | None, *, from_nose: b
 
 
 def direction_to(context: VehicleContext, target: Position) -> Angles | None:
-    """Direction from the vehicle to a position; None while the vehicle's position or height is unknown."""
-    cell = context.session.telemetry.position
-    here = cell.latest
-    if here is None or cell.age > POSITION_MAX_AGE_S:
+    """Return the direction from the vehicle to a position; None while the vehicle's position or height is unknown."""
+    position = context.session.telemetry.position
+    here = position.latest
+    if here is None or position.age > POSITION_MAX_AGE_S:
         return None
     height_m = _height_above(here, target)
     if height_m is None:
@@ -202,7 +204,10 @@ def direction_to(context: VehicleContext, target: Position) -> Angles | None:
 
 
 def _height_above(here: Position, target: Position) -> float | None:
-    """Height of the target above the vehicle; None if it is unknown. A target without an altitude is at its height."""
+    """Return the height of the target above the vehicle; None if unknown.
+
+    A target without an altitude counts as being at the height of the vehicle.
+    """
     if target.altitude_relative_m is None and target.altitude_amsl_m is None:
         return 0.0
     if target.altitude_relative_m is not None and here.altitude_relative_m is not None:
@@ -236,7 +241,7 @@ class PointingMixin(GimbalMixin):
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
             roll_deg: from the horizon, −360 to 360. A roll other than 0 is sent by the older mount command. The gimbal
-                then turns with the vehicle, so a yaw from north is right only at the time of the order.
+                then turns with the vehicle, so a yaw from north is correct only at the time of the order.
             frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
@@ -333,7 +338,7 @@ class PointingMixin(GimbalMixin):
         with attitude_stream(orders):
             since = self._now()
             await send()
-            target = RestTarget(flag, or_ahead=flag == NEUTRAL)
+            target = RestTarget(flag, or_ahead=flag == NEUTRAL)  # The neutral position is usually straight ahead.
             await wait_until_there(orders, order, f"{orders.name}: {action}", target, since=since, timeout=timeout)
 
     def _check_limits(self, pitch: float, roll: float, yaw: float | None) -> None:
@@ -353,6 +358,6 @@ class PointingMixin(GimbalMixin):
             # The same yaw may be written as −90 or 270.
             turns = (-360, 0, 360) if name == "yaw_deg" else (0,)
             is_allowed = any(lowest <= angle + turn <= highest for turn in turns)
-            if not is_allowed and highest - lowest < 360:
+            if not is_allowed and highest - lowest < 360:  # A gimbal that turns all the way round reaches every angle.
                 text = f"{self._orders.name} turns from {lowest:g} to {highest:g}"
                 raise InvalidArgument(f"{name} = {angle:g} is not allowed: {text}")

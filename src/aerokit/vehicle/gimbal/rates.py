@@ -51,15 +51,15 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     def __init__(
         self,
         orders: GimbalOrders,
-        first: tuple[float, float],
+        first_rates: tuple[float, float],
         is_from_north: bool,
         rate_hz: float,
         valid_for_s: float,
         max_lag_s: float,
     ) -> None:
         check_range("rate_hz", rate_hz, 2, MAX_RATE_HZ)
-        super().__init__(orders.context, self._encode_rates, first, rate_hz, valid_for_s, max_lag_s)
-        _check(*first)
+        super().__init__(orders.context, self._encode_rates, first_rates, rate_hz, valid_for_s, max_lag_s)
+        _check(*first_rates)
         self._orders, self._flags = orders, int(LOCKED if is_from_north else LEVEL)
         self._began_at = -math.inf
         self._order: Order | None = None
@@ -68,7 +68,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._in_use = ExitStack()
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
-        """Set new rates; they are sent at the next tick, and repeated until ``valid_for_s`` has passed.
+        """Set new rates. They are sent at the next tick, and repeated until ``valid_for_s`` seconds have passed.
 
         Args:
             pitch_deg_s: degrees per second, −720 to 720; positive is up.
@@ -83,7 +83,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._set((pitch_deg_s, yaw_deg_s))
 
     async def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
-        """Supply one pair of rates for ``duration_s`` seconds. Arguments and errors as for :meth:`set`."""
+        """Turn at one pair of rates for ``duration_s`` seconds. Arguments and errors are those of :meth:`set`."""
         _check(pitch_deg_s, yaw_deg_s)
         await self._supply_for((pitch_deg_s, yaw_deg_s), duration_s)
 
@@ -103,7 +103,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         except (CommandRejected, NotSupported):  # The gimbal does not turn, because the manager refused.
             self._end()
             raise
-        except BaseException:  # Without an answer, the gimbal may turn.
+        except BaseException:  # The gimbal may turn, because the manager may have received the command.
             self._stop("it was not entered")
             raise
         return self
@@ -113,7 +113,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         if reason:
             self._stop(reason, hold=False)
         if self._stop_error is None:
-            zero = self._zero_rates_command()  # Before `_end`: afterwards, the first gimbal may be another one.
+            zero = self._zero_rates_command()  # Must precede `_end`, after which the first gimbal may be another one.
             self._end()
             self._stop_error = SetpointStreamStopped("the block of these rates has ended")
             if error is None:
@@ -124,7 +124,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             raise self._stop_error
 
     def _send(self) -> None:
-        self._session.connection.send(self._encode_rates(self._value))  # The manager may have changed.
+        self._session.connection.send(self._encode_rates(self._value))  # Encoded again: the manager may have changed.
 
     def _encode_rates(self, rates: tuple[float, float]) -> Message:
         orders = self._orders

@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
     from aerokit.vehicle.session.transfers import Transfers
 
-# Two and a half periods of MISSION_CURRENT, which is sent at 1 Hz.
+# Maximum age of a reported plan id: two and a half periods of MISSION_CURRENT, which is sent at 1 Hz.
 PLAN_ID_MAX_AGE_S = 2.5
 
 # If the same item is reported as reached again within this time, the message is a duplicate.
 DUPLICATE_WINDOW_S = 0.3
 
-# If an item becomes the current one this long after it was reached, the vehicle approaches it a second time.
+# If an item becomes the current one more than this many seconds after it was reached, the vehicle approaches it again.
 SECOND_APPROACH_S = 1.0
 
-# Between a landing and disarming, a vehicle may report another item than the last for this long.
+# After a landing, a vehicle may report another item than the last one for up to this many seconds, until it disarms.
 FINAL_ITEM_MAX_AGE_S = 3.0
 
 # After a second start of its mission, a vehicle may still report for this long that the mission is complete.
@@ -109,7 +109,7 @@ class PlanContext:
         return (current.mission_id, current.fence_id, current.rally_points_id)[mission_type]
 
     async def wait_for_plan_id(self, mission_type: int, opaque_id: int) -> bool:
-        """Wait for a MISSION_CURRENT with this plan id; False if none arrives in time."""
+        """Wait for a MISSION_CURRENT with this plan id; return False if none arrives in time."""
         received, started_at = asyncio.Event(), self.now()
 
         def check(_: MissionCurrent) -> None:
@@ -130,7 +130,7 @@ class PlanContext:
 
 
 class MissionTracker:
-    """Cells and events for mission progress. Item numbers do not count home.
+    """State values and events for mission progress. Item numbers do not count home.
 
     If the mission of an ArduCopter ends with a landing, the vehicle disarms and reports its first item as current, but
     never reports the mission as complete. PX4 reports completion until the next mission has started. It reports an
@@ -147,15 +147,15 @@ class MissionTracker:
         self.count: StateCell[int] = new_cell("mission.count", "MISSION_CURRENT with a number of items")
         self.progress: StateCell[MissionProgress] = new_cell("mission.progress", "MISSION_CURRENT")
         session.add_timeout_hint(self.current, self.count, self.progress)
-        # The last item that was reached.
+        # The item that was reached last.
         self.reached: int | None = None
         # True if the last mission was flown to its end.
         self.is_complete: bool = False
         self._reached_at = self._last_item_current_at = -math.inf
         self._is_approached_again = False
-        # True if the vehicle has flown the mission since its last end.
+        # True if the vehicle has flown the mission since the mission last ended.
         self._was_active = False
-        # Until this time, a report of completion may be about the previous flight.
+        # A report of completion before this time may be about the previous flight.
         self._stale_until = -math.inf
         telemetry = session.telemetry
         session.at_close(
@@ -195,10 +195,10 @@ class MissionTracker:
             cell.close(error)
 
     def _on_current(self, _: MissionProgress | None, reported: MissionProgress) -> None:
-        """Set the cells from MISSION_CURRENT, with the item numbers of the program, which do not count home."""
+        """Set the state values from MISSION_CURRENT, with the item numbers of the program, which do not count home."""
         before = self.current.latest
         current = None if reported.current is None else reported.current - self._offset
-        if current is not None and current < 0:  # item 0 of ArduPilot, which is home
+        if current is not None and current < 0:  # The current item is ArduPilot's item 0, which is home.
             current = None
         if reported.total is None and reported.state == MissionState.NO_MISSION:
             current = None
@@ -215,10 +215,10 @@ class MissionTracker:
         self._on_state(reported.state)
 
     def _detect_second_approach(self, before: int | None, current: int | None) -> None:
-        """Record whether the vehicle flies again to the item that it has reached last.
+        """Record whether the vehicle again flies to the item that it reached last.
 
-        This takes time or comes from a later item, because PX4 may report an item as reached just before it becomes
-        the current one.
+        PX4 may report an item as reached just before the item becomes the current one. A second approach therefore only
+        counts some time after the item was reached, or if the vehicle comes from a later item.
         """
         if current is None or current != self.reached:
             return
@@ -240,9 +240,9 @@ class MissionTracker:
             self._complete()
 
     def _on_reached(self, _: int | None, seq: int) -> None:
-        # ArduPilot reports item 0 (home) when it has reached a guided target.
+        # ArduPilot reports item 0 (home) when it has reached a guided target. `item` is then negative.
         item, now = seq - self._offset, self._session.connection.now()
-        if self._repeats_item_reached:
+        if self._repeats_item_reached:  # Only a second approach makes the same item count again.
             is_duplicate = item == self.reached and not self._is_approached_again
         else:
             is_duplicate = item == self.reached and now - self._reached_at < DUPLICATE_WINDOW_S

@@ -45,8 +45,8 @@ class MissionEndDetector:
 
     A mission has ended when the vehicle reports the mission as complete, or has landed and disarmed at its last item.
     If the mission ends with a landing, or with a return that includes a landing, the vehicle must also be on the
-    ground: PX4 reports completion when the return starts, and returns in another mode. A return without a landing ends
-    at home. If a vehicle reports no mission state, it must have reached the last item.
+    ground, because PX4 reports completion when the return starts, and returns in another mode. A return without a
+    landing ends at home. If a vehicle reports no mission state, the mission has ended when the last item is reached.
     """
 
     def __init__(
@@ -70,14 +70,14 @@ class MissionEndDetector:
         self.ground: GroundCheck = GroundCheck(session)
 
     def has_ended(self) -> bool:
-        """Return True if the mission has ended; on the ground, only if the vehicle has landed rather than fallen."""
+        """Return True if the mission has ended. If the vehicle is on the ground, it must have landed, not fallen."""
         is_reported, is_on_ground = self._is_end_reported(), self._is_on_ground
-        # The check must see every call, because it watches the velocity.
+        # `confirms` must be called each time, because it watches the velocity.
         has_landed = self.ground.confirms(is_reported and is_on_ground)
         return has_landed if is_on_ground else is_reported
 
     def _is_end_reported(self) -> bool:
-        """Return True if the vehicle reports the end, be it a landing or a fall."""
+        """Return True if the vehicle reports the end of the mission, which may also be a fall."""
         if self._tracker.is_complete:
             # ArduPilot reports completion at home, PX4 already when it begins to return.
             at_home = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
@@ -91,6 +91,7 @@ class MissionEndDetector:
         progress = self._tracker.progress.latest
         reports_state = progress is not None and progress.state != MissionState.UNKNOWN
         last = self._tracker.last_item
+        # Without a mission state, the last item that was reached shows the end.
         return not reports_state and last is not None and self._tracker.reached == last
 
     def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
@@ -101,7 +102,7 @@ class MissionEndDetector:
         fall = self.ground.fall()
         if fall:
             return f"{fall}, {self.describe()}"
-        if self.ground.is_pending:  # `has_ended` has not decided yet whether this is a landing.
+        if self.ground.is_pending:  # It is not yet decided whether the vehicle has landed.
             return None
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
@@ -110,7 +111,7 @@ class MissionEndDetector:
         if may_have_this_mode and not session.telemetry.is_confirmed_disarmed:
             self._left_at = None
             return None
-        if self._left_at is None:  # The end of the mission causes a mode change, and may be reported after it.
+        if self._left_at is None:  # The end of the mission changes the mode, and may be reported after the change.
             self._left_at = now
         if now - self._left_at < END_GRACE_S or now < self._grace_until:
             return None
@@ -118,7 +119,7 @@ class MissionEndDetector:
             return f"the mission has not ended ({self.describe()}), but the vehicle is disarmed"
         if self._was_in_mode:
             return f"the mode changed to {session.telemetry.mode_name}, {self.describe()}"
-        return f"the vehicle is not flying its mission, it is in {session.telemetry.mode_name}"
+        return f"the vehicle is not flying its mission but is in {session.telemetry.mode_name}"
 
     def describe(self) -> str:
         """Return e.g. ``at item 3 of 7``."""
@@ -171,7 +172,7 @@ class MissionControl(VehiclePlan["Mission"]):
 
     @property
     def current(self) -> StateCell[int | None]:
-        """Current item (MISSION_CURRENT); None before the start, and without a mission."""
+        """Current item (MISSION_CURRENT); None before the start of the mission, and without a mission."""
         return self._tracker.current
 
     @property
@@ -192,8 +193,8 @@ class MissionControl(VehiclePlan["Mission"]):
     async def set_current(self, item: int, *, timeout: float = 5.0) -> None:
         """Set the next item. A vehicle that is flying its mission proceeds to it immediately.
 
-        Sends MAV_CMD_DO_SET_MISSION_CURRENT. PX4 does not support it, and gets MISSION_SET_CURRENT. An item without a
-        position (a DO command) is executed; ``current`` then shows the next item.
+        Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which does not support the command. An item
+        without a position (a DO command) is executed; ``current`` then shows the next item.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -211,8 +212,8 @@ class MissionControl(VehiclePlan["Mission"]):
         The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
         a take-off as the first item. If you cancel the call, aerokit orders the vehicle to hold.
 
-        Sends MISSION_START to ArduPilot, because a mode change alone does not make it take off. Other autopilots get a
-        mode change.
+        ArduPilot gets MISSION_START, because a mode change alone does not make it take off. Other autopilots get a mode
+        change.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -246,7 +247,7 @@ class MissionControl(VehiclePlan["Mission"]):
         mode = vehicle_context.sender.mode_for("mission.pause", "hold")
         if not self._context.is_flying_mission:
             raise OperationRejected(
-                f"mission.pause: the vehicle is not flying its mission, it is in {session.telemetry.mode_name};"
+                f"mission.pause: the vehicle is not flying its mission but is in {session.telemetry.mode_name};"
                 " nothing was sent"
             )
         self._order = vehicle_context.arbiter.order(mode)
@@ -273,8 +274,7 @@ class MissionControl(VehiclePlan["Mission"]):
         self._is_paused = False
 
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Wait until the mission has been flown to its end. If it ends with a landing, wait until the vehicle has
-        landed.
+        """Wait until the mission has been flown to its end, including a landing at its end.
 
         A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
         command is sent when it fails.
@@ -287,8 +287,8 @@ class MissionControl(VehiclePlan["Mission"]):
             OperationRejected: the vehicle no longer flies the mission: a pilot, a failsafe or another order changed the
                 mode, or the vehicle disarmed on the way or fell. ``reasons`` has the vehicle's status texts.
             OperationTimeout: the mission was not finished in time; or the armed vehicle has not moved for 12 s after it
-                descended to the ground at more than 3 m/s; or it has not moved for 60 s at a take-off or at a waypoint
-                without a hold. The last case is only detected if the items are known from an upload or a download.
+                descended to the ground at more than 3 m/s; or the vehicle has not moved for 60 s at a take-off or at a
+                waypoint without a hold (only if the items are known from an upload or a download).
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         vehicle_context, session = self._vehicle_context, self._session
@@ -345,7 +345,7 @@ class MissionControl(VehiclePlan["Mission"]):
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(0)
         if session.autopilot.sets_current_by_command:
-            # ArduPilot resets the jump counts if the number is 0, which is home there.
+            # ArduPilot also resets the jump counts if it gets the number 0, which is the number of home.
             number = 0 if item == 0 and not keeps_jump_counts else seq
             try:
                 await vehicle_context.sender.send_long(order, MavCmd.DO_SET_MISSION_CURRENT, number)

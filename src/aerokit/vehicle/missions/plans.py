@@ -30,7 +30,7 @@ PlanMethod = Literal["auto", "ftp", "items"]
 class VehiclePlan(ReadOnly, Generic[PlanT]):
     """A mission, a fence or rally points on a vehicle.
 
-    Transfers with one vehicle run one at a time. You can cancel any call; the vehicle is informed.
+    Transfers with one vehicle run one at a time. You can cancel any call; aerokit then tells the vehicle to stop.
     """
 
     def __init__(self, context: PlanContext) -> None:
@@ -101,7 +101,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
-            OperationTimeout: the transfer was not done within ``timeout``.
+            OperationTimeout: the transfer was not complete within ``timeout``.
         """
         async with self._transfer(idle_timeout_s, timeout, on_progress) as transfer:
             plan = await transfer.download(method)

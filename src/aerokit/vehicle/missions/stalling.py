@@ -17,8 +17,10 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 MISSION_STALL_TIMEOUT_S = 60.0
-"""Seconds without movement that count as a stall in a mission. Longer than ``STALL_TIMEOUT_S``, because obstacle
-avoidance and strong wind may stop a vehicle between waypoints.
+"""A vehicle has stalled if it does not move for this many seconds during a mission.
+
+The time is longer than ``STALL_TIMEOUT_S``, because obstacle avoidance and strong wind may stop a vehicle between
+waypoints.
 """
 
 GROUND_HEIGHT_M = 3.0
@@ -33,8 +35,8 @@ class MissionStallDetector:
 
     A fall is a standstill of 12 s right after a fast descent, on the ground or at an item without a hold. Without a
     fast descent, a standstill is reported after ``MISSION_STALL_TIMEOUT_S`` at an item without a hold, while the
-    vehicle is in its mission mode and not paused. Items are known after an upload or a download. A disarmed vehicle is
-    never reported.
+    vehicle is in its mission mode and not paused. The items are known only after an upload or a download. A disarmed
+    vehicle is never reported.
     """
 
     def __init__(
@@ -48,9 +50,9 @@ class MissionStallDetector:
         self._session, self._tracker, self._mode = session, tracker, mode
         self._items, self._is_paused = items or (), is_paused
         self._stall = StallDetector(session)
-        # The item that should have moved the vehicle at the last call, and the time since which it should.
+        # At the last call, the vehicle should have been moving because of this item, and since this time.
         self._item: int | None = None
-        self._moving_since = session.connection.now()
+        self._should_move_since = session.connection.now()
 
     def __call__(self) -> str | None:
         """Return a clause about the standstill; None if the vehicle moves, may stand still here, or is disarmed."""
@@ -60,18 +62,18 @@ class MissionStallDetector:
             self._stall = StallDetector(self._session)
             return None
         should_move = self._should_move(current)
-        standstill = self._stall()  # for 12 s
+        standstill = self._stall()  # None unless the vehicle has stood still for 12 s
         if standstill is not None and self._stall.follows_fast_descent and (should_move or self._is_on_ground):
             return standstill
         if not should_move or current != self._item:
             self._item = current if should_move else None
-            self._moving_since = self._session.connection.now()
+            self._should_move_since = self._session.connection.now()
             return None
-        is_late = self._session.connection.now() - self._moving_since >= MISSION_STALL_TIMEOUT_S
+        is_late = self._session.connection.now() - self._should_move_since >= MISSION_STALL_TIMEOUT_S
         return self._stall(MISSION_STALL_TIMEOUT_S) if is_late else None
 
     def _should_move(self, current: int | None) -> bool:
-        """Return True if the vehicle flies its mission, and the current item has no hold."""
+        """Return True if the vehicle flies its mission, and is at a take-off or a waypoint without a hold."""
         if current is None or current >= len(self._items):
             return False
         if self._tracker.is_complete or not self._session.telemetry.is_in(self._mode):

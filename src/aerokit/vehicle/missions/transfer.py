@@ -40,7 +40,7 @@ REFUSAL_TEXT_DELAY_S = 0.3
 class PlanChannel:
     """Transfers plans of one MAV_MISSION_TYPE. Items are numbered as the vehicle numbers them.
 
-    Errors use the item numbers of the program, and contain the vehicle's status texts and the state of the old items.
+    Errors use the item numbers of the program, and contain the vehicle's status texts and which items it has now.
     """
 
     def __init__(
@@ -50,10 +50,8 @@ class PlanChannel:
         self._context = context
         self._options: dict[str, Any] = {"idle_timeout_s": idle_timeout_s, "on_progress": on_progress}
         self._path = PACKED_PATHS[mission_type]
-        # True if the vehicle may have received some of our items.
-        self._has_changed = False
-        # True if positions are sent as 32-bit floats, because the vehicle does not support MISSION_ITEM_INT.
-        self.is_single_precision: bool = False
+        self._has_changed = False  # True if the vehicle may have received some of our items
+        self.is_single_precision: bool = False  # True if positions are sent as 32-bit floats (MISSION_ITEM)
 
     async def send(self, items: Sequence[MissionItem]) -> UploadResult:
         """Send all items. If a refusal does not identify the refused item, send the items again one at a time."""
@@ -74,7 +72,7 @@ class PlanChannel:
         except MissionRejected:
             if exchange.was_started:
                 raise
-            return None
+            return None  # The vehicle refused the partial upload itself, not an item.
         self._has_changed = True
         return result
 
@@ -108,7 +106,7 @@ class PlanChannel:
         return self._normalized(unpack_items(data, self.mission_type))
 
     def _normalized(self, items: tuple[MissionItem, ...]) -> tuple[MissionItem, ...]:
-        # Fences and rally points have no autocontinue; ArduPilot returns False for it.
+        # Fences and rally points have no autocontinue; ArduPilot returns False for them.
         if self.mission_type == MavMissionType.MISSION:
             return items
         return tuple(item.replace(autocontinue=True) for item in items)
@@ -183,7 +181,7 @@ class PlanChannel:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
         if is_overwritten and self._has_changed and refused_item:
             new_items = "only item 0 is new" if refused_item == 1 else f"items 0 to {refused_item - 1} are new"
-            return f"; on the vehicle {new_items} now, and later items, if it has any, are old: upload again, or clear"
+            return f"; on the vehicle, {new_items} now, and all later items are old: upload again, or clear"
         if is_overwritten and self._has_changed:
             return "; the vehicle now has some new and some old items: upload again, or clear"
         if is_overwritten and is_silent:
@@ -234,7 +232,7 @@ class PlanTransfer(Generic[PlanT]):
 
     async def upload(self, plan: PlanT, method: str, *, only_changes: bool, verify: bool) -> None:
         items = plan.to_items()
-        if self._offset:  # The vehicle's own home, because older firmware might take another one in item 0 as its home.
+        if self._offset:  # Item 0 must be the vehicle's own home, because older firmware may move its home to item 0.
             items = with_home(items, self._context.home)
         if len(items) == self._offset:  # The plan is empty, except for home.
             await self.clear()
@@ -258,6 +256,7 @@ class PlanTransfer(Generic[PlanT]):
             self._raise_mismatch((f"the vehicle still has items: {remaining}",))
 
     async def _read(self, method: str) -> tuple[MissionItem, ...]:
+        """Read the plan into the cache, as a file if possible."""
         if await self._uses_file(method):
             try:
                 items = await self._channel.read_file()
@@ -272,6 +271,7 @@ class PlanTransfer(Generic[PlanT]):
         return received.items
 
     async def _uses_file(self, method: str, *, is_upload: bool = False) -> bool:
+        """Return True if the plan is to be transferred as a file."""
         if method == "items":
             return False
         has_ftp = await self._channel.has_ftp()
@@ -284,7 +284,7 @@ class PlanTransfer(Generic[PlanT]):
         return has_ftp and self._cache.has_file is not False and not is_flying  # `has_file` is None until tried.
 
     def _on_file_error(self, error: Exception, method: str) -> None:
-        """Transfer no files from now on. Raise the error if the caller chose files, or if files have worked before."""
+        """Transfer no files from now on. Raise the error if the caller chose files, or if files have worked."""
         if method == "ftp" or (self._cache.has_file and not isinstance(error, FileError)):
             raise error
         self._cache.has_file = False
@@ -301,13 +301,14 @@ class PlanTransfer(Generic[PlanT]):
             if result.is_confirmed:
                 raise
             raise MissionRejected(
-                f"{self._name}: the vehicle refused at about item {result.item}, and now has other items",
+                f"{self._name}: the vehicle refused the plan at about item {result.item}, and now has other items",
                 result=MavMissionResult.ERROR,
                 item=result.item,
                 reasons=error.differences,
             ) from None
 
     async def _send_file(self, items: Sequence[MissionItem], method: str) -> None:
+        """Send the plan as a file and read it back. With "auto", send the items if that fails."""
         try:
             await self._channel.write_file(items)
         except (FileError, FileTimeout) as error:
@@ -320,18 +321,16 @@ class PlanTransfer(Generic[PlanT]):
             except VerificationFailed:
                 if method == "ftp":
                     raise
-        # There is no such file, or an item was refused. The mission protocol reports which item was refused and why.
+        # The vehicle has no such file, or has refused an item. The mission protocol reports which item and why.
         await self._send_items(items, method, verify=True)
 
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:
-        """Send only the differences; return False if the vehicle's plan is unknown, or sending differences is not
-        faster.
-        """
+        """Send only the differences. Returns False if the vehicle's plan is unknown or differs in too many items."""
         autopilot = self._context.autopilot
         if autopilot.reports_mission_checksum:
             reported = self._context.plan_id(self._type, self._cache.updated_at)
             checksum = mission_checksum(items)
-            # The plan may have been replaced a moment ago, so the next report must have the same checksum.
+            # Another station may have just replaced the plan, so the next report must have the same checksum.
             if reported == checksum and await self._context.wait_for_plan_id(self._type, checksum):
                 return True
         if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changed_seqs(items), len(items)):
@@ -343,7 +342,7 @@ class PlanTransfer(Generic[PlanT]):
         if changed_seqs is None or not self._is_worthwhile(changed_seqs, len(items)):
             return False
         vehicle_items = list(self._cache.items or ())
-        # Unknown until all parts are confirmed, in case the call fails or is cancelled.
+        # The vehicle's plan is unknown until all parts are confirmed, because the call may fail or be cancelled.
         self._cache.forget(self._context.now())
         for part in _consecutive_ranges(changed_seqs):
             if not await self._send_part(items[part.start : part.stop], part.start, verify=verify):
@@ -353,6 +352,7 @@ class PlanTransfer(Generic[PlanT]):
         return True
 
     async def _send_part(self, items: Sequence[MissionItem], first: int, *, verify: bool) -> bool:
+        """Send consecutive items; return False if the vehicle does not support partial uploads."""
         result = await self._channel.send_part(items, first)
         if result is None:
             return False
@@ -363,7 +363,7 @@ class PlanTransfer(Generic[PlanT]):
         return True
 
     def _changed_seqs(self, items: Sequence[MissionItem]) -> list[int] | None:
-        """Return the seqs of changed items; None if the vehicle's items are unknown, or there are more or fewer."""
+        """Return the seqs of changed items; None if the vehicle's items are unknown, or their number differs."""
         vehicle_items = self._cache.items
         if vehicle_items is None or len(vehicle_items) != len(items):
             return None
@@ -399,7 +399,7 @@ class PlanTransfer(Generic[PlanT]):
         is_single_precision = self._channel.is_single_precision
         for seq in sorted(sent.keys() & received.keys()):
             if seq >= self._offset:
-                # Targets of jumps are compared and shown as the program numbers them.
+                # Compare and show jump targets with the item numbers of the program, which do not count home.
                 item, vehicle_item = shift_jumps([sent[seq], received[seq]], -self._offset)
                 texts = item_differences(item, vehicle_item, self._storage, single_precision=is_single_precision)
                 differences += [f"item {seq - self._offset} ({item.name}): {text}" for text in texts]

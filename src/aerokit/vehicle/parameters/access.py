@@ -42,7 +42,8 @@ DEFAULT_INTERVAL = 0
 ECHO_WINDOW_S = 3.0
 # ArduPilot answers this many reads at once. Further reads wait until it handles parameters again.
 MAX_READS_UNBOOSTED = 5
-# The rate is raised if reading takes longer than this: a parameter counts as missing only after several requests.
+# The rate is raised after this many seconds. Reading takes longer if the vehicle lacks a parameter, because a parameter
+# counts as missing only after several requests.
 BOOST_DELAY_S = 0.5
 # Fewer changes than this are set one by one. That is as fast as a file, and the vehicle confirms each value.
 MIN_PACK_SIZE = 10
@@ -51,25 +52,25 @@ MAX_READ_BACK = 100
 
 
 class ParameterAccess:
-    """Access to the parameters of one vehicle by their names on it. Does not translate renamed parameters."""
+    """Access to the parameters of one vehicle by the names that the vehicle uses. Does not translate renamed ones."""
 
     def __init__(self, transfers: Transfers, files: Files) -> None:
         self._transfers, self._files = transfers, files
         self.store: ParameterStore = ParameterStore(transfers)
         self._downloading = asyncio.Lock()
         self._writing = asyncio.Lock()
-        self._has_pack: bool | None = None
+        self._has_pack: bool | None = None  # True if the vehicle offers all parameters in one file; None until tried
         self._answer_round_trip: RoundTrip | None = None
-        self._boosts = 0  # number of running operations that need the raised rate
-        self._written_at: dict[str, float] = {}
+        self._boosts = 0  # number of running operations that need a raised rate of answers
+        self._written_at: dict[str, float] = {}  # maps each name to the time of its last write
         # Last value of each parameter that this program has written and the vehicle has confirmed.
         self.written: dict[str, int | float] = {}
 
     @property
     def _reply_round_trip(self) -> RoundTrip:
-        """Estimate of the time until an answer.
+        """Estimate of the time from a read to its answer.
 
-        It is longer than the round trip of the link, because ArduPilot answers at most five reads every 0.1 s.
+        The time is longer than the round trip of the link, because ArduPilot answers at most five reads every 0.1 s.
         """
         if self._answer_round_trip is None:
             link_s = self._transfers.round_trip.smoothed_s
@@ -112,7 +113,7 @@ class ParameterAccess:
 
     async def _download(self, method: DownloadMethod, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
         if method == "ftp" or (method == "auto" and await self.has_pack()):
-            # The probe ends the attempt early, so that the list can be tried. With "ftp" there is nothing else to try.
+            # With "auto", the probe ends the attempt early, so that the list can be downloaded instead.
             probe = nullcontext() if method == "ftp" else self._ftp_probe()
             try:
                 with probe:
@@ -121,15 +122,16 @@ class ParameterAccess:
             except (FileError, FileTimeout, NotSupported, RemoteProtocolError) as error:
                 if method == "ftp":
                     raise
+                # A damaged file, or a vehicle with another open file, may be different next time.
                 is_temporary = isinstance(error, RemoteProtocolError) or (
                     isinstance(error, FileError) and error.code == MavFtpErr.NOSESSIONSAVAILABLE
                 )
-                self._has_pack = None if is_temporary else False  # None: try the file again next time.
+                self._has_pack = None if is_temporary else False  # With None, the next download tries the file again.
         await self._download_list(idle_timeout_s, on_progress)
 
     @contextmanager
     def _ftp_probe(self) -> Iterator[None]:
-        """Raise FileTimeout early in the block if MAVFTP is not answered, because some relays drop only MAVFTP."""
+        """Raise FileTimeout in the block if no MAVFTP answer arrives soon, because some relays drop only MAVFTP."""
         connection, round_trip = self._transfers.connection, self._transfers.round_trip
         timeout_s = max(FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS * round_trip.timeout_s())
         answers: list[object] = []
@@ -147,7 +149,7 @@ class ParameterAccess:
                 timer.cancel()
                 detach()
         if scope.cancelled_caught:
-            raise FileTimeout(f"MAVFTP was not answered within {timeout_s:.1f} s")
+            raise FileTimeout(f"the vehicle did not answer MAVFTP requests within {timeout_s:.1f} s")
 
     async def has_pack(self) -> bool:
         """Return True if the vehicle has MAVFTP and has not refused ``@PARAM/param.pck``."""
@@ -179,7 +181,7 @@ class ParameterAccess:
                 return
 
     def _with_known_defaults(self, table: ParameterTable) -> ParameterTable:
-        """Return the table, with defaults that an earlier download has reported and this one has not."""
+        """Return the table, and add the defaults that only an earlier download has reported."""
         known = self.store.table
         parameters = []
         for parameter in table.values():
@@ -231,7 +233,7 @@ class ParameterAccess:
         )
         if len(names) > MAX_READS_UNBOOSTED:
             boost_after_s = 0.0
-        elif probe:
+        elif probe:  # A missing parameter is requested several times.
             boost_after_s = BOOST_DELAY_S
         else:
             boost_after_s = math.inf
@@ -315,7 +317,7 @@ class ParameterAccess:
             return answers
 
     def _recently_written(self) -> set[str]:
-        """Names for which a late answer to a write may arrive. Their next write is therefore read back."""
+        """Return the names for which a late answer to a write may arrive. Their next write is therefore read back."""
         earliest = self._transfers.connection.now() - ECHO_WINDOW_S
         self._written_at = {name: written_at for name, written_at in self._written_at.items() if written_at > earliest}
         return set(self._written_at)
@@ -382,7 +384,7 @@ class _CachedList:
     async def load_if_current(self, refresh: bool) -> bool:
         """Load the cached list into the store if its hash is the vehicle's; return True if it was loaded."""
         key, store, since = await self._key(), self._access.store, self._access.store.updates
-        self._hash = await self._read_hash()  # also with `refresh`, because `save` needs it
+        self._hash = await self._read_hash()  # With `refresh` too, because `save` needs the hash.
         if refresh or self._hash is None:
             return False
         table = self._cache.load(key, self._hash)

@@ -73,7 +73,7 @@ class Parameters(ReadOnly):
         return self._access.store.table
 
     def known(self, name: str) -> Parameter | None:
-        """Return the last known parameter of this name on the vehicle; ``table.get(name)`` without building a table."""
+        """Return the last known parameter with this name, like ``table.get(name)`` but without building a table."""
         return self._access.store.get(name)
 
     @property
@@ -117,8 +117,8 @@ class Parameters(ReadOnly):
             method: ``"ftp"`` reads one small file that also has the defaults (``@PARAM/param.pck``), ``"list"``
                 requests one message for each parameter, ``"auto"`` uses the file if there is one.
             refresh: download again, even if the parameters are known or cached.
-            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged, so that the next
-                program needs one request. True means the user's cache directory; or pass a path. Only PX4 has a hash.
+            cache: store the list on disk, and use it while the vehicle's parameter hash is unchanged. The next program
+                then needs only one request. True means the user's cache directory; or pass a path. Only PX4 has a hash.
                 The hash does not cover parameters that PX4 changes by itself, so these may be outdated. Off by default.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
@@ -152,7 +152,7 @@ class Parameters(ReadOnly):
         """
         with self._transfers.limit(timeout):
             resolved = _value_or_raise((await self._names.resolve([name], idle_timeout_s))[name])
-            if resolved.is_fresh:  # It has just been read to resolve the name.
+            if resolved.is_fresh:  # The parameter has just been read to resolve the name.
                 return resolved.as_requested(resolved.parameter)
             answers = await self._access.read([resolved.name], idle_timeout_s)
             return resolved.as_requested(_value_or_raise(answers[resolved.name]))
@@ -182,7 +182,7 @@ class Parameters(ReadOnly):
         Raises:
             InvalidArgument: the name is invalid, or the value is NaN or does not fit the parameter's type.
             ParameterRejected: the vehicle has no such parameter, or keeps the previous value; see ``code``.
-            ParameterTimeout: not confirmed, but it may have been set.
+            ParameterTimeout: the vehicle did not confirm the value, but may have set it.
         """
         results = await self.set_many({name: value}, idle_timeout_s=idle_timeout_s, timeout=timeout)
         result = results[name]
@@ -252,13 +252,14 @@ class Parameters(ReadOnly):
         "aerokit" names the parameter.
 
         Raises:
-            RollbackFailed: values could not be restored; ``not_restored`` has them.
+            RollbackFailed: some values could not be restored; ``not_restored`` has them.
         """
         return TemporaryParameters(self._registry, self._access, self._writing, values, idle_timeout_s)
 
     def transaction(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> Transaction:
-        """Write all of several parameters, or none: ``async with vehicle.parameters.transaction() as t: await
-        t.set(…)``.
+        """Write several parameters, either all or none.
+
+        ``async with vehicle.parameters.transaction() as t: await t.set(…)``
 
         Each write is verified. If the block raises or is cancelled, or a write fails, the previous values are
         restored; see :class:`Transaction`.
@@ -307,7 +308,8 @@ class Parameters(ReadOnly):
         defaults = {name: entry.default for name, entry in (self._metadata or {}).items() if name in table}
         if not any(default is not None for default in defaults.values()):
             raise NotSupported(
-                "the defaults of this vehicle are unknown: they need MAVFTP, or metadata, see load_metadata()"
+                "the defaults of this vehicle are unknown, because it did not send them by MAVFTP: call load_metadata()"
+                " first"
             )
         return ParameterTable(param.replace(default=defaults.get(name)) for name, param in table.items())
 

@@ -41,9 +41,9 @@ class ParameterStore:
         self.updates = 0
         # Number of parameters according to the last message. ArduPilot may show and hide parameters at any time.
         self.count: int | None = None
-        # Value of `updates` at the last message with this parameter.
+        # Maps each name to the value of `updates` at the last message with this parameter.
         self._updated_at: dict[str, int] = {}
-        # Previous value of a written parameter, and the time until which messages with it are ignored.
+        # Maps each written name to the previous value, and the time until which messages with this value are ignored.
         self._replaced: dict[str, tuple[int | float, float]] = {}
 
     @property
@@ -65,7 +65,7 @@ class ParameterStore:
         return name in self._known
 
     def mark_replaced(self, name: str, value: float) -> None:
-        """Ignore messages with this previous value for ``IN_FLIGHT_S``, because a write has just replaced it.
+        """Ignore messages with this previous value for ``IN_FLIGHT_S`` seconds, because a write has just replaced it.
 
         ArduPilot answers PARAM_SET at once, but sends the answer to PARAM_REQUEST_READ up to 0.1 s after it read the
         value. An answer with the previous value may therefore arrive after the confirmation of the write.
@@ -77,7 +77,7 @@ class ParameterStore:
         self._replaced.pop(name, None)
 
     def replaced_value(self, name: str) -> int | float | None:
-        """Return the value marked by `mark_replaced`, while messages with it are ignored."""
+        """Return the value that was marked by `mark_replaced`, as long as messages with this value are ignored."""
         if name not in self._replaced:
             return None
         value, ignored_until = self._replaced[name]
@@ -94,7 +94,10 @@ class ParameterStore:
         self._table, self.is_complete, self.count = None, False, None
 
     def replace(self, table: ParameterTable, *, since: int) -> None:
-        """Replace all parameters by a list requested when ``updates`` was ``since``. Newer messages take precedence."""
+        """Replace all parameters by a downloaded list.
+
+        ``since`` is the value of ``updates`` when the list was requested. Messages since then take precedence.
+        """
         newer_names = {name for name, updated_at in self._updated_at.items() if updated_at > since}
         old, self._known = self._known, {}
         for name, parameter in table.items():
@@ -120,7 +123,7 @@ class ParameterStore:
             return
         replaced_value = self.replaced_value(name)
         if old is not None and replaced_value is not None and same_value(received.value, replaced_value):
-            return  # a late message, from before the last write
+            return  # This message is from before the last write.
         new = received if old is None else merge_update(old, received, self.bytewise)
         self._known[name], self._table = new, None
         self.updates += 1
@@ -178,9 +181,10 @@ class ParameterCache:
                 return None
             return ParameterTable(_parameter(row, i) for i, row in enumerate(content["parameters"]))
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
-            return None
+            return None  # The file is missing, unreadable or damaged.
 
     def save(self, vehicle: str, hash_: int, table: ParameterTable) -> None:
+        """Replace the cached list of a vehicle atomically. Errors of the disk are ignored."""
         rows = [[param.name, param.value, int(param.type), param.default] for param in table.values()]
         content = {"format": CACHE_FORMAT, "vehicle": vehicle, "hash": hash_, "parameters": rows}
         path = self._path(vehicle)

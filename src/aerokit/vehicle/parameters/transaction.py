@@ -26,7 +26,7 @@ __all__ = ["TemporaryParameters", "Transaction"]
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# Leaving a block takes at most this many times ``idle_timeout_s``, however slow the link is.
+# Leaving a block takes at most this many times ``idle_timeout_s``, even if the link is slow.
 MAX_RESTORE_TIMEOUTS = 3
 
 
@@ -40,7 +40,7 @@ class RestoreRegistry:
         self._blocks.setdefault(name, []).append(block)
 
     def remove(self, name: str, block: _Block) -> _Block | None:
-        """Remove a block; return the block that wrote the parameter next after the removed one, if any."""
+        """Remove a block; return the block that first wrote the parameter after the removed block, if any."""
         blocks = self._blocks[name]
         position = blocks.index(block)
         del blocks[position]
@@ -64,7 +64,7 @@ class _Block:
         return await self._writing.write(values, idle_timeout_s=self._idle_timeout_s)
 
     async def _save_previous(self, values: Mapping[str, float]) -> None:
-        # Read again, because the store may be outdated.
+        # Read the values again, because those in the store may be outdated.
         answers_by_name = await self._writing.names.resolve(values, self._idle_timeout_s)
         resolved = [answer for answer in answers_by_name.values() if isinstance(answer, ResolvedParameter)]
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
@@ -74,13 +74,15 @@ class _Block:
             if not isinstance(answer, Parameter):
                 raise answer
             if name not in self._saved:
-                # The store is preferred, because a value that was read as a float may lack its last bits.
+                # Prefer the value in the store, because a value that was read as a float may lack its last bits.
                 self._saved[name] = self._access.store.get(name) or answer
                 self._registry.add(name, self)
 
     def _take_saved(self) -> list[Parameter]:
-        """Return the parameters that this block must restore. Those that an overlapping block has written later are
-        left to that block, with the value from before this block.
+        """Return the parameters that this block must restore.
+
+        If an overlapping block has written a parameter later, that block restores it, to the value from before this
+        block.
         """
         to_restore = []
         for name, saved in self._saved.items():
@@ -96,7 +98,10 @@ class _Block:
             self._registry.remove(name, self)
 
     async def _restore(self, cause: BaseException | None) -> None:
-        """Restore within a limited time, shielded from cancellation; RollbackFailed names what was not restored."""
+        """Restore the parameters within a limited time, shielded from cancellation.
+
+        RollbackFailed names the parameters that were not restored.
+        """
         await run_shielded(self._write_previous(self._take_saved(), cause))
 
     async def _write_previous(self, saved: list[Parameter], cause: BaseException | None) -> None:
@@ -105,7 +110,7 @@ class _Block:
         with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
             try:
                 changed = await self._changed_by_others(saved)
-                # A value of another station stays. What cannot be read is not written, and counts as not restored.
+                # Keep values that another station has set. Parameters that cannot be read count as not restored.
                 saved = [param for param in saved if not isinstance(changed.get(param.name), Parameter)]
                 to_write = [param for param in saved if param.name not in changed]
                 answers = await self._access.write(to_write, self._idle_timeout_s)
@@ -117,8 +122,9 @@ class _Block:
             raise RollbackFailed(f"could not restore{reason}: {names}", not_restored=not_restored) from cause
 
     async def _changed_by_others(self, saved: list[Parameter]) -> dict[str, object]:
-        """Return the parameters that cannot be read, or that another station has changed since the write; log these
-        changes.
+        """Return the parameters that cannot be read, and those that another station has changed since the write.
+
+        Changes by another station are logged.
         """
         written = self._access.written
         names = [param.name for param in saved if param.name in written]
@@ -146,12 +152,12 @@ class TemporaryParameters(_Block):
     ) -> None:
         super().__init__(registry, access, writing, idle_timeout_s)
         self._values = dict(values)
-        self._is_open = False
+        self._was_entered = False
 
     async def __aenter__(self) -> dict[str, ParameterWrite]:
-        if self._is_open:
+        if self._was_entered:
             raise InvalidArgument("this block was entered already: call temporarily() again")
-        self._is_open = True
+        self._was_entered = True
         try:
             results = await self._write(self._values)
             _raise_first_error(results)
@@ -168,9 +174,9 @@ class TemporaryParameters(_Block):
 class Transaction(_Block):
     """Several parameter writes, of which either all take effect or none.
 
-    Every write is verified; a write that fails or is clamped raises. If the block raises, aerokit restores all written
-    parameters and the exception of the block propagates. If some could not be restored,
-    :class:`aerokit.errors.RollbackFailed` names them; they are not tried again when the link returns.
+    Every write is verified; a write that fails or is clamped raises an error. If the block raises, aerokit restores all
+    written parameters, and the exception of the block propagates. :class:`aerokit.errors.RollbackFailed` names the
+    parameters that could not be restored; aerokit does not try again when the link returns.
 
     A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names the parameter.
     Other tasks of your program may write at the same time: a transaction restores the values from before its own first
@@ -204,12 +210,13 @@ class Transaction(_Block):
 
     @property
     def needs_reboot(self) -> tuple[str, ...]:
-        """Names of changes that take effect after a reboot; needs :meth:`Parameters.load_metadata`."""
+        """Names of the changed parameters that need a reboot; empty without :meth:`Parameters.load_metadata`."""
         return tuple(change.name for change in self.changes if self._name_needs_reboot(change.name))
 
     async def set(self, name: str, value: float) -> ParameterWrite:
-        """Set one parameter; errors as for :meth:`Parameters.set`, and VerificationFailed if the vehicle clamps the
-        value.
+        """Set one parameter; errors as for :meth:`Parameters.set`.
+
+        Raises VerificationFailed if the vehicle clamps the value.
         """
         return (await self.set_many({name: value}))[name]
 

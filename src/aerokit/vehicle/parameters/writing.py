@@ -29,7 +29,10 @@ ParameterFailure = ParameterRejected | ParameterTimeout
 
 
 class ResolvedParameter(Snapshot):
-    """A parameter of the vehicle, and the name that the program ``requested``. ``is_fresh``: it was just read."""
+    """A parameter of the vehicle, and the name that the program ``requested``.
+
+    ``is_fresh`` is True if the parameter was just read from the vehicle.
+    """
 
     requested: str
     parameter: Parameter
@@ -114,14 +117,14 @@ class NameResolver:
         from aerokit.parameters.renames import other_names, resolve_rename
 
         store = self._access.store
-        to_read: dict[str, None] = {}  # a dictionary, because its order is that of the requests
+        to_read: dict[str, None] = {}  # an ordered set: the names are requested in this order
         for name in names:
             if name not in store and resolve_rename(name, store) is None:
                 to_read.update(dict.fromkeys((name, *other_names(name))))
         return to_read
 
     def _resolve_one(self, name: str, answers: Mapping[str, ParameterAnswer]) -> ResolvedParameter | ParameterFailure:
-        """Find the parameter under this name or another name of it, in the answers or else in the store."""
+        """Find the parameter by this name or by another of its names, in the answers or else in the store."""
         direct = answers.get(name, self._access.store.get(name))
         if isinstance(direct, Parameter):
             return ResolvedParameter(name, direct, is_fresh=name in answers)
@@ -250,8 +253,9 @@ class ParameterWriter:
         idle_timeout_s: float,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
-        """Write the values; return a result for each, in order. With ``upload``, send only differences, as a file if
-        possible.
+        """Write the values; return a result for each, in order.
+
+        With ``upload``, send only values that differ from the known ones, by the method ``upload``.
         """
         results: dict[str, ParameterWrite] = {}
         pending = check_values(values)
@@ -290,7 +294,7 @@ class ParameterWriter:
     ) -> tuple[list[_PlannedWrite], dict[str, AerokitError]]:
         """Return the planned writes and the errors. In the first round, an invalid value raises InvalidArgument."""
         plans: list[_PlannedWrite] = []
-        first_plans: dict[str, _PlannedWrite] = {}  # by the vehicle's name: two requested names may mean one parameter
+        first_plans: dict[str, _PlannedWrite] = {}  # the first plan for each name on the vehicle
         errors: dict[str, AerokitError] = {}
         for name, answer in answers.items():
             if not isinstance(answer, ResolvedParameter):
@@ -298,6 +302,7 @@ class ParameterWriter:
                 continue
             try:
                 plan = _plan_write(answer, values[name])
+                # Two requested names may mean the same parameter.
                 _check_same_value(plan, first_plans.setdefault(plan.to_send.name, plan))
                 plans.append(plan)
             except InvalidArgument as error:
@@ -330,7 +335,7 @@ def _check_same_value(plan: _PlannedWrite, first: _PlannedWrite) -> None:
     if not same_value(plan.to_send.value, first.to_send.value):
         raise InvalidArgument(
             f"{plan.resolved.requested} = {plan.requested:g} and {first.resolved.requested} = {first.requested:g}"
-            f" contradict: both names mean {plan.to_send.name} on this vehicle"
+            f" contradict each other: both names mean {plan.to_send.name} on this vehicle"
         )
 
 

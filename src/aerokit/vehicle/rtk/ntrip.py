@@ -47,7 +47,7 @@ MAX_SILENCE_S = 30.0
 POSITION_INTERVAL_S = 10.0
 POSITION_POLL_INTERVAL_S = 1.0
 POSITION_MAX_AGE_S = 10.0
-# GPS_FIX_TYPE → quality of GGA: 1 autonomous, 2 differential, 4 RTK fixed, 5 RTK float.
+# Maps GPS_FIX_TYPE to the quality in GGA: 1 autonomous, 2 differential, 4 RTK fixed, 5 RTK float.
 QUALITIES = {4: 2, 5: 5, 6: 4}
 MAX_HEADER_LINES, MAX_CHUNK_SIZE, MAX_TABLE_SIZE = 100, 1 << 20, 4 << 20
 CLOSE_TIMEOUT_S = 1.0
@@ -71,13 +71,13 @@ class Caster:
         try:
             parts = urlsplit(url)
             host, port = parts.hostname, parts.port
-        except ValueError:  # The text of this error may contain the password.
+        except ValueError:  # This error is not passed on, because its text may contain the password.
             parts, host, port = urlsplit(""), None, None
         mount = unquote(parts.path[1:])
         is_mount_valid = mount.isascii() and mount.isprintable() and "/" not in mount and " " not in mount
         if not host or not mount or not is_mount_valid or parts.scheme not in ("ntrip", "ntrips") or port == 0:
             raise InvalidArgument(
-                "url is not allowed (it is not shown, because it may contain a password):"
+                "url is not allowed (it is not shown, because it may contain a password): write"
                 " ntrip://user:password@host:2101/MOUNT, with %40 for an @ in the password"
             )
         user, password = unquote(parts.username or ""), unquote(parts.password or "")
@@ -138,14 +138,14 @@ class _Response:
             if not 0 < size <= MAX_CHUNK_SIZE:
                 return
             yield await self._reader.readexactly(size)
-            await self._reader.readline()
+            await self._reader.readline()  # Skip the line break after the chunk.
 
 
 class NtripClient:
     """Fetches corrections from an NTRIP caster while its ``async with`` block runs, and sends them to the vehicle.
 
     Entering returns when the caster has accepted the request. If the connection ends or is silent for 30 s, the client
-    reconnects after 1 to 30 s, as often as necessary, and logs it (logger ``aerokit``). Messages of more than 720
+    reconnects after 1 to 30 s, as often as necessary, and logs this (logger ``aerokit``). Messages of more than 720
     bytes, which GPS_RTCM_DATA cannot carry, are dropped. Leaving the block closes the connection.
 
     Entering raises:
@@ -243,7 +243,7 @@ class NtripClient:
                     self._reconnects += 1
                     logger.info("%s: connected again", self._name)
                     if await self._forward(response):
-                        pause_s = MIN_RETRY_S
+                        pause_s = MIN_RETRY_S  # The caster sent corrections, so the next attempt may follow soon.
         except (ConnectionClosed, LinkLost) as error:
             self._problem = f"the vehicle's connection has ended: {error}"
         finally:
@@ -267,7 +267,7 @@ class NtripClient:
                         self._oversized += 1
         except asyncio.TimeoutError:
             reason = f"no data for {MAX_SILENCE_S:g} s"
-        except StopAsyncIteration:  # the end of the body
+        except StopAsyncIteration:  # The body has ended.
             pass
         except (OSError, ValueError, EOFError) as error:
             reason = f"the connection failed ({type(error).__name__})"
@@ -342,7 +342,7 @@ class NtripClient:
         return {printable(row[1]): len(row) > 11 and row[11] == "1" for row in rows if len(row) > 1}
 
     async def _report_position(self) -> None:
-        """Send the position to the caster every 10 s; while it is unknown, look for it every second."""
+        """Send the position to the caster every 10 s. While the position is unknown, check for it every second."""
         with self._session.streaming("position", "gps"):
             while self._writer is not None:
                 sentence = gga_sentence(self._session)
@@ -358,9 +358,9 @@ class NtripClient:
 
 def gga_sentence(session: VehicleSession) -> bytes | None:
     """Return the vehicle's position as ``$GPGGA,…`` (NMEA); None while no recent position is known."""
-    cell = session.telemetry.position
-    place = cell.latest
-    if place is None or cell.age > POSITION_MAX_AGE_S or place.altitude_amsl_m is None:
+    position = session.telemetry.position
+    place = position.latest
+    if place is None or position.age > POSITION_MAX_AGE_S or place.altitude_amsl_m is None:
         return None
     receivers = session.telemetry.cells["gps"].latest
     quality, satellites = 1, 4  # A position needs four satellites at least.
@@ -370,7 +370,7 @@ def gga_sentence(session: VehicleSession) -> bytes | None:
     utc = time.strftime("%H%M%S", time.gmtime(session.connection.unix_time()))
     latitude = f"{_format_angle(place.latitude_deg, 2)},{'S' if place.latitude_deg < 0 else 'N'}"
     longitude = f"{_format_angle(place.longitude_deg, 3)},{'W' if place.longitude_deg < 0 else 'E'}"
-    # HDOP and the height of the geoid are mandatory, but casters use only the position: 1.0 and 0.0.
+    # HDOP (1.0) and the height of the geoid (0.0) are mandatory but made up, because casters use only the position.
     fields = (
         f"GPGGA,{utc}.00,{latitude},{longitude},{quality},{satellites:02d},1.0,{place.altitude_amsl_m:.1f},M,0.0,M,,"
     )

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 __all__ = ["Corrections", "Rtk"]
 
 BANDWIDTH_WINDOW_S = 10.0
-# If the program passes an equal message to another vehicle within this many seconds, it is the same message. A base
-# station repeats an equal message (1005, its position) after a second at the earliest.
+# An equal message that the program passes to another vehicle within this many seconds counts as the same message. A
+# base station repeats an equal message (1005, its position) after a second at the earliest.
 REPEAT_WINDOW_S = 0.9
 MAX_RECENT = 64
 
@@ -48,6 +48,7 @@ def send_rtcm(connection: Connection, message: bytes, sender: object) -> int:
     sent, now = _SENT.setdefault(connection, _SentMessages()), connection.now()
     if message in sent.recent:
         sent_at, sender_ids = sent.recent[message]
+        # A message that the same sender passes again is sent again, because base stations repeat their position.
         if id(sender) not in sender_ids and now - sent_at < REPEAT_WINDOW_S:
             sender_ids.add(id(sender))
             return 0
@@ -55,7 +56,7 @@ def send_rtcm(connection: Connection, message: bytes, sender: object) -> int:
     for piece in pieces:
         connection.send(piece)
     sent.sequence += 1
-    # Removed before it is stored, so that the dictionary has the newest message last, and the oldest can be dropped.
+    # Remove the message first: the dictionary then has the newest message last, so that the oldest can be dropped.
     sent.recent.pop(message, None)
     sent.recent[message] = (now, {id(sender)})
     if len(sent.recent) > MAX_RECENT:
@@ -95,7 +96,7 @@ class Rtk:
 
     @property
     def corrections(self) -> StateCell[Corrections]:
-        """Number, bytes and bandwidth of the corrections sent. The age of this cell is the age of the last message."""
+        """Number, bytes and bandwidth of the corrections sent; their ``age`` is the time since the last message."""
         return self._corrections
 
     def send(self, rtcm: bytes) -> None:
@@ -133,6 +134,7 @@ class Rtk:
         return NtripClient(self._session, self._send, Caster.parse(url), send_position, timeout)
 
     def _send(self, message: bytes) -> None:
+        """Send one RTCM message and update the statistics."""
         if self._session.is_closed:
             raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
         send_rtcm(self._session.connection, message, self)
