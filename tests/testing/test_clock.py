@@ -137,7 +137,7 @@ def test_silent_socket_raises_after_deadlock_timeout() -> None:
 
     loop = VirtualClockLoop(deadlock_timeout_s=0.01)
     task = loop.create_task(receive_without_sender())
-    with pytest.raises(DeadlockError, match="no socket or thread woke the loop"):
+    with pytest.raises(DeadlockError, match="no socket or thread has woken the loop"):
         loop.run_until_complete(task)
     task.cancel()
     with pytest.raises(asyncio.CancelledError):

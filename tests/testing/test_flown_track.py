@@ -101,7 +101,7 @@ WRONG: dict[str, Callable[[Track], None]] = {
         lambda track: Track(track.home, track[:-1]).assert_landed_near(within_m=9)
     ),
     "never took off": lambda track: Track(track.home, track[:1]).assert_landed_near(),
-    "nothing was recorded": lambda track: Track(track.home).assert_stayed_below(10),
+    "the track is empty": lambda track: Track(track.home).assert_stayed_below(10),
     "at least three positions, not 2": lambda track: track.assert_stayed_inside(SQUARE[:2]),
 }
 

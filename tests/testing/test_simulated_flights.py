@@ -92,7 +92,7 @@ async def test_fleet_stands_in_a_row() -> None:
 
 
 async def test_unknown_parameter_lists_similar_names() -> None:
-    with pytest.raises(InvalidArgument, match=r"no parameter 'RTL_ALT_MM'; similar: RTL_ALT\b"):
+    with pytest.raises(InvalidArgument, match=r"no parameter 'RTL_ALT_MM'; similar names: RTL_ALT\b"):
         async with open_flight(parameters={"RTL_ALT_MM": 15}):
             pass
 

@@ -23,21 +23,21 @@ _CORRECTIONS_MAX_AGE_S = 5.0
 
 
 class VehicleSigning:
-    """Message signing of ArduPilot and PX4: SETUP_SIGNING sets the key, then ports sign and check frames.
+    """Message signing of ArduPilot and PX4. After SETUP_SIGNING has set the key, the ports sign and check frames.
 
-    ``key`` and ``timestamp`` (units of 10 µs since 2015) are the stored values. All ports share the time stamps of
-    accepted frames, until the vehicle is switched off.
+    ``key`` and ``timestamp`` (units of 10 µs since 2015) are the stored values. All ports share the record of the time
+    stamps of accepted frames, which is cleared at power-on.
     """
 
     AHEAD: ClassVar[int] = 0
-    """Added to the stored time stamp when a port starts to sign."""
+    """Number that is added to the stored time stamp when a port starts to sign."""
 
     def __init__(self, vehicle: SimulatedVehicle, key: SigningKey | None, timestamp: int) -> None:
         self.key = key
-        """The stored key; None turns signing off. Call `load` after assigning it."""
+        """The stored key; None turns signing off. Call `load` after an assignment."""
         self.timestamp: int = timestamp if key is not None else 0
         self.trusts_first_port = False
-        """True if the first port accepts unsigned frames, ArduPilot's default. Call `load` after assigning it."""
+        """True if the first port accepts unsigned frames, as ArduPilot does. Call `load` after an assignment."""
         self._vehicle = vehicle
         self._streams: dict[tuple[int, int, int], int] = {}
         vehicle.on(SetupSigning, self._on_setup)
@@ -48,7 +48,7 @@ class VehicleSigning:
             self.start(channel)
 
     def start(self, channel: Channel) -> None:
-        """Apply the stored key to one port; its index is the link id."""
+        """Apply the stored key to one port. The index of the port is its link id in signatures."""
         link_id = self._vehicle.channels.index(channel)
         if self.key is None or channel.version == 1 or not self.is_for(link_id):
             channel.sign_with(None)
@@ -67,11 +67,11 @@ class VehicleSigning:
         return True
 
     def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:
-        """Return the predicate for unsigned frames that this port accepts."""
+        """Return the function that decides which unsigned frames this port accepts; None accepts no such frame."""
         raise NotImplementedError
 
     def may_change(self) -> bool:
-        """Return True if the key can be changed now, otherwise send the reason."""
+        """Return True if the key can be changed now. If not, send a text with the reason."""
         raise NotImplementedError
 
     def on_key_changed(self) -> None:
@@ -85,13 +85,14 @@ class VehicleSigning:
         if not self.may_change():
             return
         self.key = SigningKey(message.secret_key) if any(message.secret_key) else None
-        self.timestamp = message.initial_timestamp & LAST_TIMESTAMP  # The time stamp of a frame has 48 bits.
+        # The field has 64 bits, but the time stamp of a frame has only 48 bits.
+        self.timestamp = message.initial_timestamp & LAST_TIMESTAMP
         self.load()
         self.on_key_changed()
 
 
 class _Signing(Signing):
-    """Message signing whose time stamps wrap around after 48 bits, as in the firmwares."""
+    """Message signing in which the 48-bit time stamp overflows to 0, as in the firmwares."""
 
     def sign(self, frame: bytes, now: float = 0.0) -> bytes:
         if self.timestamp > LAST_TIMESTAMP:
@@ -102,7 +103,7 @@ class _Signing(Signing):
 class ReceivedCorrections:
     """Assembles the fragments of RTCM messages as ArduPilot does (AP_GPS.cpp, handle_gps_rtcm_fragment).
 
-    ``messages`` has the assembled messages; ``is_recent`` is True while they arrive.
+    ``messages`` contains the assembled messages. ``is_recent`` is True if the latest message is recent.
     """
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
@@ -125,10 +126,12 @@ class ReceivedCorrections:
         if sequence != self._sequence or fragment_id in self._fragments:
             self._fragments.clear()
         self._sequence, self._fragments[fragment_id] = sequence, data
-        # A fragment that is not full is the last one; there is none if the message fills all fragments.
+        # Only the last fragment is shorter than FRAGMENT_SIZE. A message that fills all MAX_FRAGMENTS fragments has no
+        # short fragment.
         has_short = any(len(fragment) < FRAGMENT_SIZE for fragment in self._fragments.values())
         has_last = has_short or len(self._fragments) == MAX_FRAGMENTS
-        if has_last and len(self._fragments) == max(self._fragments) + 1:
+        has_all = len(self._fragments) == max(self._fragments) + 1  # The ids of the fragments count from 0.
+        if has_last and has_all:
             self._add(b"".join(self._fragments[index] for index in range(len(self._fragments))))
             self._fragments.clear()
 
@@ -138,7 +141,7 @@ class ReceivedCorrections:
         self._received_at = self._vehicle.now
 
 
-# FIRMWARE_VERSION_TYPE by the suffix of the version.
+# The FIRMWARE_VERSION_TYPE for each suffix of a version text.
 _RELEASE_TYPES = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "": 255, "official": 255}
 
 
@@ -154,9 +157,9 @@ class SimulatedAutopilot(SimulatedVehicle):
     """MAV_PROTOCOL_CAPABILITY flags."""
 
     files: FileTree
-    """Files on the memory card and generated files; they survive a reboot."""
+    """Files on the memory card and generated files, which survive a reboot."""
     signing: VehicleSigning
-    """Message signing; its key survives a reboot."""
+    """Message signing, whose key survives a reboot."""
     motion: Motion
 
     def __init__(
@@ -182,9 +185,9 @@ class SimulatedAutopilot(SimulatedVehicle):
         raise NotImplementedError
 
     def open_channel(self, *, version: int = 2) -> Channel:
-        """Open another port, which has its own stream rates; ``version`` is its MAVLink version."""
+        """Open another port, which has its own stream rates. ``version`` is the MAVLink version of the port."""
         channel = super().open_channel(version=version)
-        if len(self.channels) > 1:  # The base class opens the first channel before `signing` exists.
+        if len(self.channels) > 1:  # The base class opens the first channel, when `signing` does not exist yet.
             self.signing.start(channel)
         return channel
 
@@ -206,7 +209,7 @@ class SimulatedAutopilot(SimulatedVehicle):
     def version_number(self) -> int:
         """Firmware version as AUTOPILOT_VERSION packs it."""
         numbers, _, release = self.version.partition("-")
-        padded = (*numbers.split("."), "0", "0")  # "4.7" means 4.7.0.
+        padded = (*numbers.split("."), "0", "0")  # The version "4.7" means 4.7.0.
         major, minor, patch = (int(number) for number in padded[:3])
         return major << 24 | minor << 16 | patch << 8 | _RELEASE_TYPES.get(release, 0)
 
@@ -214,12 +217,12 @@ class SimulatedAutopilot(SimulatedVehicle):
         self.on(m.Timesync, self._on_timesync)
 
     def serve_commands(self, handlers: Mapping[int, CommandHandler]) -> CommandServer:
-        """Answer these MAV_CMDs, except those in ``unsupported_commands``."""
+        """Answer the MAV_CMDs with these handlers, except those in ``unsupported_commands``."""
         supported = {number: handler for number, handler in handlers.items() if number not in self.unsupported_commands}
         return CommandServer(self, supported, self.refusal_of_command)
 
     def refusal_of_command(self, command: ReceivedCommand) -> int | None:
-        """Return the MAV_RESULT with which any command is refused at present; None if commands are handled."""
+        """Return the MAV_RESULT with which this command is refused before it is handled; None to handle it."""
         return None
 
     def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:
@@ -228,7 +231,7 @@ class SimulatedAutopilot(SimulatedVehicle):
 
 
 _RESTING_CELL_VOLTS = ((0.0, 3.0), (5.0, 3.3), (20.0, 3.6), (50.0, 3.75), (75.0, 3.95), (100.0, 4.2))
-# From full to empty: percent, volts, volts per percent.
+# Linear sections of the resting voltage, from full to empty: percent and volts at the lower end, volts per percent.
 _RESTING_CELL_SLOPES = tuple(
     (low, volts, (high_volts - volts) / (high - low))
     for (low, volts), (high, high_volts) in pairwise(_RESTING_CELL_VOLTS)
@@ -236,7 +239,7 @@ _RESTING_CELL_SLOPES = tuple(
 
 
 class SimulatedBattery:
-    """A lithium battery pack: charge, resting voltage by charge, voltage sag by current."""
+    """A lithium battery pack. Its voltage depends on the charge, and sags under a current."""
 
     consumed_mah: float
     consumed_wh: float
@@ -253,7 +256,7 @@ class SimulatedBattery:
         self.cells = cells
         self.resistance_ohm = resistance_ohm
         self.consumed_mah = 0.0
-        """Consumption since power-on, as a current sensor counts it."""
+        """Charge in mAh that was consumed since power-on, as a current sensor counts it."""
         self.consumed_wh = 0.0
         self.current_a: float = 0.0
         self._charge_mah = capacity_mah * percent / 100.0
@@ -274,7 +277,7 @@ class SimulatedBattery:
 
     def drain(self, current_a: float, dt: float) -> None:
         self.current_a = current_a
-        used_mah = current_a * dt / 3.6  # 3.6 As are 1 mAh.
+        used_mah = current_a * dt / 3.6  # 1 mAh is 3.6 As.
         self.consumed_mah += used_mah
         self.consumed_wh += used_mah * self.voltage_v / 1000.0
         self._charge_mah = max(0.0, self._charge_mah - used_mah)

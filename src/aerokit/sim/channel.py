@@ -20,9 +20,10 @@ _MAX_FLOAT32 = 3.4028234663852886e38
 
 
 def fitted(message: MessageT) -> MessageT:
-    """Return a copy of the message whose values fit their fields: integers clamped, large floats infinite, texts cut.
+    """Return a copy of the message whose values fit their fields.
 
-    Values of a wrong type are not changed, so that encoding them reveals the bug.
+    Integers are clamped, floats that are too large become infinite, and texts are cut. Values of a wrong type are not
+    changed, so that encoding them reveals the bug.
     """
     fitting = copy.copy(message)
     for field in fitting.FIELDS:
@@ -53,18 +54,18 @@ def _fit_number(type_: str, value: Any) -> Any:
 
 
 MAX_PEERS = 256
-"""Peers whose partial frames a `MessageReader` keeps; beyond this number, the oldest peer is forgotten."""
+"""Maximum number of peers whose partial frames a `MessageReader` keeps. A further peer replaces the oldest one."""
 
 
 class MessageReader:
-    """Decodes the bytes of several peers. ``wanted`` holds the message ids to decode; None decodes all."""
+    """Decodes the bytes of several peers. ``wanted`` contains the message ids to decode; None decodes all."""
 
     def __init__(self, wanted: Container[int] | None) -> None:
         self._wanted = wanted
         self._framers: dict[Hashable, Framer] = {}
 
     def messages(self, data: bytes, now: float, peer: Hashable) -> list[Message]:
-        """Return the messages that these bytes complete, each with its ``received_frame``."""
+        """Return the messages whose last bytes are in ``data``, each with its ``received_frame``."""
         framer = self._framers.get(peer)
         if framer is None:
             if len(self._framers) >= MAX_PEERS:
@@ -76,7 +77,7 @@ class MessageReader:
 
 
 class SharedMessageReader(MessageReader):
-    """Decodes the same bytes only once for several vehicles: caches the result until `forget`."""
+    """Decodes the same bytes only once for several vehicles. The result is cached until `forget` is called."""
 
     def __init__(self) -> None:
         super().__init__(None)
@@ -92,22 +93,22 @@ class SharedMessageReader(MessageReader):
 
 
 class Streams:
-    """Schedule of the streamed messages of a port. A late stream skips messages instead of sending a burst."""
+    """Schedule of the messages that a port streams. A late stream skips messages instead of sending a burst."""
 
     __slots__ = ("_heap", "_intervals", "_token", "next_due")
 
     def __init__(self) -> None:
         self.next_due: float = math.inf
-        """Time of the next message; infinity when nothing is streamed."""
-        # Interval and token by message id. Every change of an interval has a new token: entries of the heap with
-        # another token are obsolete.
+        """Time of the next message; infinity if no message is streamed."""
+        # Interval and token of each stream, by message id. Every change of an interval creates a new token, so that
+        # heap entries with an older token are recognised as obsolete.
         self._intervals: dict[int, tuple[float, int]] = {}
-        # (due time, token, message id, time of the first message, number of messages since then)
+        # Heap entries: (due time, token, message id, time of the first message, number of messages since then).
         self._heap: list[tuple[float, int, int, float, int]] = []
         self._token = 0
 
     def set_interval(self, message_id: int, interval_s: float, now: float) -> None:
-        """Send a message every ``interval_s`` seconds, starting now; 0 stops the stream."""
+        """Stream a message every ``interval_s`` seconds from now on. 0 stops the stream."""
         self._token += 1
         if interval_s <= 0.0:
             self._intervals.pop(message_id, None)
@@ -125,7 +126,7 @@ class Streams:
         return frozenset(self._intervals)
 
     def postpone(self, seconds: float) -> None:
-        """Delay all streams."""
+        """Delay all streams by this time."""
         self._heap = [
             (due + seconds, token, message_id, start + seconds, count)
             for due, token, message_id, start, count in self._heap
@@ -133,10 +134,10 @@ class Streams:
         self._update_next_due()
 
     def _update_next_due(self) -> None:
-        self.take_due(-math.inf)  # Nothing is due at this time, so this only updates the time.
+        self.take_due(-math.inf)  # No message is due at this time, so the call only updates `next_due`.
 
     def take_due(self, now: float) -> list[int]:
-        """Return the message ids that are due, and schedule each again."""
+        """Return the ids of the messages that are due, and schedule the next message of each stream."""
         ids: list[int] = []
         heap, intervals = self._heap, self._intervals
         while heap:
@@ -149,11 +150,11 @@ class Streams:
                 self.next_due = due
                 return ids
             ids.append(message_id)
-            # Rounded, so that streams of different rates are due at the same instants.
+            # The due time is rounded, so that streams with different rates are due at exactly the same instants.
             following = round(start + (count + 1) * interval, 9)
             if following > now:
                 heapreplace(heap, (following, token, message_id, start, count + 1))
-            else:  # The stream is late: it starts again now.
+            else:  # The stream is late by more than an interval, so it starts again at the present time.
                 heapreplace(heap, (now + interval, token, message_id, now, 1))
         self.next_due = math.inf
         return ids
@@ -171,16 +172,16 @@ class Channel:
         self._wanted = wanted
         self._own_ids = (system_id, component_id)
         self.reader: MessageReader = MessageReader(wanted)
-        """Decodes incoming bytes; vehicles on one link may share a reader."""
+        """Decodes incoming bytes. Several vehicles on one link may share a reader."""
         self._encoders: dict[tuple[int, int], FrameEncoder] = {}
         self._outbox: list[bytes] = []
         self.closes_clients: bool = False
-        """Set by a vehicle to disconnect the clients of a TCP port."""
+        """True if the vehicle wants the server to disconnect the clients of this (TCP) port."""
         self.signing: Signing | None = None
         """Signs and checks frames; see `sign_with`."""
 
     def sign_with(self, signing: Signing | None) -> None:
-        """Sign and check frames with ``signing`` from now on; None turns signing off."""
+        """Sign and check frames with ``signing`` from now on. None turns signing off."""
         self.signing = signing
         for encoder in self._encoders.values():
             encoder.signing = signing
@@ -194,7 +195,7 @@ class Channel:
         return [message for message in messages if message.received_frame and signing.accepts(message.received_frame)]
 
     def encode(self, message: Message, sender: tuple[int, int] | None = None) -> bytes:
-        """Return a frame with the sender's next sequence number; empty if MAVLink 1 has no such message."""
+        """Return a frame with the next sequence number. It is empty if a MAVLink 1 port cannot send the message."""
         if self.version == 1 and message.ID > 255:
             return b""
         sender = self._own_ids if sender is None else sender
@@ -205,11 +206,11 @@ class Channel:
         try:
             return encoder.encode(message)
         except InvalidArgument:
-            # A NaN parameter or a position out of range must not stop a vehicle.
+            # A value that does not fit its field, such as NaN or a distant position, must not stop a vehicle.
             return encoder.encode(fitted(message))
 
     def write(self, data: bytes) -> None:
-        """Append a frame, or bytes that must stay in one piece, to the outbox."""
+        """Append a frame to the outbox, or other bytes that must not be divided."""
         if data:
             self._outbox.append(data)
 
@@ -219,7 +220,7 @@ class Channel:
         return bool(self._outbox)
 
     def take_outbox(self) -> bytes:
-        """Return and clear the outbox; it holds whole frames only."""
+        """Return and clear the outbox, which contains only whole frames."""
         if not self._outbox:
             return b""
         data = b"".join(self._outbox)
@@ -227,7 +228,7 @@ class Channel:
         return data
 
     def take_pieces(self) -> list[bytes]:
-        """Return and clear the outbox, one element for each `write`."""
+        """Return and clear the outbox, with one element for each call of `write`."""
         pieces, self._outbox = self._outbox, []
         return pieces
 
@@ -236,14 +237,14 @@ class Channel:
         return datagrams(self.take_pieces())
 
     def reset(self) -> None:
-        """Reset rates, partial frames and sequence numbers because of a reboot; the outbox stays."""
+        """Reset stream rates, partial frames and sequence numbers because of a reboot. The outbox stays."""
         self.streams = Streams()
         self.reader = MessageReader(self._wanted)
         self._encoders.clear()
 
 
 def datagrams(pieces: Iterable[bytes]) -> list[bytes]:
-    """Join pieces into as few datagrams as possible."""
+    """Join the pieces, in their order, into as few datagrams as possible."""
     joined: list[bytes] = []
     datagram = b""
     for piece in pieces:

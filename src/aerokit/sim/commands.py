@@ -23,7 +23,7 @@ from aerokit.sim.vehicle import MessageHost
 
 
 class CommandServer(commands.CommandDispatcher):
-    """Answers commands, modified by the `Faults` of a vehicle or component."""
+    """Answers commands. The `Faults` of the vehicle or component change the answers."""
 
     def __init__(
         self,
@@ -50,9 +50,10 @@ class CommandServer(commands.CommandDispatcher):
             self._answer_with(command, answer, fault)
 
     def _answer_with(self, command: ReceivedCommand, result: int, fault: CommandFault | None) -> None:
-        """Send the acknowledgement, modified by ``fault``."""
+        """Send the acknowledgement as ``fault`` changes it: with progress, repeated, delayed or not at all."""
         fault = CommandFault() if fault is None else fault
         if fault.progress:
+            # After the progress, the remaining faults apply to the final acknowledgement.
             final_fault = CommandFault(acks=fault.acks, delay_s=fault.delay_s)
             progress = CommandProgress(fault.progress, fault.progress_interval_s, result)
             self.report(command, progress, lambda: self._answer_with(command, result, final_fault))
@@ -66,7 +67,8 @@ class CommandServer(commands.CommandDispatcher):
 
 PositionTarget = SetPositionTargetLocalNed | SetPositionTargetGlobalInt
 
-# Bits of the three axes. Plain integers, because arithmetic on flags takes ten times as long.
+# Mask bits of the three axes of each vector. They are plain integers, because operators of enum flags take ten times
+# as long.
 _POSITION = (int(Mask.X_IGNORE), int(Mask.Y_IGNORE), int(Mask.Z_IGNORE))
 _VELOCITY = (int(Mask.VX_IGNORE), int(Mask.VY_IGNORE), int(Mask.VZ_IGNORE))
 _ACCELERATION = (int(Mask.AX_IGNORE), int(Mask.AY_IGNORE), int(Mask.AZ_IGNORE))
@@ -74,14 +76,14 @@ _ACCELERATION = (int(Mask.AX_IGNORE), int(Mask.AY_IGNORE), int(Mask.AZ_IGNORE))
 
 @dataclass(frozen=True)
 class Setpoint:
-    """A decoded set-point message; vectors are in the frame of the message."""
+    """The content of a set-point message. Its vectors are in the frame of the message."""
 
     mask: int
     velocity: Ned
     acceleration: Ned
     yaw: float | None
     yaw_rate: float | None
-    """Radians; None if ignored."""
+    """Yaw is in radians, the yaw rate in radians per second. None if the mask ignores the value."""
 
     @classmethod
     def of(cls, message: PositionTarget) -> Setpoint:
@@ -112,7 +114,7 @@ class Setpoint:
         return bool(self.mask & Mask.FORCE_SET) and self.has_acceleration
 
     def axes(self, position: Ned) -> tuple[Ned, Ned, Ned]:
-        """Return position, velocity and acceleration; an axis is NaN if it is ignored or not finite."""
+        """Return position, velocity and acceleration. An axis that is ignored or not finite is NaN."""
         return (
             self._masked(position, _POSITION),
             self._masked(self.velocity, _VELOCITY),
@@ -128,12 +130,12 @@ class Setpoint:
 
 
 def rotated(vector: Ned, yaw: float) -> Ned:
-    """Rotate a body vector (forward, right, down) to north, east, down."""
+    """Rotate a vector of the body frame (forward, right, down) by ``yaw`` radians to north, east, down."""
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     forward, right, down = vector
     return (forward * cos_yaw - right * sin_yaw, forward * sin_yaw + right * cos_yaw, down)
 
 
 def is_finite(*vectors: Ned | None) -> bool:
-    """Return True if all components of all vectors are finite; None is skipped."""
+    """Return True if all components of all vectors are finite. Vectors that are None do not count."""
     return all(math.isfinite(part) for vector in vectors if vector is not None for part in vector)

@@ -13,19 +13,19 @@ from aerokit.mavlink.messages import Heartbeat
 
 @dataclass
 class CommandFault:
-    """Fault of one command. ``times`` counts down; None means always."""
+    """Fault of one command, which applies ``times`` times. None means that the fault applies every time."""
 
     times: int | None = None
     refuse_with: int | None = None
-    """MAV_RESULT of the refusal, instead of executing the command."""
+    """MAV_RESULT with which the command is refused instead of being executed; None to execute the command."""
     text: str | None = None
     """Status text sent with the refusal."""
     ignore: bool = False
     """Neither execute nor acknowledge the command."""
     acks: int = 1
-    """Number of acknowledgements sent: 0 loses the acknowledgement, 2 repeats it."""
+    """Number of acknowledgements to send. 0 loses the acknowledgement, 2 repeats it."""
     delay_s: float = 0.0
-    """Delay of the acknowledgement in seconds; the command is executed at once."""
+    """Delay of the acknowledgement in seconds. The command itself is executed at once."""
     progress: tuple[int, ...] = ()
     """Percentages of IN_PROGRESS answers sent before the result."""
     progress_interval_s: float = 0.5
@@ -33,22 +33,22 @@ class CommandFault:
 
 @dataclass
 class Faults:
-    """Faults of a vehicle or component, initially all off. A change applies from the next message or step on.
+    """Faults of a vehicle or component, initially all off. A change takes effect at the next message or step.
 
     - ``gps_lost``: no GPS fix; the estimator drops its position after seven seconds
     - ``rc_lost``: the pilot's transmitter is off; the failsafes of the vehicle react
     - ``leak``: water in the hull of a submarine
     - ``heartbeats_stopped``: HEARTBEAT stops, all other streams continue
-    - ``frozen``: the autopilot hangs; it does not receive, move or send until this is False
+    - ``frozen``: the autopilot hangs; it does not receive, move or send until the fault is False again
     - ``silent``: the radio fails in both directions; the vehicle continues to fly
     - ``prearm_failures``: additional reasons of the arming checks, such as "Compass not healthy"
-    - ``drop_outgoing``, ``drop_incoming``: number of frames to lose next (counts down)
+    - ``drop_outgoing``, ``drop_incoming``: how many of the next frames to lose; each lost frame decrements the number
     - ``loss``, ``loss_incoming``: share of outgoing and incoming frames to lose, 0 to 1; chosen at random from the
       vehicle's seed
-    - ``lost_messages``: message id → number of outgoing messages to lose next; see ``lose``
+    - ``lost_messages``: how many of the next outgoing messages to lose, by message id; see ``lose``
     - ``motor_failed``: one motor stops; the vehicle cannot hold its altitude and descends
     - ``no_ftp``: FILE_TRANSFER_PROTOCOL is not answered and not in the capabilities
-    - ``parameter_limits``: name → minimum and maximum; values that are set are clamped silently
+    - ``parameter_limits``: minimum and maximum by parameter name; values that are set are clamped silently
     - ``read_only_parameters``: names of parameters that cannot be set
     - ``mute_parameters``: names of parameters whose PARAM_VALUE is always lost
     """
@@ -72,7 +72,7 @@ class Faults:
     mute_parameters: set[str] = field(default_factory=set)
     commands: dict[int, CommandFault] = field(default_factory=dict)
 
-    if not TYPE_CHECKING:  # A type checker that sees this method does not report misspelled names.
+    if not TYPE_CHECKING:  # If a type checker saw this method, it would no longer report misspelled names.
 
         def __setattr__(self, name: str, value: object) -> None:
             # A misspelled fault would otherwise be accepted and change nothing.
@@ -88,7 +88,7 @@ class Faults:
         *,
         times: int | None = None,
     ) -> None:
-        """Refuse a MAV_CMD with this MAV_RESULT and an optional status text, without executing it."""
+        """Do not execute a MAV_CMD, but answer with this MAV_RESULT and an optional status text."""
         self.commands[command] = CommandFault(times, refuse_with=result, text=text)
 
     def ignore(self, command: int, *, times: int | None = None) -> None:
@@ -104,7 +104,7 @@ class Faults:
         self.lost_messages[message_type.ID] = times
 
     def drops_outgoing(self, message: Message, rng: random.Random) -> bool:
-        """Return True if this message is lost while being sent; decrements the counters."""
+        """Return True if this outgoing message is lost, and decrement the counter of the fault."""
         if self.silent or (self.heartbeats_stopped and message.ID == Heartbeat.ID):
             return True
         remaining = self.lost_messages.get(message.ID, 0)
@@ -117,7 +117,7 @@ class Faults:
         return self.loss > 0.0 and rng.random() < self.loss
 
     def drops_incoming(self, rng: random.Random) -> bool:
-        """Return True if the next incoming message is lost; decrements the counters."""
+        """Return True if the next incoming message is lost, and decrement the counter of the fault."""
         if self.drop_incoming > 0:
             self.drop_incoming -= 1
             return True
@@ -145,7 +145,7 @@ class Faults:
             self.commands.pop(command, None)
 
     def next_command_fault(self, command: int) -> CommandFault | None:
-        """Return the fault to apply to this command now, or None; decrements its ``times``."""
+        """Return the fault to apply to this command now, or None. Decrement the ``times`` of the fault."""
         fault = self.commands.get(command)
         if fault is not None and fault.times is not None:
             fault.times -= 1

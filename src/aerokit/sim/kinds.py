@@ -14,7 +14,7 @@ from aerokit.sim.vehicle import SimulatedVehicle
 __all__ = ["kind_class", "kind_names", "scale_timeouts", "simulated"]
 
 
-# Name → module and class; imported on first use.
+# Module and class of each kind, by name. A module is imported when its kind is used first.
 _KINDS = {
     "copter": ("aerokit.sim.ardupilot", "SimulatedCopter"),
     "plane": ("aerokit.sim.ardupilot", "SimulatedPlane"),
@@ -45,27 +45,27 @@ def kind_class(name: str) -> type[SimulatedVehicle]:
 
 
 def simulated(name: str, **options: Any) -> SimulatedVehicle:
-    """Create a vehicle of this kind; ``options`` are passed to its class (``system_id``, ``home``, ``seed`` …).
+    """Create a vehicle of this kind. Its class gets the ``options``, such as ``system_id``, ``home`` and ``seed``.
 
     Raises InvalidArgument for an unknown kind, TypeError for an unknown option.
     """
     return kind_class(name)(**options)
 
 
-# Timeouts of ArduPilot and PX4 for heartbeats, set-points, channel overrides and the take-off.
+# Names of ArduPilot's and PX4's timeouts for heartbeats, set-points, channel overrides and the take-off.
 _TIMEOUT_PARAMETERS = (
     "FS_GCS_TIMEOUT", "FS_LONG_TIMEOUT", "FS_PILOT_TIMEOUT", "GUID_TIMEOUT", "RC_OVERRIDE_TIME",
     "DISARM_DELAY", "COM_DISARM_PRFLT", "COM_DL_LOSS_T", "COM_OBC_LOSS_T", "COM_OF_LOSS_T", "COM_RC_LOSS_T",
 )  # fmt: skip
-_INT8_MAX = 127.0  # limit of DISARM_DELAY
+_INT8_MAX = 127.0  # The maximum of DISARM_DELAY, which is an INT8.
 
 
 def scale_timeouts(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leave: Collection[str] = ()) -> None:
-    """Multiply the timeouts in the vehicles' parameters by ``speedup``; ``leave`` names parameters to skip.
+    """Multiply the timeouts in the vehicles' parameters by ``speedup``, except the parameters named in ``leave``.
 
-    A client times its heartbeats and set-points by its own clock. At ten times the speed, five simulated seconds last
-    only half a second for the client. PX4's simulation scales COM_DL_LOSS_T in the same way. ArduPilot's DISARM_DELAY
-    is limited to 127 s by its type. A ``speedup`` of 1 or less changes nothing.
+    A client times its heartbeats and set-points by its own clock. With a ``speedup`` of ten, five simulated seconds
+    last only half a second for the client. PX4's simulation scales COM_DL_LOSS_T in the same way. The type of
+    ArduPilot's DISARM_DELAY limits this parameter to 127 s. A ``speedup`` of 1 or less changes nothing.
     """
     if speedup <= 1.0:
         return

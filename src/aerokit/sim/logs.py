@@ -30,20 +30,20 @@ _BLOCK = 90
 
 @dataclass(frozen=True)
 class SimulatedLog:
-    """A sample of a flight log, without a flight.
+    """A log file of a simulated vehicle, which does not describe a flight.
 
-    Its content is `SAMPLE_LOG`, followed by pseudo-random bytes derived from ``seed``, or from size and time.
+    The content is `SAMPLE_LOG`, followed by pseudo-random bytes that depend on ``seed``, or on size and time.
     """
 
     size: int
     time_utc: int = 1_790_000_000
-    """Seconds since 1970."""
+    """Time of the log in seconds since 1970."""
     seed: int | None = None
-    """Seed of the content; None derives it from size and time."""
+    """Seed of the pseudo-random content. If None, the content depends on size and time."""
 
     def make(self) -> bytes:
-        """Return the content. The contents of two logs with the same seed are equal up to the shorter length."""
-        words = -(-self.size // 4)  # rounded up
+        """Return the content. Of two logs with the same seed, the longer one starts with the shorter one."""
+        words = -(-self.size // 4)  # The number of 32-bit words, rounded up.
         return (SAMPLE_LOG + random.Random(self._content_seed).randbytes(4 * words))[: self.size]
 
     def grown(self, count: int, time_utc: int) -> SimulatedLog:
@@ -56,9 +56,9 @@ class SimulatedLog:
 
 
 class LogServer:
-    """Sends lists and contents of logs, ``rate_hz`` messages a second in groups of ``burst``.
+    """Sends lists and contents of logs at ``rate_hz`` messages per second, in groups of ``burst`` messages.
 
-    Serves one transfer at a time. Subclasses implement what differs between autopilots.
+    The server makes one transfer at a time. Subclasses implement what differs between autopilots.
     """
 
     burst = 10
@@ -117,27 +117,27 @@ class LogServer:
         return self._content[1]
 
     def write_on(self, count: int, time_utc: int) -> None:
-        """Extend the newest log by ``count`` bytes and update its time."""
+        """Extend the newest log by ``count`` bytes, and set its time to ``time_utc``."""
         old = self.logs[-1]
         self.logs[-1] = old.grown(count, time_utc)
         self._append_to_file(len(self.logs) - 1, self.logs[-1].make()[old.size :])
 
     def blocks(self, number: int, log_id: int, offset: int, count: int) -> list[Callable[[], Message]]:
-        """Return functions that create the LOG_DATA blocks of a range, or one empty block for a range without data."""
+        """Return functions that create the LOG_DATA messages of a range. A range without data has one empty block."""
         data = self.content(number)
         end = min(len(data), offset + count)
         starts = range(offset, end, _BLOCK) if offset < end else range(offset, offset + 1)
         return [lambda start=start: _block(data, log_id, start, end) for start in starts]  # type: ignore[misc]
 
     def transfer(self, messages: Sequence[Callable[[], Message]], channel: Channel) -> None:
-        """Abort the running transfer and send these messages."""
+        """Abort the running transfer, if any, and send these messages."""
         self.restart()
         self._outgoing.extend(messages)
         self._channel = channel
         self._send_next(self._transfer_number)
 
     def _send_next(self, transfer: int) -> None:
-        if transfer != self._transfer_number:  # This transfer was aborted.
+        if transfer != self._transfer_number:  # This transfer was aborted or replaced.
             return
         for _ in range(min(self.burst, len(self._outgoing))):
             self._vehicle.send(self._outgoing.popleft()(), self._channel)
@@ -146,7 +146,7 @@ class LogServer:
 
 
 class ArduPilotLogServer(LogServer):
-    """ArduPilot's log server: log numbers start at 1, and requests are refused while armed.
+    """ArduPilot's log server. Log numbers start at 1, and requests are refused while the vehicle is armed.
 
     Requests during a transfer are ignored. A request for an unknown log aborts the transfer.
     """
@@ -170,7 +170,7 @@ class ArduPilotLogServer(LogServer):
             self._vehicle.info("Log download in progress")
             return
         first, last = max(1, request.start), min(len(self.logs), request.end)
-        if not self.logs:  # The answer is then a single empty entry with number 0.
+        if not self.logs:  # Without logs, answer with a single empty entry that has the number 0.
             first = last = 0
         numbers = range(first, last + 1)
         self.transfer([lambda number=number: self._entry(number, last) for number in numbers], channel)  # type: ignore[misc]
@@ -206,7 +206,7 @@ class ArduPilotLogServer(LogServer):
 
 
 class Px4LogServer(LogServer):
-    """PX4's log server: log numbers start at 0, and data is sent only after a list request.
+    """PX4's log server. Log numbers start at 0, and data is sent only after a list request.
 
     The ``end`` of a list request is ignored. A new request replaces the transfer. The last block is not cut to the
     requested size. Without logs, a list request is not answered.
@@ -230,7 +230,7 @@ class Px4LogServer(LogServer):
         if not is_available or request.ofs >= self.logs[request.id].size:
             self.restart()
             return
-        whole_blocks = max(1, -(-request.count // _BLOCK))  # rounded up
+        whole_blocks = max(1, -(-request.count // _BLOCK))  # The number of blocks, rounded up.
         self.transfer(self.blocks(request.id, request.id, request.ofs, whole_blocks * _BLOCK), channel)
 
 

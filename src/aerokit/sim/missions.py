@@ -38,12 +38,12 @@ class MissionStore(Protocol):
         ...
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Replace the items at once, like a file upload; return the MAV_MISSION_RESULT."""
+        """Replace the items at once, as a file upload does, and return the MAV_MISSION_RESULT."""
         ...
 
 
 def float32(value: float) -> float:
-    """Round to single precision; infinity beyond the range."""
+    """Round to single precision. Values beyond its range become infinite."""
     try:
         return float(struct.unpack("<f", struct.pack("<f", value))[0])
     except OverflowError:
@@ -55,13 +55,13 @@ _FILES = {
     "fence.dat": MavMissionType.FENCE,
     "rally.dat": MavMissionType.RALLY,
 }
-# A part of a file that was not received consists of zero bytes, which decode as this item.
+# The parts of a file that were not received consist of zero bytes. These bytes decode as this item.
 _EMPTY = MissionItem(0, 0, autocontinue=False)
 _PLACEHOLDER_SIZE = 1 << 20
 
 
 class MissionMount(Mount):
-    """Files mounted as ``@MISSION``. Accepts one upload at a time; opening a file reports a size of 1 MiB."""
+    """The virtual files of ``@MISSION``. One upload at a time is accepted. Opening a file reports 1 MiB as its size."""
 
     def __init__(self, store: MissionStore) -> None:
         self._store = store
@@ -72,7 +72,7 @@ class MissionMount(Mount):
         return _PLACEHOLDER_SIZE
 
     def open(self, path: str, *, writing: bool) -> FileHandle:
-        """Open the stored items for reading, or an upload that replaces them."""
+        """Open a file to read the stored items, or to replace them by an upload."""
         type_ = _type_of(path)
         if not writing:
             return _Reader(_packed(self._store.items(type_), type_))
@@ -91,7 +91,7 @@ class _Reader(FileHandle):
 
 
 class _Writer(UploadedFile):
-    """Upload of items. An incomplete or rejected upload has no effect and sends no status text."""
+    """Upload of a list of items. An incomplete or rejected upload has no effect, and no status text reports it."""
 
     def __init__(self, store: MissionStore, type_: int) -> None:
         super().__init__()

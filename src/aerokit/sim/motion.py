@@ -1,8 +1,8 @@
-"""Local frame and motion of a simulated multicopter: a point mass that leans as its acceleration requires.
+"""Local frame and motion of a simulated multicopter, which is a point mass that leans as its acceleration requires.
 
-Modelled: limits of speed, acceleration and turn rate; braking before a target, by the square-root controller of
-ArduPilot and PX4; drag, against which the copter leans in steady flight; constant wind with gusts; ground. Not
-modelled: propeller dynamics, attitude control loops, ground effect, drift.
+The model has limits of speed, acceleration and turn rate. The copter brakes before a target like the square-root
+controller of ArduPilot and PX4, and leans against its drag in steady flight. There is a constant wind with gusts, and a
+ground. Not modelled: propeller dynamics, attitude control loops, ground effect, drift.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from aerokit._internal.rotations import euler_from_quaternion as euler_from_quat
 from aerokit._internal.rotations import quaternion_from_euler as quaternion_from_euler
 from aerokit.errors import InvalidArgument
 
-_METRES_PER_DEGREE_E7 = 0.011131884502145034  # ArduPilot's LOCATION_SCALING_FACTOR, for the same sphere and rounding.
+# ArduPilot's LOCATION_SCALING_FACTOR, so that positions are rounded as in the firmware.
+_METRES_PER_DEGREE_E7 = 0.011131884502145034
 
 
 Ned = tuple[float, float, float]
@@ -32,9 +33,9 @@ class GlobalPoint(NamedTuple):
 
 
 class LocalFrame:
-    """Conversion between global positions and metres north, east and down of an origin.
+    """Converts between global positions and metres north, east and down of an origin.
 
-    Accurate within a few kilometres, like the autopilots' own local frames.
+    The conversion is accurate within a few kilometres of the origin, like that of the autopilots.
     """
 
     __slots__ = ("_east_scale", "origin")
@@ -65,7 +66,7 @@ def true_place(vehicle: Any) -> GlobalPoint:
     """
     frame, motion = getattr(vehicle, "frame", None), getattr(vehicle, "motion", None)
     if frame is None or motion is None:
-        raise InvalidArgument(f"{type(vehicle).__name__} has no true position")
+        raise InvalidArgument(f"{type(vehicle).__name__} has no true position, because its motion is not simulated")
     place: GlobalPoint = frame.to_global(*motion.place)
     return place
 
@@ -75,17 +76,19 @@ HOME = (-35.363261, 149.165230, 584.09)
 
 
 GRAVITY_M_S2 = 9.80665
-_DRAG_PER_S = 0.33  # Deceleration divided by airspeed: a 450 mm quadrotor leans 20 degrees at 10 m/s.
+# Deceleration by drag, divided by the airspeed. With this value the copter leans 20 degrees at 10 m/s, as a quadrotor
+# of 450 mm does.
+_DRAG_PER_S = 0.33
 _VELOCITY_TIME_CONSTANT_S = 0.3
-# Part of a lean error that remains after a second: 50 steps of 0.02 s with a time constant of 0.15 s.
+# Fraction of a lean error that remains after a second, which is 50 steps of 0.02 s with a time constant of 0.15 s.
 _LEAN_KEPT_PER_S = (1.0 - 0.02 / 0.15) ** 50
 _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
-BRAKING_SHARE = 0.7  # Share of the acceleration limit with which a vehicle plans to brake; the rest is a reserve.
+BRAKING_SHARE = 0.7  # A vehicle plans to brake with 70 % of the acceleration limit, and keeps the rest in reserve.
 _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
-# Limits of steady motion, for which steps of 0.1 s suffice. In such a step, a constant jerk of 4 m/s³ changes the
-# position by jerk · 0.1³ / 6, which is less than 1 mm. Touchdown does not count as steady, so its time and speed come
-# from short steps.
+# Motion within these limits counts as steady, and steps of 0.1 s suffice. In such a step, a constant jerk of 4 m/s³
+# changes the position by jerk · 0.1³ / 6, which is less than 1 mm. Motion near the ground is not steady, so that short
+# steps determine the time and speed of a touchdown.
 _STEADY_JERK_M_S3 = 4.0
 _STEADY_LEAN_RATE_RAD_S = 0.6
 _STEADY_ABOVE_GROUND_S = 0.3
@@ -96,6 +99,11 @@ def wrap_pi(angle: float) -> float:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
+def centidegrees(angle: float) -> int:
+    """Convert an angle in radians to hundredths of a degree, from 0 to 35999."""
+    return round(math.degrees(angle) % 360.0 * 100) % 36000  # Rounding may give 36000, which is 0.
+
+
 def _clamp(value: float, limit: float) -> float:
     if value > limit:
         return limit
@@ -103,15 +111,15 @@ def _clamp(value: float, limit: float) -> float:
 
 
 def velocity_to_landing_target(north: float, east: float) -> tuple[float, float]:
-    """Return the horizontal velocity (m/s) of a precision landing whose target is this many metres away."""
+    """Return the horizontal velocity (m/s) towards the target of a precision landing, which is this far away (m)."""
     gain_per_s = min(_APPROACH_PER_S, _MAX_APPROACH_M_S / max(math.hypot(north, east), 1e-6))
     return (north * gain_per_s, east * gain_per_s)
 
 
 def approach_speed(distance: float, gain: float, deceleration: float) -> float:
-    """Return the highest speed at which a vehicle can still stop at a point ``distance`` metres away.
+    """Return the speed with which a vehicle approaches a point ``distance`` metres away, to stop there.
 
-    The speed is ``gain`` times the distance near the point, and the square-root curve of constant deceleration beyond.
+    Near the point, the speed is ``gain`` times the distance. Farther away, the speed allows a constant deceleration.
     """
     linear_distance = deceleration / (gain * gain)
     if distance <= linear_distance:
@@ -131,7 +139,7 @@ class MotionLimits:
 
 @dataclass
 class SimulatedWind:
-    """Velocity of the air in m/s. ``gusts_m_s`` is the standard deviation of the gusts."""
+    """Velocity of the air in m/s. ``gusts_m_s`` is the standard deviation of the gusts, also in m/s."""
 
     north_m_s: float = 0.0
     east_m_s: float = 0.0
@@ -175,10 +183,10 @@ class Motion:
         """Vertical speed at the last touchdown."""
         self._gust_north = self._gust_east = 0.0
         self._jerk_m_s3 = math.inf
-        # Target velocity or acceleration (north, east, down).
+        # The target velocity or target acceleration (north, east, down).
         self._target = (0.0, 0.0, 0.0)
         self._target_is_acceleration = False
-        # Target roll and pitch, which replace the horizontal part of the target unless they are None.
+        # The target roll and pitch, which replace the horizontal components of `_target`; None without such a target.
         self._target_lean: tuple[float, float] | None = None
         self._wanted_yaw: float | None = None
         self._wanted_yaw_rate = 0.0
@@ -193,11 +201,11 @@ class Motion:
         self._set_target((north, east, down))
 
     def seek_acceleration(self, north: float, east: float, down: float) -> None:
-        """Apply this acceleration (m/s²) until the next target."""
+        """Accelerate with these components (m/s²) until the next target is set."""
         self._set_target((north, east, down), is_acceleration=True)
 
     def seek_attitude(self, roll: float, pitch: float, velocity_down: float) -> None:
-        """Hold these angles (rad) and this vertical speed."""
+        """Hold these angles in radians, and this vertical velocity in m/s (positive down)."""
         self._set_target((0.0, 0.0, velocity_down), lean=(roll, pitch))
 
     def _set_target(
@@ -208,7 +216,7 @@ class Motion:
     def seek_position(
         self, north: float, east: float, down: float, *, speed: float, climb: float, descent: float
     ) -> None:
-        """Fly to a point and stop there, with these speed limits in m/s."""
+        """Fly to a point and stop there, with limits of the horizontal speed, climb rate and sink rate in m/s."""
         offset_north, offset_east, offset_down = north - self.north, east - self.east, down - self.down
         distance = math.hypot(offset_north, offset_east)
         scale = 0.0
@@ -233,7 +241,7 @@ class Motion:
 
     @property
     def is_steady(self) -> bool:
-        """True in flight while acceleration and lean hardly change, so that long steps are exact."""
+        """True in flight while acceleration and lean hardly change, so that long steps are exact enough."""
         height_m = self.ground_down - self.down
         return (
             self._jerk_m_s3 < _STEADY_JERK_M_S3
@@ -256,7 +264,7 @@ class Motion:
         return math.hypot(self.velocity_north, self.velocity_east)
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds; an unpowered copter falls."""
+        """Advance by ``dt`` seconds. A copter without power falls."""
         if self.wind.gusts_m_s > 0.0:
             self._update_gusts(dt)
         if powered:
@@ -272,7 +280,7 @@ class Motion:
         self._turn(dt, powered=powered)
 
     def settle(self) -> None:
-        """Rest level on the ground, without a target."""
+        """Stop level on the ground and forget all targets."""
         self.down = self.ground_down
         self.velocity_north = self.velocity_east = self.velocity_down = 0.0
         self.acceleration_north = self.acceleration_east = self.acceleration_down = 0.0

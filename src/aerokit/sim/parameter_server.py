@@ -19,7 +19,7 @@ from aerokit.sim.vehicle import SimulatedVehicle, sender_of
 
 
 class ParameterServer(servers.ParameterProtocolServer):
-    """Answers parameter requests; each autopilot has a subclass. The `Faults` of the vehicle apply."""
+    """Base of the parameter servers, which answer parameter requests. The `Faults` of the vehicle apply."""
 
     def __init__(
         self,
@@ -39,7 +39,7 @@ class ParameterServer(servers.ParameterProtocolServer):
         return ParamValue(name, parameters[name], parameters.type(name), len(parameters), index)
 
     def send(self, name: str, index: int, channel: Channel | None) -> None:
-        """Send a PARAM_VALUE on one port, or on all if ``channel`` is None."""
+        """Send a PARAM_VALUE on one port, or on all ports if ``channel`` is None."""
         if name not in self._vehicle.faults.mute_parameters:
             super().send(name, index, channel)
 
@@ -57,12 +57,12 @@ _ROUNDING_OFFSET = 0.01
 class ArduPilotParameterServer(ParameterServer):
     """Parameter protocol of ArduPilot.
 
-    A request may have an unknown name, or a value that is not a number. Without ``errors``, such a request gets no
-    answer, as in the development version of 4.7. With ``errors``, the answer is PARAM_ERROR, as in the released
-    version, and PARAM_SET is confirmed on the sender's port in addition to the broadcast.
+    Without ``errors``, a request with an unknown name, or with NaN or infinity as value, is not answered. This is the
+    behaviour of the development version of 4.7. With ``errors``, as in the released version, the answer is PARAM_ERROR,
+    and PARAM_SET is confirmed on the sender's port in addition to the broadcast.
 
-    A queue holds 20 read requests, of which one is served each millisecond; further requests are lost. The banner
-    texts precede a list.
+    One read request is served each millisecond. Up to 20 requests wait in a queue, and further requests are lost.
+    The banner texts are sent before a list.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class ArduPilotParameterServer(ParameterServer):
             names = self._parameters.names
             name = names[index] if 0 <= index < len(names) else ""
         if name in self._parameters:
-            self.send(name, index & 0xFFFF, channel)
+            self.send(name, index & 0xFFFF, channel)  # The index -1 of a read by name becomes 65535.
         elif self.errors:
             self.send_error(sender_of(request), name, index, MavParamError.DOES_NOT_EXIST, channel)
 
@@ -134,7 +134,7 @@ class ArduPilotParameterServer(ParameterServer):
 
 
 def rounded(value: float, type_: int) -> float:
-    """Convert a float for an integer parameter like ArduPilot: add 0.01 away from zero, then truncate."""
+    """Round a value for an integer parameter as ArduPilot does: add 0.01 away from zero, then truncate."""
     if type_ == MavParamType.REAL32:
         return value
     shifted = value + math.copysign(_ROUNDING_OFFSET, value)
@@ -142,21 +142,21 @@ def rounded(value: float, type_: int) -> float:
 
 
 _SECOND_ECHO_S = 0.02
-# Observed value of the unused index field of PX4's PARAM_ERROR.
+# PX4's PARAM_ERROR does not use its index field; PX4 was observed to send this value.
 _UNUSED_INDEX = 24400
 
 
 class Px4ParameterServer(ParameterServer):
-    """Parameter protocol of PX4; ``errors`` sends PARAM_ERROR, like PX4's main branch, but unlike v1.16.
+    """Parameter protocol of PX4. With ``errors``, PARAM_ERROR is sent, as in PX4's main branch, but not in v1.16.
 
-    Values are stored unchecked. PARAM_SET is confirmed on the sender's port, and a change is broadcast shortly after.
-    Setting _HASH_CHECK stops a running list. A second list request restarts the list without the hash.
+    Values are stored without a check. PARAM_SET is confirmed on the sender's port, and a change is broadcast shortly
+    after. Setting _HASH_CHECK stops a running list. A second list request restarts the list, without the hash.
     """
 
     burst = 10
 
     def value_message(self, name: str, index: int) -> ParamValue:
-        """Return the PARAM_VALUE; its float field holds the bytes of the value."""
+        """Return the PARAM_VALUE, whose float field contains the bytes of the value."""
         parameter = self._parameters.row(name).as_parameter(index)
         return value_message(parameter, len(self._parameters), bytewise=True)
 

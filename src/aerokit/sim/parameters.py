@@ -39,12 +39,13 @@ class SimParameter:
     is_volatile: bool = False
     """True if the parameter is excluded from PX4's hash, because the vehicle changes its value."""
     switch: str | None = None
-    """Name of an enabling parameter. While it is 0, ArduPilot omits this parameter from lists and counts, but answers
-    reads by name.
+    """Name of the parameter that enables this parameter; None without one.
+
+    While the enabling parameter is 0, ArduPilot omits this parameter from lists and counts, but answers reads by name.
     """
 
     def as_parameter(self, index: int | None = None) -> Parameter:
-        """Convert to the client's `Parameter`; integer types become int."""
+        """Convert to a `Parameter`, the client's class. Values of integer types become int."""
         type_ = ParameterType(self.type)
         value, default = (int(x) if type_.is_integer else x for x in (self.value, self.default))
         return Parameter(self.name, value, type_, default, index)
@@ -53,7 +54,7 @@ class SimParameter:
 class SimParameters:
     """Parameters by name, in the vehicle's order. They survive a reboot.
 
-    Values are rounded and clamped as the vehicle stores them: 32-bit floats, or integers within the type's range.
+    A value is stored as the vehicle stores it: rounded to a 32-bit float, or to an integer within the type's range.
     """
 
     def __init__(self, rows: Iterable[SimParameter]) -> None:
@@ -64,9 +65,9 @@ class SimParameters:
 
     @classmethod
     def from_text(cls, text: str, *, used: Iterable[str] = (), count: int | None = None) -> SimParameters:
-        """Parse lines of ``name,type,value[,default[,switch]]``; the switch ``v`` marks a volatile parameter.
+        """Parse lines of ``name,type,value[,default[,switch]]``. The switch ``v`` marks a volatile parameter.
 
-        ``count`` limits the number of parameters, in the order of the text. Names in ``used`` are always included.
+        ``count`` limits the number of parameters. Those in ``used`` are always included.
         """
         lines = text.split()
         if count is not None:
@@ -81,18 +82,18 @@ class SimParameters:
     def __getitem__(self, name: str) -> float:
         try:
             return self._rows[name].value  # type: ignore[union-attr]
-        except AttributeError:  # The row has not been parsed yet.
+        except AttributeError:  # The row is still a line of text, which `row` parses.
             return self.row(name).value
 
     def get(self, name: str, default: float) -> float:
         return self[name] if name in self else default  # noqa: SIM401 - this is `get`
 
     def __setitem__(self, name: str, value: float) -> None:
-        """Set a value; raises KeyError for an unknown name."""
+        """Set a value. Raises KeyError for an unknown name."""
         row = self.row(name)
         row.value = stored(value, row.type)
         if name in self._switches.values():
-            self._names = None  # to be listed again, as parameters may appear or disappear
+            self._names = None  # The switch may have shown or hidden parameters, so the list is made again.
 
     def change(self, values: Mapping[str, float]) -> None:
         """Set several parameters.
@@ -102,7 +103,7 @@ class SimParameters:
         for name, value in values.items():
             if name not in self:
                 similar = ", ".join(get_close_matches(name, self._rows)) or "none"
-                raise InvalidArgument(f"the simulated vehicle has no parameter {name!r}; similar: {similar}")
+                raise InvalidArgument(f"the simulated vehicle has no parameter {name!r}; similar names: {similar}")
             self[name] = value
 
     def __contains__(self, name: object) -> bool:
@@ -116,7 +117,7 @@ class SimParameters:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names that a list contains, in the vehicle's order; the position is ``param_index``."""
+        """Names of the parameters in a list, in the vehicle's order. The position of a name is its ``param_index``."""
         if self._names is None:
             hidden = {name for name, switch in self._switches.items() if not self[switch]}
             self._names = tuple(name for name in self._rows if name not in hidden)
@@ -124,8 +125,8 @@ class SimParameters:
         return self._names
 
     def index(self, name: str) -> int:
-        """Return the position in ``names``; raises KeyError for a name that is not listed."""
-        _ = self.names  # updates the indices
+        """Return the position of a name in ``names``. Raises KeyError for a name that is not listed."""
+        _ = self.names  # Reading the property updates `_indices`.
         return self._indices[name]
 
     def type(self, name: str) -> int:
@@ -135,7 +136,7 @@ class SimParameters:
         return self.row(name).default
 
     def row(self, name: str) -> SimParameter:
-        """Return the parameter; its line is parsed on first access."""
+        """Return the parameter. The first access parses its line."""
         row = self._rows[name]
         if isinstance(row, str):
             row = self._rows[name] = _row(row.split(","))
@@ -180,7 +181,7 @@ def _switch_of(line: str) -> str | None:
 
 
 def _select_lines(lines: list[str], used: frozenset[str], count: int) -> list[str]:
-    """Return the lines of all parameters in ``used``, and the first others without a switch up to ``count`` lines."""
+    """Return up to ``count`` lines, with all parameters in ``used`` and the first others that have no switch."""
     is_used = [line.partition(",")[0] in used for line in lines]
     others_left = max(0, count - sum(is_used))
     selected: list[str] = []
@@ -200,9 +201,9 @@ _GUESSED_ROW_SIZE = 12
 class ParameterPackMount(Mount):
     """Files mounted as ``@PARAM``.
 
-    ``apply(name, value)`` is called for each uploaded parameter. ``block`` is the block size; no value extends over the
-    end of a block. With ``block``, opening the file reports the exact size (PX4). Without ``block``, the first read
-    sets the block size (ArduPilot).
+    ``apply(name, value)`` is called for each uploaded parameter. No value extends over the end of a block. PX4 has the
+    fixed block size ``block``, and reports the exact size of a file when the file is opened. With ArduPilot, ``block``
+    is None and the first read of the client sets the block size.
     """
 
     def __init__(
@@ -213,14 +214,14 @@ class ParameterPackMount(Mount):
         self._block = block
 
     def size(self, path: str) -> int:
-        """Return the exact size if the block size is fixed, else 12 bytes per parameter."""
+        """Return the exact size of the file if the block size is fixed, otherwise a guess of 12 bytes per parameter."""
         if self._block is not None:
             return len(_Reader(self._parameters, path, self._block).content)
         _query(path)
         return len(self._parameters) * _GUESSED_ROW_SIZE
 
     def open(self, path: str, *, writing: bool) -> FileHandle:
-        """Open for reading, with the query ``?start=&count=&withdefaults=``, or for writing."""
+        """Open the file for writing, or for reading, where the path may end in ``?start=&count=&withdefaults=``."""
         if writing:
             _query(path)
             return _Writer(self._parameters, self._apply)
@@ -238,7 +239,7 @@ class _Reader(FileHandle):
         if self._with_defaults > 1 or max(self._start, self._count) >= 0xFFFF:
             raise FileFault(EINVAL)
         self._block = block or 0
-        # Only PX4 has a fixed block size, and only PX4 keeps a value and its default in one block.
+        # PX4, which is recognised by its fixed block size, keeps a value and its default in one block.
         self._whole_defaults = block is not None
         self._content: bytes | None = None
 
@@ -272,7 +273,7 @@ class _Reader(FileHandle):
 
 
 class _Writer(UploadedFile):
-    """Upload of parameters, applied on close. An invalid file has no effect and sends no status text."""
+    """Upload of parameters, which are applied on close. An invalid file has no effect, and no text reports it."""
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
         super().__init__()
@@ -296,7 +297,8 @@ class _Writer(UploadedFile):
             raise FileFault(EINVAL) from None
 
     def _read_rows(self, content: bytes, count: int) -> None:
-        position, previous_name = HEADER.size, b""  # An entry omits what its name has in common with the previous one.
+        # An entry omits the beginning of its name that is equal to that of the previous name.
+        position, previous_name = HEADER.size, b""
         for _ in range(count):
             entry = read_entry(content, position, previous_name) if position < len(content) else None
             if entry is None or entry.default is not None:
@@ -308,7 +310,7 @@ class _Writer(UploadedFile):
 
 
 def _query(path: str) -> dict[str, int]:
-    """Parse the query string; raises FileFault for another file name."""
+    """Parse the query string of a path. Raises FileFault for a file name other than param.pck."""
     name, _, query = path.partition("?")
     if name != _NAME:
         raise FileFault(ENOENT)

@@ -17,12 +17,14 @@ from aerokit.sim.channel import Channel, SharedMessageReader, datagrams
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
 from aerokit.transport import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 
-# Minimum timer delay in loop time. With many vehicles or above real time, several ticks then run in one callback.
+# Minimum delay of a timer in loop time, so that with many vehicles, or faster than real time, one callback runs several
+# ticks.
 _MIN_WAIT_S = 0.001
 _BATCH_THRESHOLD = 10
-# Output of this many simulated seconds is sent together for more than `_BATCH_THRESHOLD` vehicles.
+# With more than `_BATCH_THRESHOLD` vehicles, the output of this many simulated seconds is sent together.
 _BATCH_INTERVAL_S = TICK_S
-# Simulated seconds that are caught up after the loop was blocked. Except in real time, the rest is skipped.
+# After the loop was blocked, the server catches up this many simulated seconds and skips the rest. In real time, it
+# catches up everything.
 _MAX_CATCH_UP_S = 0.5
 
 
@@ -32,13 +34,13 @@ class SimulatorServer:
     Every vehicle is on every link, unless ``vehicles_on`` lists the vehicles of each link.
 
     The server uses timers of the event loop, without tasks or threads. ``speedup`` 10 simulates ten seconds per
-    second. After the loop was blocked, the server catches up in real time. At other speeds it skips all but half a
-    simulated second, so that vehicles do not detect a link loss while the client could not send.
+    second. If the loop was blocked, the server catches up with the missed time if ``speedup`` is 1. At other speeds it
+    skips all but half a simulated second, so that vehicles do not detect a link loss while the client could not send.
 
-    An exception in a vehicle or a callback closes the links and cancels the task that runs the block; the block then
+    An exception in a vehicle or a callback closes the links and cancels the task that runs the block. The block then
     raises the exception.
 
-    Raises LinkOpenError if a link cannot be opened; the other links are closed again.
+    Raises LinkOpenError if a link cannot be opened. The other links are then closed again.
     """
 
     def __init__(
@@ -50,7 +52,7 @@ class SimulatorServer:
         vehicles_on: Sequence[Sequence[SimulatedVehicle]] | None = None,
     ) -> None:
         if not speedup > 0:
-            raise InvalidArgument(f"speedup = {speedup!r} must be above 0")
+            raise InvalidArgument(f"speedup = {speedup!r} is not allowed: it must be above 0")
         self.vehicles: tuple[SimulatedVehicle, ...] = (
             (vehicles,) if isinstance(vehicles, SimulatedVehicle) else tuple(vehicles)
         )
@@ -58,30 +60,34 @@ class SimulatorServer:
         on_all: Sequence[Sequence[SimulatedVehicle]] = [self.vehicles] * len(self._links)
         self.vehicles_on: list[Sequence[SimulatedVehicle]] = list(on_all if vehicles_on is None else vehicles_on)
         if len(self.vehicles_on) != len(self._links):
-            raise InvalidArgument(f"vehicles_on has {len(self.vehicles_on)} entries for {len(self._links)} links")
+            raise InvalidArgument(
+                f"vehicles_on has {len(self.vehicles_on)} entries for {len(self._links)} links;"
+                " pass one entry for each link"
+            )
         self._speedup = speedup
-        self._dues = [0.0] * len(self.vehicles)  # Next due time of each vehicle.
+        self._dues = [0.0] * len(self.vehicles)  # The simulated time of each vehicle's next event.
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
         self._min_wait_s = _MIN_WAIT_S if speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._end_source: Callable[[], None] | None = None  # used instead of timers on a `VirtualClockLoop`
+        # Ends the event source, which replaces the timers on a `VirtualClockLoop`.
+        self._end_source: Callable[[], None] | None = None
         self._started_at = 0.0
         self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)
         self._ports: list[_Port] = []
         self._timer: asyncio.TimerHandle | None = None
         self._timer_due = self._timer_at = 0.0
         self._exit = AsyncExitStack()
-        # The task that entered the block, to be cancelled if a vehicle fails.
+        # The task that entered the `async with` block. A failing vehicle cancels this task.
         self._owner: asyncio.Task[Any] | None = None
         self._cancels_owner = False
         self.on_datagram: Callable[[float, bytes, bool], object] | None = None
-        """Called with simulated time, bytes and direction of every datagram. True as direction: sent by a vehicle."""
+        """Called with every datagram: simulated time, bytes, and True if a vehicle has sent the datagram."""
         self.failure: Exception | None = None
-        """Exception of a vehicle that stopped the simulation; None while it runs."""
+        """Exception of a vehicle that has stopped the simulation; None if there was none."""
 
     @property
     def addresses(self) -> tuple[str, ...]:
-        """Addresses of the links; once the links are open, with the actual ports."""
+        """Addresses of the links. While the links are open, the addresses contain the actual port numbers."""
         return tuple(link.address for link in self._links)
 
     @property
@@ -93,9 +99,9 @@ class SimulatorServer:
 
     async def __aenter__(self) -> Self:
         if self._loop is not None:
-            raise BusyError("this SimulatorServer was already started; create a new one")
+            raise BusyError("this SimulatorServer was already started once; create a new SimulatorServer")
         self._loop, self._owner = asyncio.get_running_loop(), asyncio.current_task()
-        add_source = getattr(self._loop, "add_event_source", None)  # None unless it is a `VirtualClockLoop`
+        add_source = getattr(self._loop, "add_event_source", None)  # None unless the loop is a `VirtualClockLoop`
         if add_source is None and len(self.vehicles) > _BATCH_THRESHOLD:
             self._min_wait_s = max(_MIN_WAIT_S, _BATCH_INTERVAL_S / self._speedup)
         self._started_at = self._loop.time()
@@ -127,7 +133,7 @@ class SimulatorServer:
         self._end(error)
 
     def _end(self, error: BaseException | None) -> None:
-        """Raise a vehicle's exception instead of the cancellation that it caused."""
+        """Stop. If a vehicle has failed, raise its exception instead of the cancellation that the failure caused."""
         self._stop()
         owner, self._owner = self._owner, None
         if self._cancels_owner and owner is not None and owner is asyncio.current_task():
@@ -136,9 +142,9 @@ class SimulatorServer:
             raise self.failure from self.failure.__cause__
 
     def wake(self) -> None:
-        """Run all due events. Call it after changing a fault or value.
+        """Run all events that are due. Call this method after a change of a fault or of a value of a vehicle.
 
-        Raises the exception that a vehicle raises now or raised before.
+        Raises the exception of a vehicle that fails now or has failed before.
         """
         if self.failure is not None:
             raise self.failure
@@ -164,13 +170,13 @@ class SimulatorServer:
         return self._loop_time(min(self._dues, default=math.inf))
 
     def _fail(self, error: Exception) -> None:
-        """Close the links and cancel the owner; asyncio only logs an exception that a callback raises."""
+        """Close the links and cancel the owner, because asyncio would only log the exception of a callback."""
         self.failure = error
         self._stop()
         for link in self._links:
             link.close()
         owner = self._owner
-        # The task may be done: a fixture can enter the block in one task and leave it in another.
+        # The task may have ended, because a fixture can enter the block in one task and leave it in another.
         if owner is not None and not owner.done() and owner is not asyncio.current_task():
             self._cancels_owner = owner.cancel()
 
@@ -205,7 +211,7 @@ class SimulatorServer:
             self.on_datagram(now, data, False)
         try:
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
-                # A timer that fired early, or another vehicle's action, may have advanced this vehicle beyond now.
+                # This vehicle may be ahead of `now`, because a timer fired early or another vehicle advanced it.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
             port.reader.forget()
@@ -240,7 +246,7 @@ class SimulatorServer:
         self._timer = loop.call_at(when, self._on_due)
 
     def _skip_lateness(self) -> None:
-        """If the timer is late by more than ``_MAX_CATCH_UP_S``, skip the excess, except in real time."""
+        """Skip the time by which the timer is late beyond ``_MAX_CATCH_UP_S``. In real time, skip nothing."""
         if self._loop is None or self._speedup == 1.0 or (self._timer is None and self._end_source is None):
             return
         due_at = self._next_loop_time() if self._timer is None else self._timer_at
@@ -274,7 +280,7 @@ class _Port:
                 channel.reader = self.reader
 
     def take_datagrams(self, *, together: bool) -> list[bytes]:
-        """Return the datagrams to send. With ``together``, many vehicles share datagrams, as a router joins them."""
+        """Return the datagrams to send. With ``together``, the frames of many vehicles are joined, as by a router."""
         active = [channel for channel in self.channels if channel.has_output]
         if not active:
             return []
@@ -293,7 +299,7 @@ class _Port:
         self._server.on_bytes(data, peer, self)
 
     def link_lost(self, error: LinkLost) -> None:
-        """Does nothing: vehicles continue to fly without a client."""
+        """Do nothing, because the vehicles continue to fly without a client."""
 
     async def close(self) -> None:
         self.link.close()
@@ -306,7 +312,11 @@ def _uncancel(task: asyncio.Task[Any]) -> None:
 
 
 def _channels(vehicles: Iterable[SimulatedVehicle], connected: set[int]) -> list[Channel]:
-    """Return one channel per vehicle: its first channel on its first link, a new channel on each further link."""
+    """Return one channel of each vehicle for a link.
+
+    A vehicle in ``connected`` gets a new channel. Other vehicles get their first channel and are added to
+    ``connected``.
+    """
     channels = []
     for vehicle in vehicles:
         is_first = id(vehicle) not in connected
@@ -319,7 +329,7 @@ def _channels(vehicles: Iterable[SimulatedVehicle], connected: set[int]) -> list
 async def simulated_link(
     vehicles: SimulatedVehicle | Iterable[SimulatedVehicle], *, speedup: float = 1.0, latency_s: float = 0.0
 ) -> AsyncIterator[MemoryLink]:
-    """Simulate vehicles in memory and yield the client's end of the link, which the caller opens.
+    """Simulate vehicles in memory, and yield the client's end of the link. The caller opens this end.
 
     ``latency_s`` delays both directions, in seconds of the loop's clock.
     """
@@ -332,7 +342,7 @@ async def simulated_link(
 async def open_simulator(
     vehicles: SimulatedVehicle | Iterable[SimulatedVehicle], *addresses: str, speedup: float = 1.0
 ) -> AsyncIterator[SimulatorServer]:
-    """Serve vehicles on addresses ("tcpin:0.0.0.0:5760", "udpout:127.0.0.1:14550") for other programs.
+    """Serve vehicles on addresses, such as "tcpin:0.0.0.0:5760" or "udpout:127.0.0.1:14550", for other programs.
 
     Raises InvalidArgument for an invalid address, LinkOpenError if an address cannot be opened.
     """

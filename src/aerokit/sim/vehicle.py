@@ -1,7 +1,7 @@
 """Base of all simulated vehicles: simulated time, channels, timers, status texts, faults.
 
-A vehicle uses no event loop. The caller passes the time, in simulated seconds that never decrease. Times and order
-of events do not depend on the step size: equal calls with an equal seed produce equal bytes.
+A vehicle uses no event loop. The caller passes the time in simulated seconds, which must never decrease. The times and
+the order of events do not depend on the step size. Equal calls with an equal seed produce equal bytes.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
 
 TICK_S = 0.02
-"""Interval of motion and modes (50 Hz) while the vehicle moves. In steady flight, several make one long tick."""
+"""Interval in which motion and modes are updated while the vehicle moves. In steady flight, a tick is longer."""
 
 _STEADY_TICKS = 6
-# Decimal places of due times in seconds. Rounded, events with different intervals are due at the same instants.
+# Due times in seconds are rounded to this many decimal places, so that events with different intervals are due at
+# exactly the same instants.
 _DUE_DECIMALS = 9
 
 _TEXT_SIZE = 50
@@ -34,7 +35,7 @@ Handler = Callable[[Any, Channel], None]
 
 
 def _whole_ticks(seconds: float) -> int:
-    """Return the number of complete ticks; a rounding error does not lose one."""
+    """Return the number of complete ticks. A tick that is incomplete only by a rounding error counts."""
     return int(seconds / TICK_S + 1e-6)
 
 
@@ -45,7 +46,10 @@ class MessageHost(ServerHost, Protocol):
 
 
 class VehicleJournal(Protocol):
-    """Records received messages and sent texts, such as `aerokit.testing.Journal`. Times are simulated seconds."""
+    """Interface of an object that records received messages and sent texts, such as `aerokit.testing.Journal`.
+
+    Times are simulated seconds.
+    """
 
     def on_text_sent(self, time_s: float, severity: int, text: str) -> None: ...
 
@@ -61,7 +65,7 @@ class AttachableComponent(Protocol):
         ...
 
     def join(self, vehicle: SimulatedVehicle) -> None:
-        """Join a vehicle; the vehicle calls this once."""
+        """Add the component to a vehicle. The vehicle calls this method once."""
         ...
 
 
@@ -73,13 +77,14 @@ class ExtraComponent:
     type: int = MavType.GIMBAL
     autopilot: int = MavAutopilot.INVALID
     system_id: int | None = None
-    """System id of the component; None: that of the vehicle."""
+    """System id of the component. None selects the system id of the vehicle."""
     base_mode: int = MavModeFlag(0)
     custom_mode: int = 0
     system_status: int = MavState.ACTIVE
 
     def join(self, vehicle: SimulatedVehicle) -> None:
         """Send heartbeats from the next power-on."""
+        # The field mavlink_version is 3.
         heartbeat = Heartbeat(self.type, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3)
         system_id = vehicle.system_id if self.system_id is None else self.system_id
         sender = (system_id, self.component_id)
@@ -87,10 +92,10 @@ class ExtraComponent:
 
 
 class SimulatedVehicle:
-    """Sans-I/O base of a vehicle; subclasses define its messages, streams and motion.
+    """Base of a simulated vehicle, which does no I/O. Subclasses define messages, streams and motion.
 
     `receive` and `step` take the time, `take_outbox` returns bytes, and `next_due` is the time of the next event.
-    The first link uses the first channel; call `open_channel` for each further link.
+    The first link uses the first channel. Call `open_channel` for each further link.
     """
 
     def __init__(
@@ -101,7 +106,7 @@ class SimulatedVehicle:
         self.faults: Faults = Faults()
         self.rng: Random = random.Random(seed)
         self.now: float = 0.0
-        """Simulated seconds of the latest event."""
+        """Simulated time of the latest event, in seconds."""
         self.booted_at: float = math.nan
         """Time of the power-on or last reboot."""
         self.components: tuple[AttachableComponent, ...] = tuple(components)
@@ -122,7 +127,7 @@ class SimulatedVehicle:
             component.join(self)
 
     def open_channel(self, *, version: int = 2) -> Channel:
-        """Open another port, which has its own stream rates; ``version`` is its MAVLink version."""
+        """Open another port, which has its own stream rates. ``version`` is the MAVLink version of the port."""
         channel = Channel(self.system_id, self.component_id, self.handlers, version=version)
         self.channels.append(channel)
         if self._is_on:
@@ -130,7 +135,7 @@ class SimulatedVehicle:
         return channel
 
     def receive(self, data: bytes, now: float, peer: Hashable = None, channel: Channel | None = None) -> None:
-        """Process bytes from a peer; replies are put into the outbox."""
+        """Process bytes from a peer, and put the replies into the outbox."""
         self.step(now)
         channel = self._channel if channel is None else channel
         if self.faults.frozen or self.faults.silent or not self._is_on:
@@ -138,7 +143,7 @@ class SimulatedVehicle:
         messages = channel.messages(data, now, peer)
         if not messages:
             return
-        # A message may end steady flight: the long tick ends before it, and a short tick follows it.
+        # A message may end a steady flight, so a long tick must end before the message, and a short tick must follow.
         self._tick_until(now)
         for message in messages:
             if sender_of(message) != (self.system_id, self.component_id):
@@ -148,7 +153,7 @@ class SimulatedVehicle:
 
     def step(self, now: float) -> None:
         """Run everything that is due up to ``now``."""
-        if not self._is_on and math.isnan(self.booted_at):  # It was never on.
+        if not self._is_on and math.isnan(self.booted_at):  # The vehicle was never switched on.
             self.now = now
             self.power_on()
         if self.faults.frozen:
@@ -165,7 +170,7 @@ class SimulatedVehicle:
         if not self._is_on and math.isnan(self.booted_at):
             return self.now
         if self.faults.frozen:
-            return self.now + TICK_S  # `step` must follow the time even while nothing happens.
+            return self.now + TICK_S  # `step` must be called even if nothing happens, because it advances the time.
         due = self._next_tick
         if self._timers and self._timers[0][0] < due:
             due = self._timers[0][0]
@@ -181,7 +186,7 @@ class SimulatedVehicle:
 
     @property
     def uptime(self) -> float:
-        """Seconds since the power-on or last reboot, as ``time_boot_ms`` counts."""
+        """Seconds since the power-on or the last reboot. Messages contain this time as ``time_boot_ms``."""
         return self.now - self.booted_at
 
     @property
@@ -203,13 +208,13 @@ class SimulatedVehicle:
             action()
 
     def on_power_on(self, action: Callable[[], None]) -> None:
-        """Call a function at each power-on, including reboots; immediately if the vehicle is on."""
+        """Call a function at each power-on and reboot. If the vehicle is on already, also call it immediately."""
         self._at_power_on.append(action)
         if self._is_on:
             action()
 
     def reboot(self, silence_s: float) -> None:
-        """Stop sending, clear rates and timers, and boot after ``silence_s`` seconds."""
+        """Stop sending, clear stream rates and timers, and boot again after ``silence_s`` seconds."""
         self._is_on = False
         self._timers.clear()
         self.set_ticking(False)
@@ -230,7 +235,7 @@ class SimulatedVehicle:
         raise NotImplementedError
 
     def tick(self, dt: float) -> None:
-        """Advance by ``dt`` seconds: one tick, or several in steady flight."""
+        """Advance the vehicle by ``dt`` seconds, which is TICK_S or, in steady flight, a multiple of TICK_S."""
         raise NotImplementedError
 
     @property
@@ -243,16 +248,19 @@ class SimulatedVehicle:
         return False
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Call a function at a simulated time; a reboot cancels the call."""
+        """Call a function at a simulated time. A reboot cancels the call."""
         self._timer_count += 1
         heappush(self._timers, (when, self._timer_count, action))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
-        """Call a function after ``delay`` simulated seconds; a reboot cancels the call."""
+        """Call a function after ``delay`` simulated seconds. A reboot cancels the call."""
         self.call_at(self.now + delay, action)
 
     def every(self, interval: float, action: Callable[[], None], *, first: float | None = None) -> None:
-        """Call a function every ``interval`` seconds until a reboot; ``first`` is the delay of the first call."""
+        """Call a function every ``interval`` seconds until a reboot.
+
+        ``first`` is the delay of the first call in seconds; None means ``interval``.
+        """
         start = self.now + (interval if first is None else first)
         booted_at = self.booted_at
         count = 0
@@ -260,7 +268,7 @@ class SimulatedVehicle:
         def repeat() -> None:
             nonlocal count
             count += 1
-            if booted_at == self.booted_at:  # The vehicle did not reboot since.
+            if booted_at == self.booted_at:  # The vehicle has not rebooted in the meantime.
                 self.call_at(round(start + count * interval, _DUE_DECIMALS), repeat)
             action()
 
@@ -270,13 +278,13 @@ class SimulatedVehicle:
         """Start or stop calling ``tick`` at 50 Hz, and in steady flight at about 10 Hz."""
         if ticking == (self._ticks_from != math.inf):
             return
-        # Counted from the boot, so that ticks, timers and streams are due at the same instants.
+        # Ticks are multiples of TICK_S since the boot, so that ticks, timers and streams are due at the same instants.
         self._ticks_from = self.booted_at + _whole_ticks(self.uptime) * TICK_S if ticking else math.inf
         self._ticks_done = 0
         self._schedule_tick(1)
 
     def _schedule_tick(self, ticks: int) -> None:
-        """Schedule the next tick after this many intervals; it may come earlier."""
+        """Schedule the next tick after this many intervals of TICK_S. An event may cause an earlier tick."""
         self._next_tick = round(self._ticks_from + (self._ticks_done + ticks) * TICK_S, _DUE_DECIMALS)
 
     def _tick_until(self, now: float) -> None:
@@ -302,7 +310,7 @@ class SimulatedVehicle:
                         self.send(message, channel)
 
     def _skip_to(self, now: float) -> None:
-        """Advance the time and delay all events equally, like a program that hung."""
+        """Advance the time and delay all events by the same time, as in a program that has hung."""
         delay = now - self.now
         if delay <= 0:
             return
@@ -318,7 +326,7 @@ class SimulatedVehicle:
         self.handlers[message_class.ID] = handler
 
     def observe(self, message_class: type[Message], handler: Handler) -> None:
-        """Call a handler for messages of a class with any target, in addition to the vehicle's own."""
+        """Call a handler for all messages of a class, with any address, in addition to the vehicle's own handler."""
         self._observers.setdefault(message_class.ID, []).append(handler)
         self.handlers.setdefault(message_class.ID, _ignore)
 
@@ -328,7 +336,7 @@ class SimulatedVehicle:
         return system in (0, self.system_id) and component in (0, self.component_id)
 
     def send(self, message: Message, channel: Channel | None = None, sender: tuple[int, int] | None = None) -> None:
-        """Send on one channel, or on all if None. A frame lost by `Faults` leaves a gap in the sequence numbers."""
+        """Send a message on one channel, or on all if None. A frame lost by `Faults` leaves a sequence gap."""
         for port in self.channels if channel is None else (channel,):
             data = port.encode(message, sender)
             if not self.faults.drops_outgoing(message, self.rng):
@@ -341,7 +349,7 @@ class SimulatedVehicle:
             self.send(message, channel)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send a STATUSTEXT on every channel; more than 50 characters are sent in chunks."""
+        """Send a STATUSTEXT on every channel. A text of more than 50 characters is divided into chunks."""
         text = text.encode("ascii", "replace").decode()
         if len(text) <= _TEXT_SIZE:
             self._record_text(severity, text)

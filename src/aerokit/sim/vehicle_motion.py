@@ -19,7 +19,7 @@ _PITCH_TIME_CONSTANT_S = 0.3
 _TURN_GAIN_PER_S = 0.8
 _HEIGHT_GAIN_PER_S = 0.4
 _ANGLE_OF_ATTACK_RAD = math.radians(2.0)
-_GLIDE_SPEED_FACTOR = 1.3  # Airspeed without power, relative to the minimum airspeed.
+_GLIDE_SPEED_FACTOR = 1.3  # The airspeed of a glide without power, divided by the minimum airspeed.
 _STOPPED_M_S = 0.3
 
 
@@ -31,7 +31,7 @@ class WingLimits:
     airspeed_max_m_s: float = 30.0
     acceleration_m_s2: float = 3.0
     roll_out_m_s2: float = 2.0
-    """Deceleration on the ground."""
+    """Deceleration while the plane rolls to a stop on the ground."""
     climb_m_s: float = 5.0
     sink_m_s: float = 5.0
     glide_sink_m_s: float = 2.0
@@ -41,7 +41,7 @@ class WingLimits:
 
 
 class FixedWing(Motion):
-    """Motion of a plane: `bank_and_climb`, `head`, `fly_to`, `circle` and `roll_out` set the target, ``step`` moves.
+    """Motion of a plane. Methods such as `head`, `fly_to` and `circle` set the target; ``step`` moves the plane.
 
     The plane starts at rest on the ground. It lifts off at its minimum airspeed, if a climb is requested.
     """
@@ -64,18 +64,18 @@ class FixedWing(Motion):
         self._wanted_climb = 0.0
 
     def bank_and_climb(self, airspeed: float, bank: float, climb: float) -> None:
-        """Hold airspeed (m/s), bank angle (rad, positive right) and climb rate (m/s)."""
+        """Hold an airspeed in m/s, a bank angle in radians (positive to the right) and a climb rate in m/s."""
         limit = self.wing_limits.bank_rad
         self._wanted_airspeed = airspeed
         self._wanted_bank = max(-limit, min(limit, bank))
         self._wanted_climb = max(-self.wing_limits.sink_m_s, min(self.wing_limits.climb_m_s, climb))
 
     def head(self, course: float, airspeed: float, climb: float, *, turn_rate: float = 0.0) -> None:
-        """Fly a ground course (rad from north) with wind correction; ``turn_rate`` is its change in rad/s."""
+        """Fly a ground course (radians from north) with wind correction. The course changes at ``turn_rate`` rad/s."""
         speed = max(self._speed, self.wing_limits.airspeed_min_m_s)
         wind_north, wind_east = self._air_movement()
         crosswind = -wind_north * math.sin(course) + wind_east * math.cos(course)
-        # Limited, so that the plane still has a heading in a crosswind that is faster than the plane.
+        # The argument of asin is limited, because the crosswind may be faster than the plane.
         wind_correction = math.asin(max(-0.9, min(0.9, crosswind / speed)))
         heading = course - wind_correction
         heading_rate = turn_rate + _TURN_GAIN_PER_S * wrap_pi(heading - self.yaw)
@@ -87,18 +87,19 @@ class FixedWing(Motion):
         self.head(course, airspeed, self.climb_to(down))
 
     def circle(self, north: float, east: float, down: float, *, radius: float, airspeed: float) -> None:
-        """Circle a point with this radius in metres; a negative radius is counter-clockwise."""
+        """Circle a point with this radius in metres, clockwise or, with a negative radius, counter-clockwise."""
         radius, turn_sign = max(1.0, abs(radius)), math.copysign(1.0, radius)
         distance = math.hypot(north - self.north, east - self.east)
         course_to_centre = math.atan2(east - self.east, north - self.north)
-        # Far away, fly straight to the centre; on the circle, along its tangent; in between, mix the two.
+        # Far away, the plane flies straight to the centre. On the circle, it flies along the tangent. In between, the
+        # course is a mixture of both.
         share_to_centre = max(-1.0, min(1.0, (distance - radius) / radius))
         course = course_to_centre - turn_sign * (math.pi / 2) * (1.0 - share_to_centre)
         turn_rate = turn_sign * self.ground_speed_m_s / radius if distance < 1.5 * radius else 0.0
         self.head(course, airspeed, self.climb_to(down), turn_rate=turn_rate)
 
     def roll_out(self) -> None:
-        """Stop on the ground."""
+        """Brake on the ground until the plane stops."""
         self.bank_and_climb(0.0, 0.0, 0.0)
 
     def climb_to(self, down: float) -> float:
@@ -110,7 +111,7 @@ class FixedWing(Motion):
         return self.is_on_ground and self._speed < _STOPPED_M_S
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds; an unpowered plane glides."""
+        """Advance by ``dt`` seconds. A plane without power glides."""
         if self.wind.gusts_m_s > 0.0:
             self._update_gusts(dt)
         was_on_ground = self.is_on_ground
@@ -157,7 +158,7 @@ class FixedWing(Motion):
         self.velocity_north: float = north + air_north
         self.velocity_east: float = east + air_east
         self._advance(dt)
-        # 45 % holds the altitude, 95 % climbs at the maximum rate.
+        # A throttle of 45 % holds the altitude, and one of 95 % climbs at the maximum rate.
         throttle = 0.45 + 0.5 * -self.velocity_down / wing.climb_m_s
         self.throttle = max(0.0, min(1.0, throttle)) if powered else 0.0
 
@@ -221,7 +222,7 @@ class GroundLimits:
 
 
 class GroundMotion(Motion):
-    """Motion of a rover or boat: `drive`, `head`, `drive_to` and `stop` set the target, ``step`` moves."""
+    """Motion of a rover or boat. `drive`, `head`, `drive_to` and `stop` set the target; ``step`` moves the vehicle."""
 
     north: float
     east: float
@@ -239,21 +240,21 @@ class GroundMotion(Motion):
         self._wanted_speed = 0.0
         self._wanted_turn_rate = 0.0
         self._wanted_heading: float | None = None
-        """Replaces the turn rate, unless it is None."""
+        """Heading to turn to, which replaces the turn rate; None without such a heading."""
 
     def stop(self) -> None:
         self.drive(0.0, 0.0)
 
     def drive(self, speed: float, turn_rate: float) -> None:
-        """Drive at this speed (m/s, negative backwards) and turn rate (rad/s)."""
+        """Drive at this speed in m/s (negative: backwards), with this turn rate in rad/s."""
         self._wanted_speed, self._wanted_turn_rate, self._wanted_heading = speed, turn_rate, None
 
     def head(self, speed: float, heading: float) -> None:
-        """Drive at this speed towards this heading (rad)."""
+        """Drive at this speed in m/s, and turn to this heading in radians."""
         self._wanted_speed, self._wanted_turn_rate, self._wanted_heading = speed, 0.0, heading
 
     def drive_to(self, north: float, east: float, *, speed: float, stops: bool = True, backwards: bool = False) -> None:
-        """Drive to a point at up to this speed (m/s); with ``stops`` the rover brakes and stops at the point."""
+        """Drive to a point at up to this speed in m/s. With ``stops``, the rover brakes and stops at the point."""
         offset_north, offset_east = north - self.north, east - self.east
         distance = math.hypot(offset_north, offset_east)
         if stops:
@@ -262,7 +263,7 @@ class GroundMotion(Motion):
         if backwards:
             self.head(-speed, course + math.pi)
             return
-        if abs(wrap_pi(course - self.yaw)) > _SLOW_TURN_ERROR_RAD:  # The point is behind the rover.
+        if abs(wrap_pi(course - self.yaw)) > _SLOW_TURN_ERROR_RAD:  # Drive slowly until the rover has turned.
             speed = min(speed, _SLOW_M_S)
         self.head(speed, course)
 
@@ -272,7 +273,7 @@ class GroundMotion(Motion):
         return 0.0
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds; an unpowered rover rolls to a stop."""
+        """Advance by ``dt`` seconds. A rover without power rolls to a stop."""
         rate = self._turn_rate()
         self._accelerate(self._curve_speed(rate) if powered else 0.0, dt)
         mean_yaw = self.yaw + 0.5 * rate * dt
@@ -299,7 +300,7 @@ class GroundMotion(Motion):
         return max(-limit, min(limit, rate))
 
     def _curve_speed(self, rate: float) -> float:
-        """Return the wanted speed, reduced to what the sideways acceleration allows at this turn rate."""
+        """Return the wanted speed, reduced so that the sideways acceleration at this turn rate is within its limit."""
         limit = self.wheels.top_speed_m_s
         if rate:
             limit = min(limit, max(_SLOW_M_S, self.wheels.sideways_m_s2 / abs(rate)))
@@ -310,7 +311,7 @@ class GroundMotion(Motion):
         limit = self.wheels.acceleration_m_s2 * dt
         is_braking = abs(wanted) < abs(self.speed_m_s)
         if is_braking:
-            limit *= 2.0  # Brakes are stronger than the engine.
+            limit *= 2.0  # The brakes are stronger than the engine.
         self.speed_m_s += max(-limit, min(limit, change))
 
 
@@ -357,12 +358,12 @@ class UnderwaterMotion(Motion):
         self._is_floating = False
 
     def push(self, north: float, east: float) -> None:
-        """Move at this horizontal velocity; the depth follows from buoyancy."""
+        """Move at this horizontal velocity, and let the buoyancy change the depth."""
         super().seek_velocity(north, east, 0.0)
         self._is_floating = True
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds; an unpowered submarine rises."""
+        """Advance by ``dt`` seconds. A submarine without power rises."""
         floating_down = -self.buoyancy_m_s2 - _DRAG_PER_S * self.velocity_down
         if powered:
             north, east, commanded_down = self._commanded_acceleration()

@@ -1,4 +1,4 @@
-"""Tools to test programs that use aerokit; only `aerokit.apps.cli` imports this package.
+"""Tools to test programs that use aerokit. Only `aerokit.apps.cli` imports this package.
 
 An event loop on virtual time (`run_virtual`), simulated vehicles with faults and true tracks (`open_flight`,
 `open_fleet`, `serve_flight`), recordings as vehicles (`RecordedVehicle`), faulty links, and a pytest plugin with

@@ -45,21 +45,22 @@ import anyio
 
 T = TypeVar("T")
 
-# The selector is polled once in this many iterations and runs of event sources.
+# The selector is polled once in this many steps. A step is an iteration of the loop or the run of an event source.
 _POLL_EVERY = 64
-# With more timers than this, most of them cancelled, asyncio's own iteration runs to discard the cancelled ones.
+# With more timers than this, if most of them are cancelled, asyncio's own iteration runs once to discard the cancelled
+# timers.
 _MANY_TIMERS = 100
 
 DEADLOCK_TIMEOUT_S = 10.0
-"""Real seconds to wait for sockets, executor calls and other threads before the loop is considered deadlocked."""
+"""Real seconds without an event from sockets, executor calls and other threads after which the loop is deadlocked."""
 
 
 class DeadlockError(RuntimeError):
-    """Nothing can happen any more: no ready callback, no timer, no socket or thread that could wake the loop."""
+    """Raised if nothing can happen any more: there is no callback, timer, socket or thread that could wake the loop."""
 
 
 class VirtualClockLoop(asyncio.SelectorEventLoop):
-    """An asyncio event loop on virtual time; the module documents its rules.
+    """An asyncio event loop on virtual time. See the rules in the documentation of this module.
 
     ``deadlock_timeout_s`` is in real seconds, see `DEADLOCK_TIMEOUT_S`.
     """
@@ -72,8 +73,9 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         super().__init__(_JumpingSelector(self))
         selector: selectors.BaseSelector = self._selector  # type: ignore[attr-defined]
         self._registered: Mapping[Any, Any] = selector.get_map()
-        self._own_registered_count = len(self._registered)  # just the loop's self-pipe
-        # asyncio waits for `when - now`, so the clock may end a rounding error before `when`; the timer is due then.
+        self._own_registered_count = len(self._registered)  # The loop itself has registered its self-pipe.
+        # asyncio waits for `when - now`. Because of rounding, the clock may then be slightly before `when`. With this
+        # resolution, the timer is due nevertheless.
         self._clock_resolution = 1e-9
 
     def time(self) -> float:
@@ -81,30 +83,30 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return self._now
 
     def add_event_source(self, next_due: Callable[[], float], run: Callable[[], None]) -> Callable[[], None]:
-        """Call ``run`` whenever the clock would pass ``next_due()``; return a function that ends this.
+        """Call ``run`` whenever the clock would pass ``next_due()``. Return a function that removes the event source.
 
         An event source does the same as a timer in a fraction of the time, because it needs neither timers nor
         iterations of the loop. ``next_due`` returns seconds on this clock, or infinity for never. After each ``run``,
-        it must return a later time. Event sources run before timers of the same instant.
+        ``next_due`` must return a later time. Event sources run before timers of the same instant.
         """
         source = (next_due, asyncio.Handle(run, (), self))
         self._sources.append(source)
         return lambda: self._sources.remove(source) if source in self._sources else None
 
     def _run_once(self) -> None:
-        """Run one iteration of the loop. Without sockets, poll only now and then, for signals and other threads."""
+        """Run one iteration of the loop. Without sockets, poll only rarely, to notice signals and other threads."""
         self._iterations += 1
         ready, timers = self._ready, self._scheduled  # type: ignore[attr-defined]
         needs_poll = self._iterations >= _POLL_EVERY or not self._can_skip_polls
         if not needs_poll and not ready:
             has_event = self._run_sources() or self._next_timer() != math.inf
-            needs_poll = not has_event  # Only a signal or another thread can wake the loop, or it is deadlocked.
+            needs_poll = not has_event  # Without an event, only a signal or another thread can wake the loop.
         if needs_poll or _MANY_TIMERS < len(timers) < 2 * self._timer_cancelled_count:  # type: ignore[attr-defined]
             self._iterations = 0
             super()._run_once()  # type: ignore[misc]
             return
         if not ready:
-            # Event sources have run and did not make a callback ready. The next iteration polls or looks again.
+            # The event sources have run, but no callback is ready. The next iteration polls or runs them again.
             if self._iterations >= _POLL_EVERY or self._next_timer() == math.inf:
                 return
             self._now = max(self._now, self._next_timer())
@@ -121,12 +123,12 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     @property
     def _can_skip_polls(self) -> bool:
-        """True if neither sockets nor threads nor the debug mode need asyncio's own iteration."""
+        """True unless sockets, threads or the debug mode need asyncio's own iteration."""
         is_watched = self._executor_calls or self._stopping or self._debug  # type: ignore[attr-defined]
         return not is_watched and len(self._registered) == self._own_registered_count
 
     def _next_timer(self) -> float:
-        """Return the time of the first timer, infinity without timers. Discard cancelled timers before it."""
+        """Discard leading cancelled timers, and return the time of the next timer; infinity if there is no timer."""
         timers: list[Any] = self._scheduled  # type: ignore[attr-defined]
         while timers and timers[0]._cancelled:
             self._timer_cancelled_count -= 1  # type: ignore[attr-defined]
@@ -134,9 +136,9 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return timers[0]._when if timers else math.inf
 
     def _run_sources(self) -> bool:
-        """Run event sources that are due before the next timer, until a callback is ready or a poll is due.
+        """Run the event sources that are due before the next timer. Return True if at least one has run.
 
-        Return True if any ran.
+        Stop when a callback is ready or the selector must be polled.
         """
         sources, ready, has_run = self._sources, self._ready, False  # type: ignore[attr-defined]
         can_skip_polls = self._can_skip_polls
@@ -152,7 +154,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             earliest._run()
             has_run = True
             self._iterations += 1
-            if self._iterations >= _POLL_EVERY or not can_skip_polls:  # Sockets are polled before every jump.
+            if self._iterations >= _POLL_EVERY or not can_skip_polls:  # Real sockets must be polled before every jump.
                 break
         return has_run
 
@@ -163,7 +165,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             self._ready.extend(handle for next_due, handle in self._sources if next_due() < end)  # type: ignore[attr-defined]
 
     def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  # type: ignore[override]
-        """Run ``func`` on a thread; the clock stands still until it returns."""
+        """Run ``func`` on a thread. The clock stands still until ``func`` returns."""
         future = super().run_in_executor(executor, func, *args)
         self._executor_calls += 1
         future.add_done_callback(self._on_executor_call_done)
@@ -181,7 +183,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             self._executor_calls -= 1
 
     def wait_for_events(self, poll: Callable[[float], list[Any]], timeout: float | None) -> list[Any]:
-        """Replace the selector's wait for ``timeout`` virtual seconds; None waits without a limit."""
+        """Wait for ``timeout`` virtual seconds (None: without a limit), in place of the selector."""
         events = self._wait(poll, timeout)
         self._schedule_sources_before_timer()
         return events
@@ -199,7 +201,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         if self._ready:  # type: ignore[attr-defined]  # Another thread has called the loop since the poll.
             return []
         if timeout is None:
-            raise DeadlockError(self._deadlock("nothing left to wait for"))
+            raise DeadlockError(self._deadlock("the loop has nothing left to wait for"))
         self._now += timeout
         return []
 
@@ -210,7 +212,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         events = poll(self._deadlock_timeout_s)
         if not events:
             raise DeadlockError(
-                self._deadlock(f"no socket or thread woke the loop in {self._deadlock_timeout_s} real seconds")
+                self._deadlock(f"no socket or thread has woken the loop for {self._deadlock_timeout_s} real seconds")
             )
         return events
 
@@ -225,7 +227,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 def run_virtual(coroutine: Coroutine[Any, Any, T]) -> T:
     """Run a coroutine on a `VirtualClockLoop`, and cancel its remaining tasks, as asyncio.run does.
 
-    Raises TypeError for a coroutine function, or any other object that is not a coroutine.
+    Raises TypeError for an object that is not a coroutine, such as a coroutine function.
     """
     if not asyncio.iscoroutine(coroutine):
         raise TypeError(f"run_virtual requires a coroutine, such as main(), not {coroutine!r}")
@@ -236,7 +238,7 @@ def run_virtual(coroutine: Coroutine[Any, Any, T]) -> T:
     try:
         return anyio.run(main, backend_options={"loop_factory": VirtualClockLoop})
     finally:
-        coroutine.close()  # It may not have started, if the event loop could not be created.
+        coroutine.close()  # This avoids a warning if the event loop could not be created and `main` never started.
 
 
 VIRTUAL_BACKEND: tuple[str, dict[str, object]] = ("asyncio", {"loop_factory": VirtualClockLoop})
@@ -244,7 +246,7 @@ VIRTUAL_BACKEND: tuple[str, dict[str, object]] = ("asyncio", {"loop_factory": Vi
 
 
 class _JumpingSelector(selectors.DefaultSelector):
-    """Selector that calls ``wait_for_events`` of the loop instead of waiting in real time."""
+    """A selector that does not wait in real time, but calls ``wait_for_events`` of the loop."""
 
     def __init__(self, loop: VirtualClockLoop) -> None:
         super().__init__()

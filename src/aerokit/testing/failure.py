@@ -19,10 +19,10 @@ _MAX_TEXTS = 6
 
 
 def failure_report(opened: Iterable[SimulatedFleet | Flight | ServedFlight], test: str, directory: str | None) -> str:
-    """Return the lines of the report on each vehicle.
+    """Return the report on the vehicles of a failed test, with the lines about each vehicle.
 
-    With ``directory``, also save a picture of all tracks there, named after the test, and recordings with their
-    reports.
+    If ``directory`` is given, also save files there: a picture of all tracks, the recordings, and reports on the
+    recordings. Their names begin with the name of the test.
     """
     flights = _flatten(opened)
     lines = [line for flight in flights for line in _describe(flight)]
@@ -42,7 +42,7 @@ def _flatten(opened: Iterable[SimulatedFleet | Flight | ServedFlight]) -> list[F
 def _describe(flight: Flight | ServedFlight) -> list[str]:
     try:
         return _describe_flight(flight)
-    except Exception as error:  # A failed simulation must not prevent the report.
+    except Exception as error:  # An exception of the simulated vehicle must not prevent the report.
         return [f"{flight.simulated!r} fails: {error!r}"]
 
 
@@ -71,13 +71,13 @@ def _picture(flights: Sequence[Flight | ServedFlight], test: str, directory: Pat
     try:
         directory.mkdir(parents=True, exist_ok=True)
         save_picture([flight.track for flight in flights], path)
-    except OSError as error:  # A missing picture must not prevent the report.
+    except OSError as error:  # A picture that cannot be saved must not prevent the report.
         return f"no picture: {error}"
     return f"track in {path}"
 
 
 def _recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: Path) -> list[str]:
-    """Save a file for each link, and a report for each vehicle."""
+    """Save a recording of each link and a report on each vehicle. Return the lines about these files."""
     by_recording: dict[int, list[Flight | ServedFlight]] = {}
     for flight in flights:
         by_recording.setdefault(id(flight.recording), []).append(flight)
@@ -91,7 +91,7 @@ def _recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: 
             path.write_bytes(recording.to_bytes())
             lines.append(f"recording in {path}")
             lines += [_report(path, flight, len(group)) for flight in group]
-        except Exception as error:  # Nothing was sent on the link, or the disk is full.
+        except Exception as error:  # For example, the recording is empty or the disk is full.
             lines.append(f"no report: {error}")
     return lines
 

@@ -1,4 +1,4 @@
-"""``FaultModel``: faults of a radio link; ``FaultyPath``: applies them to frames in one direction, without I/O."""
+"""Faults of a radio link (``FaultModel``), which ``FaultyPath`` applies to the frames of one direction, without I/O."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _SECONDS = ("delay_s", "jitter_s", "overtaken_s")
 
 
 class FaultModel(Snapshot):
-    """Faults of one direction of a radio link; none by default.
+    """Faults of one direction of a radio link. By default, there are no faults.
 
-    Shares are probabilities from 0 to 1 for each frame, independent of each other and of previous frames.
+    A share is the probability (0 to 1) that a frame has the fault. All faults and all frames are independent.
 
     Raises InvalidArgument for a value out of range.
     """
@@ -25,7 +25,7 @@ class FaultModel(Snapshot):
     loss: float = 0.0
     """Share of lost frames."""
     duplication: float = 0.0
-    """Share of frames that arrive twice; the copy follows at once."""
+    """Share of frames that arrive twice. The copy follows the frame at once."""
     reordering: float = 0.0
     """Share of frames that are delayed, so that later frames overtake them."""
     corruption: float = 0.0
@@ -33,17 +33,17 @@ class FaultModel(Snapshot):
     delay_s: float = 0.0
     """Latency in seconds."""
     jitter_s: float = 0.0
-    """Maximum random delay in seconds that is added; frames keep their order, as in a queue."""
+    """Maximum of a random delay in seconds, which is added to ``delay_s``. Frames keep their order, as in a queue."""
     overtaken_s: float = 0.05
-    """Delay in seconds of frames that are reordered."""
+    """Additional delay in seconds of the frames that are reordered."""
     bandwidth: float = math.inf
-    """Bytes per second; a serial line or radio of 57,600 baud transfers about 5,760. Excess frames are queued."""
+    """Bytes per second, for example 5,760 for a serial line of 57,600 baud. Frames wait in a queue until they fit."""
     queue_bytes: float = math.inf
-    """Size of the queue; frames beyond it are dropped. Telemetry radios have about 4,000 bytes."""
+    """Size of the queue in bytes. Frames that do not fit are dropped. Telemetry radios have about 4,000 bytes."""
     outages: tuple[tuple[float, float], ...] = ()
     """Intervals (begin, end), in seconds since the link was opened, in which all frames are lost."""
     per_frame: bool = True
-    """True applies faults to each MAVLink frame, as a radio does; False applies them to whole writes and datagrams."""
+    """True to apply the faults to each MAVLink frame, as a radio does; False to apply them to whole datagrams."""
 
     def _check(self) -> None:
         for name in _SHARES:
@@ -52,24 +52,25 @@ class FaultModel(Snapshot):
             _check_number(name, getattr(self, name), 0.0, 3600.0)
         for name in ("bandwidth", "queue_bytes"):
             if not getattr(self, name) > 0:
-                raise InvalidArgument(f"{name} = {getattr(self, name)!r} is not allowed: above 0")
+                raise InvalidArgument(f"{name} = {getattr(self, name)!r} is not allowed: it must be above 0")
         for begin, end in self.outages:
             if not begin <= end:
-                raise InvalidArgument(f"outages: ({begin!r}, {end!r}) is not allowed: begin before end")
+                raise InvalidArgument(f"the outage ({begin!r}, {end!r}) is not allowed: it must begin before its end")
 
 
 class Air:
-    """A transmission medium that carries one frame at a time. Two directions that share a medium are half duplex."""
+    """A transmission medium that carries one frame at a time. A half-duplex link has one medium for both directions."""
 
     def __init__(self) -> None:
         self.busy_until: float = -math.inf
 
 
 class FaultyPath:
-    """Applies faults to one direction of a link. Equal model, seed, frames and times produce equal results.
+    """Applies faults to one direction of a link. Equal models, seeds, frames and times produce equal results.
 
-    ``frames`` and ``bytes`` count the traffic passed in; ``lost`` (including outages), ``overflowed`` (queue full),
-    ``duplicated``, ``reordered`` and ``corrupted`` count frames.
+    ``frames`` and ``bytes`` count everything that was sent. ``lost`` counts the lost frames, including those during
+    outages, ``overflowed`` the frames that did not fit into the queue. ``duplicated``, ``reordered`` and ``corrupted``
+    count the frames with these faults.
     """
 
     frames: int
@@ -81,7 +82,7 @@ class FaultyPath:
 
     def __init__(self, model: FaultModel, seed: object = 0, air: Air | None = None) -> None:
         self.model = model
-        """Faults of this direction; may be replaced at any time."""
+        """Faults of this direction. The model may be replaced at any time."""
         self.frames = self.lost = self.overflowed = 0
         self.bytes: int = 0
         self.duplicated = self.reordered = self.corrupted = 0
@@ -92,11 +93,11 @@ class FaultyPath:
         self._latest_due = -math.inf
 
     def start(self, now: float) -> None:
-        """Start the clock of the outages. Without this call, the first frame starts it."""
+        """Start the clock of the outages at ``now``. Without this call, the clock starts at the first frame."""
         self._started_at = now
 
     def carry(self, data: bytes, now: float) -> list[tuple[float, bytes]]:
-        """Return the arrivals (time, bytes) of a write or datagram, in the order of sending."""
+        """Return when which bytes of a write or datagram arrive, as (time, bytes), in the order of sending."""
         if self._started_at is None:
             self.start(now)
         arrivals: list[tuple[float, bytes]] = []
@@ -105,8 +106,8 @@ class FaultyPath:
         return arrivals
 
     def _carry_frame(self, frame: bytes, now: float) -> list[tuple[float, bytes]]:
-        # Every frame draws these five random numbers, even if it is lost. A change of one share therefore does not
-        # change which frames have other faults.
+        # Five random numbers are drawn for every frame, even for a lost one. A change of one share therefore does not
+        # change which frames the other faults hit.
         model, chance = self.model, self._chance
         is_lost, is_duplicated = chance() < model.loss, chance() < model.duplication
         is_reordered, is_corrupted = chance() < model.reordering, chance() < model.corruption
@@ -132,13 +133,13 @@ class FaultyPath:
         return [(due, frame)] * (2 if is_duplicated else 1)
 
     def _transmit(self, size: int, now: float) -> float | None:
-        """Return the time at which the last byte is sent; None if the queue is full."""
+        """Return the time at which the last byte of a frame is sent; None if the queue is full."""
         model, air = self.model, self._air
         begin = max(now, air.busy_until)
         if math.isinf(model.bandwidth):
             return begin
         queued_bytes = (begin - now) * model.bandwidth
-        # An empty queue accepts even a frame that is larger than the queue.
+        # An empty queue accepts every frame, even if the frame is larger than the queue.
         if queued_bytes > 0 and queued_bytes + size > model.queue_bytes:
             return None
         air.busy_until = begin + size / model.bandwidth
@@ -158,9 +159,9 @@ class FaultyPath:
 
 
 def split_frames(data: bytes) -> Sequence[bytes]:
-    """Split a write or datagram into MAVLink frames; other bytes and partial frames are one piece.
+    """Split a write or datagram into MAVLink frames. Bytes that are no complete frame form one piece.
 
-    Only lengths are checked, no checksums.
+    Only the lengths of frames are checked, not their checksums.
     """
     pieces: list[bytes] = []
     begin, size = 0, len(data)
@@ -172,12 +173,12 @@ def split_frames(data: bytes) -> Sequence[bytes]:
 
 
 def _end_of_frame(data: bytes, begin: int) -> int | None:
-    """Return the end of the frame that begins here, by its header; None if none does."""
+    """Return the end of the frame that begins at ``begin``, according to its header; None if no frame begins there."""
     if len(data) < begin + 3 or data[begin] not in (MAGIC_V1, MAGIC_V2):
         return None
     magic, payload_length, flags = data[begin : begin + 3]
     if magic == MAGIC_V1:
-        return begin + payload_length + 8  # header and checksum
+        return begin + payload_length + 8  # 6 bytes of header and 2 bytes of checksum
     return begin + payload_length + 12 + (SIGNATURE_LENGTH if flags & SIGNED else 0)
 
 

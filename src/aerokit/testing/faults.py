@@ -14,18 +14,18 @@ from aerokit.testing.stage import FlightScheduler
 from aerokit.testing.track import true_point
 from aerokit.testing.track_points import TrackPoint
 
-# Function that calls its argument, a plan, with the scheduler of the flight.
+# A function that takes a plan, and calls the plan with the scheduler of the flight.
 ScheduleWith = Callable[[Callable[[FlightScheduler], None]], None]
 
 
 class FaultInjector:
     """Injects faults at once or after ``after_s`` simulated seconds, permanently or for ``for_s`` simulated seconds.
 
-    Before the flight is opened, times count from its opening. Scheduled faults survive a reboot of the vehicle.
-    Raises InvalidArgument for times and shares out of range.
+    If a fault is injected before the flight is opened, its times count from the opening. Scheduled faults survive a
+    reboot of the vehicle. Raises InvalidArgument for a time or share out of range.
     """
 
-    # With slots, setting an attribute of `Faults` on this object by mistake raises AttributeError.
+    # The slots make it an AttributeError to set an attribute of `Faults` on this object by mistake.
     __slots__ = ("_schedule_with", "_vehicle")
 
     def __init__(self, vehicle: Any, schedule_with: ScheduleWith) -> None:
@@ -33,9 +33,9 @@ class FaultInjector:
         self._schedule_with = schedule_with
 
     def when(self, condition: Callable[[TrackPoint], bool]) -> FaultInjector:
-        """Return an injector whose faults start when a condition on the true state is first met.
+        """Return an injector whose faults start when the true state of the vehicle first meets a condition.
 
-        ``after_s`` counts from that time. The condition is checked ten times per simulated second:
+        ``after_s`` counts from that moment. The condition is checked ten times per simulated second:
         ``faults.when(lambda point: point.altitude_m > 15).lose_gps()``.
         """
 
@@ -54,7 +54,7 @@ class FaultInjector:
         return faults
 
     def lose_gps(self, *, after_s: float = 0.0, for_s: float | None = None) -> None:
-        """Lose the GPS fix; the estimator drops its position some seconds later."""
+        """Lose the GPS fix. Some seconds later, the estimator has no position any more."""
         self._set("gps_lost", True, False, after_s, for_s)
 
     def lose_rc(self, *, after_s: float = 0.0, for_s: float | None = None) -> None:
@@ -62,22 +62,22 @@ class FaultInjector:
         self._set("rc_lost", True, False, after_s, for_s)
 
     def fail_motor(self, *, after_s: float = 0.0) -> None:
-        """Stop a motor, so that the vehicle falls."""
+        """Stop a motor, so that the vehicle cannot fly any more."""
         self._set("motor_failed", True, False, after_s, None)
 
     def drop_packets(self, share: float, *, after_s: float = 0.0, for_s: float | None = None) -> None:
-        """Lose this share of packets, 0 to 1, in both directions. The vehicle's seed determines which packets."""
+        """Lose a share of the packets, from 0 to 1, in both directions. The vehicle's seed determines which ones."""
         if not 0.0 <= share <= 1.0:
             raise InvalidArgument(f"share = {share!r} is not allowed: 0 to 1")
         self._set("loss", share, 0.0, after_s, for_s)
         self._set("loss_incoming", share, 0.0, after_s, for_s)
 
     def go_silent(self, for_s: float | None = None, *, after_s: float = 0.0) -> None:
-        """Interrupt the radio in both directions, by default until :meth:`end`. The vehicle continues to fly."""
+        """Interrupt the radio in both directions, by default until :meth:`end`. The vehicle flies on."""
         self._set("silent", True, False, after_s, for_s)
 
     def hang(self, for_s: float | None = None, *, after_s: float = 0.0) -> None:
-        """Freeze the autopilot, by default until :meth:`end`: it does not receive, move or send."""
+        """Freeze the autopilot, by default until :meth:`end`. It then does not receive, move or send."""
         self._set("frozen", True, False, after_s, for_s)
 
     def fail_prearm(self, reason: str, *, after_s: float = 0.0, for_s: float | None = None) -> None:
@@ -99,13 +99,13 @@ class FaultInjector:
         self._schedule(partial(setattr, self._vehicle.motion, "wind", wind), after_s)
 
     def set_battery(self, percent: float, *, after_s: float = 0.0) -> None:
-        """Set the remaining battery charge in percent; the battery continues to drain."""
+        """Set the remaining battery charge in percent. The battery then continues to drain."""
         if not 0.0 <= percent <= 100.0:
             raise InvalidArgument(f"percent = {percent!r} is not allowed: 0 to 100")
         self._schedule(partial(setattr, self._vehicle.battery, "percent", percent), after_s)
 
     def end(self, *, after_s: float = 0.0) -> None:
-        """End all faults that a vehicle can recover from: GPS, radios, motor, processor."""
+        """End the faults of GPS, radios, motor and processor."""
         for name in ("gps_lost", "rc_lost", "motor_failed", "silent", "frozen"):
             self._set(name, False, False, after_s, None)
         self.drop_packets(0.0, after_s=after_s)
@@ -118,11 +118,11 @@ class FaultInjector:
 
     def _schedule(self, action: Callable[[], None], after_s: float) -> None:
         if not (math.isfinite(after_s) and after_s >= 0.0):
-            raise InvalidArgument(f"after_s = {after_s!r} must be 0 or more seconds")
+            raise InvalidArgument(f"after_s = {after_s!r} is not allowed: it must be 0 or more")
         self._schedule_with(lambda scheduler: scheduler.do(action, after_s=after_s))
 
 
 def _duration(for_s: float) -> float:
     if not for_s > 0.0:
-        raise InvalidArgument(f"for_s = {for_s!r} must be above 0 seconds")
+        raise InvalidArgument(f"for_s = {for_s!r} is not allowed: it must be above 0")
     return for_s

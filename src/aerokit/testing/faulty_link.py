@@ -34,14 +34,15 @@ from aerokit.transport.link import (
 )
 from aerokit.transport.outbox import Outbox
 
-# Bytes that an outbox keeps for a peer, as many as the TCP links keep.
+# Maximum number of bytes that wait for a peer, as in the TCP links.
 LIMIT = 256 * 1024
 
 
 class StalledQueue:
-    """Simulates a stalled TCP connection: the operating system accepts ``system_bytes``, further bytes are queued.
+    """Simulates a stalled TCP connection. The operating system accepts ``system_bytes``, and further bytes are queued.
 
-    ``carry(data, peer)`` sends bytes; ``dropped`` and ``stalled`` are callbacks of an `Outbox`.
+    ``carry(data, peer)`` sends bytes. ``on_drop`` is called with the number of dropped writes, and ``on_stall`` with
+    True or False when the connection stalls or continues.
     """
 
     def __init__(
@@ -52,7 +53,8 @@ class StalledQueue:
         on_stall: Callable[[bool], object],
     ) -> None:
         self._system_limit, self._carry, self._on_drop, self._on_stall = system_bytes, carry, on_drop, on_stall
-        self._accepted: list[tuple[bytes, Peer]] = []  # Sent by the operating system after the stall.
+        # Bytes that the simulated operating system has accepted, and sends after the stall.
+        self._accepted: list[tuple[bytes, Peer]] = []
         self._outboxes: dict[Peer, Outbox] = {}
         self._stalled_peers: set[Peer] = set()
         self._is_stalled = True
@@ -70,7 +72,7 @@ class StalledQueue:
         outbox.write(data)
 
     def discard(self) -> None:
-        """Discard bytes that the operating system has not accepted."""
+        """Discard the queued bytes, which the operating system has not accepted."""
         for outbox in self._outboxes.values():
             outbox.discard()
 
@@ -106,7 +108,8 @@ class StalledQueue:
             self._carry(data, peer)
             return
         self._accepted.append((data, peer))
-        if sum(len(piece) for piece, _ in self._accepted) >= self._system_limit:
+        accepted_bytes = sum(len(piece) for piece, _ in self._accepted)
+        if accepted_bytes >= self._system_limit:  # The operating system accepts no more bytes.
             for outbox in self._outboxes.values():
                 outbox.pause()
 
@@ -124,11 +127,11 @@ class StalledQueue:
 class FaultyLink(Link):
     """Loses, duplicates, delays and corrupts the traffic of another link, as `FaultModel` specifies.
 
-    ``outgoing`` applies to data that this program writes, ``incoming`` to data that it receives. ``model`` is the
-    default of both. Each direction has a separate random generator, derived from ``seed``, so that a program on virtual
-    time gets the same faults in every run. With ``half_duplex``, only one direction transmits at a time.
+    ``outgoing`` applies to data that this program writes, ``incoming`` to data that this program receives. ``model`` is
+    the default of both. Each direction has a separate random generator, derived from ``seed``, so that a program on
+    virtual time gets the same faults in every run. With ``half_duplex``, only one direction transmits at a time.
 
-    The wrapped link must not be open; this link opens and closes it.
+    The wrapped link must not be open, because this link opens and closes it.
     """
 
     def __init__(
@@ -146,13 +149,13 @@ class FaultyLink(Link):
         model = FaultModel() if model is None else model
         air = Air() if half_duplex else None
         self.outgoing: FaultyPath = FaultyPath(outgoing or model, (seed, "outgoing"), air)
-        """Outgoing direction with its counters; its ``model`` may be replaced at any time."""
+        """The outgoing direction, with counters. Its ``model`` may be replaced at any time."""
         self.incoming: FaultyPath = FaultyPath(incoming or model, (seed, "incoming"), air)
-        """Incoming direction with its counters."""
+        """The incoming direction, with counters. Its ``model`` may be replaced at any time."""
         self._incoming_path: _IncomingPath | None = None
         self._in_flight: _DeliveryQueue | None = None
         self._is_closed = False
-        self._stalled_queue: StalledQueue | None = None  # None before the first stall.
+        self._stalled_queue: StalledQueue | None = None  # None before the first call of `stall`.
         self._stalled_at: float | None = None
         self._expired = 0
         self._drained = asyncio.Event()
@@ -165,15 +168,15 @@ class FaultyLink(Link):
 
     @property
     def dropped_writes(self) -> int:  # type: ignore[override]
-        """Number of writes that the wrapped link dropped, that overflowed a queue, or that expired during a stall.
+        """Number of writes that the wrapped link dropped, that did not fit into a queue, or that expired in a stall.
 
-        Frames lost in transit do not count.
+        Frames that were lost in transit do not count.
         """
         return self.link.dropped_writes + self.outgoing.overflowed + self._expired
 
     @property
     def unsent_bytes(self) -> int:
-        """See `Link.unsent_bytes`; bytes in transit do not count."""
+        """See `Link.unsent_bytes`. Bytes in transit do not count."""
         return self.link.unsent_bytes + (0 if self._stalled_queue is None else self._stalled_queue.unsent_bytes)
 
     def discard_unsent(self) -> None:
@@ -186,8 +189,8 @@ class FaultyLink(Link):
         """Stop sending until :meth:`drain`, like TCP over an interrupted network.
 
         The simulated operating system accepts ``system_bytes``, which arrive after :meth:`drain`. Further bytes are
-        queued, and dropped if they wait for more than a second; :meth:`discard_unsent` drops them at once. The link
-        must be open.
+        queued. They are dropped after a second in the queue, or at once by :meth:`discard_unsent`. The link must be
+        open.
         """
         if self._stalled_queue is not None:
             self._stalled_queue.close()
@@ -201,9 +204,9 @@ class FaultyLink(Link):
     async def open(self, receiver: Receiver) -> None:
         """See `Link.open`."""
         if self._is_closed:
-            raise ConnectionClosed(f"{self.address} was closed; make a new link to open it again")
+            raise ConnectionClosed(f"{self.address} was closed and cannot be opened again; make a new link")
         if self._incoming_path is not None:
-            raise BusyError(f"{self.address} is open; a link can be opened only once")
+            raise BusyError(f"{self.address} is already open; a link can be opened only once")
         loop = asyncio.get_running_loop()
         self._in_flight = _DeliveryQueue(loop)
         self._incoming_path = _IncomingPath(self.incoming, receiver, self._discard_in_transit)
@@ -218,7 +221,7 @@ class FaultyLink(Link):
             raise
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; a frame lost in transit is not a dropped write."""
+        """See `Link.write`. A frame that is lost in transit does not count as a dropped write."""
         if self._in_flight is None or self._is_closed:
             return
         if self._stalled_queue is not None:
@@ -250,7 +253,7 @@ class FaultyLink(Link):
         return self.link.has_peer(peer)
 
     def close(self) -> None:
-        """See `Link.close`; frames in transit are still delivered, for up to `LINGER_S`."""
+        """See `Link.close`. Frames in transit are still delivered, for up to `LINGER_S` seconds."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -285,7 +288,7 @@ class FaultyLink(Link):
             self._incoming_path.link_drained(now - stalled_at)
 
     def _discard_in_transit(self) -> None:
-        """Discard the outgoing frames in transit."""
+        """Discard the outgoing frames that are in transit."""
         if self._stalled_queue is not None:
             self._stalled_queue.close()
         if self._in_flight is not None:
@@ -298,7 +301,7 @@ class FaultyLink(Link):
 
 
 class _IncomingPath:
-    """Receiver of the wrapped link, which applies the faults of the incoming direction."""
+    """The receiver of the wrapped link. It applies the faults of the incoming direction."""
 
     def __init__(self, path: FaultyPath, receiver: Receiver, when_lost: Callable[[], None]) -> None:
         self._path, self._receiver, self._when_lost = path, receiver, when_lost
@@ -309,12 +312,12 @@ class _IncomingPath:
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         """See `Receiver`."""
         for due, piece in self._path.carry(data, self._in_flight.loop.time()):
-            if self._is_closed:  # The receiver closed the link while processing the previous piece.
+            if self._is_closed:  # The receiver has closed the link while it processed the previous piece.
                 return
             self._in_flight.put(due, lambda piece=piece: self._receiver.bytes_received(piece, peer))  # type: ignore[misc]
 
     def link_lost(self, error: LinkLost) -> None:
-        """See `Receiver`; frames in transit are delivered first."""
+        """See `Receiver`. Frames in transit are delivered first."""
         self._when_lost()
         if not self._is_closed:
             self._in_flight.put(self._in_flight.latest_due, lambda: self._receiver.link_lost(error))
@@ -350,7 +353,7 @@ class _IncomingPath:
 
 
 class _DeliveryQueue:
-    """Runs actions when they are due, in order, with a single timer."""
+    """Runs actions when they are due, in the order of their times, with a single timer."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.loop = loop
@@ -358,16 +361,14 @@ class _DeliveryQueue:
         self._waiting: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0  # stored here, because uvloop's TimerHandle.when() fails for a time that has passed
+        # The time of `_timer`, which is kept because uvloop's TimerHandle.when() fails after this time.
+        self._timer_at = 0.0
 
     def __bool__(self) -> bool:
         return bool(self._waiting)
 
     def put(self, due: float, action: Callable[[], None]) -> None:
-        """Queue an action, or run it at once if it is due and the queue is empty.
-
-        A radio without faults therefore adds no delay.
-        """
+        """Queue an action. If it is due and the queue is empty, run it at once, so that no faults add no delay."""
         if due <= self.loop.time() and not self._waiting:
             action()
             return
@@ -397,6 +398,6 @@ class _DeliveryQueue:
             while self._waiting and self._waiting[0][0] <= now:
                 _, _, action = heappop(self._waiting)
                 action()
-        finally:  # If an action raises, the loop reports the exception, and the other actions still run.
+        finally:  # The other actions must run even if one raises an exception, which the loop then reports.
             if self._waiting:
                 self._schedule()

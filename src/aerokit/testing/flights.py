@@ -42,7 +42,7 @@ _BOOT_TIME_S = 1.0
 
 
 class Flight:
-    """A simulated vehicle in a test. Faults can be scheduled before the flight. The track remains after it."""
+    """A simulated vehicle in a test. Faults can be scheduled before the flight, and the track remains afterwards."""
 
     def __init__(self, fleet: SimulatedFleet, number: int) -> None:
         self._fleet = fleet
@@ -58,24 +58,26 @@ class Flight:
 
     @property
     def vehicle(self) -> aerokit.Vehicle:
-        """The program's vehicle, connected; RuntimeError if the flight is not open."""
+        """The program's vehicle, which is connected. Raises RuntimeError if the flight is not open."""
         if self._vehicle is None:
             self._fleet._check_open()
-            raise RuntimeError("no vehicle: this flight was opened with connect=False; connect to flight.link")
+            raise RuntimeError(
+                "the flight was opened with connect=False and has no vehicle; connect your program to flight.link"
+            )
         return self._vehicle
 
     @property
     def recording(self) -> FlightRecording | None:
-        """Recording of the link, which all vehicles of a fleet share; None without ``record=True``."""
+        """Recording of the link, which all vehicles of a fleet share. None without ``record=True``."""
         return self._fleet.recording
 
     @property
     def link(self) -> Link:
-        """The program's end of the link, for programs that connect themselves; needs ``connect=False``."""
+        """The program's end of the link, for a program that connects by itself. Needs ``connect=False``."""
         return self._fleet.link
 
     def run(self, main: Callable[[Flight], Awaitable[T]]) -> T:
-        """Open the flight, run ``main(flight)`` on virtual time and close it; for tests without ``async``."""
+        """Open the flight, run ``main(flight)`` on virtual time and close the flight, in a test without ``async``."""
 
         async def fly() -> T:
             async with self._fleet.open():
@@ -85,9 +87,9 @@ class Flight:
 
 
 class SimulatedFleet(Sequence[Flight]):
-    """Simulated vehicles on one link, with system ids 1, 2, 3 …: a sequence of `Flight`. Can be opened once.
+    """Simulated vehicles on one link, as a sequence of `Flight`. A fleet can be opened only once.
 
-    The vehicles stand in a row to the east of ``home``, ``spacing_m`` metres apart.
+    The vehicles have the system ids 1, 2, 3 … and stand in a row to the east of ``home``, ``spacing_m`` metres apart.
     """
 
     def __init__(
@@ -127,11 +129,11 @@ class SimulatedFleet(Sequence[Flight]):
 
     @property
     def min_distance_m(self) -> float:
-        """Minimum distance of any two vehicles in space; infinity for fewer than two."""
+        """Minimum distance of any two vehicles in space, in metres. It is infinite for fewer than two vehicles."""
         return self._closest_approach()[0]
 
     def assert_stayed_apart(self, distance_m: float) -> None:
-        """Assert that no two vehicles came nearer to each other than this distance, in space."""
+        """Assert that the distance of any two vehicles in space was never below ``distance_m``."""
         __tracebackhide__ = True
         closest_m, time_s, names = self._closest_approach()
         text = f"{names} came nearer than {distance_m:g} m: {closest_m:.1f} m at {time_s:.1f} s"
@@ -142,7 +144,7 @@ class SimulatedFleet(Sequence[Flight]):
         save_picture([flight.track for flight in self], path)
 
     def _closest_approach(self) -> tuple[float, float, str]:
-        """Return the minimum distance of any two vehicles in metres, its time, and the names of the two."""
+        """Return the minimum distance of any two vehicles in metres, its time, and the names of these vehicles."""
         approaches = [
             (*min_distance_m(first.track, second.track), f"{first.track.name} and {second.track.name}")
             for first, second in combinations(self, 2)
@@ -151,15 +153,17 @@ class SimulatedFleet(Sequence[Flight]):
 
     @property
     def link(self) -> Link:
-        """The program's end of the link, for programs that connect themselves; needs ``connect=False``."""
+        """The program's end of the link, for a program that connects by itself. Needs ``connect=False``."""
         self._check_open()
         if self._connect:
-            raise RuntimeError("this link is in use: open the flight with connect=False to connect by yourself")
+            raise RuntimeError(
+                "the flight itself uses this link; open the flight with connect=False to connect your program instead"
+            )
         assert self._link is not None
         return self._link
 
     def run(self, main: Callable[[SimulatedFleet], Awaitable[T]]) -> T:
-        """Open the fleet, run ``main(fleet)`` on virtual time and close it; for tests without ``async``."""
+        """Open the fleet, run ``main(fleet)`` on virtual time and close the fleet, in a test without ``async``."""
 
         async def fly() -> T:
             async with self.open():
@@ -169,12 +173,12 @@ class SimulatedFleet(Sequence[Flight]):
 
     @asynccontextmanager
     async def open(self) -> AsyncIterator[SimulatedFleet]:
-        """Switch the vehicles on and connect; tracks and journals remain after the block.
+        """Switch the vehicles on and connect. Tracks and journals remain after the block.
 
         Raises RuntimeError if the fleet was opened before.
         """
         if self._was_opened:
-            raise RuntimeError("this flight was opened before; create a new one")
+            raise RuntimeError("this flight was already opened, and can be opened only once; create a new flight")
         self._was_opened = True
         near_end, far_end = memory_link_pair(latency_s=self._latency_s)
         async with AsyncExitStack() as stack:
@@ -212,12 +216,12 @@ class SimulatedFleet(Sequence[Flight]):
     def _check_open(self) -> None:
         if self._server is None:
             raise RuntimeError(
-                "this flight is not open: it opens when an `async def` test begins; in a `def` test use"
-                " flight.run(main), in a fixture `async with open_flight()`"
+                "this flight is not open. The plugin opens a flight when an `async def` test begins. In a `def` test"
+                " use flight.run(main), and in a fixture `async with open_flight()`"
             )
 
     def _schedule_with(self, plan: Callable[[FlightScheduler], None]) -> None:
-        """Bring the vehicles to the current time, call ``plan`` with the scheduler, and run what is due at once."""
+        """Advance the vehicles to the current time, call ``plan`` with the scheduler, and run events that are due."""
         self._refresh()
         plan(self._scheduler)
         if self._server is not None:
@@ -227,7 +231,7 @@ class SimulatedFleet(Sequence[Flight]):
 def _side_by_side(
     kinds: Sequence[str], spacing_m: float, *, system_id: int = 1, seed: int = 0, **options: Any
 ) -> list[SimulatedVehicle]:
-    """Create a vehicle of each kind: the first at its home, the others in a row to the east of it."""
+    """Create a vehicle of each kind. The first is at its home, the others stand in a row to the east of it."""
     vehicles: list[Any] = []
     for number, kind in enumerate(kinds):
         if vehicles:
@@ -240,10 +244,10 @@ def _side_by_side(
 
 @asynccontextmanager
 async def open_flight(kind: str = "copter", **options: Any) -> AsyncIterator[Flight]:
-    """Open a connected vehicle of a kind ("copter", "plane", "rover", "sub", "px4", "px4_plane").
+    """Simulate a vehicle of a kind ("copter", "plane", "rover", "sub", "px4", "px4_plane") and connect to it.
 
-    ``connect=False`` lets the program connect to ``flight.link``; ``latency_s`` delays both directions;
-    ``record=True`` records the link for the report of a failed test. Other options are those of the simulated
+    With ``connect=False``, the program connects to ``flight.link`` by itself. ``latency_s`` delays both directions of
+    the link. ``record=True`` records the link for the report of a failed test. Other options are those of the simulated
     vehicle: ``seed``, ``home``, ``parameters``, ``battery_percent`` …
 
     Raises InvalidArgument for an unknown kind.
@@ -262,13 +266,13 @@ def open_fleet(*kinds: str, count: int | None = None, **options: Any) -> Abstrac
 
 
 def expand_kinds(kinds: Sequence[str], count: int | None) -> Sequence[str]:
-    """Return the kinds, or one kind ``count`` times.
+    """Return the kinds, or the single kind ``count`` times.
 
-    Raises InvalidArgument for ``count`` with several kinds or below 1.
+    Raises InvalidArgument for a ``count`` below 1, or with several kinds.
     """
     kinds = kinds or ("copter",)
     if count is None:
         return kinds
     if len(kinds) != 1 or count < 1:
-        raise InvalidArgument(f"count = {count!r} needs a single kind, and must be 1 or more")
+        raise InvalidArgument(f"count = {count!r} is not allowed: count must be 1 or more, and needs a single kind")
     return list(kinds) * count

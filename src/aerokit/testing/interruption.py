@@ -20,8 +20,8 @@ _CONTEXT_FILES = ("interruption.py", "served.py")
 class Interruption:
     """Raises KeyboardInterrupt in the main thread, but only within a block of `allowed`.
 
-    Python may run a signal handler long after the signal was sent, even while the block is entered or left. No code
-    would catch the exception there, so the signal is sent again in this case. No signal is pending after the block.
+    Python may run a signal handler long after the signal was sent, even while the block is being entered or left. In
+    this case no code would catch the exception, so the signal is sent again. After the block, no signal is pending.
     """
 
     def __init__(self) -> None:
@@ -31,7 +31,7 @@ class Interruption:
 
     @contextlib.contextmanager
     def allowed(self) -> Iterator[None]:
-        """Allow interruptions in this block, if it runs on the main thread and no other handler of SIGINT is set."""
+        """Allow interruptions in this block, if the block runs on the main thread and SIGINT has no other handler."""
         if threading.current_thread() is not threading.main_thread() or not _is_sigint_available():
             yield
             return
@@ -43,12 +43,12 @@ class Interruption:
             with self._lock:  # `_send_signal` must not send after this block has ended.
                 self._is_allowed = False
             if signal.getsignal(signal.SIGINT) == self._on_signal:
-                # signal.signal() runs a pending handler first.
+                # If a signal is pending, signal.signal() first runs the present handler.
                 signal.signal(signal.SIGINT, self._previous_handler)
 
     @contextlib.contextmanager
     def on_error(self) -> Iterator[None]:
-        """Interrupt the main thread when an exception leaves this block, which runs on another thread."""
+        """When an exception leaves this block, which runs on another thread, interrupt the main thread."""
         try:
             yield
         except Exception:
@@ -57,7 +57,7 @@ class Interruption:
             raise
 
     def _send_signal(self) -> bool:
-        """Send the signal unless it was delivered or the block has ended; return True if it was sent."""
+        """Send the signal and return True. If it was delivered already, or the block has ended, return False."""
         with self._lock:
             is_needed = self._is_allowed and not self._is_delivered
             if is_needed:
@@ -66,7 +66,7 @@ class Interruption:
         return is_needed
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if not self._is_sent:  # The user pressed Ctrl-C.
+        if not self._is_sent:  # This is not our signal: the user has pressed Ctrl-C.
             if callable(self._previous_handler):  # signal.SIG_IGN is not callable
                 self._previous_handler(number, frame)
         elif self._is_allowed and not self._is_delivered and not _is_in_context_code(frame):
@@ -75,8 +75,10 @@ class Interruption:
 
 
 def _is_sigint_available() -> bool:
-    """Return True if SIGINT has the default handler, is ignored (as in jobs of a script), or belongs to an
-    Interruption.
+    """Return True if an Interruption may replace the handler of SIGINT.
+
+    This is the default handler, that of another Interruption, or none because the signal is ignored (as in jobs of a
+    script).
     """
     handler = signal.getsignal(signal.SIGINT)
     return handler in (signal.default_int_handler, signal.SIG_IGN) or isinstance(
@@ -93,6 +95,6 @@ def _is_in_context_code(frame: FrameType | None) -> bool:
 def _interrupt_main() -> None:
     ident = threading.main_thread().ident
     if hasattr(signal, "pthread_kill") and ident is not None:
-        signal.pthread_kill(ident, signal.SIGINT)  # unlike interrupt_main, this ends a sleep
+        signal.pthread_kill(ident, signal.SIGINT)  # Unlike interrupt_main, a real signal ends a sleep.
     else:
         _thread.interrupt_main()

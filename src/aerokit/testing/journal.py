@@ -31,7 +31,7 @@ class SentText:
 
 @dataclass(frozen=True)
 class ReceivedMessage:
-    """A message that reached the vehicle, was addressed to it and is supported by it."""
+    """A message that reached the vehicle, was addressed to the vehicle, and is supported by its firmware."""
 
     time_s: float
     """Simulated seconds."""
@@ -39,7 +39,10 @@ class ReceivedMessage:
 
 
 class Journal:
-    """Texts and messages, oldest first. The journal grows while the vehicle runs. Assertions raise AssertionError."""
+    """Texts that a vehicle sent and messages that it received, from the oldest to the newest.
+
+    The journal grows while the vehicle runs. Assertions raise AssertionError.
+    """
 
     def __init__(self) -> None:
         self._texts: list[SentText] = []
@@ -78,7 +81,7 @@ class Journal:
         assert is_sent, f"no text with {part!r} was sent; sent texts:{_lines(self.texts)}"
 
     def assert_received_command(self, command: int, *, times: int | None = None) -> None:
-        """Assert that the vehicle received this MAV_CMD: at least once, or exactly ``times`` times (0: never)."""
+        """Assert that the vehicle received this MAV_CMD at least once or, if ``times`` is given, that many times."""
         __tracebackhide__ = True
         count = len(self.commands(command))
         is_expected = count > 0 if times is None else count == times
@@ -91,7 +94,7 @@ class Journal:
         return [message for message in messages if isinstance(message, CommandLong | CommandInt)]
 
     def _command_counts(self) -> list[str]:
-        """Command names in the order of their first reception, with counts."""
+        """Return each received command as text with its count, in the order of the first receptions."""
         counts = Counter(_name(message.command) for message in self._received_commands())
         return [name if count == 1 else f"{name}, {count} times" for name, count in counts.items()]
 

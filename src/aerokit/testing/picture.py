@@ -1,4 +1,4 @@
-"""Pictures of tracks, from above and as altitude profile: SVG, or PNG with Pillow."""
+"""Pictures of tracks from above, with altitude profiles, as SVG or (with Pillow) as PNG."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Drawable(Protocol):
     def __len__(self) -> int: ...
 
     def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
-        """Return metres north and east of ``origin`` (default: home), and metres above home."""
+        """Return metres north and east of ``origin``, by default home, and metres above home."""
         ...
 
     def snapshot(self) -> Drawable:
@@ -50,13 +50,13 @@ class Drawable(Protocol):
 
 
 def check_picture(path: str | PathLike[str]) -> None:
-    """Check a file name.
+    """Check the file name of a picture.
 
-    Raises InvalidArgument unless the suffix is .svg or .png, and AerokitError for .png without Pillow.
+    Raises InvalidArgument unless the suffix is .svg or .png, and AerokitError for a .png if Pillow is not installed.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".svg", ".png"):
-        raise InvalidArgument(f"cannot draw {str(path)!r}: the name must end in .svg or .png")
+        raise InvalidArgument(f"cannot draw {str(path)!r}: the file name must end in .svg or .png")
     if suffix == ".png":
         _pillow("Image")
 
@@ -75,7 +75,7 @@ def save_picture(tracks: Iterable[Drawable], path: str | PathLike[str]) -> None:
 
 
 def draw_svg(tracks: Sequence[Drawable]) -> str:
-    """Return the picture as SVG text: north is up, in metres from the first vehicle's home."""
+    """Return the picture as SVG text. North is up, and distances are in metres from the first vehicle's home."""
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH}" height="{_HEIGHT}"'
         f' font-family="sans-serif" font-size="{_FONT_SIZE}">',
@@ -153,7 +153,7 @@ def _shapes(tracks: Sequence[Drawable]) -> list[_Shape]:
 
 
 class _Axes:
-    """Maps values to positions in a rectangle of the picture, with a margin."""
+    """Maps the values of two axes to positions in a rectangle of the picture, with a margin."""
 
     def __init__(self, xs: Sequence[float], ys: Sequence[float], top: float, height: float, *, square: bool) -> None:
         self.left, self.top, self.width, self.height = _MARGIN, top, _WIDTH - 2 * _MARGIN, height
@@ -199,7 +199,7 @@ def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
 
 
 def _outlines(track: Drawable, origin: Position) -> list[list[tuple[float, float]]]:
-    """Return the circle or polygon of the failed assertion, in metres east and north."""
+    """Return the outline of the circle or polygon of the failed assertion, in metres east and north."""
     failure = track.failure
     if failure is None:
         return []
@@ -233,7 +233,7 @@ def _index_of(track: Drawable, point: TrackPoint) -> int:
 
 
 class _Labels:
-    """Mode names where modes start; names that would overlap are left out."""
+    """Labels with mode names at the points where modes start. Labels that would overlap are left out."""
 
     def __init__(self) -> None:
         self._places: list[tuple[float, float]] = []
@@ -241,7 +241,7 @@ class _Labels:
     def modes(
         self, track: Drawable, places: Sequence[tuple[float, float]], colour: str, *, above: float = 8
     ) -> list[_Shape]:
-        """Return dots and names where modes start."""
+        """Return a dot and a label with the mode name for each point of the track at which a mode starts."""
         shapes: list[_Shape] = []
         previous_mode = None
         for point, (x, y) in zip(track, places, strict=True):
@@ -317,7 +317,7 @@ def _ticks(bounds: tuple[float, float], max_count: int) -> list[float]:
 
 
 def _save_png(shapes: Sequence[_Shape], path: str | PathLike[str]) -> None:
-    """Draw at double size and scale down, for smooth lines."""
+    """Draw the shapes at double size and scale the picture down, which makes the lines smooth."""
     scale = 2
     image = _pillow("Image").new("RGB", (_WIDTH * scale, _HEIGHT * scale), "white")
     drawing = _pillow("ImageDraw").Draw(image)
@@ -331,4 +331,4 @@ def _pillow(module: str) -> Any:
     try:
         return import_module(f"PIL.{module}")
     except ImportError:
-        raise AerokitError("a .png needs Pillow: pip install pillow, or use .svg") from None
+        raise AerokitError("a .png picture needs Pillow: run `pip install pillow`, or draw an .svg picture") from None

@@ -27,9 +27,10 @@ if TYPE_CHECKING:
     from aerokit.testing.served import ServedFlight
 
 _MARKER, _PICTURES = "simulated", "--flight-pictures"
-# Attribute of a test function that pytest-asyncio will run: the same test, with its flights opened around it.
+# Name of an attribute of a test function that pytest-asyncio will run. Its value is a version of the test that opens
+# the flights.
 _OPENING_TEST = "_aerokit_opening_test"
-# Names instead of classes, because tests without flights must not import aerokit.
+# The plugin compares names instead of classes, because tests without flights must not import aerokit.
 _REPORTED_CLASSES = ("SimulatedFleet", "Flight", "ServedFlight")
 
 
@@ -53,7 +54,7 @@ def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
     marked = getattr(rewriting, "_must_rewrite", None)  # pytest has no public API to exclude a package.
     if rewriting is not None and isinstance(marked, set):
         marked -= {name for name in marked if name.partition(".")[0] == "aerokit"}
-        rewriting.mark_rewrite()  # clears the cached decisions
+        rewriting.mark_rewrite()  # This call clears the cached decisions.
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -72,13 +73,13 @@ def flight(request: pytest.FixtureRequest) -> Flight:
 
     kinds, options = _requested(request)
     if len(kinds) != 1 or "count" in options:
-        raise pytest.UsageError("`flight` is one vehicle: use the fixture `fleet` for several")
+        raise pytest.UsageError("the fixture `flight` has one vehicle; use the fixture `fleet` for several vehicles")
     return SimulatedFleet(*kinds, **options)[0]
 
 
 @pytest.fixture
 def fleet(request: pytest.FixtureRequest) -> SimulatedFleet:
-    """Simulated vehicles on one link, on virtual time; two copters by default."""
+    """Simulated vehicles on one link, on virtual time. By default, these are two copters."""
     from aerokit.testing.flights import SimulatedFleet, expand_kinds
 
     kinds, options = _requested(request)
@@ -113,7 +114,7 @@ def dronekit_address(served_flight: ServedFlight) -> str:
 
 @pytest.fixture
 def dronekit() -> Iterator[ModuleType]:
-    """`aerokit.dronekit`, which ``import dronekit`` imports during the test unless DroneKit was imported before."""
+    """`aerokit.dronekit`, which ``import dronekit`` imports meanwhile, unless DroneKit itself was imported before."""
     import sys
 
     import aerokit.dronekit as package
@@ -176,7 +177,7 @@ def _flight_fixtures(item: pytest.Item) -> list[Any]:
 
 
 def _reported_flights(item: pytest.Item) -> list[Any]:
-    """Return the flight fixtures, and flights opened by fixtures of the project."""
+    """Return the values of the flight fixtures, and flights that fixtures of the project have returned."""
     fixture_values = getattr(item, "funcargs", None) or {}
     flights: list[Any] = []
     for value in (*_flight_fixtures(item), *fixture_values.values()):
@@ -191,12 +192,12 @@ def _is_of_this_package(value: object) -> bool:
 
 
 def _fleets(item: pytest.Item) -> list[SimulatedFleet]:
-    """Return the fleets of a test that the plugin opens. A served flight has no ``run`` and is open already."""
+    """Return the fleets of a test that the plugin has to open. A served flight (without ``run``) is open already."""
     return [getattr(value, "_fleet", value) for value in _flight_fixtures(item) if hasattr(value, "run")]
 
 
 def _runnable_function(item: pytest.Function) -> Callable[..., Any]:
-    """Return the function that pytest has to call: an ``async def`` test runs with its flights open."""
+    """Return the function that pytest must call to run the test, with its flights open if it is an ``async def``."""
     fleets = _fleets(item)
     test: Callable[..., Any] = item.obj
     opening_test = getattr(test, _OPENING_TEST, None)
@@ -206,7 +207,7 @@ def _runnable_function(item: pytest.Function) -> Callable[..., Any]:
     if not fleets or not inspect.iscoroutinefunction(test):
         return test
     opening_test = _opening_flights(test, fleets)
-    # With this fixture, anyio's plugin runs the test.
+    # A test that uses the fixture `anyio_backend` is run by anyio's plugin.
     return opening_test if "anyio_backend" in item.fixturenames else _on_virtual_time(opening_test)
 
 
@@ -226,11 +227,11 @@ def _opening_flights(test: Callable[..., Any], fleets: list[SimulatedFleet]) -> 
 
 
 class _NotVirtualTime(Exception):
-    """The running loop is not on virtual time."""
+    """Raised if the running loop is not on virtual time."""
 
 
 def _only_on_virtual_time(opening_test: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a test that raises `_NotVirtualTime`, before it begins, on a loop of pytest-asyncio in real time."""
+    """Return a test that raises `_NotVirtualTime` at its beginning if pytest-asyncio's loop runs in real time."""
 
     @functools.wraps(opening_test)
     async def run(**arguments: Any) -> None:
@@ -250,7 +251,8 @@ def _only_on_virtual_time(opening_test: Callable[..., Any]) -> Callable[..., Any
 def _on_virtual_time(test: Callable[..., Any], *, try_first: Callable[..., Any] | None = None) -> Callable[..., None]:
     """Return a function that runs an ``async def`` test on virtual time.
 
-    ``try_first`` is the same test as pytest-asyncio runs it. It counts unless its loop is not on virtual time.
+    ``try_first`` is the same test in the version that pytest-asyncio runs. If its loop is on virtual time, this version
+    is run instead.
     """
 
     @functools.wraps(test)

@@ -55,11 +55,11 @@ class RecordedParameters(ParameterProtocolServer):
         self.names = sorted(indices, key=lambda name: (indices[name], name))
         """Names in the order in which the vehicle lists its parameters."""
         self.names += [name for name in without_index if name != HASH_NAME]
-        # PX4's hash covers all parameters, so it is wrong for an incomplete recording.
+        # PX4's hash covers all parameters, so the recorded hash is wrong for an incomplete list of parameters.
         self._has_hash = is_complete and HASH_NAME in without_index
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
-        """Return the latest PARAM_VALUE, written or recorded. Before the first recorded value, return that value."""
+        """Return the latest PARAM_VALUE that was written or played or, before that, the first recorded one."""
         position, recorded = self._vehicle.position_s, self._recorded[name]
         latest = next((value for time, value in reversed(recorded) if time <= position), recorded[0][1])
         written = self._written.get(name, latest.param_value)
@@ -95,7 +95,7 @@ class RecordedParameters(ParameterProtocolServer):
 
 
 class RecordedMissions(MissionServer):
-    """Serves the recorded plans; accepts uploads with their recorded result."""
+    """Serves the recorded plans, and answers uploads with the recorded results."""
 
     retry_interval_s: ClassVar[float] = 1.0
 
@@ -109,7 +109,10 @@ class RecordedMissions(MissionServer):
         self.listen()
 
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
-        """Return the current plan, or the first recorded plan before that; None if the recording has no plan."""
+        """Return the items of the plan that the vehicle has at present.
+
+        Before the first recorded plan, return that plan. Return None if the recording contains no plan of this type.
+        """
         if mission_type in self._written:
             return self._written[mission_type]
         position_s, items = self._vehicle.position_s, None
@@ -161,7 +164,7 @@ class RecordedMissions(MissionServer):
         """Do nothing: the recording decides which item is current."""
 
     def _recorded_result(self, request: str, results: list[int], mission_type: int) -> int:
-        """Return the next of the recorded results; the last result is repeated."""
+        """Return the next of the recorded results. After the last result, return that result again."""
         number = self._result_counts.get((request, mission_type), 0)
         self._result_counts[request, mission_type] = number + 1
         return results[min(number, len(results) - 1)]
@@ -169,7 +172,7 @@ class RecordedMissions(MissionServer):
 
 def _item_message(item: AnyItem, seq: int, client: tuple[int, int], as_float: bool) -> AnyItem:
     """Convert a recorded item to the message that the client requests: MISSION_ITEM or MISSION_ITEM_INT."""
-    scale = 1.0 if item.frame == MavFrame.MISSION else 1e7  # With MAV_FRAME_MISSION, x and y are not degrees.
+    scale = 1.0 if item.frame == MavFrame.MISSION else 1e7  # In MAV_FRAME_MISSION, x and y are not in degrees.
     is_float = isinstance(item, m.MissionItem)
     if as_float:
         place = (item.x, item.y) if is_float else (item.x / scale, item.y / scale)
@@ -186,13 +189,14 @@ _MESSAGE_REQUESTS = (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE)
 class RecordedVehicle(SimulatedVehicle):
     """Plays a ``.tlog`` by the simulator's clock. Requests of clients do not change the streamed messages.
 
-    - Commands: a command gets the acknowledgements that were recorded for the same params or, if there are none, for
-      any params, with the recorded delay. The last acknowledgement repeats. Commands that were not recorded are
-      UNSUPPORTED. REQUEST_MESSAGE sends the latest recorded message.
+    - Commands: a command gets the acknowledgements that were recorded for the same params, with the recorded delay. If
+      there are none, it gets those for other params. The last acknowledgement repeats. Commands that were not recorded
+      are UNSUPPORTED. REQUEST_MESSAGE sends the latest recorded message.
     - Parameters: the vehicle has the recorded parameters, renumbered without gaps. Only parameters that were set in the
       recording can be set. A request for an unknown name gets PARAM_ERROR if the recorded vehicle sent that message,
       otherwise no answer.
-    - Missions: the vehicle has the recorded missions. An upload or clearing gets the recorded result, or UNSUPPORTED.
+    - Missions: the vehicle has the recorded missions. An upload or a clearing gets the recorded result or, if there is
+      none, UNSUPPORTED.
     - File operations are refused, the list of logs is empty, and rates cannot be changed. TIMESYNC and PING are
       answered.
 
@@ -249,7 +253,7 @@ class RecordedVehicle(SimulatedVehicle):
     def boot(self) -> None:
         stream = self.recording.stream
         self._began_at = self.now
-        # The tolerance includes messages of exactly the start time.
+        # The tolerance includes messages that were recorded at exactly the start time.
         self._next = bisect_right([time for time, _ in stream], self._start - 1e-9)
         self._schedule_next()
 
@@ -294,12 +298,13 @@ class RecordedVehicle(SimulatedVehicle):
         return None
 
     def _answer_to(self, command: ReceivedCommand) -> RecordedAnswer | None:
-        """Return the recorded answer to a command; equal commands get successive answers, then the last one again."""
+        """Return the recorded answer to a command. Equal commands get successive answers. The last answer repeats."""
         answers = self.recording.answers.get(command.command, [])
         params = (command.param1, command.param2, command.param3, command.param4)
-        # Compared as text, because NaN is not equal to NaN.
+        # The params are compared as texts, because NaN is not equal to NaN.
         candidates = [answer for answer in answers if repr(answer.params) == repr(params)]
-        if not candidates and command.command in _MESSAGE_REQUESTS:  # Param 1 is the message id.
+        # A message request matches an answer for the same message, whose id is param 1.
+        if not candidates and command.command in _MESSAGE_REQUESTS:
             candidates = [answer for answer in answers if answer.params[:1] == params[:1]]
         elif not candidates:
             candidates = answers
@@ -318,7 +323,7 @@ class RecordedVehicle(SimulatedVehicle):
         return self._on_command(command)
 
     def _latest_message(self, message_id: int) -> Message | None:
-        """Return the latest message with this id. Before the first such message was played, return that message."""
+        """Return the latest played message with this id, or else the first recorded one, or None."""
         stream = self.recording.stream
         own = (self.system_id, self.component_id)
         for _, frame in (*reversed(stream[: self._next]), *stream[self._next :]):

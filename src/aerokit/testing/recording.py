@@ -17,11 +17,11 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.tlog import read_tlog
 
 MAX_GAP_S = 60.0
-"""Longer gaps are shortened to this time, because the recording was paused or the clock was set."""
+"""Longer gaps between messages are shortened to this time, because the recording was paused or the clock was set."""
 
 _ITEMS = (m.MissionItemInt, m.MissionItem)
 _COMMANDS = (m.CommandLong, m.CommandInt)
-# Answers to requests of the recorded client. The played vehicle does not stream them.
+# Messages that answer requests of the recorded client. The played vehicle does not send them by itself.
 _ANSWERS = frozenset(
     kind.ID
     for kind in (
@@ -41,15 +41,15 @@ class RecordedAnswer:
     """The acknowledgements of one command."""
 
     params: tuple[float, ...]
-    """Params 1 to 4 of the command; empty if only the acknowledgement was recorded."""
+    """Params 1 to 4 of the command; empty if the command itself was not recorded."""
     requested_at: float
     acks: list[tuple[float, m.CommandAck]] = field(default_factory=list)
-    """Seconds after the command, and the acknowledgement."""
+    """The acknowledgements, each with its time in seconds after the command."""
 
 
 @dataclass(frozen=True)
 class RecordedPlan:
-    """A plan that the vehicle had from a point in time on."""
+    """A mission, fence or list of rally points, and the time from which on the vehicle had it."""
 
     since: float
     mission_type: int
@@ -57,10 +57,10 @@ class RecordedPlan:
 
 
 class RecordedFlight:
-    """The content of a recording. Times are seconds since the first message of the vehicle, without long gaps.
+    """Content of a recording about one vehicle. Times are seconds since the vehicle's first message, without long gaps.
 
-    ``system_id`` None selects the first autopilot with a HEARTBEAT. Raises InvalidArgument if there is none, OSError
-    if the file cannot be read.
+    If ``system_id`` is None, the vehicle is the first autopilot with a HEARTBEAT. Raises InvalidArgument if the
+    recording contains no such vehicle, and OSError if the file cannot be read.
     """
 
     system_id: int
@@ -70,7 +70,7 @@ class RecordedFlight:
         frames = _frames(source)
         self.system_id, self.component_id = _autopilot(frames, system_id)
         self.stream: list[tuple[float, Frame]] = []
-        """Frames sent without a request, in order."""
+        """Frames that the vehicle sent without a request, with their times, in order."""
         self.answers: dict[int, list[RecordedAnswer]] = {}
         """Recorded answers by MAV_CMD, in order."""
         self.parameters: list[tuple[float, m.ParamValue]] = []
@@ -88,7 +88,7 @@ class RecordedFlight:
         """True if the vehicle requests items by MISSION_REQUEST_INT, False by MISSION_REQUEST."""
         self.duration_s: float = 0.0
         self._unconfirmed_sets: dict[str, float] = {}
-        # Transfers in progress by MAV_MISSION_TYPE: items by index, for downloads after their count.
+        # Transfers in progress by MAV_MISSION_TYPE. An upload has its items by index, a download its count and items.
         self._uploads: dict[int, dict[int, m.MissionItemInt | m.MissionItem]] = {}
         self._downloads: dict[int, tuple[int, dict[int, m.MissionItemInt | m.MissionItem]]] = {}
         self._clearing: set[int] = set()
@@ -101,7 +101,7 @@ class RecordedFlight:
             if previous_stamp is not None:
                 now += min(max(stamp - previous_stamp, 0.0), MAX_GAP_S)
             elif not is_of_vehicle:
-                continue  # The recording begins with the vehicle's first message.
+                continue  # Messages before the first message of the vehicle are skipped.
             previous_stamp = stamp
             if not is_of_vehicle:
                 if frame.message_id in _REQUESTS:
@@ -114,7 +114,7 @@ class RecordedFlight:
         self._discard_unanswered()
 
     def _discard_unanswered(self) -> None:
-        """Discard requests without an acknowledgement, and commands that were never acknowledged."""
+        """Discard the recorded commands that were not acknowledged."""
         acknowledged = {
             command: [answer for answer in answers if answer.acks] for command, answers in self.answers.items()
         }

@@ -23,7 +23,7 @@ SPEEDUP = 10.0
 
 
 class ServedFlight:
-    """A simulated vehicle that a thread serves faster than real time. All times are simulated seconds."""
+    """A simulated vehicle that another thread serves faster than real time. All times are simulated seconds."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class ServedFlight:
         self.address: str = server.addresses[0].replace("tcpin:", "tcp:")
         """Address to connect to, such as "tcp:127.0.0.1:5760"."""
         self.simulated: Any = vehicle
-        """The simulated vehicle. It runs on another thread, so only read it here, and change it by ``faults``."""
+        """The simulated vehicle, which runs on another thread. Only read its attributes; use ``faults`` for changes."""
         self.track: Track = scheduler.tracks[0]
         """True track of the vehicle."""
         self.journal: Journal = scheduler.journals[0]
@@ -74,7 +74,7 @@ class ServedFlight:
         failure = self._server.failure
         if failure is not None:
             self._is_raised = True
-            # "from" hides the exception that ended the block, such as KeyboardInterrupt, from the traceback.
+            # With "from", the traceback does not show the exception that ended the block, such as KeyboardInterrupt.
             raise failure from failure.__cause__
 
     @contextmanager
@@ -119,8 +119,9 @@ def hosted_flight(
     """Serve a vehicle on an address while the block runs; ``options`` are those of the vehicle.
 
     Timeouts after which the vehicle reacts to a silent client are multiplied by ``speedup``, except those in
-    ``parameters``; see `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind or address,
-    LinkOpenError if the address cannot be opened, and on exit an exception of the vehicle that was not raised before.
+    ``parameters``; see `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind or address, and
+    LinkOpenError if the address cannot be opened. At the end, the block raises an exception of the vehicle that was not
+    raised before.
     """
     from anyio.from_thread import start_blocking_portal
 

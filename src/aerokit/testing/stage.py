@@ -22,10 +22,10 @@ _POLL_INTERVAL_S = 0.1
 
 
 class FlightScheduler(SimulatedVehicle):
-    """A silent vehicle on the links that runs scheduled actions.
+    """Runs scheduled actions. For the server, the scheduler is a further vehicle on the links, which sends nothing.
 
-    Its timers survive a reboot of a vehicle, and are not delayed while a vehicle is frozen. Pass the scheduler to the
-    server before the vehicles, because it advances them to the time of each action.
+    The actions survive a reboot of a vehicle, and are not delayed while a vehicle is frozen. Pass the scheduler to the
+    server before the vehicles, because the scheduler advances the vehicles to the time of each action.
     """
 
     def __init__(self, vehicles: Sequence[Any]) -> None:
@@ -57,14 +57,14 @@ class FlightScheduler(SimulatedVehicle):
         """Send nothing."""
 
     def do(self, action: Callable[[], None], *, after_s: float) -> None:
-        """Run an action after ``after_s`` simulated seconds; 0 runs it at once."""
+        """Run an action after ``after_s`` simulated seconds. 0 runs the action at once."""
         if after_s:
             self.call_later(after_s, action)
         else:
             action()
 
     def do_when(self, condition: Callable[[], bool], action: Callable[[], None]) -> None:
-        """Run an action once, when a condition is true. The condition is checked ten times per simulated second."""
+        """Run an action once, as soon as a condition is true. It is checked ten times per simulated second."""
         if condition():
             action()
         else:
@@ -81,17 +81,17 @@ class FlightScheduler(SimulatedVehicle):
             track.refresh_with(refresh)
 
 
-# UTC at simulated second 0, the same in every run.
+# UTC at simulated second 0, which is the same in every run.
 _UTC_AT_START = 1_790_000_000.0
 
 
 class FlightRecording:
-    """A .tlog in memory, of some kilobytes per simulated second."""
+    """Records the traffic of a server as a .tlog in memory, which needs some kilobytes per simulated second."""
 
     def __init__(self) -> None:
         self._file = BytesIO()
         self._writer = TlogWriter(self._file)
-        self._framers = Framer(), Framer()  # received and sent bytes
+        self._framers = Framer(), Framer()  # One for the received bytes, one for the sent bytes.
         for framer in self._framers:
             framer.keep_unknown = True
 

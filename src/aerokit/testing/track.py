@@ -35,9 +35,9 @@ _ON_GROUND_M = 0.3
 
 
 class Track(Sequence[TrackPoint]):
-    """True points of a flight, oldest first. The track grows while the vehicle runs.
+    """The true points of a flight, from the oldest to the newest. The track grows while the vehicle runs.
 
-    Assertions raise AssertionError; all of them fail on an empty track.
+    Assertions raise AssertionError. All of them fail on an empty track.
     """
 
     def __init__(self, home: Position, points: Sequence[TrackPoint] = (), *, name: str = "track") -> None:
@@ -70,7 +70,7 @@ class Track(Sequence[TrackPoint]):
         self._points.append(point)
 
     def refresh_with(self, refresh: Callable[[], None] | None) -> None:
-        """Set a function that appends recent points before each read of the track; None removes the function."""
+        """Set a function that is called before each read of the track, to append recent points. None removes it."""
         self._refresh = refresh
 
     def _refreshed(self) -> list[TrackPoint]:
@@ -80,22 +80,22 @@ class Track(Sequence[TrackPoint]):
 
     @property
     def end(self) -> TrackPoint:
-        """The latest point; AssertionError if there is none."""
+        """The latest point. Raises AssertionError if the track is empty."""
         points = self._refreshed()
-        assert points, "nothing was recorded: was the flight opened?"
+        assert points, "the track is empty: was the flight opened?"
         return points[-1]
 
     def _check_not_empty(self) -> None:
-        _ = self.end  # raises AssertionError for an empty track
+        _ = self.end  # Reading `end` raises AssertionError for an empty track.
 
     @property
     def max_altitude_m(self) -> float:
-        """Maximum altitude above home."""
+        """Maximum altitude above home in metres."""
         return self._highest().altitude_m
 
     @property
     def max_distance_m(self) -> float:
-        """Maximum distance from home, along the ground."""
+        """Maximum distance from home in metres, along the ground."""
         return self._farthest(self.home)[0]
 
     @property
@@ -114,21 +114,21 @@ class Track(Sequence[TrackPoint]):
 
     @property
     def max_speed_m_s(self) -> float:
-        """Maximum ground speed."""
+        """Maximum ground speed in m/s."""
         return self._fastest().speed_m_s
 
     @property
     def battery_used_percent(self) -> float:
-        """Battery use in percent of a full battery; negative if the battery was charged."""
+        """Charge that the battery has lost, in percent of a full battery. Negative if the battery was charged."""
         return self[0].battery_percent - self.end.battery_percent if self else 0.0
 
     @property
     def length_m(self) -> float:
-        """Length of the path, including climbs."""
+        """Length of the path in metres, including climbs."""
         return sum(math.dist(start, end) for start, end in pairwise(self.local()))
 
     def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
-        """Return metres north and east of ``origin`` (default: home), and metres above home."""
+        """Return for each point metres north and east of ``origin``, by default home, and metres above home."""
         offset_of = metres_from(self.home if origin is None else origin)
         return [(*offset_of(point), point.altitude_m) for point in self]
 
@@ -143,7 +143,10 @@ class Track(Sequence[TrackPoint]):
         save_picture([self], path)
 
     def nearest_m(self, place: Position) -> float:
-        """Return the minimum distance to a position: along the ground, or in space if it has an altitude above home."""
+        """Return the minimum distance to a position, in metres.
+
+        The distance is in space if the position has an ``altitude_relative_m``, otherwise along the ground.
+        """
         return self._nearest(place)[0]
 
     def assert_reached_altitude(self, altitude_m: float, *, within_m: float = 1.0) -> None:
@@ -162,8 +165,9 @@ class Track(Sequence[TrackPoint]):
         assert highest.altitude_m <= altitude_m, f"the vehicle rose above {altitude_m:g} m: {highest}"
 
     def assert_passed(self, place: Position, *, within_m: float = 2.0) -> None:
-        """Assert that the vehicle came this near to a position: along the ground, or in space if the position has an
-        ``altitude_relative_m``.
+        """Assert that the vehicle came within ``within_m`` metres of a position.
+
+        The distance is in space if the position has an ``altitude_relative_m``, otherwise along the ground.
         """
         __tracebackhide__ = True
         distance, point = self._nearest(place)
@@ -196,7 +200,7 @@ class Track(Sequence[TrackPoint]):
         )
 
     def assert_stayed_slower_than(self, speed_m_s: float) -> None:
-        """Assert that the ground speed was never above this, in m/s."""
+        """Assert that the ground speed was never above ``speed_m_s``."""
         __tracebackhide__ = True
         fastest = self._fastest()
         self._record_failure(fastest.speed_m_s <= speed_m_s, TrackFailure(fastest))
@@ -205,7 +209,7 @@ class Track(Sequence[TrackPoint]):
         )
 
     def assert_landed_near(self, place: Position | None = None, *, within_m: float = 2.0) -> None:
-        """Assert that the vehicle flew, and ended on the ground near home, or near a position."""
+        """Assert that the vehicle flew and landed within ``within_m`` metres of home, or of ``place`` if given."""
         __tracebackhide__ = True
         end, target = self.end, self.home if place is None else place
         self._record_failure(self.max_altitude_m > _ON_GROUND_M, TrackFailure(end))
@@ -232,14 +236,14 @@ class Track(Sequence[TrackPoint]):
         assert not self.end.armed, f"the vehicle is armed at the end, {self.end}"
 
     def assert_modes(self, *names: str) -> None:
-        """Assert that the vehicle was in these modes in this order; other modes in between are allowed."""
+        """Assert that the vehicle was in these modes in this order. Other modes in between are allowed."""
         __tracebackhide__ = True
         modes = iter(self.modes)
         for name in names:
             assert name in modes, f"{name} is missing in {' → '.join(names)}: the modes were {' → '.join(self.modes)}"
 
     def _record_failure(self, passes: bool, failure: TrackFailure) -> None:
-        """Keep the details of an assertion that does not pass."""
+        """Store the details of an assertion in `failure`, if the assertion does not pass."""
         if not passes:
             self.failure = failure
 
@@ -252,14 +256,17 @@ class Track(Sequence[TrackPoint]):
         return max(self, key=lambda point: point.speed_m_s)
 
     def _farthest(self, centre: Position) -> tuple[float, TrackPoint]:
-        """Return the maximum horizontal distance in metres, and its point."""
+        """Return the maximum horizontal distance from a position in metres, and the point of the track."""
         self._check_not_empty()
         offset_of = metres_from(centre)
         farthest = max(self, key=lambda point: math.hypot(*offset_of(point)))
         return math.hypot(*offset_of(farthest)), farthest
 
     def _nearest(self, place: Position) -> tuple[float, TrackPoint]:
-        """Return the minimum distance in metres, also between two points, and the point at the end of that segment."""
+        """Return the minimum distance between a position and the track in metres, and the nearest point.
+
+        If the minimum is between two points of the track, return the later one.
+        """
         self._check_not_empty()
         offset_of, altitude = metres_from(place), place.altitude_relative_m
         min_distance, nearest, previous_offset = math.inf, self._points[0], None
@@ -279,7 +286,7 @@ def true_point(vehicle: SimulatedVehicle) -> TrackPoint:
     Raises InvalidArgument if the vehicle has no true position.
     """
     place = true_place(vehicle)
-    autopilot = cast("Any", vehicle)  # A vehicle with a true position has these attributes, too.
+    autopilot = cast("Any", vehicle)  # A vehicle with a true position also has the attributes that are read here.
     return TrackPoint(
         vehicle.now,
         place.latitude_e7 * 1e-7,
@@ -299,8 +306,8 @@ def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.1) -> Track
     for a vehicle without a true position, and for an interval that is not positive.
     """
     if not interval_s > 0:
-        raise InvalidArgument(f"interval_s = {interval_s!r} must be above 0")
-    true_place(vehicle)  # raises InvalidArgument for a vehicle without a true position
+        raise InvalidArgument(f"interval_s = {interval_s!r} is not allowed: it must be above 0")
+    true_place(vehicle)  # This call raises InvalidArgument for a vehicle without a true position.
     origin = cast("Any", vehicle).frame.origin
     home = Position(origin.latitude_e7 * 1e-7, origin.longitude_e7 * 1e-7, origin.altitude_m)
     track = Track(home, name=f"system {vehicle.system_id}")
@@ -317,9 +324,9 @@ def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.1) -> Track
 
 
 def min_distance_m(first: Track, second: Track) -> tuple[float, float]:
-    """Return the minimum distance between two vehicles in space, and its time.
+    """Return the minimum distance between two vehicles in space, in metres, and the time of the minimum.
 
-    Returns (infinity, 0) if the vehicles never ran at the same time.
+    Return (infinity, 0) if the two vehicles never ran at the same time.
     """
     first_home_m, second_home_m = first.home.altitude_amsl_m or 0.0, second.home.altitude_amsl_m or 0.0
     second_path = [
@@ -341,12 +348,12 @@ def min_distance_m(first: Track, second: Track) -> tuple[float, float]:
     return closest
 
 
-# Time, and metres north, east and up.
+# A time, and a place in metres north, east and up.
 _TimedPlace = tuple[float, tuple[float, float, float]]
 
 
 def _interpolated(before: _TimedPlace, after: _TimedPlace, time_s: float) -> tuple[float, float, float]:
-    """Return the place at a time between two recorded ones."""
+    """Return the place at a time between the times of two recorded places."""
     (start_s, start), (end_s, end) = before, after
     share = (time_s - start_s) / (end_s - start_s) if end_s > start_s else 0.0
     north, east, up = (from_ + share * (to - from_) for from_, to in zip(start, end, strict=True))
@@ -369,7 +376,7 @@ def _distance_of_origin(start: tuple[float, float, float], end: tuple[float, flo
     """Return the distance from the origin to a line segment."""
     segment = [to - from_ for from_, to in zip(start, end, strict=True)]
     squared_length = sum(component * component for component in segment)
-    share = 0.0  # Part of the segment before the point that is nearest to the origin.
+    share = 0.0  # Point of the segment that is nearest to the origin: 0 is the start, 1 the end.
     if squared_length != 0.0:
         dot_product = sum(from_ * component for from_, component in zip(start, segment, strict=True))
         share = max(0.0, min(1.0, -dot_product / squared_length))

@@ -18,12 +18,12 @@ class TrackPoint:
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
-    """Altitude above home."""
+    """Altitude above home in metres."""
     armed: bool
     mode: str
     """Mode name, as in ``vehicle.mode``."""
     speed_m_s: float = 0.0
-    """Ground speed."""
+    """Ground speed in m/s."""
     battery_percent: float = 100.0
 
     @property
@@ -39,18 +39,21 @@ class TrackPoint:
 
 @dataclass(frozen=True)
 class TrackFailure:
-    """Point and limit of a failed assertion; pictures of the track show them."""
+    """The point and the limit of a failed assertion, which pictures of the track show."""
 
     point: TrackPoint
     circle: tuple[Position, float] | None = None
-    """Centre and radius in metres of the allowed area."""
+    """The allowed area of the assertion: its centre, and its radius in metres. None without such an area."""
     polygon: Sequence[Position] | None = None
     altitude_m: float | None = None
     """Altitude above home."""
 
 
 def metres_from(origin: Position) -> Callable[[Position | TrackPoint], tuple[float, float]]:
-    """Return a function that converts to metres north and east of ``origin``, on the tangent plane of the ellipsoid."""
+    """Return a function that converts a position to metres north and east of ``origin``.
+
+    The metres are measured on the tangent plane of the earth's ellipsoid at ``origin``.
+    """
     latitude, longitude = origin.latitude_deg, origin.longitude_deg
     per_latitude = geo.distance_m(latitude - 0.005, longitude, latitude + 0.005, longitude) * 100
     per_longitude = geo.distance_m(latitude, longitude - 0.005, latitude, longitude + 0.005) * 100

@@ -98,7 +98,7 @@ def test_simulated_fleet_is_placed_in_row_eastwards() -> None:
 
 def test_sim_unknown_option_or_recording_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--vehicle", "px4", "--parameter", "RTL_ALT=3000"]) == 2
-    assert "the simulated vehicle has no parameter 'RTL_ALT'; similar: " in capsys.readouterr().err
+    assert "the simulated vehicle has no parameter 'RTL_ALT'; similar names: " in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["sim", "--vehicle", "nowhere.tlog"])
     assert "recording 'nowhere.tlog' does not exist" in capsys.readouterr().err

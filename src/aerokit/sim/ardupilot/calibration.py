@@ -21,10 +21,11 @@ _LAST = AccelcalVehiclePos.BACK
 
 
 class AccelerometerCalibration:
-    """Six-position calibration, which broadcasts the requested position as a COMMAND_LONG every second.
+    """Calibration of the accelerometers in six positions.
 
-    The client confirms each position with the same command. The result is broadcast every second until a reboot.
-    Set ``is_held_wrong`` to let the calibration fail.
+    The vehicle broadcasts the requested position as a COMMAND_LONG every second. The client confirms each position with
+    the same command. The result is broadcast every second until a reboot. Set ``is_held_wrong`` to let the calibration
+    fail.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
@@ -51,68 +52,68 @@ class AccelerometerCalibration:
         if not self.is_waiting or command.param1 != self._requested:
             return MavResult.FAILED
         self._requested = None
-        run, position = self._run_number, whole(command.param1)
-        self._vehicle.call_later(_SAMPLE_S, lambda: self._on_sample(run, position))
+        run_number, position = self._run_number, whole(command.param1)
+        self._vehicle.call_later(_SAMPLE_S, lambda: self._on_sample(run_number, position))
         return MavResult.ACCEPTED
 
-    def _on_sample(self, run: int, position: int) -> None:
-        if run != self._run_number:  # The calibration was started again or cancelled.
+    def _on_sample(self, run_number: int, position: int) -> None:
+        if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
         if self.is_held_wrong and position > AccelcalVehiclePos.LEVEL:
             self._end("Calibration FAILED", AccelcalVehiclePos.FAILED)
         elif position == _LAST:
             self._end("Calibration successful", AccelcalVehiclePos.SUCCESS)
         else:
-            self._request(run, position + 1)
+            self._request(run_number, position + 1)
 
     def _end(self, text: str, result: int) -> None:
         self._vehicle.send_text(MavSeverity.CRITICAL, text)
         self._request(self._run_number, result)
 
-    def _request(self, run: int, position: int) -> None:
+    def _request(self, run_number: int, position: int) -> None:
         self._requested = position
 
-        def request() -> None:
-            if run == self._run_number and self._requested == position:
+        def request_until_confirmed() -> None:
+            if run_number == self._run_number and self._requested == position:
                 params = (float(position), 0, 0, 0, 0, 0, 0)
                 self._vehicle.send(m.CommandLong(0, 0, MavCmd.ACCELCAL_VEHICLE_POS, 0, *params))
-                self._vehicle.call_later(_REPEAT_INTERVAL_S, request)
+                self._vehicle.call_later(_REPEAT_INTERVAL_S, request_until_confirmed)
 
-        request()
+        request_until_confirmed()
 
 
-_COMPASSES, _ALL = 3, 0b111
+_COMPASSES, _ALL_COMPASSES = 3, 0b111
 _SETTLING_S = 1.0
 _FITNESS = 5.0
 
 
 class CompassCalibration:
-    """Compass calibration: DO_START_MAG_CAL, DO_ACCEPT_MAG_CAL, DO_CANCEL_MAG_CAL and their reports.
+    """Compass calibration, with the commands DO_START_MAG_CAL, DO_ACCEPT_MAG_CAL and DO_CANCEL_MAG_CAL.
 
-    ``turns_s``: seconds until the vehicle has been turned in all directions. With infinity, as in SITL, the progress
-    stays at 0 % until the calibration is cancelled. The vehicle cannot be armed while a calibration runs.
+    ``turns_s`` is the number of seconds after which the vehicle has been turned in all directions. With infinity, as in
+    SITL, the progress stays at 0 % until the calibration is cancelled. The vehicle cannot be armed meanwhile.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.turns_s: float = 30.0
-        self._mask = 0
+        self._compass_mask = 0
         self._started_at = math.inf
         self._saves_at_once = False
         self._progress_compass = 0
         self._reported_compass = 0
 
     def reset(self) -> None:
-        self._mask, self._started_at = 0, math.inf
+        self._compass_mask, self._started_at = 0, math.inf
 
     @property
     def is_running(self) -> bool:
-        """True until the progress reaches 100 %; a calibration that waits for acceptance is not running."""
-        return bool(self._mask) and self.percent < 100
+        """True until the progress reaches 100 %. A calibration that waits for acceptance does not run any more."""
+        return bool(self._compass_mask) and self.percent < 100
 
     @property
     def percent(self) -> int:
-        if not self._mask:
+        if not self._compass_mask:
             return 0
         seconds = self._vehicle.now - self._started_at - _SETTLING_S
         return max(0, min(100, int(100.0 * seconds / self.turns_s)))
@@ -127,18 +128,18 @@ class CompassCalibration:
         }
 
     def _start(self, command: ReceivedCommand) -> int:
-        """Start a calibration. Param 1 is a mask of compasses (0: all); param 3 is 1 to save without acceptance."""
+        """Start a calibration. Param 1 is a mask of compasses (0: all). Param 3 is 1 to save without acceptance."""
         if self._vehicle.motors.is_armed:
             self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
             return MavResult.FAILED
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
-        self._mask = whole(command.param1) & _ALL or _ALL
+        self._compass_mask = whole(command.param1) & _ALL_COMPASSES or _ALL_COMPASSES
         self._started_at, self._saves_at_once = self._vehicle.now, command.param3 != 0.0
         return MavResult.ACCEPTED
 
     def _accept(self, command: ReceivedCommand) -> int:
-        if not 0 <= command.param1 <= 255 or not self._mask or self.is_running:
+        if not 0 <= command.param1 <= 255 or not self._compass_mask or self.is_running:
             return MavResult.FAILED
         self.reset()
         return MavResult.ACCEPTED
@@ -146,7 +147,7 @@ class CompassCalibration:
     def _cancel(self, command: ReceivedCommand) -> int:
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
-        self._mask &= ~(whole(command.param1) or _ALL)
+        self._compass_mask &= ~(whole(command.param1) or _ALL_COMPASSES)
         return MavResult.ACCEPTED
 
     def progress(self) -> m.MagCalProgress | None:
@@ -156,45 +157,48 @@ class CompassCalibration:
         self._progress_compass = self._next_compass(self._progress_compass)
         percent = self.percent
         status = MagCalStatus.RUNNING_STEP_ONE if percent < 50 else MagCalStatus.RUNNING_STEP_TWO
-        # One bit for each of 80 directions in which the vehicle has pointed.
+        # The mask has one bit for each of 80 directions in which the vehicle can point.
         direction_count = percent * 80 // 100
         directions = ((1 << direction_count) - 1).to_bytes(10, "little")
-        return m.MagCalProgress(self._progress_compass, self._mask, status, 1, percent, directions, 0.0, 0.0, 0.0)
+        return m.MagCalProgress(
+            self._progress_compass, self._compass_mask, status, 1, percent, directions, 0.0, 0.0, 0.0
+        )
 
     def report(self) -> m.MagCalReport | None:
-        """Return the result of the next compass until it is accepted or cancelled, else None."""
-        if not self._mask or self.is_running:
+        """Return the results of the compasses in turn, after a calibration, until they are accepted or cancelled."""
+        if not self._compass_mask or self.is_running:
             return None
         self._reported_compass = self._next_compass(self._reported_compass)
         offsets, diagonal, off_diagonal = (5.0, 13.0, -18.0), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
         saved = int(self._saves_at_once)
         status = MagCalStatus.SUCCESS
         return m.MagCalReport(
-            self._reported_compass, self._mask, status, saved, _FITNESS, *offsets, *diagonal, *off_diagonal
+            self._reported_compass, self._compass_mask, status, saved, _FITNESS, *offsets, *diagonal, *off_diagonal
         )
 
     def _next_compass(self, compass: int) -> int:
         candidates = ((compass + step) % _COMPASSES for step in range(1, _COMPASSES + 1))
-        return next(number for number in candidates if self._mask & 1 << number)
+        return next(number for number in candidates if self._compass_mask & 1 << number)
 
 
 _GYROS_S, _TRIM_S, _ACCELEROMETERS_S = 0.5, 1.0, 1.0
 _MIN_ACCELEROMETERS_INTERVAL_S = 5.0
-_FORCED = 76  # Keeps the present calibration (GCS_Common.cpp, _handle_command_preflight_calibration).
+# This param value accepts the present calibration (GCS_Common.cpp, _handle_command_preflight_calibration).
+_FORCED = 76
 _Accelerometers = PreflightCalibrationAccelerometer
 
 
 class Calibrations:
-    """Sensor calibrations. PREFLIGHT_CALIBRATION is acknowledged when it ends or requests the first position.
+    """Sensor calibrations. Those of ``compasses`` and ``accelerometers`` require that the vehicle is turned by hand.
 
-    The calibrations ``compasses`` and ``accelerometers`` require that the vehicle is turned by hand.
+    PREFLIGHT_CALIBRATION is acknowledged at the end of the calibration, or when the first position is requested.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.compasses: CompassCalibration = CompassCalibration(vehicle)
         self.accelerometers: AccelerometerCalibration = AccelerometerCalibration(vehicle)
-        self._accelerometers_at = -math.inf
+        self._simple_calibration_at = -math.inf
 
     @property
     def is_compass_running(self) -> bool:
@@ -220,7 +224,7 @@ class Calibrations:
             return MavResult.FAILED
         if command.param1 == 1.0:
             vehicle.info("Initialising ArduPilot")
-            return CommandProgress((), _GYROS_S)
+            return CommandProgress(percents=(), interval_s=_GYROS_S)
         if command.param3 == 1.0:
             vehicle.info("Updating barometer calibration")
             vehicle.info("Barometer calibration complete")
@@ -231,16 +235,16 @@ class Calibrations:
         vehicle = self._vehicle
         if command.x == _Accelerometers.FULL:
             vehicle.info("Initialising ArduPilot")
-            return CommandProgress((), _GYROS_S, finish=self.accelerometers.start)
+            return CommandProgress(percents=(), interval_s=_GYROS_S, finish=self.accelerometers.start)
         if command.x == _Accelerometers.TRIM:
             vehicle.info("Initialising ArduPilot")
             text = "Trim OK: roll=0.00 pitch=0.00 yaw=0.00"
-            return CommandProgress((), _TRIM_S, finish=lambda: vehicle.info(text))
+            return CommandProgress(percents=(), interval_s=_TRIM_S, finish=lambda: vehicle.info(text))
         if command.x == _Accelerometers.SIMPLE:
-            if vehicle.now - self._accelerometers_at < _MIN_ACCELEROMETERS_INTERVAL_S:
+            if vehicle.now - self._simple_calibration_at < _MIN_ACCELEROMETERS_INTERVAL_S:
                 return MavResult.TEMPORARILY_REJECTED
-            self._accelerometers_at = vehicle.now
+            self._simple_calibration_at = vehicle.now
             vehicle.info("Initialising ArduPilot")
-            return CommandProgress((), _ACCELEROMETERS_S)
+            return CommandProgress(percents=(), interval_s=_ACCELEROMETERS_S)
         is_forced = _FORCED in (command.x, command.param2)
         return MavResult.ACCEPTED if is_forced else MavResult.UNSUPPORTED

@@ -16,10 +16,10 @@ _UNLIMITED = -1
 
 
 class ArduPilotCamera:
-    """Takes images on command, by time or by distance, and sends CAMERA_FEEDBACK for each image on every link.
+    """Takes images on command, by time or by distance. Each image is reported by CAMERA_FEEDBACK on every link.
 
-    The camera belongs to the autopilot component (1). Like the firmware, it sends neither CAMERA_IMAGE_CAPTURED nor
-    heartbeats. CAM1_TYPE 0 disables it.
+    The camera belongs to the autopilot component (1). As in the firmware, there are neither CAMERA_IMAGE_CAPTURED nor
+    heartbeats of the camera. CAM1_TYPE 0 disables the camera.
     """
 
     image_count: int
@@ -27,10 +27,10 @@ class ArduPilotCamera:
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
-        self.image_count = 0  # Images since power-on.
-        self.interval_s: float = 0.0  # Interval of the series.
-        self.remaining = 0  # Remaining images of the series; -1 is unlimited.
-        self.trigger_distance_m: float = 0.0  # Distance in metres between images; 0 is off.
+        self.image_count = 0  # Number of images since power-on.
+        self.interval_s: float = 0.0  # Seconds between two images of a series.
+        self.remaining = 0  # Number of images that the series still has to take; -1 is unlimited.
+        self.trigger_distance_m: float = 0.0  # Metres between two images triggered by distance; 0 is off.
         self._taken_at = -math.inf
         self._taken_place: tuple[float, float] | None = None
         self._is_update_scheduled = False
@@ -46,7 +46,7 @@ class ArduPilotCamera:
         return self._vehicle.parameters.get("CAM1_DURATION", _SHUTTER_S)
 
     def take(self) -> bool:
-        """Take an image; return False if there is no camera or its shutter is still open."""
+        """Take an image and return True. Return False if there is no camera or its shutter is still open."""
         if not self.is_fitted or self._vehicle.now - self._taken_at < self._shutter_s:
             return False
         motion = self._vehicle.motion
@@ -57,7 +57,7 @@ class ArduPilotCamera:
         return True
 
     def take_series(self, interval_s: float, count: int) -> bool:
-        """Take an image every ``interval_s`` seconds, the first at once; ``count`` -1 continues until `stop`."""
+        """Take ``count`` images (-1: until `stop`), one every ``interval_s`` seconds, the first one at once."""
         if not self.is_fitted:
             return False
         self.interval_s, self.remaining = interval_s, count
@@ -69,7 +69,7 @@ class ArduPilotCamera:
         self.remaining = 0
 
     def trigger_by_distance(self, metres: float) -> None:
-        """Take an image each time the vehicle has moved this far in metres; 0 stops."""
+        """Take an image each time the vehicle has moved by this distance in metres. 0 stops the series."""
         self.trigger_distance_m = metres
         self._taken_place = None
         self._schedule_update()
@@ -100,7 +100,7 @@ class ArduPilotCamera:
             self.take()
 
     def run(self, item: MissionItem) -> None:
-        """Execute a mission command; commands that do not concern cameras are ignored."""
+        """Execute a camera command of a mission. Other commands are ignored."""
         if item.command == MavCmd.DO_DIGICAM_CONTROL and item.x == 1:
             self.take()
         elif item.command == MavCmd.DO_SET_CAM_TRIGG_DIST:
@@ -118,7 +118,7 @@ class ArduPilotCamera:
         return self.take_series(interval_s if math.isfinite(interval_s) else 0.0, whole(count) or _UNLIMITED)
 
     def start_capture(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_IMAGE_START_CAPTURE; param1 is the camera, 0 for all."""
+        """Handle MAV_CMD_IMAGE_START_CAPTURE. Param 1 is the number of the camera, or 0 for all cameras."""
         if command.param1 < 0.0:
             return MavResult.UNSUPPORTED
         if command.param1 > 1.0:
@@ -132,25 +132,25 @@ class ArduPilotCamera:
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
     def control(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_DO_DIGICAM_CONTROL: param5 is 1 to take an image; accepted even without a camera."""
+        """Handle MAV_CMD_DO_DIGICAM_CONTROL, which is accepted even without a camera. Param 5 is 1 to take an image."""
         if command.x == 1:
             self.take()
         return MavResult.ACCEPTED
 
     def set_trigger_distance(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_DO_SET_CAM_TRIGG_DIST; param3 is 1 to take an image at once."""
+        """Handle MAV_CMD_DO_SET_CAM_TRIGG_DIST. Param 3 is 1 to take an image at once."""
         self.trigger_by_distance(command.param1)
         if command.param3 == 1.0:
             self.take()
         return MavResult.ACCEPTED
 
     def zoom(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_SET_CAMERA_ZOOM, continuous or in percent; no message reports the zoom."""
+        """Handle MAV_CMD_SET_CAMERA_ZOOM by rate or in percent. No message reports the zoom."""
         is_supported = self.is_fitted and command.param1 in (1.0, 2.0)
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
     def focus(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_SET_CAMERA_FOCUS, continuous or in percent; the lens has no autofocus."""
+        """Handle MAV_CMD_SET_CAMERA_FOCUS. Focus by rate or in percent is accepted. Autofocus is UNSUPPORTED."""
         kind = whole(command.param1)
         if kind in (SetFocusType.STEP, SetFocusType.METERS) or kind not in list(SetFocusType):
             return MavResult.DENIED

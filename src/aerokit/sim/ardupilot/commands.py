@@ -34,16 +34,16 @@ _FIXED_TEXTS: dict[tuple[int, Kind], tuple[tuple[int, str], ...]] = {
 
 
 def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
-    """Return the handlers by MAV_CMD. Each kind of vehicle adds and replaces handlers."""
+    """Return the common handlers by MAV_CMD. Each kind of vehicle adds handlers and replaces some of these."""
     common, requests = _CommonCommands(vehicle), vehicle.requests
-    # Commands of absent devices.
+    # Commands of devices that no simulated vehicle has fail.
     handlers: dict[int, CommandHandler] = {
         Cmd[command]: common.fixed(Result[result], _FIXED_TEXTS.get((Cmd[command], vehicle.KIND), ()))
         for command, result in rows_of(vehicle.KIND, "fixed_results.csv")
     }
     if vehicle.KIND != "sub":
         handlers[Cmd.DO_FOLLOW] = lambda command: Result.ACCEPTED if 0 < command.param1 <= 255 else Result.DENIED
-    # A reboot replaces the devices, so they are looked up at each command.
+    # Each lambda reads the device again, because a reboot replaces the device objects.
     if vehicle.KIND in ("copter", "plane"):
         handlers[Cmd.AIRFRAME_CONFIGURATION] = lambda command: vehicle.devices.move_gear(command)
         handlers[Cmd.DO_PARACHUTE] = lambda command: vehicle.devices.handle_chute(command)
@@ -93,13 +93,16 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     }
 
 
-def relative_heading(command: ReceivedCommand, yaw: float) -> float | None:
-    """Return the heading of CONDITION_YAW in radians; None if its parameters are invalid."""
-    angle_deg, is_relative = command.param1, command.param4
-    if not 0.0 <= angle_deg <= 360.0 or is_relative not in (0.0, 1.0):
+def commanded_heading(command: ReceivedCommand, yaw: float) -> float | None:
+    """Return the heading that CONDITION_YAW commands, in radians; None if its params are invalid.
+
+    ``yaw`` is the vehicle's present heading, to which a relative angle is added.
+    """
+    angle_deg, relative_flag = command.param1, command.param4
+    if not 0.0 <= angle_deg <= 360.0 or relative_flag not in (0.0, 1.0):
         return None
     angle = math.radians(angle_deg)
-    if not is_relative:
+    if relative_flag == 0.0:
         return angle
     return yaw + math.copysign(angle, command.param3 or 1.0)
 
@@ -109,7 +112,7 @@ class _CommonCommands:
         self._vehicle = vehicle
 
     def fixed(self, result: int, texts: tuple[tuple[int, str], ...]) -> CommandHandler:
-        """Return a handler that sends these texts and answers ``result``, whatever the params are."""
+        """Return a handler that always sends these texts and answers ``result``."""
 
         def handle(_: ReceivedCommand) -> int:
             for severity, text in texts:
@@ -130,22 +133,22 @@ class _CommonCommands:
         return Result.ACCEPTED if is_done else Result.FAILED
 
     def set_mission_current(self, command: ReceivedCommand) -> int:
-        vehicle, resets = self._vehicle, command.param2 == 1.0
+        vehicle, resets_mission = self._vehicle, command.param2 == 1.0
         if not 0 <= command.param1 < vehicle.missions.commands.count:
             return Result.DENIED
-        if resets:
+        if resets_mission:
             vehicle.mission.reset()
         if not vehicle.mission.set_current(whole(command.param1)):
             return Result.FAILED
-        if resets:
+        if resets_mission:
             vehicle.mission.start_or_resume()
         vehicle.requests.send_soon(m.MissionCurrent.ID, command.channel)
         return Result.ACCEPTED
 
     def start_mission(self, command: ReceivedCommand) -> int:
-        """Start or resume the mission; if the vehicle is armed on the ground, this permits the take-off."""
+        """Start or resume the mission. An armed vehicle on the ground may then take off."""
         vehicle = self._vehicle
-        if command.param1 or command.param2:
+        if command.param1 or command.param2:  # The firmware does not support a first and a last item.
             return Result.DENIED
         result = vehicle.change_to(vehicle.auto.number)
         if result == Result.ACCEPTED:
@@ -156,7 +159,7 @@ class _CommonCommands:
 
     def reposition(self, command: ReceivedCommand) -> int:
         vehicle, guided = self._vehicle, self._vehicle.guided
-        if command.is_long:  # COMMAND_LONG does not specify the altitude frame that ArduPilot requires here.
+        if command.is_long:  # ArduPilot requires an altitude frame here, and COMMAND_LONG has none.
             return Result.UNSUPPORTED
         if vehicle.mode is not guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
             return Result.DENIED
@@ -191,7 +194,7 @@ class _CommonCommands:
             return Result.FAILED
         if command.param1 not in (1.0, 3.0):
             return Result.UNSUPPORTED
-        self._vehicle.call_later(0.1, self._vehicle.restart)  # The acknowledgement is sent first.
+        self._vehicle.call_later(0.1, self._vehicle.restart)  # later, so that the acknowledgement is still sent
         return Result.ACCEPTED
 
     def send_banner(self, _: ReceivedCommand) -> int:
@@ -212,7 +215,7 @@ class _CommonCommands:
         return Result.ACCEPTED
 
     def look_at(self, command: ReceivedCommand) -> int:
-        """Set the region of interest, with or without a gimbal; zeros or DO_SET_ROI_NONE clear it."""
+        """Set the region of interest, also without a gimbal. Zeros, and DO_SET_ROI_NONE, clear the region."""
         point = None
         if command.command != Cmd.DO_SET_ROI_NONE:
             point = self._vehicle.world_point(*command.place(), command.z, command.altitude_frame)
@@ -239,8 +242,8 @@ _FRAMES = frozenset(
 class HomeAndOrigin:
     """Handlers of DO_SET_HOME, GET_HOME_POSITION and SET_GPS_GLOBAL_ORIGIN.
 
-    SET_GPS_GLOBAL_ORIGIN is accepted only once, and only before GPS has set the origin. Copter and Sub refuse a home
-    before they have an origin; Plane and Rover accept it.
+    SET_GPS_GLOBAL_ORIGIN is accepted only once, and only before GPS has set the origin. Until the origin is set, Copter
+    and Sub refuse DO_SET_HOME, whereas Plane and Rover accept it.
     """
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
@@ -257,7 +260,8 @@ class HomeAndOrigin:
             return self._make_home(vehicle.motion.place) if nav.has_position else Result.FAILED
         if command.param1 != 0.0:
             return Result.FAILED
-        frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame  # COMMAND_LONG has no frame.
+        # COMMAND_LONG has no frame, and the firmware takes its altitude as AMSL.
+        frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
         if frame not in _FRAMES:
             vehicle.info(f"Unknown mavlink coordinate frame {frame}")
             return Result.DENIED
@@ -282,7 +286,7 @@ class HomeAndOrigin:
         return Result.ACCEPTED
 
     def _on_origin(self, message: m.SetGpsGlobalOrigin, channel: Channel) -> None:
-        """Set the origin and send it to the requester. Invalid values and second requests are ignored."""
+        """Set the estimator's origin and send the origin back. Invalid and repeated requests are ignored."""
         vehicle = self._vehicle
         place = (message.latitude, message.longitude)
         point = vehicle.world_point(*place, message.altitude / 1000.0, MavFrame.GLOBAL)
@@ -313,7 +317,7 @@ class GimbalCommands:
         vehicle.on(m.GimbalManagerSetPitchyaw, self._on_pitch_and_yaw)
 
     def _gimbal(self, device_id: float = 0) -> ArduPilotGimbal | None:
-        """Return the gimbal if it is fitted and ``device_id`` selects it (1, or 0 for all)."""
+        """Return the gimbal if it is fitted and ``device_id`` is 1, or 0 for all gimbals. Otherwise return None."""
         gimbal = self._vehicle.gimbal
         return gimbal if gimbal.is_fitted and whole(device_id) in (0, 1) else None
 
@@ -338,7 +342,7 @@ class GimbalCommands:
                 return Result.FAILED
             gimbal.point(roll, pitch, yaw, from_north=False)
             return Result.ACCEPTED
-        # The firmware refuses a position in params 1 and 2, which AP 4.2 accepted (AP_Mount_Backend.cpp).
+        # Params 1 and 2 held the position until AP 4.2. Newer firmware refuses such a command (AP_Mount_Backend.cpp).
         has_place_in_params = command.param1 and not command.x and not command.y
         if mode == MavMountMode.GPS_POINT and not has_place_in_params:
             place = (whole(command.x), whole(command.y), float(whole(command.param4)))
@@ -364,7 +368,7 @@ class GimbalCommands:
         rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
         has_angles = not any(map(math.isnan, message.q))
         has_rates = not any(map(math.isnan, rates))
-        if gimbal is None or (has_angles and has_rates):
+        if gimbal is None or (has_angles and has_rates):  # The firmware ignores a message with both.
             return
         angles = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
         gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))

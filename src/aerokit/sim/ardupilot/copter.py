@@ -19,7 +19,7 @@ from aerokit.mavlink.enums import (
     SpeedType,
 )
 from aerokit.sim.ardupilot import copter_modes as modes
-from aerokit.sim.ardupilot.commands import common_commands, relative_heading
+from aerokit.sim.ardupilot.commands import commanded_heading, common_commands
 from aerokit.sim.ardupilot.copter_auto import CopterAuto
 from aerokit.sim.ardupilot.copter_failsafes import CopterArming, CopterFailsafes, CopterFence
 from aerokit.sim.ardupilot.copter_guided import CopterGuided, CopterSetpoints
@@ -33,7 +33,7 @@ from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
 from aerokit.sim.motion import Ned
 
 _MAX_S = 600.0
-# Pause between two motors, as a share of the test time of one motor.
+# The pause between the tests of two motors, divided by the test time of one motor.
 _PAUSE_SHARE = 0.5
 _MIN_PWM, _MAX_PWM = 800, 2200
 
@@ -47,7 +47,7 @@ class MotorTest:
         self._test_number = 0
 
     def command(self, command: ReceivedCommand) -> int:
-        """Start a test, or replace the motors of the running test. A text reports the end."""
+        """Start a test, or replace the running test. A status text reports the end of the test."""
         if not self.is_running:
             reason = "" if self._copter.is_landed else "vehicle not landed"
             if not self._copter.is_initialised:
@@ -62,7 +62,7 @@ class MotorTest:
         return MavResult.ACCEPTED
 
     def _duration_s(self, command: ReceivedCommand) -> float:
-        """Return the duration; 0 for an invalid throttle."""
+        """Return the seconds that the whole test takes. An invalid throttle ends the test at once, after 0 s."""
         throttle_type, throttle = command.param2, command.param3
         if throttle_type == MotorTestThrottleType.THROTTLE_PILOT:
             is_valid = True
@@ -92,7 +92,7 @@ class CopterHold(CopterModeBase):
 
 
 class CopterThrow(CopterHold):
-    """THROW: reports once after arming that the copter waits for the throw; the throw itself is not simulated."""
+    """THROW: reports once after arming that the copter waits for the throw. The throw itself is not simulated."""
 
     _reported_at = -math.inf
 
@@ -104,7 +104,7 @@ class CopterThrow(CopterHold):
 
 
 class CopterFollow(CopterHold):
-    """FOLLOW: needs FOLL_ENABLE, and holds the position, like the firmware without a vehicle to follow."""
+    """FOLLOW: holds the position, as the firmware does without a vehicle to follow. FOLL_ENABLE enables the mode."""
 
     def enter(self, *, force: bool) -> bool:
         if self.vehicle.parameters["FOLL_ENABLE"]:
@@ -140,7 +140,7 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     variant(modes.CopterStabilize, CopterMode.ACRO, "ACRO"),
     variant(modes.CopterStabilize, CopterMode.STABILIZE, "STABILIZE"),
     variant(modes.CopterPilotedMode, CopterMode.ALT_HOLD, "ALT_HOLD", needs_position=False),
-    # On the ground CIRCLE commands a movement to its circle, so that the land detector never triggers.
+    # Even on the ground, CIRCLE commands a movement to its circle. The land detector therefore never triggers.
     variant(
         modes.CopterLoiter, CopterMode.CIRCLE, "CIRCLE", takes_off=False, can_arm=False, notices_landing=False
     ),
@@ -168,7 +168,7 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
 class SimulatedCopter(CopterHost):
     """ArduCopter, as far as a client can observe it. `Motion` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`. It has 1,349 parameters; MNT1_TYPE 1 fits a gimbal with three axes.
+    Takes the arguments of `ArduPilotVehicle`. It has 1,349 parameters. MNT1_TYPE 1 fits a gimbal with three axes.
 
     Not simulated: braking before a fence, the terrain failsafe.
     """
@@ -237,7 +237,7 @@ class SimulatedCopter(CopterHost):
             self.info(f"SIM Hit ground at {motion.impact_speed_m_s:f} m/s")
         keeps_flying = self.motors.is_armed and (self.mode.is_taking_off or not self.mode.notices_landing)
         on_ground_for = self._on_ground_timer.seconds(is_on_ground and not keeps_flying, self.now)
-        # With stopped motors, the copter has landed as soon as it is on the ground.
+        # A disarmed copter counts as landed as soon as it touches the ground; an armed one after `_LAND_DETECTOR_S`.
         if on_ground_for >= _LAND_DETECTOR_S or (on_ground_for > 0.0 and not self.motors.is_armed):
             self.is_landed: bool = True
             self._on_ground_timer.reset()
@@ -256,12 +256,12 @@ class SimulatedCopter(CopterHost):
     def may_go_to(self, place: Ned) -> bool:
         if not self.fence.contains(place):
             return False
-        self.yaw.apply_default()  # A new target ends a commanded heading.
+        self.yaw.apply_default()  # A new target position ends a commanded heading.
         return True
 
     def _change_speed(self, command: ReceivedCommand) -> int:
         mode, speed = self.mode, command.param2
-        if not speed > 0:
+        if not speed > 0:  # also refuses NaN
             return MavResult.DENIED
         if not mode.can_change_speed:
             return MavResult.FAILED
@@ -278,10 +278,10 @@ class SimulatedCopter(CopterHost):
         return MavResult.ACCEPTED
 
     def _turn(self, command: ReceivedCommand) -> int:
-        heading = relative_heading(command, self.motion.yaw)
+        heading = commanded_heading(command, self.motion.yaw)
         if heading is None:
             return MavResult.FAILED
-        # The sign of a relative angle (param 4) is its direction already.
+        # `commanded_heading` has already applied the direction to a relative angle (param 4 is 1).
         direction = 0 if command.param4 else int(command.param3)
         self.yaw.turn_to(heading, math.radians(command.param2), direction)
         return MavResult.ACCEPTED

@@ -21,11 +21,11 @@ from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance, 
 from aerokit.sim.motion import Ned, wrap_pi
 
 _STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
-_TAKE_OFF_WITHOUT_THROTTLE, _RAISED_THROTTLE = 2, 1100  # bit of AUTO_OPTIONS, and µs
+_TAKE_OFF_WITHOUT_THROTTLE, _RAISED_THROTTLE = 2, 1100  # A bit of AUTO_OPTIONS, and a pulse in µs.
 
 
 class _Leg(Protocol):
-    """Manoeuvre of a navigation command; `update` sets the motion targets for the next ``dt`` seconds."""
+    """The manoeuvre of a navigation command. `update` sets the motion targets for the next ``dt`` seconds."""
 
     def update(self, dt: float) -> None: ...
     @property
@@ -33,7 +33,7 @@ class _Leg(Protocol):
 
 
 class _FlyLeg:
-    """Straight flight to a place. It ends within WPNAV_RADIUS of the place; with ``stops``, at the place itself."""
+    """Straight flight to a place. With ``stops``, it ends at the place, otherwise within WPNAV_RADIUS of the place."""
 
     def __init__(self, auto: CopterAuto, destination: Ned, *, stops: bool) -> None:
         self._copter, self._auto = auto.vehicle, auto
@@ -51,7 +51,7 @@ class _FlyLeg:
 
 
 class _CircleLeg:
-    """Flight to the nearest point of a circle, then around it; a negative radius is anticlockwise."""
+    """Flight to the nearest point of a circle, and then around the circle. A negative radius is anticlockwise."""
 
     def __init__(self, auto: CopterAuto, centre: Ned, *, turns: float, radius: float) -> None:
         self._copter, self._turns, self._centre = auto.vehicle, turns, centre
@@ -60,7 +60,7 @@ class _CircleLeg:
         self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
         north, east = motion.north - centre[0], motion.east - centre[1]
         self._angle = math.atan2(east, north)
-        self._turned = 0.0
+        self._turned_rad = 0.0
         self._reported_turns = -1
         self._approach: _FlyLeg | None = None
         distance_to_circle = abs(math.hypot(north, east) - self._radius)
@@ -69,7 +69,7 @@ class _CircleLeg:
 
     @property
     def is_complete(self) -> bool:
-        return self._approach is None and self._turned / math.tau >= self._turns
+        return self._approach is None and self._turned_rad / math.tau >= self._turns
 
     def update(self, dt: float) -> None:
         if self._approach is not None:
@@ -78,15 +78,15 @@ class _CircleLeg:
                 self._approach = None
             return
         motion = self._copter.motion
-        # The centripetal acceleration uses 70 % of the limit; the rest keeps the copter on the circle.
+        # The turn may use 70 % of the acceleration limit. The remaining 30 % correct the distance from the circle.
         max_rate = math.sqrt(0.7 * motion.limits.acceleration_m_s2 / max(0.5, self._radius))
         rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)
         self._report_new_turn()
         self._angle += rate * dt
-        self._turned += abs(rate) * dt
+        self._turned_rad += abs(rate) * dt
         self._report_new_turn()
         point, speed = self._point(), rate * self._radius
-        # The velocity of the moving point, plus a correction of 1 m/s per metre between the copter and the point.
+        # Follow a point on the circle: command its velocity, plus 1 m/s for each metre between copter and point.
         motion.seek_velocity(
             point[0] - motion.north - speed * math.sin(self._angle),
             point[1] - motion.east + speed * math.cos(self._angle),
@@ -98,14 +98,14 @@ class _CircleLeg:
         return (north, self._centre[1] + self._radius * math.sin(self._angle), self._centre[2])
 
     def _report_new_turn(self) -> None:
-        number = int(self._turned / math.tau)
+        number = int(self._turned_rad / math.tau)
         if number > self._reported_turns:
             self._reported_turns = number
             self._copter.info(f"Mission: starting circle {number + 1}/{int(self._turns)}")
 
 
 class _ClimbLeg:
-    """Take-off, which waits on the ground for MISSION_START or a raised throttle; AUTO_OPTIONS can skip the wait."""
+    """Take-off. On the ground, it waits for MISSION_START or a raised throttle, unless AUTO_OPTIONS skips the wait."""
 
     def __init__(self, auto: CopterAuto, altitude_m: float) -> None:
         self._copter, self._auto = auto.vehicle, auto
@@ -144,7 +144,7 @@ class _DescendLeg:
 
 _ALLOW_ARMING, _CONTINUE_AFTER_LAND = 1, 4  # bits of AUTO_OPTIONS and of MIS_OPTIONS
 _HEADING_REACHED_RAD, _MIN_TAKE_OFF_M = math.radians(2.0), 1.0
-# A waypoint without delay is passed without a stop if one of these commands follows.
+# The copter does not stop at a waypoint without delay if one of these commands follows.
 _PASSED_BEFORE = frozenset(
     {Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_PAYLOAD_PLACE}
 )
@@ -159,7 +159,7 @@ _WITHOUT_EFFECT = (
 
 
 class CopterAuto(MissionMode):
-    """AUTO: `MissionRun` selects the commands; the manoeuvre of each navigation command is a leg."""
+    """AUTO: flies the mission. `MissionRun` selects the commands, and each navigation command is flown as a leg."""
 
     number: int = CopterMode.AUTO
     name = "AUTO"
@@ -168,11 +168,11 @@ class CopterAuto(MissionMode):
 
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
-        self.climb: float = 0.0  # Limit in m/s.
-        self.descent: float = 0.0  # Limit in m/s.
-        self._leg: _Leg | None = None  # AUTO holds the position without a leg.
+        self.climb: float = 0.0  # Maximum climb rate in m/s.
+        self.descent: float = 0.0  # Maximum sink rate in m/s.
+        self._leg: _Leg | None = None  # None: hold the position.
         self._last_reached = 0
-        self._reached_at = self._condition_from = self._delay_until = 0.0
+        self._reached_at = self._condition_started_at = self._delay_until = 0.0
         self._list_version = -1
         self._upcoming: tuple[tuple[int, MissionItem], ...] = ()
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
@@ -225,7 +225,7 @@ class CopterAuto(MissionMode):
         """Enter AUTO, which requires a mission. On the ground, its first navigation command must be a take-off."""
         copter, run = self.vehicle, self.vehicle.mission
         if copter.mode is self:
-            return True  # Arming in AUTO enters the mode again.
+            return True  # Arming enters the current mode again, which must not restart the mission.
         if not run.is_present and not force:
             return False
         if copter.is_armed and copter.is_landed and not run.starts_with_take_off():
@@ -239,15 +239,15 @@ class CopterAuto(MissionMode):
         return True
 
     def on_mission_started(self) -> None:
-        self._upcoming_changed()  # remembers the commands
+        self._check_upcoming()  # records the commands that the next call compares
 
     def update(self, dt: float) -> None:
         self.start_if_waiting()
         if not self.is_waiting:
-            if self._upcoming_changed() and isinstance(self._leg, _FlyLeg):
+            if self._check_upcoming() and isinstance(self._leg, _FlyLeg):
                 self._restart_command()
             self.vehicle.mission.update()
-            self._upcoming_changed()  # remembers the commands
+            self._check_upcoming()  # `mission.update` may have started the next command
         if self.vehicle.mode is not self:
             return
         is_stopped = self.is_paused and isinstance(self._leg, _FlyLeg)
@@ -258,8 +258,8 @@ class CopterAuto(MissionMode):
         if not is_stopped:
             self.vehicle.yaw.update()
 
-    def _upcoming_changed(self) -> bool:
-        """Return True if an upload changed the next three commands since the last call, at the same current index."""
+    def _check_upcoming(self) -> bool:
+        """Record the next three commands. Return True if an upload, instead of the progress, has changed them."""
         run, commands = self.vehicle.mission, self.vehicle.missions.commands
         has_same_index = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
         if commands.version == self._list_version and has_same_index:
@@ -291,7 +291,7 @@ class CopterAuto(MissionMode):
         self.vehicle.send(MissionItemReached(index))
 
     def end_mission(self) -> None:
-        """Hold the position in the air; disarm on the ground."""
+        """Hold the position in the air, or disarm on the ground."""
         if self.vehicle.is_landed:
             self.vehicle.arming.disarm()
         else:
@@ -313,7 +313,7 @@ class CopterAuto(MissionMode):
         if command == Cmd.NAV_DELAY:
             return now > self._delay_until
         if command == Cmd.CONDITION_DELAY:
-            return now - self._condition_from > max(0.0, item.param1)
+            return now - self._condition_started_at > max(0.0, item.param1)
         if command == Cmd.CONDITION_DISTANCE:
             return horizontal_distance(self.vehicle, self.destination) < max(0.0, item.param1)
         if command == Cmd.CONDITION_YAW:
@@ -332,9 +332,9 @@ class CopterAuto(MissionMode):
         return True
 
     def _has_landed(self, index: int) -> bool:
-        """Disarm after landing and return False; return True if MIS_OPTIONS lets a following take-off continue."""
+        """Disarm the copter after landing. Return True if it continues with a take-off instead (MIS_OPTIONS)."""
         copter = self.vehicle
-        if isinstance(self._leg, _FlyLeg):
+        if isinstance(self._leg, _FlyLeg):  # The copter first flies to the place of the landing.
             if self._leg.is_complete:
                 copter.yaw.hold()
                 self._leg = _DescendLeg(copter)
@@ -348,11 +348,11 @@ class CopterAuto(MissionMode):
         return False
 
     def _place(self, item: MissionItem) -> Ned:
-        """Return the place of an item; zero coordinates mean the vehicle's current coordinates."""
+        """Return the place of an item. Zero latitude and longitude, or a zero altitude, keep the current values."""
         leg = self._leg
         current: Ned = self.vehicle.motion.place
         if isinstance(leg, _FlyLeg) and leg.is_complete:
-            current = leg.destination  # The copter is there, except for a small error.
+            current = leg.destination  # more exact than the copter's position, which differs a little
         point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
         if point is None:
             return current
@@ -376,9 +376,9 @@ class CopterAuto(MissionMode):
 
     def _take_off(self, item: MissionItem) -> None:
         copter, down = self.vehicle, self.vehicle.motion.down
-        point = copter.world_point(0, 0, item.z, item.frame)
+        point = copter.world_point(0, 0, item.z, item.frame)  # Only the altitude is used.
         copter.yaw.hold()
-        # Never descend; from the ground, climb at least this much.
+        # A take-off never descends, and climbs at least `_MIN_TAKE_OFF_M` from the ground.
         min_climb = _MIN_TAKE_OFF_M if copter.is_landed else 0.0
         target_down = min(down - min_climb, down if point is None else point[2])
         self._leg = _ClimbLeg(self, copter.ground_or_home_down - target_down)
@@ -399,16 +399,16 @@ class CopterAuto(MissionMode):
         leg.enter(force=True)
 
     def _delay(self, item: MissionItem) -> None:
-        seconds = max(0.0, item.param1)  # A negative number means until a time of day, which is not simulated.
+        seconds = max(0.0, item.param1)  # A negative number, for a time of day, is not simulated.
         self._delay_until = self.vehicle.now + seconds
         self.vehicle.info(f"Delaying {int(seconds)} sec")
 
     def _wait(self, _: MissionItem) -> None:
-        self._condition_from = self.vehicle.now
+        self._condition_started_at = self.vehicle.now
 
     def _turn(self, item: MissionItem) -> None:
         heading, direction = math.radians(item.param1), int(item.param3)
-        if item.param4 > 0:  # The angle is relative, so that its sign is the direction.
+        if item.param4 > 0:  # The angle is relative; the direction (param 3) is its sign.
             heading = self.vehicle.motion.yaw + math.copysign(heading, direction or 1.0)
             direction = 0
         self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)
@@ -426,4 +426,4 @@ class CopterAuto(MissionMode):
     def _look_at(self, item: MissionItem) -> None:
         is_none = (item.x, item.y, item.z) == (0, 0, 0)
         point = None if is_none else self.vehicle.world_point(int(item.x), int(item.y), item.z, MavFrame.GLOBAL)
-        self.vehicle.yaw.region_of_interest(point)
+        self.vehicle.yaw.set_region_of_interest(point)

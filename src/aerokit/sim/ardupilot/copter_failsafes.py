@@ -16,7 +16,7 @@ _STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 
 
 class CopterArming(ArduPilotArming[CopterHost]):
-    """ArduCopter's arming checks: a position only in modes that use it, and a low or centred throttle stick."""
+    """ArduCopter's arming checks. Only modes that use a position require it; the throttle must be low or centred."""
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
@@ -25,14 +25,14 @@ class CopterArming(ArduPilotArming[CopterHost]):
         return ()  # `position_reasons` checks the estimator after GPS.
 
     def position_reasons(self) -> Sequence[str]:
-        """Check GPS and the estimator, and run the mandatory checks."""
+        """Return the failures of the checks of GPS and of the estimator, and of the mandatory checks."""
         if self.vehicle.mode.needs_position and (reasons := self.gps_reasons()):
             return reasons
         return super().ahrs_reasons() or self.mandatory_reasons()
 
     def own_reasons(self) -> list[str]:
         reasons = []
-        if self.vehicle.failsafes.ground_station:
+        if self.vehicle.failsafes.is_ground_station_lost:
             reasons.append("GCS failsafe on")
         if self.vehicle.failsafes.battery_is_low:
             reasons.append("Battery failsafe")
@@ -41,7 +41,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
     def mandatory_reasons(self) -> list[str]:
         copter, nav = self.vehicle, self.vehicle.navigation
         reasons = []
-        if copter.mode.needs_position and not (nav.has_position and not copter.failsafes.estimator):
+        if copter.mode.needs_position and not (nav.has_position and not copter.failsafes.has_estimator_failed):
             reasons.append("Need Position Estimate")
         if not copter.mode.has_manual_throttle and not nav.has_altitude:
             reasons.append("Need Alt Estimate")
@@ -61,7 +61,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
 
 
 _NONE, _LAND, _RTL, _SMART_RTL, _SMART_RTL_OR_LAND, _TERMINATE, _AUTO, _BRAKE = range(8)
-# FS_THR_ENABLE and FS_GCS_ENABLE → action.
+# Actions of FS_THR_ENABLE and FS_GCS_ENABLE, by parameter value.
 _LINK_ACTIONS = (_NONE, _RTL, _RTL, _SMART_RTL, _SMART_RTL_OR_LAND, _LAND, _AUTO, _BRAKE)
 _MODES: dict[int, tuple[int, ...]] = {
     _LAND: (CopterMode.LAND,),
@@ -71,13 +71,13 @@ _MODES: dict[int, tuple[int, ...]] = {
     _AUTO: (CopterMode.RTL, CopterMode.LAND),
     _BRAKE: (CopterMode.BRAKE, CopterMode.LAND),
 }
-# Text that reports that the first mode of an action was refused.
+# Texts for the case that the first mode of an action was refused.
 _FALLBACK_TEXTS = {
     _SMART_RTL: "SmartRTL Unavailable, Trying RTL Mode",
     _SMART_RTL_OR_LAND: "SmartRTL Unavailable, Using Land Mode",
     _BRAKE: "Trying Land Mode",
 }
-# Bits of FS_OPTIONS that continue the flight in spite of a failsafe; in the tables: (modes, bit, text).
+# Bits of FS_OPTIONS that let a flight continue in spite of a failsafe. A table row has the modes, the bit and the text.
 _IF_LANDING = 8
 _RADIO_OPTIONS = (
     (frozenset({"AUTO"}), 1, "Continuing Auto"),
@@ -117,32 +117,33 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         self.vehicle.fence.update()
 
     def _check_radio(self) -> None:
-        """Detect missing pulses for RC_FS_TIMEOUT, or a throttle below FS_THR_VALUE."""
+        """Detect a radio whose pulses are missing for RC_FS_TIMEOUT, or whose throttle is below FS_THR_VALUE."""
         copter, parameters = self.vehicle, self.vehicle.parameters
         is_receiving = copter.rc.is_receiving
         if is_receiving:
             self.radio_received_at: float = copter.now
         if not parameters["FS_THR_ENABLE"]:
-            self._set_radio(is_lost=False)
+            self._set_radio_lost(is_lost=False)
             return
         is_throttle_low = copter.rc[2] < parameters["FS_THR_VALUE"]
         if is_receiving and not is_throttle_low:
             if math.isnan(self._radio_good_at):
                 self._radio_good_at = copter.now
             if copter.now - self._radio_good_at >= _MIN_PULSES_S:
-                self._set_radio(is_lost=False)
+                self._set_radio_lost(is_lost=False)
             return
-        if math.isnan(self.radio_received_at):  # No transmitter was ever received, so none can be lost.
+        if math.isnan(self.radio_received_at):  # A transmitter that was never received cannot be lost.
             return
         is_silent = copter.now - self.radio_received_at >= parameters["RC_FS_TIMEOUT"]
         self._radio_good_at = math.nan
-        if is_receiving or is_silent:  # While pulses are received, the throttle is low.
-            self._set_radio(is_lost=True)
+        # Pulses with a low throttle trigger the failsafe at once, missing pulses only after RC_FS_TIMEOUT.
+        if is_receiving or is_silent:
+            self._set_radio_lost(is_lost=True)
 
-    def _set_radio(self, *, is_lost: bool) -> None:
-        if is_lost == self.radio:
+    def _set_radio_lost(self, *, is_lost: bool) -> None:
+        if is_lost == self.is_radio_lost:
             return
-        self.radio = is_lost
+        self.is_radio_lost = is_lost
         if is_lost:
             action = self._configured_action("FS_THR_ENABLE", _LAND)
             self._execute(self._action_after_loss("Radio", action, _RADIO_OPTIONS))
@@ -154,9 +155,9 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
             return
         is_lost = self.ground_station_silence > parameters["FS_GCS_TIMEOUT"]
-        if is_lost == self.ground_station:
+        if is_lost == self.is_ground_station_lost:
             return
-        self.ground_station = is_lost
+        self.is_ground_station_lost = is_lost
         if not is_lost:
             self.warn("GCS Failsafe Cleared")
             return
@@ -172,7 +173,11 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return _LINK_ACTIONS[value] if 0 <= value < len(_LINK_ACTIONS) else default
 
     def _action_after_loss(self, name: str, action: int, options: Sequence[tuple[frozenset[str], int, str]]) -> int:
-        """Report the loss of the link ``name``. Return ``action``, or what replaces it in the present situation."""
+        """Report the loss of the link ``name`` and return the action to execute.
+
+        This is ``action``, unless the copter disarms on the ground, continues a landing, or one of ``options`` lets
+        the present mode continue.
+        """
         mode = self.vehicle.mode
         if self._disarm_if_landed(name):
             return _NONE
@@ -189,7 +194,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return action
 
     def act_on_battery(self, action: int) -> None:
-        """Execute the action; on the ground disarm instead. With FS_OPTIONS bit 3 a landing continues."""
+        """Execute the action in the air, or disarm on the ground. With FS_OPTIONS bit 3 a landing continues."""
         if self._disarm_if_landed("Battery"):
             return
         if self.vehicle.mode.is_landing and self._has_option(_IF_LANDING) and action != _NONE:
@@ -199,23 +204,23 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         self._execute(action)
 
     def _check_estimator(self) -> None:
-        """Detect the loss of the position estimate. A disarmed vehicle only reports it."""
+        """Detect the loss of the position estimate. A disarmed vehicle only reports the loss."""
         copter = self.vehicle
         if copter.navigation.has_position:
             self._had_position = True
             self._position_lost.reset()
-            if self.estimator and self._acted_on_estimator:
+            if self.has_estimator_failed and self._acted_on_estimator:
                 self.warn("EKF Failsafe Cleared", MavSeverity.CRITICAL)
-            self.estimator = self._acted_on_estimator = False
+            self.has_estimator_failed = self._acted_on_estimator = False
             return
-        may_act = self._had_position and not self.estimator
+        may_act = self._had_position and not self.has_estimator_failed
         if may_act and self._position_lost.seconds(True, copter.now) >= _ESTIMATOR_TIMEOUT_S:
             self._lose_estimator()
 
     def _lose_estimator(self) -> None:
         copter = self.vehicle
         self.warn("EKF variance", MavSeverity.CRITICAL)
-        self.estimator: bool = True
+        self.has_estimator_failed: bool = True
         self._acted_on_estimator = copter.is_armed
         if not copter.is_armed:
             return
@@ -241,11 +246,11 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return action
 
     def _disarm_if_landed(self, name: str) -> bool:
-        """Disarm a landed vehicle and return True; return False in the air or if a mission is about to take off."""
+        """Disarm a landed vehicle and return True. A vehicle in the air, or about to take off, stays armed (False)."""
         copter = self.vehicle
         if not copter.is_landed or (copter.mode.needs_mission and not copter.motors.is_idle):
             return False
-        if name == "Radio":  # The firmware reports the other failsafes after disarming.
+        if name == "Radio":  # The firmware reports this failsafe before disarming, all others after it.
             self.warn("Radio Failsafe - Disarming")
         copter.arming.disarm()
         if name != "Radio":
@@ -255,7 +260,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
     def _execute(self, action: int) -> None:
         if action == _TERMINATE:
             self.vehicle.arming.disarm()
-        if action == _AUTO:  # The firmware looks for a landing sequence first, which is not simulated.
+        if action == _AUTO:  # Landing sequences are not simulated, so the search of the firmware fails.
             self.warn("Unable to start landing sequence")
             self.warn("Mode change to AUTO RTL failed: No return path or landing sequence found")
             self.warn("Trying RTL Mode")
@@ -277,9 +282,9 @@ _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
 
 
 class CopterFence(ArduPilotFence[CopterHost]):
-    """Fence. FENCE_ACTION: report only (0), RTL (1), LAND (2), SMART_RTL (3, 5), BRAKE (4).
+    """Fence with the values of FENCE_ACTION: report only (0), RTL (1), LAND (2), SMART_RTL (3, 5), BRAKE (4).
 
-    If that mode is refused, or the copter is more than 100 m outside the fence, the mode is LAND instead.
+    If the mode is refused, or the copter is more than 100 m outside the fence, the copter lands instead.
     """
 
     PERIOD_S: ClassVar[float] = 0.1
@@ -287,7 +292,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
-        """Disarm on the ground; execute FENCE_ACTION in the air."""
+        """Execute FENCE_ACTION in the air, or disarm on the ground."""
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
         if vehicle.is_landed:
@@ -297,10 +302,12 @@ class CopterFence(ArduPilotFence[CopterHost]):
         self.report("breached", new_breaches)
         if action == REPORT_ONLY:
             return
+        # The firmware treats an unknown action as RTL (fence.cpp).
         modes = _FENCE_ACTIONS.get(action, _FENCE_ACTIONS[1])
         if self.beyond_m(new_breaches) > _LAND_BEYOND_M:
             modes = (CopterMode.LAND,)
-        self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)  # until one is not refused
+        # Try the modes in turn, until one of them is not refused.
+        self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
 
     def on_cleared(self) -> None:
         if not self.vehicle.is_landed:
@@ -312,7 +319,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
         return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"
 
     def on_mode_changed(self) -> None:
-        """Suspend the fence's actions for ten seconds, unless FENCE_ACTION only reports."""
+        """Called after every mode change. Suspend the fence's actions for ten seconds, unless they only report."""
         super().on_mode_changed()
         if self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY:
             self.recover_by_hand()

@@ -30,8 +30,8 @@ class GuidedSubmode(Enum):
 class CopterGuided(CopterModeBase):
     """GUIDED: holds the position until the first target. Targets other than a position expire after GUID_TIMEOUT.
 
-    As in ArduCopter, a change of the submode resets the speed limits to WPNAV_SPEED, WPNAV_SPEED_UP and
-    WPNAV_SPEED_DN: DO_CHANGE_SPEED is valid until the kind of target changes.
+    As in ArduCopter, a change of the submode resets the speed limits to WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN.
+    A speed that DO_CHANGE_SPEED has set is therefore valid until the kind of target changes.
     """
 
     number: int = CopterMode.GUIDED
@@ -42,7 +42,7 @@ class CopterGuided(CopterModeBase):
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
         self.submode: GuidedSubmode = GuidedSubmode.VELOCITY
-        # Limits in m/s.
+        # The maximum horizontal speed, climb rate and sink rate in m/s.
         self.speed: float = 0.0
         self.climb: float = 0.0
         self.descent: float = 0.0
@@ -89,7 +89,7 @@ class CopterGuided(CopterModeBase):
         self._updated_at = self.vehicle.now
 
     def set_target(self, position: Ned | None, velocity: Ned | None, acceleration: Ned | None) -> bool:
-        """Follow a set-point; return False if the combination of vectors is not supported."""
+        """Follow the vectors of a set-point. Return False if the firmware does not support their combination."""
         if velocity is not None:
             submode = GuidedSubmode.VELOCITY if position is None else GuidedSubmode.POSITION_VELOCITY
             acceleration = acceleration or _ZERO
@@ -103,13 +103,13 @@ class CopterGuided(CopterModeBase):
         return True
 
     def lean(self, roll: float, pitch: float, climb: float) -> None:
-        """Hold roll and pitch (radians) and a climb rate (m/s); on the ground a positive climb rate takes off."""
+        """Hold roll and pitch (radians) and a climb rate (m/s). On the ground, a positive climb rate takes off."""
         self.submode = GuidedSubmode.ATTITUDE
         self._attitude, self._attitude_climb, self._body_rates = (roll, pitch), climb, None
         self._updated_at = self.vehicle.now
 
     def rotate(self, roll_rate: float, pitch_rate: float, climb: float) -> None:
-        """Roll and pitch at rates in radians per second, from the present attitude, and climb (m/s)."""
+        """Change roll and pitch at rates in radians per second, starting at the present attitude, and climb (m/s)."""
         if self.submode is not GuidedSubmode.ATTITUDE or self._body_rates is None:
             self._attitude = (self.vehicle.motion.roll, self.vehicle.motion.pitch)
         self.submode = GuidedSubmode.ATTITUDE
@@ -148,7 +148,7 @@ class CopterGuided(CopterModeBase):
         elif self.submode is GuidedSubmode.ATTITUDE:
             self._run_attitude(dt)
         elif copter.is_landed:
-            copter.hold_position()  # Only a take-off command or a climb rate leaves the ground.
+            copter.hold_position()  # On the ground, only a take-off command or an attitude target has an effect.
         else:
             copter.motors.spool_up_requested = True
             self._run_target()
@@ -182,14 +182,14 @@ class CopterGuided(CopterModeBase):
         elif self.submode is GuidedSubmode.VELOCITY:
             self._seek_velocity(*self.velocity)
         elif self.submode is GuidedSubmode.ACCELERATION:
-            if self._is_stale:
+            if self._is_stale:  # An acceleration of zero would keep the velocity, so stop instead.
                 motion.seek_velocity(*_ZERO)
             else:
                 motion.seek_acceleration(*self.acceleration)
         else:
-            # The distance to the moving position corrects the velocity, with a gain of 1 per second.
-            errors = (target - current for target, current in zip(self.position, motion.place, strict=True))
-            north, east, down = (speed + error for speed, error in zip(self.velocity, errors, strict=True))
+            # Add 1 m/s towards the target position for each metre of distance to the target velocity.
+            offsets = (target - current for target, current in zip(self.position, motion.place, strict=True))
+            north, east, down = (speed + offset for speed, offset in zip(self.velocity, offsets, strict=True))
             self._seek_velocity(north, east, down)
 
     def _seek_velocity(self, north: float, east: float, down: float) -> None:
@@ -230,24 +230,24 @@ class CopterSetpoints:
         frame = target.coordinate_frame
         point = self._copter.local_point(target, _BODY)
         if frame not in _LOCAL or not self._follow(target, point, rotate=frame in _BODY):
-            self._guided.enter(force=False)
+            self._guided.enter(force=False)  # An invalid message stops the vehicle.
 
     def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
         if not self._is_guided:
             return
         point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
         is_invalid = point is None and Setpoint.of(target).has_position
-        # Without a position in the set-point, any point does.
+        # `_follow` does not read the point if the set-point has no position.
         if is_invalid or not self._follow(target, point or _ZERO, rotate=False):
-            self._guided.enter(force=False)
+            self._guided.enter(force=False)  # An invalid message stops the vehicle.
 
     def _follow(self, target: PositionTarget, point: Ned, *, rotate: bool) -> bool:
-        """Follow a set-point; return False if it is invalid. With ``rotate``, its vectors are in the body frame."""
+        """Follow a set-point. Return False if it is invalid. With ``rotate``, its vectors are in the body frame."""
         setpoint, motion, yaw = Setpoint.of(target), self._copter.motion, self._copter.yaw
         velocity = setpoint.velocity if setpoint.has_velocity else None
         acceleration = setpoint.acceleration if setpoint.has_acceleration else None
-        is_sane = all(abs(part) <= _MAX_VELOCITY_M_S for part in velocity or _ZERO)
-        if setpoint.is_force or not is_sane or not is_finite(acceleration, point):
+        is_velocity_valid = all(abs(part) <= _MAX_VELOCITY_M_S for part in velocity or _ZERO)
+        if setpoint.is_force or not is_velocity_valid or not is_finite(acceleration, point):
             return False
         if rotate:
             velocity = None if velocity is None else rotated(velocity, motion.yaw)
@@ -270,10 +270,10 @@ class CopterSetpoints:
             return
         has_attitude, ignored_rates = not mask & AttitudeMask.ATTITUDE_IGNORE, mask & _ALL_RATES
         quaternion_norm = math.sqrt(sum(component * component for component in target.q))
-        has_some_rates = ignored_rates not in (0, _ALL_RATES)
-        is_invalid = mask & AttitudeMask.THROTTLE_IGNORE or has_some_rates
-        if is_invalid or (has_attitude and not abs(quaternion_norm - 1.0) < 1e-3):
-            guided.enter(force=False)
+        has_one_or_two_rates = ignored_rates not in (0, _ALL_RATES)
+        is_mask_invalid = mask & AttitudeMask.THROTTLE_IGNORE or has_one_or_two_rates
+        if is_mask_invalid or (has_attitude and not abs(quaternion_norm - 1.0) < 1e-3):
+            guided.enter(force=False)  # An invalid message stops the vehicle.
             return
         roll = pitch = 0.0
         if has_attitude:
@@ -281,7 +281,8 @@ class CopterSetpoints:
             copter.motion.face(yaw)
         elif not ignored_rates:
             copter.motion.turn(target.body_yaw_rate)
-        # Thrust is a climb rate; 0.5 holds the altitude. Thrust as throttle (GUID_OPTIONS bit 3) is not simulated.
+        # The field thrust sets a climb rate: 0.5 holds the altitude. GUID_OPTIONS bit 3, with which the field sets the
+        # throttle, is not simulated.
         climb_share = (max(0.0, min(1.0, target.thrust)) - 0.5) * 2.0
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * copter.parameters[max_climb_parameter] / 100.0

@@ -16,7 +16,7 @@ _HEADING_TOLERANCE_RAD = 0.02
 
 
 class AutoYaw:
-    """Heading control: hold, look ahead, fixed heading, turn rate, or region of interest."""
+    """Controls the heading: holds it, looks ahead, turns to a heading or at a rate, or faces a region of interest."""
 
     def __init__(self, copter: ArduPilotVehicle) -> None:
         self._copter = copter
@@ -25,7 +25,7 @@ class AutoYaw:
         self._roi: tuple[float, float] | None = None
         self._heading = 0.0
         self._rate = 0.0
-        """Turn rate of `turn`, or of `turn_to` while the commanded direction is the longer way, else 0."""
+        """Turn rate that `turn` has set, or `turn_to` for a turn by the longer way; otherwise 0."""
 
     def hold(self) -> None:
         self._control = self._hold
@@ -43,17 +43,21 @@ class AutoYaw:
             self.hold()
 
     def turn_to(self, heading: float, rate: float = 0.0, direction: int = 0) -> None:
-        """Turn to a heading (radians). ``rate`` 0 is the default rate, ``direction`` 1 clockwise, -1 anticlockwise."""
+        """Turn to a heading in radians, at ``rate`` radians per second (0: the default rate).
+
+        ``direction`` is 1 for clockwise, -1 for anticlockwise, and 0 for the shorter way.
+        """
         motion = self._copter.motion
         self._heading, self._control = wrap_pi(heading), self._go_to_heading
         self._rate = 0.0
         offset = wrap_pi(self._heading - motion.yaw)
         is_longer_way = direction and math.copysign(1, offset) != direction
-        if is_longer_way and abs(offset) > _HEADING_TOLERANCE_RAD:  # `Motion.face` turns the shorter way.
+        # `Motion.face` turns the shorter way, so the longer way needs a turn rate.
+        if is_longer_way and abs(offset) > _HEADING_TOLERANCE_RAD:
             self._rate = direction * (rate or motion.limits.turn_rate_rad_s)
 
     def turn_to_last_heading(self, tolerance: float) -> bool:
-        """Turn to the last `turn_to` heading again; return True within ``tolerance`` radians of it."""
+        """Turn to the last heading of `turn_to` again. Return True within ``tolerance`` radians of that heading."""
         self._control = self._go_to_heading
         return abs(wrap_pi(self._heading - self._copter.motion.yaw)) <= tolerance
 
@@ -65,8 +69,8 @@ class AutoYaw:
         """Turn continuously, in radians per second."""
         self._rate, self._control = rate, self._turn
 
-    def region_of_interest(self, point: Ned | None) -> None:
-        """Turn towards a place until the next target; None stops. A gimbal, if fitted, turns instead of the copter."""
+    def set_region_of_interest(self, point: Ned | None) -> None:
+        """Turn towards a place until the next target. None ends this. A fitted gimbal turns instead of the copter."""
         gimbal = self._copter.gimbal
         gimbal.look_at(point)
         if point is None:
@@ -98,7 +102,7 @@ class AutoYaw:
         motion = self._copter.motion
         offset = wrap_pi(self._heading - motion.yaw)
         if self._rate and math.copysign(1, offset) != math.copysign(1, self._rate):
-            motion.turn(self._rate)  # The commanded direction is the longer way.
+            motion.turn(self._rate)  # The commanded direction is still the longer way.
             return
         self._rate = 0.0
         motion.face(self._heading)
@@ -121,7 +125,7 @@ class CopterHost(ArduPilotVehicle):
         self.path.start()
 
     def look_at(self, place: Ned | None) -> None:
-        self.yaw.region_of_interest(place)
+        self.yaw.set_region_of_interest(place)
 
     @property
     def ground_or_home_down(self) -> float:
@@ -134,7 +138,7 @@ class CopterHost(ArduPilotVehicle):
         return self.parameters[name] / 100.0
 
     def fly_to(self, target: Ned, speed: float) -> float:
-        """Fly towards a target with the default climb and sink rates; return the distance in metres."""
+        """Fly towards a target with the default climb and sink rates, and return its distance in metres."""
         self.motors.spool_up_requested = True
         climb, descent = self.speed_limit("WPNAV_SPEED_UP"), self.speed_limit("WPNAV_SPEED_DN")
         self.motion.seek_position(*target, speed=speed, climb=climb, descent=descent)
@@ -142,12 +146,12 @@ class CopterHost(ArduPilotVehicle):
         return math.dist(target, self.motion.place)
 
     def hold_position(self) -> None:
-        """Hold the position; on the ground let the motors idle."""
+        """Hold the position. On the ground, let the motors idle."""
         self.motors.spool_up_requested = not self.is_landed
         self.motion.seek_velocity(0.0, 0.0, 0.0)
 
     def descend(self) -> None:
-        """Descend with the speeds of LAND; on the ground let the motors idle."""
+        """Descend with the speeds of the mode LAND. On the ground, let the motors idle."""
         self.motors.spool_up_requested = not self.is_landed
         if self.is_landed:
             return
@@ -167,8 +171,11 @@ class CopterModeBase(ArduPilotMode):
     vehicle: CopterHost
 
 
+_REACHED_M, _AT_REST_M_S, _DRIFT_CORRECTION_M_S = 0.1, 0.2, 2.0
+
+
 class CopterTakeOff:
-    """Vertical climb of a commanded take-off; it begins once the motors have spooled up."""
+    """The vertical climb of a commanded take-off, which begins as soon as the motors have spooled up."""
 
     def __init__(self, copter: CopterHost, altitude_m: float) -> None:
         self._copter = copter
@@ -182,8 +189,8 @@ class CopterTakeOff:
         if copter.is_landed:
             copter.is_landed = not copter.motors.can_lift
             return
-        motion.seek_position(*self.target, speed=2.0, climb=climb_m_s, descent=1.0)
-        if abs(motion.down - self.target[2]) < 0.1 and abs(motion.velocity_down) < 0.2:
+        motion.seek_position(*self.target, speed=_DRIFT_CORRECTION_M_S, climb=climb_m_s, descent=1.0)
+        if abs(motion.down - self.target[2]) < _REACHED_M and abs(motion.velocity_down) < _AT_REST_M_S:
             self.is_complete = True
 
 
@@ -195,7 +202,7 @@ _STABILIZE_CLIMB_M_S = 6.0
 
 
 class CopterPilotedMode(CopterModeBase):
-    """Base of the piloted modes: sticks control the attitude, the altitude is held.
+    """Base of the piloted modes, in which sticks control the attitude and a climb rate.
 
     Stick positions come from RC_CHANNELS_OVERRIDE, or from the test (``copter.rc``).
     """
@@ -212,7 +219,7 @@ class CopterPilotedMode(CopterModeBase):
         return True
 
     def climb_from_stick(self) -> float:
-        """Return the climb rate of the throttle stick in m/s; the middle holds the altitude."""
+        """Return the climb rate in m/s that the throttle stick commands. The middle holds the altitude."""
         stick = self.vehicle.rc[2] - _MID_STICK
         if abs(stick) <= _THROTTLE_DEADZONE:
             return 0.0
@@ -237,11 +244,11 @@ class CopterPilotedMode(CopterModeBase):
         copter.motion.turn(yaw * _FULL_STICK_TURN_RAD_S)
 
     def fly(self, roll: float, pitch: float, climb: float) -> None:
-        """Follow the roll and pitch sticks (-1 to 1) and a climb rate in m/s."""
+        """Fly as the roll and pitch sticks (-1 to 1) and the climb rate in m/s command."""
         self.vehicle.motion.seek_attitude(roll * _FULL_STICK_LEAN_RAD, pitch * _FULL_STICK_LEAN_RAD, -climb)
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        # Without position control the pilot must control the horizontal position.
+        # In a mode without position control, only a take-off that the pilot may steer is accepted.
         if not self.takes_off or (must_navigate and not self.needs_position):
             return False
         self._take_off = CopterTakeOff(self.vehicle, altitude_m)
@@ -257,7 +264,7 @@ class CopterStabilize(CopterPilotedMode):
     takes_off = False
 
     def climb_from_stick(self) -> float:
-        # The stick is a throttle rather than a climb rate: the middle hovers.
+        # In this mode the stick sets the throttle instead of a climb rate. The middle position hovers.
         throttle = self.vehicle.rc[2]
         if self.vehicle.is_landed and throttle <= _MID_STICK:
             return 0.0
@@ -265,7 +272,7 @@ class CopterStabilize(CopterPilotedMode):
 
 
 class CopterLoiter(CopterPilotedMode):
-    """LOITER and similar modes: hold the position; sticks are velocities. A low throttle stick lands."""
+    """LOITER and similar modes: sticks set velocities, centred sticks hold the position. A low throttle stick lands."""
 
     def fly(self, roll: float, pitch: float, climb: float) -> None:
         velocity = (-pitch * _LOITER_SPEED_M_S, roll * _LOITER_SPEED_M_S, -climb)
@@ -278,7 +285,7 @@ _SMART_RTL_EXTRA_ALTITUDE_M = 2.0
 
 
 class CopterLand(CopterModeBase):
-    """LAND: descends with WPNAV_SPEED_DN to LAND_ALT_LOW, then with LAND_SPEED; disarms on the ground."""
+    """LAND: descends with WPNAV_SPEED_DN to LAND_ALT_LOW and then with LAND_SPEED, and disarms on the ground."""
 
     needs_position = False
     can_arm = False
@@ -293,7 +300,7 @@ class CopterLand(CopterModeBase):
 
 
 class CopterRtl(CopterModeBase):
-    """RTL: climbs to RTL_ALT (less near home), flies to home or a rally point, waits RTL_LOIT_TIME, lands."""
+    """RTL: climbs to RTL_ALT (less near home), flies to home or a rally point, waits for RTL_LOIT_TIME and lands."""
 
     can_arm = False
     can_change_speed = True
@@ -319,7 +326,7 @@ class CopterRtl(CopterModeBase):
         return True
 
     def _return_altitude(self, distance: float) -> float:
-        """Return the altitude of the way back in metres above home."""
+        """Return the altitude in metres above home at which the copter flies back from ``distance`` metres."""
         parameters = self.vehicle.parameters
         current = self.vehicle.navigation.altitude_above_home
         after_min_climb = current + parameters["RTL_CLIMB_MIN"] / 100.0
@@ -340,7 +347,7 @@ class CopterRtl(CopterModeBase):
         copter, target = self.vehicle, self.destination
         if self._phase == "land":
             copter.land()
-        elif copter.is_landed:  # The copter disarms after DISARM_DELAY.
+        elif copter.is_landed:  # Let the motors idle; the copter then disarms after DISARM_DELAY.
             copter.motors.spool_up_requested = False
         elif target is not None:
             self._next_phase(copter.fly_to(target, self.speed))
@@ -371,7 +378,7 @@ class CopterSmartRtl(CopterModeBase):
         if not self.vehicle.path.is_active:
             return False
         self._way_back, self.is_landing = self.vehicle.path.take_way_back(), False
-        self._raise_last(_SMART_RTL_EXTRA_ALTITUDE_M)  # The copter lands from there.
+        self._raise_last(_SMART_RTL_EXTRA_ALTITUDE_M)  # The last point is the start of the landing.
         self.vehicle.yaw.apply_default(returning=True)
         return True
 

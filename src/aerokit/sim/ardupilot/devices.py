@@ -18,7 +18,7 @@ _MIN_CHUTE_ALTITUDE_M = 10.0
 
 
 class ArduPilotDevices:
-    """Devices beside the outputs; a reboot resets them."""
+    """State of gripper, landing gear, parachute and winch, which a reboot resets."""
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
@@ -33,7 +33,7 @@ class ArduPilotDevices:
         return bool(self._vehicle.parameters.get(name, 0))
 
     def grip(self, command: ReceivedCommand) -> int:
-        """Move the servo gripper. The answer comes at once, a status text at the end (AP_Gripper_Servo.cpp)."""
+        """Move the servo gripper, and acknowledge at once. A text reports the end (AP_Gripper_Servo.cpp)."""
         is_known = command.param2 in (GripperActions.GRAB, GripperActions.RELEASE)
         if not self._is_set("GRIP_ENABLE") or not is_known:
             return Result.FAILED
@@ -50,7 +50,7 @@ class ArduPilotDevices:
         return Result.ACCEPTED
 
     def move_gear(self, command: ReceivedCommand) -> int:
-        """Accept every command, like the firmware without a landing gear."""
+        """Accept every command, as the firmware does if no landing gear is fitted."""
         is_retraction = command.param2 == 1
         if self._is_set("LGR_ENABLE") and is_retraction is not self.gear_is_up:
             self.gear_is_up = is_retraction
@@ -93,14 +93,14 @@ class ArduPilotDevices:
 
     def _run(self) -> None:
         self.line_m += self.line_rate_m_s * _WINCH_STEP_S
-        # The remaining length and the rate have opposite signs once the line has passed the goal.
+        # Once the line has passed the goal, the remaining length and the rate have opposite signs.
         if self._goal_m is not None and (self._goal_m - self.line_m) * self.line_rate_m_s <= 0:
             self.line_rate_m_s = 0.0
         if self.line_rate_m_s:
             self._vehicle.call_later(_WINCH_STEP_S, self._run)
 
     def winch_status(self) -> m.WinchStatus | None:
-        """Return WINCH_STATUS; None without a winch."""
+        """Return WINCH_STATUS, or None if the vehicle has no winch."""
         if not self._is_set("WINCH_TYPE"):
             return None
         unknown, unknown_temperature, healthy = float("nan"), 0x7FFF, 1

@@ -33,7 +33,8 @@ class ArduPilotExternal:
         self.latest: dict[type[Message], Message] = {}
         self._navigation_at = self._target_at = -math.inf
         self._target: tuple[float, float] = (0.0, 0.0)
-        self.wind: tuple[float, float] | None = None  # Speed in m/s, and direction in degrees that the wind comes from.
+        # Wind speed in m/s, and the direction in degrees from which the wind comes.
+        self.wind: tuple[float, float] | None = None
 
     def listen(self) -> None:
         vehicle = self._vehicle
@@ -49,7 +50,7 @@ class ArduPilotExternal:
         return self._vehicle.now - self._navigation_at
 
     def velocity_to_target(self) -> tuple[float, float]:
-        """Return the horizontal velocity of a landing towards a target that was seen recently, else zero."""
+        """Return the horizontal velocity towards the landing target; zero unless the target was seen recently."""
         if self._vehicle.now - self._target_at > _TARGET_TIMEOUT_S:
             return (0.0, 0.0)
         motion = self._vehicle.motion
@@ -58,7 +59,7 @@ class ArduPilotExternal:
     def _on_navigation(self, message: Message, _: Channel) -> None:
         if not self._vehicle.parameters.get("VISO_TYPE", 0.0):
             return
-        frames = (MavFrame.LOCAL_FRD, MavFrame.BODY_FRD)
+        frames = (MavFrame.LOCAL_FRD, MavFrame.BODY_FRD)  # The firmware ignores ODOMETRY in other frames.
         if isinstance(message, m.Odometry) and (message.frame_id, message.child_frame_id) != frames:
             return
         self.latest[type(message)] = message
@@ -77,7 +78,7 @@ class ArduPilotExternal:
         self._target, self._target_at = (motion.north + north, motion.east + east), self._vehicle.now
 
     def set_wind(self, command: ReceivedCommand) -> int:
-        """Execute EXTERNAL_WIND_ESTIMATE; the wind has no effect."""
+        """Record the wind of EXTERNAL_WIND_ESTIMATE. It has no effect on the flight."""
         if command.param1 < 0 or not 0 <= command.param3 <= 360:
             return MavResult.DENIED
         self.wind = (command.param1, command.param3)

@@ -19,8 +19,8 @@ _PERIOD_S = 0.1
 class BatteryFailsafe:
     """Checks voltage and remaining charge while the vehicle is armed.
 
-    ``priorities`` lists the actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, most severe first. An action is not
-    executed after a more severe one.
+    ``priorities`` lists the actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, from the most to the least severe. An
+    action is not executed if a more severe action was executed before.
     """
 
     def __init__(self, vehicle: ArduPilotHost, priorities: Sequence[int], act: Callable[[int], None]) -> None:
@@ -28,12 +28,12 @@ class BatteryFailsafe:
         self._priorities = tuple(priorities)
         self._act = act
         self._voltage_low = {_LOW: ConditionTimer(), _CRITICAL: ConditionTimer()}
-        self.level: int = _OK  # 0 OK, 1 low, 2 critical; it never decreases.
+        self.level: int = _OK  # 0 is OK, 1 low, 2 critical. The level never decreases.
         self.priority: int = len(self._priorities)
         """Index in ``priorities`` of the most severe action executed so far."""
 
     def update(self) -> None:
-        """Check now. A low charge counts at once, a low voltage only after BATT_LOW_TIMER."""
+        """Check the battery. A low charge triggers at once, a low voltage after BATT_LOW_TIMER."""
         if not self._vehicle.motors.is_armed:
             return
         level = max(self._level_if_below(_LOW), self._level_if_below(_CRITICAL))
@@ -50,7 +50,7 @@ class BatteryFailsafe:
             self._act(action)
 
     def reason_not_to_arm(self) -> str | None:
-        """Return the text of the failing arming check, if any."""
+        """Return the text of the first failing arming check, or None."""
         battery, parameters = self._vehicle.battery, self._vehicle.parameters
         if battery.voltage_v < parameters["BATT_ARM_VOLT"]:
             return "Battery 1 below minimum arming voltage"
@@ -68,16 +68,17 @@ class BatteryFailsafe:
         return None
 
     def _level_if_below(self, level: int) -> int:
-        """Return the level if the battery has been below the limits of this level for long enough, else 0."""
+        """Return ``level`` if the battery has been below the limits of this level for long enough, otherwise 0."""
         is_voltage_low, is_charge_low = self._is_voltage_and_charge_low(level)
         voltage_low_for = self._voltage_low[level].seconds(is_voltage_low, self._vehicle.now)
         timeout = self._vehicle.parameters["BATT_LOW_TIMER"]
         return level if is_charge_low or 0 < timeout < voltage_low_for else _OK
 
     def _is_voltage_and_charge_low(self, level: int) -> tuple[bool, bool]:
-        """Return two values: True if the voltage, and True if the charge, is below the limit of the level."""
+        """Return whether the voltage, and whether the charge, is below the limit of the level."""
         parameters, name = self._vehicle.parameters, _NAMES[level]
-        min_volts, min_mah = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]  # 0: no limit
+        # The value 0 of these parameters means that there is no limit.
+        min_volts, min_mah = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
         is_voltage_low = min_volts > 0 and self._vehicle.battery.voltage_v < min_volts
         is_charge_low = min_mah > 0 and self._remaining_mah() < min_mah
         return is_voltage_low, is_charge_low
@@ -87,20 +88,20 @@ class BatteryFailsafe:
 
 
 class ArduPilotFailsafes(Generic[HostT]):
-    """Failsafes, checked ten times a second. A failsafe acts once when it triggers, and sends a text.
+    """Base of the failsafes. They are checked ten times a second. When one triggers, it acts once and sends a text.
 
     A subclass overrides `update` with the checks of its firmware and `act_on_battery` with the battery actions.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = ()
-    """Actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, most severe first."""
+    """Actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, from the most to the least severe."""
 
     def __init__(self, vehicle: HostT) -> None:
         self.vehicle = vehicle
         self.battery: BatteryFailsafe = BatteryFailsafe(vehicle, self.BATTERY_PRIORITIES, self.act_on_battery)
-        self.ground_station = False
-        self.estimator = False
-        self.radio = False  # True while the RC link counts as lost, which also prevents arming.
+        self.is_ground_station_lost = False
+        self.has_estimator_failed = False
+        self.is_radio_lost = False  # A lost radio also prevents arming.
         self.ground_station_seen_at: float = math.nan
         """Time of the last heartbeat of the ground station MAV_GCS_SYSID."""
         self.radio_received_at: float = math.nan  # Time of the last RC pulses or overrides.
@@ -110,7 +111,7 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     @property
     def battery_is_low(self) -> bool:
-        """True once the battery has been low or critical on an armed vehicle."""
+        """True after the battery was low or critical while the vehicle was armed."""
         return self.battery.level > 0
 
     @property
@@ -119,12 +120,12 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     @property
     def is_any_active(self) -> bool:
-        return self.battery_is_low or self.ground_station or self.estimator or self.radio
+        return self.battery_is_low or self.is_ground_station_lost or self.has_estimator_failed or self.is_radio_lost
 
     @property
     def is_radio_healthy(self) -> bool:
-        """Health of the RC receiver in SYS_STATUS."""
-        return not self.radio
+        """True if SYS_STATUS reports that the RC receiver is healthy."""
+        return not self.is_radio_lost
 
     @property
     def ground_station_silence(self) -> float:
@@ -132,7 +133,7 @@ class ArduPilotFailsafes(Generic[HostT]):
         return self.vehicle.now - self.ground_station_seen_at
 
     def update(self) -> None:
-        """Run all checks once. The base class checks battery and fence."""
+        """Run all checks once. The base class checks the battery and the fence."""
         self.battery.update()
         self.vehicle.fence.update()
 
@@ -144,7 +145,7 @@ class ArduPilotFailsafes(Generic[HostT]):
         self.vehicle.send_text(severity, text)
 
     def change_to(self, *modes: int) -> bool:
-        """Change to the first mode that is not refused; return False if all are refused."""
+        """Change to the first mode that is not refused. Return False if all modes are refused."""
         return any(self.vehicle.set_mode(mode) for mode in modes)
 
 
@@ -170,8 +171,8 @@ class ArmingCheck(IntFlag):
 class ArduPilotArming(Generic[HostT]):
     """Arms and disarms. Runs the arming checks once a second and reports failures every 30 s while disarmed.
 
-    `common_reasons` has the checks of all firmwares. New failures of these checks are reported at once. A subclass adds
-    its own checks in `own_reasons` and `final_reasons`.
+    `common_reasons` contains the checks of all firmwares. A new failure of these checks is reported at once. A subclass
+    adds its own checks in `own_reasons` and `final_reasons`.
     """
 
     ARMED_TEXT: ClassVar[str] = "Throttle armed"
@@ -179,7 +180,7 @@ class ArduPilotArming(Generic[HostT]):
 
     def __init__(self, vehicle: HostT) -> None:
         self.vehicle = vehicle
-        self.passes: bool = False  # True if SYS_STATUS reports healthy pre-arm checks.
+        self.passes: bool = False  # True if the last pre-arm checks have passed, as SYS_STATUS reports.
         self._reported_at = -math.inf
         self._passed_common = self._has_new_failure = False
         self._was_always_armed = False
@@ -204,7 +205,7 @@ class ArduPilotArming(Generic[HostT]):
         return [*self.common_reasons(), *self.own_reasons()]
 
     def common_reasons(self) -> list[str]:
-        """Run the checks that all firmwares have, in the order of the firmwares."""
+        """Return the failures of the checks that all firmwares have, in the order of the firmware."""
         vehicle, check = self.vehicle, ArmingCheck
         reasons = list(vehicle.faults.prearm_failures)
         if vehicle.calibrations.is_compass_running:
@@ -214,7 +215,7 @@ class ArduPilotArming(Generic[HostT]):
         reasons += self.position_reasons()
         if self.is_checked(check.BATTERY):
             reasons += _listed(vehicle.failsafes.battery.reason_not_to_arm())
-        if self.is_checked(check.RC) and vehicle.failsafes.radio:
+        if self.is_checked(check.RC) and vehicle.failsafes.is_radio_lost:
             reasons.append("Radio failsafe on")
         if self.is_checked(check.MISSION) and vehicle.mode.needs_mission and not vehicle.mission.is_present:
             reasons.append("Mode requires mission")
@@ -228,7 +229,7 @@ class ArduPilotArming(Generic[HostT]):
         return []
 
     def final_reasons(self) -> list[str]:
-        """Return the failures of the checks that only a request to arm runs: here, whether the sticks are centred."""
+        """Return the failures of the checks that run only on a request to arm: the sticks must be centred."""
         options = int(self.vehicle.parameters["RC_OPTIONS"])
         if not self.is_checked(ArmingCheck.RC) or not self.vehicle.rc.is_receiving:
             return []
@@ -243,7 +244,7 @@ class ArduPilotArming(Generic[HostT]):
         return abs(self.vehicle.rc[number - 1] - middle) > dead_zone
 
     def ahrs_reasons(self) -> Sequence[str]:
-        """Check the estimator."""
+        """Return the failures of the estimator checks."""
         nav = self.vehicle.navigation
         if nav.flags is None:
             return ("AHRS: EKF3 not started",)
@@ -252,14 +253,14 @@ class ArduPilotArming(Generic[HostT]):
         return () if nav.is_healthy else ("AHRS: Not healthy",)
 
     def gps_reasons(self) -> Sequence[str]:
-        """Check the GPS receiver and home."""
+        """Return the failures of the checks of the GPS receiver and of home."""
         nav = self.vehicle.navigation
         if nav.fix_type < GpsFixType.TYPE_3D_FIX and not (nav.uses_external and not nav.is_gps_detected):
             return ("GPS 1: Bad fix" if nav.is_gps_detected else "GPS 1: not healthy",)
         return () if nav.home is not None else ("AHRS: waiting for home",)
 
     def position_reasons(self) -> Sequence[str]:
-        """Check the position. In the base class every mode needs GPS."""
+        """Return the failures of the position checks. In the base class every mode needs GPS."""
         return self.gps_reasons() if self.is_checked(ArmingCheck.GPS) else ()
 
     def _check(self) -> None:
@@ -303,7 +304,7 @@ class ArduPilotArming(Generic[HostT]):
             vehicle.set_ticking(True)
 
     def arm(self, *, force: bool = False) -> bool:
-        """Arm and return True, or report the failing checks."""
+        """Arm and return True. If checks fail, report the failures and return False."""
         vehicle = self.vehicle
         reasons = self.mandatory_reasons() if force else self.reasons()
         if not reasons and not force and not self.checks_nothing:
@@ -316,12 +317,12 @@ class ArduPilotArming(Generic[HostT]):
         if self.checks_nothing and not force:
             vehicle.send_text(MavSeverity.WARNING, "Warning: Arming Checks Disabled")
         vehicle.fence.on_armed()
-        # Home moves to the place of arming, unless a command has set it.
+        # Arming moves home to the vehicle, unless a command has set home.
         if vehicle.navigation.home is not None and not vehicle.navigation.home_is_locked:
             vehicle.navigation.set_home(vehicle.motion.place, lock=False)
         vehicle.info(self.ARMED_TEXT)
         vehicle.motors.set_armed(True, vehicle.now)
-        vehicle.mode.enter(force=False)  # The mode begins anew, because it was entered while disarmed.
+        vehicle.mode.enter(force=False)  # again, because the mode was entered while disarmed
         vehicle.set_ticking(True)
         self.on_armed()
         return True
@@ -330,7 +331,7 @@ class ArduPilotArming(Generic[HostT]):
         """Called after arming."""
 
     def disarm(self, *, force: bool = True) -> bool:
-        """Stop the motors and return True; without ``force`` return False in the air."""
+        """Stop the motors and return True. Without ``force``, a vehicle in the air stays armed (False)."""
         vehicle = self.vehicle
         if not vehicle.motors.is_armed:
             return True

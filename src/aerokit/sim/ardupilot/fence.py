@@ -47,7 +47,7 @@ class FenceZones:
                     corners = []
 
     def __bool__(self) -> bool:
-        """Return True if there is a zone; a return point does not count."""
+        """Return True if there is at least one zone. A return point is not a zone."""
         return bool(self._inclusions or self._exclusions)
 
     @property
@@ -56,7 +56,10 @@ class FenceZones:
         return min((zone.radius for zone in self._inclusions if isinstance(zone, CircleZone)), default=math.inf)
 
     def breach_m(self, place: Point, *, union: bool = False) -> float:
-        """Return metres beyond the border; negative within. With ``union``, being in one inclusion zone suffices."""
+        """Return the metres beyond the border, which are negative inside the allowed area.
+
+        With ``union``, the allowed area is the union of the inclusion zones, otherwise their intersection.
+        """
         out_of_inclusions = [zone.outside_m(place) for zone in self._inclusions]
         into_exclusions = [-zone.outside_m(place) for zone in self._exclusions]
         if union and out_of_inclusions:
@@ -86,14 +89,14 @@ class PolygonZone:
         """Return the distance from the border in metres; negative inside."""
         distance = min(_distance_to_side(place, start, end) for start, end in self._sides)
         crossings = sum(_crosses(place, start, end) for start, end in self._sides)
-        is_inside = crossings % 2 == 1  # A ray from inside crosses the border an odd number of times.
+        is_inside = crossings % 2 == 1  # A ray from a point inside crosses the border an odd number of times.
         return -distance if is_inside else distance
 
 
 def _distance_to_side(place: Point, start: Point, end: Point) -> float:
     north, east = end[0] - start[0], end[1] - start[1]
     squared_length = north * north + east * east
-    share = 0.0  # Part of the side before the point that is nearest to the place.
+    share = 0.0  # Point of the side that is nearest to the place: 0 is the start, 1 the end.
     if squared_length > 0.0:
         projection = ((place[0] - start[0]) * north + (place[1] - start[1]) * east) / squared_length
         share = min(1.0, max(0.0, projection))
@@ -113,7 +116,7 @@ _MAX_ALT, _CIRCLE = int(FenceType.ALT_MAX), int(FenceType.CIRCLE)
 _POLYGON, _MIN_ALT = int(FenceType.POLYGON), int(FenceType.ALT_MIN)
 _NAMES = {_MAX_ALT: "Max Alt", _CIRCLE: "Circle", _POLYGON: "Polygon", _MIN_ALT: "Min Alt"}
 _ALL = _MAX_ALT | _CIRCLE | _POLYGON | _MIN_ALT
-# A breach counts as new again when the vehicle is this much farther outside.
+# A breach counts as a new breach once the vehicle has moved this many metres farther outside.
 _BACKUP_M = 20.0
 _RECOVERY_S = 10.0
 _STATUS_INTERVAL_S = 1.0
@@ -122,35 +125,35 @@ _WHEN_ARMED = 3
 _DEFAULTS = {"FENCE_ALT_MAX": 100.0, "FENCE_ALT_MIN": -10.0, "FENCE_AUTOENABLE": 0.0}
 
 REPORT_ONLY = 0
-"""FENCE_ACTION that only reports, on every kind of vehicle."""
+"""Value of FENCE_ACTION that only reports a breach, on every kind of vehicle."""
 
 
 class ArduPilotFence(Generic[HostT]):
-    """Checks height, distance from home and the uploaded zones; `update` is called 10 times a second.
+    """Checks the height, the distance from home and the uploaded zones. `update` is called ten times a second.
 
-    FENCE_STATUS reports a breach; a subclass adds the reaction of its firmware in `act`. This class itself is the fence
-    of ArduSub, which does nothing but report breaches while armed. Braking before the fence (AVOID_ENABLE) is not
-    simulated.
+    FENCE_STATUS reports a breach. In `act`, a subclass adds the reaction of its firmware. This class itself is the
+    fence of ArduSub, which only reports breaches while armed. Braking before the fence (AVOID_ENABLE) is not simulated.
     """
 
     PERIOD_S: ClassVar[float] = 1.0 / 3.0
     """Minimum interval between two checks."""
     CIRCLE_BACKUP_M: ClassVar[float] = 20.0
-    """Metres by which a breach of the circle must grow to count as new again."""
+    """Metres by which a breach of the circle must grow to count as a new breach."""
     CHECKS_DISARMED: ClassVar[bool] = False
     MITIGATION: ClassVar[int] = FenceMitigate.UNKNOWN
-    """FENCE_MITIGATE in FENCE_STATUS; UNKNOWN for firmwares without AVOID_ENABLE."""
+    """FENCE_MITIGATE that FENCE_STATUS reports; UNKNOWN for firmwares without AVOID_ENABLE."""
 
     def __init__(self, vehicle: HostT) -> None:
         self.vehicle = vehicle
-        self.enabled: int = 0  # Enabled kinds (bits of FENCE_TYPE), configured or not.
-        self.breached: int = 0  # Kinds that are breached now.
+        self.enabled: int = 0  # Enabled kinds of fences (bits of FENCE_TYPE), even if not configured.
+        self.breached: int = 0  # Kinds of fences that are breached at present.
         self.breach_count: int = 0
         self.breach_time_ms: int = 0  # Start of the latest breach, in milliseconds since boot.
         self.caused_mode: bool = False  # True while the present mode is the result of FENCE_ACTION.
-        self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE, as followed last.
-        self._new_breach_m: dict[int, float] = {}  # Metres beyond a breached limit that count as a new breach.
-        self._floor_enabled_by_command: bool | None = None  # The lower limit as a command enabled or disabled it.
+        self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE when they were read last.
+        self._new_breach_m: dict[int, float] = {}  # Metres beyond a breached limit, by kind, that are a new breach.
+        # True or False if the last command about the lower limit enabled or disabled it; None without a command.
+        self._floor_enabled_by_command: bool | None = None
         self._recovering_since = -math.inf
         self._reported_at = self._checked_at = -math.inf
         self._zones = FenceZones((), vehicle.frame)
@@ -158,12 +161,12 @@ class ArduPilotFence(Generic[HostT]):
 
     @property
     def configured(self) -> int:
-        """FENCE_TYPE."""
+        """Kinds of fences in FENCE_TYPE, as a bit mask."""
         return int(self.vehicle.parameters["FENCE_TYPE"]) & _ALL
 
     @property
     def present(self) -> int:
-        """Configured kinds of fences; polygons only if zones are uploaded."""
+        """Configured kinds of fences that exist: polygons exist once zones are uploaded."""
         return self.configured if self.zones else self.configured & ~_POLYGON
 
     @property
@@ -180,15 +183,15 @@ class ArduPilotFence(Generic[HostT]):
 
     @property
     def health(self) -> tuple[bool, bool, bool]:
-        """The fence's bits in SYS_STATUS: present, enabled, healthy."""
+        """The three bits of the fence in SYS_STATUS: present, enabled and healthy."""
         present = self.present != 0
         enforced = present and self.enabled != 0 and self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY
         return present, enforced, not (present and self.breached)
 
     def enable(self, on: bool, kinds: int = _ALL, *, by_command: bool = True) -> int:
-        """Enable (``on``) or disable kinds of fences that are configured; return the kinds that changed.
+        """Enable (``on``) or disable those of ``kinds`` that are configured. Return the kinds that changed.
 
-        ``by_command`` is False if the firmware does it, which a later command can override.
+        ``by_command`` is True for a command of a client, and False for an automatic change of the firmware.
         """
         kinds &= self.configured
         if by_command and kinds & _MIN_ALT:
@@ -202,7 +205,7 @@ class ArduPilotFence(Generic[HostT]):
         return previous ^ self.enabled
 
     def command(self, command: ReceivedCommand) -> int:
-        """Execute DO_FENCE_ENABLE: param 1 is 0 to disable, 1 to enable, 2 to disable the lower limit only."""
+        """Execute DO_FENCE_ENABLE. Param 1 is 0 to disable, 1 to enable, and 2 to disable only the lower limit."""
         kinds = whole(command.param2) or _ALL
         if command.param1 == 1.0:
             if not self.present & kinds:
@@ -251,7 +254,7 @@ class ArduPilotFence(Generic[HostT]):
             self.act(new_breaches)
 
     def _check(self) -> int:
-        """Compare the position with all active limits; return the kinds with a new breach."""
+        """Compare the position with all active limits, and return the kinds of fences with a new breach."""
         vehicle = self.vehicle
         may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed
         if may_be_low and self._floor_enabled_by_command is not True and self.enabled & _MIN_ALT:
@@ -261,22 +264,27 @@ class ArduPilotFence(Generic[HostT]):
             if self.active & kind and self._update_breach(kind, beyond_m):
                 new_breaches |= kind
         if not may_be_low:
-            self._raise_floor()
+            self._enable_floor_above()
         return new_breaches
 
     def _update_breach(self, kind: int, beyond_m: float) -> bool:
-        """Record the state of a limit; return True for a new breach. One that grows by the backup distance is new."""
-        if beyond_m < 0.0 or (kind == _POLYGON and beyond_m == 0.0):
+        """Record whether a limit is breached. Return True for a new breach.
+
+        A breach of a circle or an altitude limit that has grown by the backup distance counts as new.
+        """
+        is_inside = beyond_m < 0.0 or (kind == _POLYGON and beyond_m == 0.0)
+        if is_inside:
             self._clear(kind)
             return False
-        if self.breached & kind and (kind == _POLYGON or beyond_m < self._new_breach_m.get(kind, math.inf)):
+        has_grown = kind != _POLYGON and beyond_m >= self._new_breach_m.get(kind, math.inf)
+        if self.breached & kind and not has_grown:
             return False
-        self._record(kind)
+        self._record_breach(kind)
         self._new_breach_m[kind] = beyond_m + (self.CIRCLE_BACKUP_M if kind == _CIRCLE else _BACKUP_M)
         return True
 
     def _beyond(self, place: Ned) -> dict[int, float]:
-        """Return metres beyond each limit by kind; negative within."""
+        """Return the distance in metres beyond the limit of each kind; negative values are within the limit."""
         parameters = self.vehicle.parameters
         home = self.vehicle.navigation.home or (0.0, 0.0, 0.0)
         height = home[2] - place[2]
@@ -288,11 +296,11 @@ class ArduPilotFence(Generic[HostT]):
             _POLYGON: self.zones.breach_m(place[:2], union=union),
         }
 
-    def _raise_floor(self) -> None:
-        """Enable the lower limit once the vehicle is above it by FENCE_MARGIN."""
+    def _enable_floor_above(self) -> None:
+        """Enable the lower limit once the vehicle is FENCE_MARGIN metres above the limit."""
         enable, auto_enable = self._enabling_parameters
-        is_enabled_in_flight = self.configured & _MIN_ALT and (enable or auto_enable > 1)
-        if not is_enabled_in_flight or self._floor_enabled_by_command is False or self.active & _MIN_ALT:
+        enables_floor = self.configured & _MIN_ALT and (enable or auto_enable > 1)
+        if not enables_floor or self._floor_enabled_by_command is False or self.active & _MIN_ALT:
             return
         floor = self._value("FENCE_ALT_MIN") + self.vehicle.parameters["FENCE_MARGIN"]
         if self.vehicle.altitude_m >= floor:
@@ -302,7 +310,7 @@ class ArduPilotFence(Generic[HostT]):
     def contains(self, place: Ned) -> bool:
         return not any(self.active & kind and beyond > 0.0 for kind, beyond in self._beyond(place).items())
 
-    def _record(self, kind: int) -> None:
+    def _record_breach(self, kind: int) -> None:
         vehicle = self.vehicle
         self.breach_count += 1
         is_first = not self.breached
@@ -329,7 +337,7 @@ class ArduPilotFence(Generic[HostT]):
         """Called when the last breach has ended."""
 
     def refusal(self, mode: ArduPilotMode) -> tuple[int, str] | None:
-        """Return severity and text of the refusal if the fence forbids the mode, else None."""
+        """Return the severity and the text of the refusal if the fence forbids the mode, otherwise None."""
         return None
 
     def on_mode_changed(self) -> None:
@@ -347,7 +355,7 @@ class ArduPilotFence(Generic[HostT]):
         return bool(forbidden and self.enabled and self.breached and self.caused_mode)
 
     def recover_by_hand(self) -> None:
-        """Suspend reactions for ten seconds because the mode was changed during a breach."""
+        """Do not react to breaches for ten seconds, because the mode was changed during a breach."""
         if self.breached:
             self._recovering_since = self.vehicle.now
             self.vehicle.info("Manual recovery started")
@@ -356,12 +364,12 @@ class ArduPilotFence(Generic[HostT]):
         return self.vehicle.parameters.get(name, _DEFAULTS[name])
 
     def report(self, event: str, kinds: int) -> None:
-        """Send a text with the kinds and the event, unless ``kinds`` is 0."""
+        """Send a text with the names of the kinds and the event. Send nothing if ``kinds`` is 0."""
         if kinds:
             self.vehicle.send_text(MavSeverity.NOTICE, f"{_joined_names(kinds)} {event}")
 
     def reason_not_to_arm(self) -> str | None:
-        """Return the text of the failing arming check, if any."""
+        """Return the text of the first failing arming check, or None."""
         self._follow_parameters()
         if self.vehicle.parameters["FENCE_ENABLE"] and not self.present:
             return "Fences enabled, but none selected"
@@ -372,7 +380,7 @@ class ArduPilotFence(Generic[HostT]):
         return next((text for failed, text in self._arming_checks() if failed), None)
 
     def _arming_checks(self) -> tuple[tuple[bool, str], ...]:
-        """Return for each check, in the order of the firmware, whether it fails, and its text."""
+        """Return the arming checks in the order of the firmware, each as (True if it fails, text)."""
         parameters = self.vehicle.parameters
         radius, margin = parameters["FENCE_RADIUS"], parameters["FENCE_MARGIN"]
         high, low = self._value("FENCE_ALT_MAX"), self._value("FENCE_ALT_MIN")
@@ -406,7 +414,7 @@ class ArduPilotFence(Generic[HostT]):
 
 
 def _joined_names(kinds: int) -> str:
-    """Join names of fences like the firmware: Max Alt, Circle and Polygon fences."""
+    """Join the names of fences as the firmware does, for example "Max Alt, Circle and Polygon fences"."""
     words = [name for kind, name in _NAMES.items() if kinds & kind]
     if len(words) == 1:
         return f"{words[0]} fence"

@@ -28,12 +28,12 @@ _WITHOUT_DATA = (Op.NONE, Op.CREATEFILE, Op.OPENFILEWO, Op.WRITEFILE)
 class ArduPilotFtp(SessionFtpServer[FileTree]):
     """MAVFTP with the limits of the firmware (GCS_FTP.cpp).
 
-    A worker processes the queue every 2 ms. The queue holds five requests; further requests are lost, also during a
-    burst. A burst cannot be stopped. The answer to a repeated sequence number is the last reply.
+    A worker processes the queue every 2 ms, except during a burst, which cannot be stopped. The queue has space for
+    five requests. Further requests are lost. A request that repeats the last sequence number gets the last reply again.
 
-    The client chooses the session number. A session with an open file blocks other sessions until its client closes
-    it, or has sent nothing for 3 s. A close is always acknowledged, even if writing failed. `Faults.no_ftp` turns the
-    server off.
+    The client chooses the session number. A session with an open file blocks other sessions until the file is closed,
+    or until its client has sent nothing for 3 s. A close is always acknowledged, even if writing failed.
+    `Faults.no_ftp` turns the server off.
     """
 
     max_sessions: ClassVar[int] = 1
@@ -54,11 +54,11 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         super().restart()
         self._queue: deque[tuple[FtpPacket, Channel]] = deque()
         self._is_worker_scheduled = self._is_bursting = self._is_banner_due = False
-        self._sent_at = float("-inf")  # Time of the last reply; infinitely long ago after a session was closed.
+        self._sent_at = float("-inf")  # Time of the last reply; minus infinity after a session was closed.
 
     @property
     def open_sessions(self) -> int:
-        """1 while an open file blocks other sessions, else 0."""
+        """Number of open sessions: 1 while an open file blocks other sessions, otherwise 0."""
         return 0 if self._is_idle() else super().open_sessions
 
     def _is_idle(self) -> bool:
@@ -72,7 +72,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             self._host.call_later(_WORKER_PERIOD_S, self._work)
 
     def _work(self) -> None:
-        """Process the queue. A burst continues by its own timer, and calls this method when it ends."""
+        """Process the queued requests. A burst interrupts this. The end of the burst calls this method again."""
         while self._queue and not self._is_bursting:
             request, channel = self._queue.popleft()
             peer = self._peer(request, channel)
@@ -84,7 +84,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._is_worker_scheduled = self._is_bursting
 
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
-        return None  # All clients share one state.
+        return None  # Like the firmware, use a single state for all clients.
 
     def _is_repeated(self, peer: FtpPeer, request: FtpPacket, last: FtpPacket) -> bool:
         is_same_session = request.client == last.client and request.session == last.session
@@ -94,10 +94,10 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return request.session
 
     def _watch(self, peer: FtpPeer, session: FtpSession) -> None:
-        """Close nothing: an idle session ends when another request needs it."""
+        """Do nothing. The firmware closes an idle session only when another client needs the session."""
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
-        """Refuse requests of another session while one has an open file, unless that session is idle."""
+        """Refuse a request while another session has an open file. If that session is idle, close it instead."""
         is_close = request.opcode in (Op.TERMINATESESSION, Op.RESETSESSION)
         if peer.sessions and request.session not in peer.sessions and not is_close:
             if not self._is_idle():
@@ -125,7 +125,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
 
     def _fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
         is_opening = request.opcode in (Op.OPENFILERO, Op.OPENFILEWO, Op.CREATEFILE)
-        # The firmware reports a folder as a missing file.
+        # If a folder is opened as a file, the firmware reports a missing file.
         errno = ENOENT if is_opening and fault.errno == EISDIR else fault.errno
         return request.refuse_errno(errno)
 
@@ -134,7 +134,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return request.refuse(MavFtpErr.FAIL)
 
     def _path(self, request: FtpPacket) -> str:
-        """Return the path; the request's size must be its length, with or without the final NUL."""
+        """Return the path in the request, whose size must be that of the path, with or without the final NUL."""
         length = len(request.data.partition(b"\0")[0])
         if request.size == 0 or request.size - length not in (0, 1):
             raise Refused(MavFtpErr.INVALIDDATASIZE)
@@ -149,7 +149,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return session
 
     def _close_all(self, peer: FtpPeer) -> None:
-        with suppress(FileFault):  # The firmware does not report the error.
+        with suppress(FileFault):  # The firmware does not report an error of a close.
             super()._close_all(peer)
 
     def _terminate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
@@ -180,7 +180,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._send_next(peer, session, request, 0)
 
     def _send_next(self, peer: FtpPeer, session: FtpSession, request: FtpPacket, number: int) -> None:
-        """Send the block with this number and schedule the next. No other request is processed until the burst ends."""
+        """Send a block of a burst, and schedule the next block. Other requests wait until the end of the burst."""
         block_size = request.size or DATA_SIZE
         offset, sequence = request.offset + number * block_size, (request.sequence + 1 + number) & 0xFFFF
         refusal = request.refuse(MavFtpErr.EOF)
@@ -189,7 +189,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         except FileFault as fault:
             data, refusal = b"", request.refuse_errno(fault.errno)
         if not data:
-            # The refusal has the offset and the flag of the block before it.
+            # The firmware sends the refusal with the offset and the flag burst_complete of the previous block.
             previous = peer.reply if number and peer.reply is not None else refusal
             end = refusal.replace(sequence=sequence, offset=previous.offset, burst_complete=previous.burst_complete)
             self._reply(peer, end)
@@ -199,7 +199,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         block = request.acknowledge(data, offset=offset)
         block = block.replace(sequence=sequence, burst_complete=is_short or is_last)
         self._reply(peer, block)
-        # The firmware has already advanced its last reply when it repeats this reply or refuses to read on.
+        # The firmware has already advanced its stored reply to the next block when it repeats this reply, or when it
+        # refuses to read on.
         next_offset = offset + len(data) if is_short else offset
         peer.reply = block.replace(sequence=(sequence + 1) & 0xFFFF, offset=next_offset)
         next_step = self._end_burst if is_last else partial(self._send_next, peer, session, request, number + 1)
@@ -210,7 +211,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._work()
 
     def _entries(self, path: str) -> list[Entry]:
-        """List a folder with `.` and `..`, like Linux; the root folder also contains the listed mounts."""
+        """Return the entries of a folder with `.` and `..`, as Linux lists them. The root also contains the mounts."""
         entries = super()._entries(path)
         if self.files.mounted(path) is not None:
             return entries
@@ -226,7 +227,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return self._change(request, self._remove_either)
 
     def _remove_either(self, path: str) -> None:
-        # In the firmware RemoveFile and RemoveDirectory are the same operation.
+        # In the firmware, RemoveFile also removes folders, and RemoveDirectory also removes files.
         try:
             self.files.remove_folder(path)
         except FileFault:
@@ -243,6 +244,6 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             raise Refused(MavFtpErr.INVALIDDATASIZE)
         old_path, new_path = path_in(old_name), path_in(new_name)
         if self.files.mounted(old_path) is not None or self.files.mounted(new_path) is not None:
-            raise FileFault(ENOENT)
+            raise FileFault(ENOENT)  # Virtual files, such as those of @PARAM, cannot be renamed.
         self.files.rename(old_path, new_path)
         return request.acknowledge()

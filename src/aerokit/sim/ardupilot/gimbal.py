@@ -26,7 +26,7 @@ from aerokit.sim.motion import Ned, quaternion_from_euler
 from aerokit.sim.vehicle import sender_of
 
 _DEVICE_ID = 1
-# Special system ids of DO_GIMBAL_MANAGER_CONFIGURE.
+# Values of the system id in DO_GIMBAL_MANAGER_CONFIGURE with a special meaning.
 _KEEP_CONTROL, _TAKE_CONTROL, _RELEASE_CONTROL = -1, -2, -3
 _Can = GimbalManagerCapFlags
 _CAPABILITIES = (
@@ -55,7 +55,7 @@ _FIXED_ANGLE_MODES = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
 
 @dataclass(frozen=True)
 class MountTarget:
-    """Target angles in degrees at the time ``since``; later, ``rates`` (degrees per second) change them."""
+    """Target angles in degrees at the time ``since``. From then on, ``rates`` (degrees per second) change them."""
 
     roll: float = 0.0
     pitch: float = 0.0
@@ -66,13 +66,13 @@ class MountTarget:
 
 
 class ArduPilotGimbal:
-    """Mode, target and control of the gimbal; :attr:`angles` is its direction."""
+    """The gimbal: its mode, its target and the component in control. :attr:`angles` is the direction of the gimbal."""
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
-        self.mode: int = int(self.setting("MNT1_DEFLT_MODE"))  # MAV_MOUNT_MODE.
+        self.mode: int = int(self.setting("MNT1_DEFLT_MODE"))  # A MAV_MOUNT_MODE.
         self.is_yaw_locked: bool = False  # True if the pilot's stick controls yaw relative to north.
-        self.in_control: tuple[int, int] = (0, 0)  # System and component id in control.
+        self.in_control: tuple[int, int] = (0, 0)  # System id and component id that control the gimbal.
         self._target = MountTarget()
         self._region: Ned | None = None
         self._followed_id = 0
@@ -90,12 +90,12 @@ class ArduPilotGimbal:
 
     @property
     def angles(self) -> tuple[float, float, float]:
-        """Roll, pitch and yaw (from the nose) of the servos in degrees."""
+        """Roll, pitch and yaw of the servos in degrees. Yaw is relative to the nose."""
         if self.mode in _FIXED_ANGLE_MODES:
             return (self.target.roll, self.target.pitch, self.target.yaw)
         target, motion = self.target, self._vehicle.motion
         yaw = self._limited("YAW", self._from_nose(target))
-        # The servos compensate the lean of the vehicle, rotated by the yaw of the gimbal.
+        # The servos compensate the roll and pitch of the vehicle, rotated into the direction of the gimbal's yaw.
         lean_roll, lean_pitch = math.degrees(motion.roll), math.degrees(motion.pitch)
         cos, sin = math.cos(math.radians(-yaw)), math.sin(math.radians(-yaw))
         roll = target.roll - (lean_roll * cos - lean_pitch * sin)
@@ -104,7 +104,7 @@ class ArduPilotGimbal:
 
     @property
     def target(self) -> MountTarget:
-        if self.mode == MavMountMode.RC_TARGETING:  # The sticks of the gimbal are not simulated; they rest centred.
+        if self.mode == MavMountMode.RC_TARGETING:  # The gimbal's sticks always rest in the middle.
             return MountTarget(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
         if self.mode in _FIXED_ANGLE_MODES:
             mode_name = MavMountMode(self.mode).name
@@ -129,7 +129,7 @@ class ArduPilotGimbal:
         return replace(target, roll=roll, pitch=pitch, yaw=yaw)
 
     def _angles_to(self, place: Ned | None) -> MountTarget:
-        """Return the angles to a position; the last ones if ``place`` or the vehicle's position is unknown."""
+        """Return the angles to a place. If the place or the vehicle's position is unknown, keep the last target."""
         motion = self._vehicle.motion
         if place is not None and self._vehicle.navigation.has_position:
             north, east, down = place[0] - motion.north, place[1] - motion.east, place[2] - motion.down
@@ -149,20 +149,20 @@ class ArduPilotGimbal:
         return (self.setting(f"MNT1_{axis}_MIN") + self.setting(f"MNT1_{axis}_MAX")) / 2.0
 
     def set_mode(self, mode: int) -> None:
-        """Set a MAV_MOUNT_MODE; unknown values are ignored."""
+        """Set a MAV_MOUNT_MODE. Unknown values are ignored."""
         if mode in list(MavMountMode):
             self._target = self.target
             self.mode = mode
 
     def point(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
-        """Turn to these angles in degrees, within the limits."""
+        """Turn to these angles in degrees. The limits of the gimbal apply."""
         if not from_north:
             yaw = self._limited("YAW", yaw - 360.0 if yaw > 180.0 else yaw)
         self._target = MountTarget(self._limited("ROLL", roll), self._limited("PITCH", pitch), yaw, from_north)
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def turn(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
-        """Turn at these rates in degrees per second from the current direction."""
+        """Turn at these rates in degrees per second, starting at the current direction."""
         current = self.target
         current_yaw = self._from_nose(current)
         if from_north and current.is_from_north:
@@ -174,7 +174,7 @@ class ArduPilotGimbal:
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def look_at(self, place: Ned | None) -> None:
-        """Point at a position; None returns to the default mode."""
+        """Point at a place. None returns to the default mode."""
         self._region = place
         if place is not None:
             self.set_mode(MavMountMode.GPS_POINT)
@@ -182,7 +182,7 @@ class ArduPilotGimbal:
             self.set_mode(int(self.setting("MNT1_DEFLT_MODE")))
 
     def follow(self, system_id: int) -> None:
-        """Point at another vehicle once its position is received."""
+        """Point at another vehicle as soon as a position of that vehicle is received."""
         self._followed_id, self._followed_place = system_id, None
         self.set_mode(MavMountMode.SYSID_TARGET)
 
@@ -192,7 +192,7 @@ class ArduPilotGimbal:
             self._followed_place = self._followed_place if place is None else place
 
     def set_control(self, sender: tuple[int, int], system: int, component: int) -> bool:
-        """Handle MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE; return False for invalid ids."""
+        """Handle MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Return False for invalid ids."""
         if not (-3 <= system <= 255 and -3 <= component <= 255):
             return False
         previous = self.in_control
@@ -212,7 +212,7 @@ class ArduPilotGimbal:
             self._vehicle.send(status)
 
     def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
-        """Apply GIMBAL_MANAGER_FLAGS with angles or rates: roll, pitch, yaw; NaN means none. Return a MAV_RESULT."""
+        """Apply GIMBAL_MANAGER_FLAGS with angles or rates, which are NaN if not given. Return the MAV_RESULT."""
         from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
         if flags & GimbalManagerFlags.RETRACT:
             self.set_mode(MavMountMode.RETRACT)
@@ -222,14 +222,14 @@ class ArduPilotGimbal:
             self.point(*angles, from_north=from_north)
         elif not any(map(math.isnan, rates)):
             self.turn(*rates, from_north=from_north)
-        elif all(map(math.isnan, (*angles[1:], *rates[1:]))):  # no pitch and yaw: a client changes only the lock
+        elif all(map(math.isnan, (*angles[1:], *rates[1:]))):  # Without pitch and yaw, the client changes the lock.
             self.is_yaw_locked = from_north
         else:
             return MavResult.FAILED
         return MavResult.ACCEPTED
 
     def warn(self) -> None:
-        """Send the text about invalid angles. A client that sends hundredths of a degree causes this text."""
+        """Send the text about invalid angles, for example to a client that sends hundredths of a degree."""
         self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
@@ -237,16 +237,16 @@ class ArduPilotGimbal:
             return None
         roll, pitch, yaw = map(math.radians, self.angles)
         return m.GimbalDeviceAttitudeStatus(
-            0,  # target system and component: broadcast
+            0,  # target_system and target_component 0: broadcast
             0,
             self._vehicle.time_boot_ms,
             _device_flags(self),
             quaternion_from_euler(roll, pitch, yaw),
-            math.nan,  # angular velocities
+            math.nan,  # three unknown angular velocities
             math.nan,
             math.nan,
-            0,  # failure flags
-            math.nan,  # yaw and yaw rate of the vehicle
+            0,  # no failure flags
+            math.nan,  # unknown yaw and yaw rate of the vehicle
             math.nan,
             _DEVICE_ID,
         )
@@ -272,7 +272,7 @@ class ArduPilotGimbal:
 
 
 def _device_flags(gimbal: ArduPilotGimbal) -> int:
-    """Return GIMBAL_DEVICE_FLAGS; yaw is reported relative to the nose, even if it is locked to north."""
+    """Return GIMBAL_DEVICE_FLAGS. They say that yaw is relative to the nose, even if it is locked to north."""
     flags = GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
     if gimbal.mode == MavMountMode.RETRACT:
         flags |= GimbalDeviceFlags.RETRACT

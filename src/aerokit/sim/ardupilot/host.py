@@ -25,7 +25,7 @@ HostT = TypeVar("HostT", bound="ArduPilotHost")
 
 
 class ArduPilotMode:
-    """A flight mode. By default optional operations are refused or do nothing."""
+    """Base of the flight modes. Optional operations do nothing or are refused, unless a subclass overrides them."""
 
     number: int
     name: str
@@ -36,7 +36,7 @@ class ArduPilotMode:
     arms_with_raised_throttle: bool = False
     can_change_speed: bool = False
     refused_because: str = "init failed"
-    """Reason reported when `enter` returns False."""
+    """Reason that a status text gives when `enter` returns False."""
     returns_on_path: bool = False
     """True for SMART_RTL, which returns along the recorded path."""
     notices_landing: bool = True
@@ -46,14 +46,14 @@ class ArduPilotMode:
     is_available: bool = True
     """False for a mode that the simulation always refuses."""
     entry_texts: tuple[str, ...] = ()
-    """Texts sent with `entry_severity` when the mode is entered or refused."""
+    """Status texts that are sent when the mode is entered or refused, with the severity `entry_severity`."""
     entry_severity: int = MavSeverity.INFO
 
     def __init__(self, vehicle: Any) -> None:
         self.vehicle = vehicle
 
     def enter(self, *, force: bool) -> bool:
-        """Start the mode; return False to refuse. ``force`` is True while the vehicle is disarmed."""
+        """Start the mode, or return False to refuse the mode. ``force`` is True while the vehicle is disarmed."""
         for text in self.entry_texts:
             self.vehicle.send_text(self.entry_severity, text)
         return self.is_available
@@ -65,18 +65,18 @@ class ArduPilotMode:
         """Set the targets of motors and motion for the next ``dt`` seconds."""
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        """Climb to an altitude above home; return False if the mode does not support commanded take-off."""
+        """Climb to an altitude above home. Return False if the mode does not support take-off by command."""
         return False
 
     def pause(self) -> bool:
-        """Stop at the current place; return False if the mode cannot be paused now."""
+        """Stop at the current place. Return False if the mode cannot be paused at present."""
         return False
 
     def resume(self) -> bool:
         return False
 
     def go_to(self, position: Ned) -> None:
-        """Go to a point of the world frame and stay there; only the guided mode implements this method."""
+        """Go to a point of the world frame and stay there. Only the guided mode implements this method."""
         raise NotImplementedError
 
     @property
@@ -87,7 +87,7 @@ class ArduPilotMode:
 def variant(
     make_mode: Callable[[HostT], ArduPilotMode], number: int, name: str, **traits: Any
 ) -> Callable[[HostT], ArduPilotMode]:
-    """Return a factory of a mode like that of ``make_mode``, with another number and name, and these attributes."""
+    """Return a function that makes a variant of a mode: with another number and name, and the attributes ``traits``."""
 
     def make_variant(host: HostT) -> ArduPilotMode:
         mode = make_mode(host)
@@ -107,7 +107,10 @@ class ConditionTimer:
         self._since: float | None = None
 
     def seconds(self, condition: bool, now: float) -> float:
-        """Return seconds since the condition became true; 0 at the first call and while the condition is false."""
+        """Return the seconds since the condition became true, or 0 while the condition is false.
+
+        A condition becomes true at the first call with ``condition`` True, which returns 0.
+        """
         if not condition:
             self._since = None
         elif self._since is None:
@@ -121,7 +124,7 @@ class ConditionTimer:
 _ARMING_DELAY_S = 2.0
 _SPOOL_UP_S = 1.3
 _SPOOL_DOWN_S = 1.1
-_HOVER_THROTTLE = 0.36
+_HOVER_THROTTLE, _IDLE_THROTTLE = 0.36, 0.05
 _AMPERES_AT_FULL = 78.0
 _STOPPED_PWM, _IDLE_PWM, _FULL_PWM = 1000, 1100, 2000
 
@@ -140,7 +143,7 @@ class ArduPilotMotors:
         self.may_turn: bool = False  # True once the arming delay is over.
         self.spool_up_requested: bool = False
         self.spool: float = 0.0
-        self.throttle: float = 0.0  # 0 to 1; VFR_HUD reports it in percent.
+        self.throttle: float = 0.0  # From 0 to 1. VFR_HUD reports the throttle in percent.
 
     @property
     def can_lift(self) -> bool:
@@ -158,7 +161,7 @@ class ArduPilotMotors:
 
     @property
     def pwm(self) -> int:
-        """Pulse width of each motor in SERVO_OUTPUT_RAW (µs); minimal until the arming delay is over."""
+        """Pulse width of each motor in SERVO_OUTPUT_RAW (µs). It is minimal until the arming delay is over."""
         if not (self.is_armed and self.may_turn):
             return _STOPPED_PWM
         return round(_IDLE_PWM + 20 * self.spool + self.throttle * (_FULL_PWM - _IDLE_PWM) * 1.3)
@@ -171,7 +174,7 @@ class ArduPilotMotors:
         self.spool = self.throttle = 0.0
 
     def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
-        """Advance spool and throttle by ``dt`` seconds; ``motion`` is the vehicle's motion model."""
+        """Advance the spool-up and the throttle by ``dt`` seconds. ``motion`` is the vehicle's motion model."""
         self.may_turn = self.is_armed and now - self.armed_at >= _ARMING_DELAY_S
         if self.may_turn and self.spool_up_requested:
             if self.spool < 1.0:
@@ -179,14 +182,15 @@ class ArduPilotMotors:
         else:
             self.spool = max(0.0, self.spool - dt / _SPOOL_DOWN_S)
         if landed or not self.is_armed:
-            self.throttle = 0.05 * self.spool
+            self.throttle = _IDLE_THROTTLE * self.spool
             return
+        # The throttle compensates a lean of up to 60 degrees, whose cosine is 0.5.
         vertical_share_of_thrust = max(0.5, math.cos(motion.roll) * math.cos(motion.pitch))
         lift = 1.0 - motion.acceleration_down / GRAVITY_M_S2
         self.throttle = max(0.0, min(1.0, _HOVER_THROTTLE * lift / vertical_share_of_thrust))
 
 
-# Interfaces of the parts, for other parts.
+# The following classes are the interfaces through which the parts of a vehicle use each other.
 
 
 class ArduPilotExternalHost(Protocol):
@@ -265,7 +269,7 @@ class ArduPilotBatteryHost(Protocol):
 
 class ArduPilotFailsafesHost(Protocol):
     ground_station_seen_at: float
-    radio: bool
+    is_radio_lost: bool
 
     @property
     def battery(self) -> ArduPilotBatteryHost: ...
@@ -298,24 +302,24 @@ _ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 
 
 class ArduPilotHost(SimulatedAutopilot):
-    """Interface of a simulated ArduPilot for its parts; `ArduPilotVehicle` implements it."""
+    """Interface of a simulated ArduPilot for its parts. `ArduPilotVehicle` implements it."""
 
     KIND: ClassVar[Kind]
-    """Firmware; selects the parameter table."""
+    """The kind of firmware, which selects the parameter table."""
     FIRMWARE: ClassVar[str]
     """Firmware name in the banner."""
     FRAME: ClassVar[str | None] = None
-    """Text about the frame in the banner; None sends none."""
+    """Text about the airframe in the banner, or None to send no such text."""
     GIT_HASH: ClassVar[bytes] = b"5ae20c17"
 
     parameters: SimParameters
-    """Parameters by name. A test may change them; they survive a reboot."""
+    """Parameters by name. A test may change them, and they survive a reboot."""
     timeline: BootTimeline
     uid: bytes
     battery: SimulatedBattery
     motors: ArduPilotMotors
     frame: LocalFrame
-    """World frame: metres north and east of the power-on location."""
+    """The world frame, which counts metres north and east of the power-on location."""
     mode: ArduPilotMode
     is_initialised: bool
     is_landed: bool
@@ -345,7 +349,7 @@ class ArduPilotHost(SimulatedAutopilot):
         return self.navigation.altitude_above_home
 
     def set_mode(self, number: int) -> bool:
-        """Change the mode and broadcast a heartbeat; if the mode is refused, send a text and return False."""
+        """Change the mode, broadcast a heartbeat and return True. If the mode is refused, send a text."""
         raise NotImplementedError
 
     def available_modes(self) -> list[m.AvailableModes]:
@@ -355,12 +359,16 @@ class ArduPilotHost(SimulatedAutopilot):
         raise NotImplementedError
 
     def send_home(self, channel: Channel | None = None) -> None:
-        """Send GPS_GLOBAL_ORIGIN and HOME_POSITION if they are set."""
+        """Send GPS_GLOBAL_ORIGIN and HOME_POSITION, if origin and home are set."""
         self.send_built(m.GpsGlobalOrigin.ID, channel)
         self.send_built(m.HomePosition.ID, channel)
 
     def local_point(self, target: m.SetPositionTargetLocalNed, body_frames: Collection[int]) -> Ned:
-        """Convert the position of a local target to the world frame."""
+        """Convert the position of a local set-point to the world frame.
+
+        In LOCAL_NED, the position is relative to the estimator's origin, and in other frames to the vehicle's place. In
+        ``body_frames``, it is also rotated by the vehicle's heading.
+        """
         offset, motion = (target.x, target.y, target.z), self.motion
         if target.coordinate_frame == MavFrame.LOCAL_NED:
             return self.navigation.world(offset)
@@ -376,7 +384,7 @@ class ArduPilotHost(SimulatedAutopilot):
             self.info(self.FRAME)
 
     def world_point(self, latitude_e7: int, longitude_e7: int, altitude: float, frame: int) -> Ned | None:
-        """Convert a global position to the world frame; return None for invalid values or an unknown frame."""
+        """Convert a global position to the world frame. Return None for invalid values or an unknown frame."""
         is_place = abs(latitude_e7) <= 900_000_000 and abs(longitude_e7) <= 1_800_000_000
         if not is_place or not math.isfinite(altitude):
             return None

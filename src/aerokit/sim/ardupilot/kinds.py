@@ -17,13 +17,13 @@ KINDS: tuple[Kind, ...] = ("copter", "plane", "rover", "sub")
 
 
 def parameters_of(kind: Kind, count: int | None = None) -> SimParameters:
-    """Return the parameters of a firmware: all, or about ``count``, including all that the simulation reads."""
+    """Return all parameters of a firmware, or about ``count`` of them, with all that the simulation reads."""
     used = [name for (name,) in rows_of(kind, "used_parameters.csv")]
     return SimParameters.from_text(_read(f"{kind}.param.csv"), used=used, count=count)
 
 
 def rows_of(kind: Kind, file: str) -> Iterator[list[str]]:
-    """Yield the rows of a table whose last column names the firmware, without that column."""
+    """Yield the rows for ``kind`` of a table whose last column names the firmware. The last column is cut off."""
     for line in _read(file).splitlines():
         *row, kinds = line.split(",")
         if kinds == "all" or kind in kinds.split():
@@ -43,7 +43,7 @@ class BootTimeline:
 
     heartbeat: float = 0.92
     ready: float = 2.36
-    """Initialised: streams start and missions are accepted; half a second later MAV_STATE_BOOT ends."""
+    """The vehicle is initialised: streams start and missions are accepted. 0.5 s later, MAV_STATE_BOOT ends."""
     estimator_active: float = 4.36
     tilt_aligned: float = 5.70
     yaw_aligned: float = 5.80
@@ -51,20 +51,20 @@ class BootTimeline:
     gps_fix: float = 9.94
     origin_set: float = 19.93
     healthy: float = 22.40
-    """The attitude reference is healthy; a second later the vehicle can be armed in modes without GPS."""
+    """The attitude estimate is healthy. A second later, the vehicle can be armed in modes without GPS."""
     position_good: float = 41.55
-    """The estimator uses GPS; modes that need a position become available."""
+    """The estimator uses GPS, so that modes that need a position become available."""
     estimator_leads_early: bool = True
-    """True if the estimator provides the attitude once it is active, False if only once it uses GPS."""
+    """True if the estimator provides the attitude as soon as it is active; False if it first has to use GPS."""
 
     def scaled(self, seconds: float) -> BootTimeline:
-        """Return the timeline scaled to end after ``seconds``; with 0 the vehicle is ready at once."""
+        """Return this timeline, scaled so that it ends after ``seconds``. With 0, the vehicle is ready at once."""
         factor = seconds / self.position_good
         times = {field.name: getattr(self, field.name) * factor for field in fields(self) if field.type == "float"}
         return replace(self, **times)
 
 
-# Measured in SITL with default parameters; values in the order of the fields.
+# Times that were measured in SITL with default parameters, in the order of the fields of `BootTimeline`.
 BOOT_TIMELINES: dict[Kind, BootTimeline] = {
     "copter": BootTimeline(),
     "plane": BootTimeline(0.92, 2.04, 9.94, 12.08, 12.12, 8.74, 8.94, 19.12, 21.40, 20.15, False),

@@ -34,9 +34,12 @@ class StoredCommand(NamedTuple):
     """Format in which ArduPilot stores a command."""
 
     name: str
-    """Name in status texts; empty if a mission cannot contain the command."""
+    """Name of the command in status texts; empty if a mission cannot contain the command."""
     parameters: str
-    """Storage types of params 1 to 4, and of x, y, z without a position; see `_CONVERSIONS`. Empty: unsupported."""
+    """Storage types (see `_CONVERSIONS`) of params 1 to 4, and of x, y and z if they are no position.
+
+    Empty for an unsupported command.
+    """
     has_place: bool
     """True if ``x``, ``y`` and ``z`` are a position."""
 
@@ -53,10 +56,10 @@ def _read_commands() -> dict[int, StoredCommand]:
 STORED_COMMANDS: dict[int, StoredCommand] = _read_commands()
 _UNKNOWN = StoredCommand("?", "", has_place=False)
 
-# ArduPlane stores acceptance radius and passing distance of waypoints, and has no splines.
+# ArduPlane stores two params of a waypoint, its acceptance radius and its passing distance. It has no splines.
 _PLANE_PARAMETERS: dict[int, str] = {Cmd.NAV_WAYPOINT: "-BB-", Cmd.NAV_SPLINE_WAYPOINT: ""}
 
-# Indices of params that may be NaN; 0 is param 1.
+# Indices of the params that may be NaN, by command. Index 0 is param 1.
 _NAN_ALLOWED: dict[int, tuple[int, ...]] = {
     Cmd.NAV_WAYPOINT: (3,),
     Cmd.NAV_LOITER_UNLIM: (3,),
@@ -88,13 +91,14 @@ def check_place(latitude_e7: float, longitude_e7: float) -> int:
 
 
 def altitude_frame(frame: int) -> int | None:
-    """Return the MAV_FRAME of an altitude after upload and download; None for an unsupported frame."""
+    """Return the MAV_FRAME with which ArduPilot stores a frame; None for an unsupported frame."""
     return _DOWNLOADED_FRAMES.get(frame)
 
 
 def stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
-    """Return the item that a download sends, or the MAV_MISSION_RESULT that refuses the upload."""
+    """Return the item as a download sends it after this upload, or the MAV_MISSION_RESULT of a refusal."""
     result = _check_numbers(item)
+    # The storage format reserves the command ids 0 and 1 (AP_Mission.cpp).
     if result == MavMissionResult.ACCEPTED and item.command in (0, 1):
         result = MavMissionResult.INVALID
     layout = STORED_COMMANDS.get(item.command, _UNKNOWN).parameters
@@ -127,7 +131,7 @@ def _check_numbers(item: MissionItem) -> int:
 
 
 def _stored_place(item: MissionItem) -> tuple[float, float, float, int] | int:
-    """Return x, y, z and frame of a position, or the MAV_MISSION_RESULT that refuses it."""
+    """Return x, y, z and frame of a position as stored, or the MAV_MISSION_RESULT of a refusal."""
     result = check_place(item.x, item.y)
     if result != MavMissionResult.ACCEPTED:
         return result
@@ -141,9 +145,9 @@ def _stored_place(item: MissionItem) -> tuple[float, float, float, int] | int:
 
 
 def _stored_turns(item: MissionItem) -> tuple[float, float, float, float]:
-    """Return params 1 to 4 of NAV_LOITER_TURNS. Turns and radius have one byte each.
+    """Return params 1 to 4 of NAV_LOITER_TURNS as stored. The number of turns and the radius have one byte each.
 
-    Less than one turn is stored in 256ths, a radius above 255 m in tens of metres.
+    A number of turns below 1 is stored in units of 1/256, a radius above 255 m in units of 10 m.
     """
     turns, radius = item.param1, abs(item.param3)
     turn_unit = 1 / 256 if 0 < turns < 1 else 1
@@ -156,7 +160,7 @@ def _stored_turns(item: MissionItem) -> tuple[float, float, float, float]:
 
 
 def whole(value: float) -> int:
-    """Truncate towards zero, like C; 0 for values beyond 32 bits."""
+    """Truncate a number towards zero, like C. Values beyond 32 bits become 0."""
     return int(value) if abs(value) < 2**31 else 0
 
 
@@ -176,7 +180,7 @@ def _signed(value: int, bits: int) -> float:
     return float(value - (1 << bits) if value >> bits - 1 else value)
 
 
-# Conversions of a value to its storage and back, by storage type.
+# Functions that return a value as it is after it was stored and read again, by storage type.
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
     "-": lambda _: 0.0,
     "f": float32,

@@ -26,7 +26,7 @@ class ItemList:
     """Name of the list in status texts."""
 
     def __init__(self, capacity: int) -> None:
-        self.capacity = capacity  # Maximum number of items.
+        self.capacity = capacity  # The maximum number of items.
 
     @property
     def count(self) -> int:
@@ -38,7 +38,7 @@ class ItemList:
         return [item for item in items_or_results if not isinstance(item, int)]
 
     def item(self, seq: int) -> MissionItem | int:
-        """Return an item, or the result that reports a missing item."""
+        """Return the item with this index, or the MAV_MISSION_RESULT for a missing item."""
         raise NotImplementedError
 
     def begin(self, count: int) -> None:
@@ -48,23 +48,23 @@ class ItemList:
         """Start a partial upload."""
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        """Store a received item; ``last`` is the last sequence number of the upload."""
+        """Store an uploaded item and return the MAV_MISSION_RESULT. ``last`` is the upload's last sequence number."""
         raise NotImplementedError
 
     def finish(self, warn: Callable[[str], None]) -> int:
-        """Complete an upload; ``warn`` sends a text."""
+        """Complete an upload and return the MAV_MISSION_RESULT. ``warn`` sends a status text."""
         return MavMissionResult.ACCEPTED
 
     def abandon(self) -> None:
         """Abort an upload."""
 
     def clear(self) -> bool:
-        """Delete all items; return False if that is not allowed now."""
+        """Delete all items. Return False if this is not allowed at present."""
         raise NotImplementedError
 
 
 class CommandList(ItemList):
-    """The mission. Item 0 is home, which each download reads from ``home``."""
+    """The list of mission commands. Item 0 is home, which the function ``home`` returns at each download."""
 
     name = "Mission"
 
@@ -78,24 +78,24 @@ class CommandList(ItemList):
         super().__init__(capacity)
         self._kind: Kind = kind
         self._home, self._is_running = home, is_running
-        self._commands: list[MissionItem] = []  # Index 0 is a placeholder for home.
-        self.version: int = 0  # Incremented whenever an item changes.
+        self._commands: list[MissionItem] = []  # The item at index 0 is a placeholder for home.
+        self.version: int = 0  # Every change of an item increments the version.
 
     @property
     def count(self) -> int:
         return len(self._commands)
 
     def item(self, seq: int) -> MissionItem | int:
-        if seq == 0:  # Home can be read without a mission.
+        if seq == 0:  # Home can be read even if there is no mission.
             return self._home()
         return self._commands[seq] if seq < len(self._commands) else MavMissionResult.INVALID_SEQUENCE
 
     def command(self, index: int) -> MissionItem | None:
-        """Return the command to execute at this index; None beyond the end and for home."""
+        """Return the command at this index. Return None for home and for an index beyond the end."""
         return self._commands[index] if 0 < index < len(self._commands) else None
 
     def add_home(self) -> None:
-        """Make home item 0 of an empty mission; called when home is set."""
+        """Add home as item 0 of an empty mission. Called when home is set."""
         if not self._commands:
             self._commands.append(self._home())
 
@@ -104,7 +104,7 @@ class CommandList(ItemList):
         self.version += 1
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        """Replace or append an item. Item 0 is validated, then ignored. Home is added to an empty list first."""
+        """Replace or append an item. Item 0 is checked, but not stored, because it is home."""
         stored_item = stored(item, self._kind)
         if isinstance(stored_item, int):
             return stored_item
@@ -117,7 +117,7 @@ class CommandList(ItemList):
 
     def _write(self, seq: int, stored_item: MissionItem) -> int:
         count = len(self._commands)
-        # A list with space for home alone accepts nothing, not even item 0, which is ignored.
+        # A list that has space only for home refuses every item, even item 0, which it would ignore.
         if seq > count or max(seq, 1) >= self.capacity:
             return MavMissionResult.ERROR
         if seq == count:
@@ -135,7 +135,7 @@ class CommandList(ItemList):
         return True
 
     def write_file(self, items: list[MissionItem], start: int) -> int:
-        """Store the items of an uploaded file, until one is refused."""
+        """Store the items of an uploaded file, and return the MAV_MISSION_RESULT. Stop at the first refused item."""
         for seq, item in enumerate(items):
             stored_item = stored(item, self._kind)
             if isinstance(stored_item, int):
@@ -149,7 +149,7 @@ class CommandList(ItemList):
 
 
 class RallyList(ItemList):
-    """Rally points: position, altitude in whole metres, and altitude frame are stored."""
+    """The list of rally points. Their position, altitude (in whole metres) and altitude frame are stored."""
 
     name = "Rally"
 
@@ -162,7 +162,7 @@ class RallyList(ItemList):
         return len(self._points)
 
     def item(self, seq: int) -> MissionItem | int:
-        """Return a point; a point at latitude and longitude 0 counts as missing."""
+        """Return a rally point. A point at latitude 0 and longitude 0 counts as missing."""
         if seq >= len(self._points):
             return MavMissionResult.INVALID_SEQUENCE
         point = self._points[seq]
@@ -217,7 +217,7 @@ Warn = Callable[[str], None]
 
 
 class FenceList(ItemList):
-    """Fence. During an upload, `count` is the number of uploaded items, while `item` reads the stored fence."""
+    """The list of fence items. During an upload, `count` counts the new items, while `item` reads the old fence."""
 
     name = "Fence"
 
@@ -264,8 +264,8 @@ class FenceList(ItemList):
         return True
 
     def store(self, items: Sequence[MissionItem], warn: Warn) -> int:
-        """Store a fence if it is valid."""
-        problem = _problem(items)
+        """Store a fence if it is valid and fits into the storage. Otherwise send texts about the problem."""
+        problem = _fence_problem(items)
         if problem is not None:
             warn(problem)
             warn("Fence validation failed")
@@ -301,9 +301,9 @@ def _stored_fence_item(item: MissionItem) -> MissionItem | int:
     return MissionItem(item.command, MavFrame.GLOBAL, size, x=int(item.x), y=int(item.y), z=0.0, autocontinue=False)
 
 
-def _problem(items: Sequence[MissionItem]) -> str | None:
-    """Return the firmware's text about an invalid fence; None if it is valid."""
-    # Type and number of vertices of the current polygon, and how many of them are still to come.
+def _fence_problem(items: Sequence[MissionItem]) -> str | None:
+    """Return the text that the firmware sends about an invalid fence; None if the fence is valid."""
+    # The current polygon: the command of its vertices, its number of vertices, and how many of them are missing.
     polygon_type, vertices, missing = 0, 0.0, 0
     has_return_point = False
     for item in items:
@@ -335,17 +335,17 @@ def _number(command: int) -> int:
 
 
 def _storage_needed(items: Sequence[MissionItem]) -> int:
-    """Return the bytes that ArduPilot needs to store a fence."""
-    size, vertices_left = 4, 0  # header
+    """Return the number of bytes that ArduPilot needs to store a fence."""
+    size, vertices_left = 4, 0  # The header has four bytes.
     for item in items:
         size += _BYTES_PER_POINT
         if vertices_left:
             vertices_left -= 1
             continue
-        size += 1  # type
+        size += 1  # One byte for the type of a polygon, circle or return point.
         if item.command in _POLYGONS:
-            size += 1  # number of vertices
+            size += 1  # One byte for the number of vertices.
             vertices_left = int(item.param1) - 1
         elif item.command in _CIRCLES:
-            size += 4  # radius
+            size += 4  # Four bytes for the radius.
     return size

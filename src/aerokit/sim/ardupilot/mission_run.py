@@ -24,7 +24,7 @@ _WITH_TARGET = frozenset({Cmd.DO_JUMP, Cmd.JUMP_TAG, Cmd.DO_JUMP_TAG})
 _TAKE_OFFS = frozenset({Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF})
 _BEFORE_TAKE_OFF = frozenset({Cmd.DO_AUX_FUNCTION, Cmd.NAV_DELAY})
 _NAVIGATION_BEYOND = frozenset({Cmd.NAV_SET_YAW_SPEED, Cmd.NAV_SCRIPT_TIME, Cmd.NAV_ATTITUDE_TIME})
-# Commands that complete at once on every vehicle, without a status text.
+# Commands that are complete as soon as they have started, on every vehicle, without a status text.
 _INSTANT = frozenset(
     {
         Cmd.DO_GRIPPER, Cmd.DO_SET_SERVO, Cmd.DO_SET_RELAY, Cmd.DO_REPEAT_SERVO, Cmd.DO_REPEAT_RELAY,
@@ -38,14 +38,14 @@ _INSTANT = frozenset(
 
 
 class MissionMode(ArduPilotMode):
-    """Base of the AUTO modes. A subclass fills ``handlers`` with the mission commands that it supports."""
+    """Base of the AUTO modes. A subclass fills ``handlers`` with handlers of the mission commands that it supports."""
 
     needs_mission = True
     can_change_speed = True
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         super().__init__(vehicle)
-        self.speed: float = 0.0  # Limit in m/s.
+        self.speed: float = 0.0  # Maximum speed in m/s.
         self.may_lift_off: bool = False
         """True once MISSION_START or a raised throttle permits a take-off from the ground."""
         self.is_paused: bool = False
@@ -54,7 +54,7 @@ class MissionMode(ArduPilotMode):
 
     def on_disarmed(self) -> None:
         """Called after the motors have stopped."""
-        # Disarming restarts an unfinished mission, which then waits on the ground.
+        # Disarming restarts an unfinished mission. The vehicle then waits on the ground.
         if self.vehicle.mode is self:
             self.vehicle.mission.update()
 
@@ -63,7 +63,7 @@ class MissionMode(ArduPilotMode):
         self.vehicle.mission.stop()
 
     def wait_for_origin(self) -> None:
-        """Start the mission once the estimator has an origin, also while disarmed."""
+        """Start the mission as soon as the estimator has an origin, even while the vehicle is disarmed."""
         self.is_waiting = True
         self.vehicle.call_later(0.0, self.start_if_waiting)
 
@@ -78,7 +78,7 @@ class MissionMode(ArduPilotMode):
         """Called after the mission has started or resumed in this mode."""
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
-        """Return True once the command is complete; polled at every tick."""
+        """Return True as soon as the command is complete. This is polled at every tick."""
         raise NotImplementedError
 
     def end_mission(self) -> None:
@@ -86,7 +86,7 @@ class MissionMode(ArduPilotMode):
         raise NotImplementedError
 
     def start_command(self, item: MissionItem) -> bool:
-        """Start a mission command; return False to skip it because it is not supported."""
+        """Start a mission command. Return False to skip a command that is not supported."""
         handler = self.handlers.get(item.command)
         if handler is not None:
             handler(item)
@@ -98,12 +98,12 @@ class MissionMode(ArduPilotMode):
 
 
 def is_navigation(item: MissionItem) -> bool:
-    """Return True for a navigation command, only one of which runs at a time."""
+    """Return True for a navigation command. Only one navigation command runs at a time."""
     return item.command <= Cmd.NAV_LAST or item.command in _NAVIGATION_BEYOND
 
 
 class MissionRun:
-    """Progress in the mission. Index 1 is the first command; index 0 (home) means that there is no command."""
+    """Progress in the mission. The first command has the index 1. The index 0 (home) means that there is no command."""
 
     def __init__(self, vehicle: ArduPilotHost, mode: MissionMode) -> None:
         self._vehicle, self._mode = vehicle, mode
@@ -111,10 +111,10 @@ class MissionRun:
         self._state = MissionState.NOT_STARTED
         self.nav_index: int = 0  # Index of the navigation command that runs or will be resumed.
         self._running_nav: MissionItem | None = None  # The running navigation command.
-        # The running "do" or "condition" command with its index, and the index of the last one that was started.
+        # Index and item of the running "do" or "condition" command.
         self._running_do: tuple[int, MissionItem] | None = None
-        self._last_do_index = 0
-        self._jumps: dict[int, int] = {}  # Number of jumps done, by index of the jump command.
+        self._last_do_index = 0  # Index of the "do" or "condition" command that was started last; 0 if none.
+        self._jumps: dict[int, int] = {}  # Number of jumps that each jump command has done, by its index.
 
     @property
     def is_present(self) -> bool:
@@ -143,7 +143,7 @@ class MissionRun:
         return max(0, self._list.count - 1)
 
     def message(self, seq: int | None = None) -> MissionCurrent:
-        """Build MISSION_CURRENT; ``seq`` replaces the index of the current command."""
+        """Build MISSION_CURRENT with the index of the current command, or with ``seq`` if given."""
         seq = self.nav_index if seq is None else seq
         return MissionCurrent(seq, self.count, self.state, int(self._vehicle.mode.needs_mission))
 
@@ -152,14 +152,14 @@ class MissionRun:
         return self.is_take_off(first_index)
 
     def is_take_off(self, index: int) -> bool:
-        """Return True if the first navigation command from ``index`` on is a take-off, delays excepted."""
+        """Return True if the first navigation command from ``index`` on, apart from delays, is a take-off."""
         for _, item in self.navigation_from(index):
             if item.command not in _BEFORE_TAKE_OFF:
                 return item.command in _TAKE_OFFS
         return False
 
     def navigation_from(self, index: int) -> Iterator[tuple[int, MissionItem]]:
-        """Yield at most sixteen navigation commands in the order of execution, following jumps."""
+        """Yield the next navigation commands in the order of execution (with jumps), at most sixteen."""
         for _ in range(16):
             navigation = self._next_navigation(index)
             if navigation is None:
@@ -180,7 +180,7 @@ class MissionRun:
         return self._vehicle.parameters["MIS_RESTART"] == 1
 
     def start_or_resume(self) -> None:
-        """Start or resume the mission, as MIS_RESTART selects."""
+        """Start the mission again or resume it, as MIS_RESTART selects. A complete mission starts again."""
         can_resume = self._state != MissionState.COMPLETE and self._list.command(self.nav_index) is not None
         if self._restarts or not can_resume:
             self._start()
@@ -195,7 +195,7 @@ class MissionRun:
             self._complete()
 
     def stop(self) -> None:
-        """Stop the mission because the mode changed; the progress is kept."""
+        """Stop the mission because the mode has changed, and keep the progress."""
         if self.is_running:
             self._state = MissionState.NOT_STARTED
 
@@ -214,8 +214,9 @@ class MissionRun:
         self._state = MissionState.NOT_STARTED
 
     def set_current(self, index: int) -> bool:
-        """Continue from this command; return False if it does not exist."""
-        if index >= self._list.count or self._list.count == 1:
+        """Continue the mission at the command with this index. Return False if there is no such command."""
+        has_only_home = self._list.count == 1
+        if index >= self._list.count or has_only_home:
             return False
         self._running_do, self._last_do_index, self._running_nav = None, 0, None
         if index == 0 or self._state == MissionState.COMPLETE:
@@ -223,13 +224,13 @@ class MissionRun:
         index = max(index, _FIRST)
         if self.is_running:
             is_started = self._start_next_navigation(index)
-            if not is_started:
+            if not is_started:  # No navigation command follows, so the mission is over.
                 self._complete()
             return is_started
         return self._set_resume_index(index)
 
     def _set_resume_index(self, index: int) -> bool:
-        """Set the command at which a stopped mission will resume; return False if there is none from ``index`` on."""
+        """Resume a stopped mission at the next navigation command from ``index`` on; return False without one."""
         for _ in range(_MAX_STEPS):
             command = self._next(index, count_jumps=True)
             if command is None:
@@ -260,7 +261,10 @@ class MissionRun:
             self._running_do = None
 
     def _start_next_navigation(self, start: int = 0) -> bool:
-        """Start the next navigation command, and the first other command before it."""
+        """Start the next navigation command, and the first of the "do" commands in front of that command.
+
+        ``start`` is the index to search from; 0 searches after the current navigation command.
+        """
         index = start or (self.nav_index + 1 if self.nav_index else _FIRST)
         self._running_do, self._last_do_index = None, 0
         for _ in range(_MAX_STEPS):
@@ -271,7 +275,7 @@ class MissionRun:
             index = command_index + 1
             if is_navigation(item):
                 self.nav_index = command_index
-                if self._begin(command_index, item):
+                if self._begin(command_index, item):  # An unsupported command is skipped.
                     self._running_nav = item
                     return True
             elif self._running_do is None:
@@ -280,7 +284,7 @@ class MissionRun:
         return False
 
     def _start_next_do(self) -> None:
-        """Start the next "do" command before the next navigation command."""
+        """Start the next "do" command, if one is left in front of the next navigation command."""
         if not self._last_do_index:
             return
         command = self._next(self._last_do_index + 1, count_jumps=False)
@@ -305,18 +309,18 @@ class MissionRun:
         self._mode.end_mission()
 
     def _next(self, index: int, *, count_jumps: bool) -> tuple[int, MissionItem] | None:
-        """Return the first command from ``index`` on, following jumps.
+        """Return the first command at or after ``index``, with its index. Jump commands are followed, not returned.
 
-        With ``count_jumps``, each jump uses up one of its repetitions; else the call only looks ahead.
+        With ``count_jumps``, each followed jump uses up one of its repetitions. Without, the call only looks ahead.
         """
-        first_jump = 0
+        first_jump = 0  # Index of the first jump command that was followed; 0 before that.
         for _ in range(_MAX_JUMPS):
             item = self._list.command(index)
             if item is None:
                 return None
             if item.command not in (Cmd.DO_JUMP, Cmd.DO_JUMP_TAG):
                 return index, item
-            target = self._target(item)
+            target = self._jump_target(item)
             is_endless = not count_jumps and first_jump == index
             if self._list.command(target) is None or is_endless:
                 return None
@@ -324,7 +328,8 @@ class MissionRun:
             index = target if self._jumps_now(index, int(item.param2), count_jumps=count_jumps) else index + 1
         return None
 
-    def _target(self, item: MissionItem) -> int:
+    def _jump_target(self, item: MissionItem) -> int:
+        """Return the index to which a jump command leads; 0 if its tag does not exist."""
         if item.command == Cmd.DO_JUMP:
             return int(item.param1)
         for index in range(_FIRST, self._list.count):
@@ -334,11 +339,12 @@ class MissionRun:
         return 0
 
     def _jumps_now(self, index: int, times: int, *, count_jumps: bool) -> bool:
-        """Return True if the jump at ``index`` has repetitions left."""
+        """Return True if the jump command at ``index``, which jumps ``times`` times, has repetitions left."""
         jumps_done = self._jumps.get(index, 0)
         if times != _UNLIMITED and jumps_done >= times:
             if count_jumps:
-                self._jumps.pop(index, None)  # The next execution of this command jumps ``times`` times again.
+                # Reset the count, because the next execution of this command again jumps ``times`` times.
+                self._jumps.pop(index, None)
             return False
         if count_jumps:
             self._jumps[index] = jumps_done + 1
@@ -348,13 +354,13 @@ class MissionRun:
 
 
 def horizontal_distance(vehicle: ArduPilotHost, place: Ned | None) -> float:
-    """Return the horizontal distance to a place in metres; 0 without a place."""
+    """Return the horizontal distance to a place in metres, or 0 if ``place`` is None."""
     motion = vehicle.motion
     return 0.0 if place is None else math.hypot(place[0] - motion.north, place[1] - motion.east)
 
 
 def set_home_from(vehicle: ArduPilotHost, item: MissionItem) -> None:
-    """Execute DO_SET_HOME of a mission: set home to the item's position, or else to the vehicle's position."""
+    """Execute DO_SET_HOME of a mission: set home to the position of the item or of the vehicle (param 1 is 1)."""
     point: Ned | None = vehicle.motion.place
     if item.param1 != 1 and (item.x, item.y, item.z) != (0, 0, 0):
         point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)

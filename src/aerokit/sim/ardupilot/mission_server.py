@@ -65,12 +65,15 @@ class ArduPilotMissionServer(MissionServer):
         self._vehicle.on(m.MissionWritePartialList, self._on_write_partial_list)
 
     def items(self, mission_type: int) -> list[MissionItem]:
-        """Return the items that a download sends, home first; empty for an unknown type."""
+        """Return the items that a download sends, for a mission with home first. An unknown type has no items."""
         items = self._lists.get(mission_type)
         return [] if items is None else items.items()
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Store items like the upload of a file; return a MAV_MISSION_RESULT. ``clear=False`` is for missions only."""
+        """Store a list of items, as the upload of a file does, and return the MAV_MISSION_RESULT.
+
+        Only a mission can be changed from the index ``start`` on and without deleting its other items (``clear``).
+        """
         if mission_type == MavMissionType.MISSION:
             if clear:
                 self._clear_list(self.commands)
@@ -98,7 +101,7 @@ class ArduPilotMissionServer(MissionServer):
         self._vehicle.send_text(MavSeverity.WARNING, text)
 
     def _warn_once(self, message: AnyItem | m.MissionRequest, text: str) -> None:
-        """Send a warning about a kind of message, once for each upload of this type."""
+        """Send a warning about the class of ``message``, at most once for each transfer of a mission type."""
         warning = (type(message), message.mission_type)
         if warning not in self._warnings:
             self._warnings.add(warning)
@@ -120,7 +123,8 @@ class ArduPilotMissionServer(MissionServer):
         if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
             return Result.UNSUPPORTED
-        # During an upload, only another upload (which the base class judges) and single requests are served.
+        # During an upload, requests for a list are denied. The base class decides on MISSION_COUNT, and requests for
+        # single items are served.
         if kind in self._uploads and not isinstance(message, (m.MissionCount, m.MissionRequest)):
             return Result.DENIED
         return None if kind in self._lists else Result.UNSUPPORTED
@@ -140,7 +144,8 @@ class ArduPilotMissionServer(MissionServer):
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         client, kind = sender_of(request), request.mission_type
-        # The firmware compares the item's command, instead of its index, with the index of the current item.
+        # A bug of the firmware: it compares the command of the item, instead of the index of the item, with the index
+        # of the current item.
         current = kind == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
         if isinstance(request, m.MissionRequestInt):
             return item_message_int(item, request.seq, client, kind, current=current)
@@ -223,7 +228,7 @@ class ArduPilotMissionServer(MissionServer):
         upload = self._uploads.get(kind)
         result: int = Result.UNSUPPORTED
         if upload is not None and upload.client != client:
-            # The firmware sends two acknowledgements.
+            # The firmware sends a second acknowledgement (ERROR, below) after this one.
             self._acknowledge(client, kind, Result.DENIED, channel)
             result = Result.ERROR
         elif kind in self._lists:
@@ -233,7 +238,7 @@ class ArduPilotMissionServer(MissionServer):
         self._acknowledge(client, kind, result, channel)
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
-        """Set the current item; MISSION_CURRENT has the requested index, even if another item runs."""
+        """Set the current item. Answer MISSION_CURRENT with the requested index, even if another item runs then."""
         if self._vehicle.mission.set_current(request.seq):
             self._vehicle.send(self._vehicle.mission.message(request.seq), channel)
 
@@ -244,11 +249,11 @@ class ArduPilotMissionServer(MissionServer):
         return is_cleared
 
     def _guide(self, item: MissionItem, current: int) -> int:
-        """Handle an item whose ``current`` field makes it a target for GUIDED."""
+        """Handle an item that is a target for GUIDED, because of the special value of its field ``current``."""
         stored_item = stored(item, self._vehicle.KIND)
         if isinstance(stored_item, int):
             return stored_item
-        if current == _ALTITUDE_CHANGE:
+        if current == _ALTITUDE_CHANGE:  # The altitude change has no effect in the simulation.
             return Result.ACCEPTED
         vehicle = self._vehicle
         point = vehicle.world_point(int(stored_item.x), int(stored_item.y), stored_item.z, stored_item.frame)
@@ -259,7 +264,10 @@ class ArduPilotMissionServer(MissionServer):
 
 
 def _without_floats(message: AnyItem) -> MissionItem | int:
-    """Convert the degrees of a MISSION_ITEM to integers, in single precision."""
+    """Return the item with x and y as integers, or the MAV_MISSION_RESULT of an invalid position.
+
+    Like the firmware, convert the degrees of a MISSION_ITEM in single precision.
+    """
     item = item_from(message)
     if isinstance(message, m.MissionItemInt):
         return item

@@ -10,7 +10,7 @@ from aerokit.mavlink.enums import GpsFixType, MavMissionType, MavSeverity
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.motion import GlobalPoint, LocalFrame, Ned
 
-# Plain integers, because operators of flags are slow and every tick tests these bits.
+# These bits are plain integers, because every tick tests them and operators of enum flags are slow.
 _ATTITUDE, _POS_HORIZ_ABS, _POS_VERT_ABS = map(int, (Ekf.ATTITUDE, Ekf.POS_HORIZ_ABS, Ekf.POS_VERT_ABS))
 _DEAD_RECKONING = int(Ekf.ATTITUDE | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS)
 _ATTITUDE_ONLY = int(_DEAD_RECKONING | Ekf.VELOCITY_HORIZ | Ekf.CONST_POS_MODE)
@@ -25,9 +25,10 @@ _GPS_CHECK_INTERVAL_S = 0.1
 
 
 class ArduPilotNavigation:
-    """State of GPS and estimator; follows the boot timeline, ``faults.gps_lost``, SIM_GPS1_ENABLE and EK3_SRC1_POSXY.
+    """State of the GPS receiver and the estimator.
 
-    Positions are in the world frame, whose origin is the power-on location.
+    The state depends on the boot timeline, ``faults.gps_lost``, SIM_GPS1_ENABLE and EK3_SRC1_POSXY. Positions are in
+    the world frame, whose origin is the power-on location.
     """
 
     def __init__(self, vehicle: ArduPilotHost, frame: LocalFrame) -> None:
@@ -40,7 +41,7 @@ class ArduPilotNavigation:
         self.origin: Ned | None = None
         self.home: Ned | None = None
         self.home_is_locked: bool = False
-        self._lost_at = math.nan
+        self._gps_lost_at = math.nan
 
     def start(self) -> None:
         """Schedule the events of the boot timeline."""
@@ -76,7 +77,7 @@ class ArduPilotNavigation:
 
     @property
     def position(self) -> GlobalPoint | None:
-        """Estimated position; None before the first fix."""
+        """Estimated global position; None before the first GPS fix."""
         if self.fix_type < GpsFixType.TYPE_3D_FIX and self.origin is None:
             return None
         return self.frame.to_global(*self._vehicle.motion.place)
@@ -98,14 +99,14 @@ class ArduPilotNavigation:
         return (local[0] + north, local[1] + east, local[2] + down)
 
     def set_home(self, point: Ned, *, lock: bool) -> None:
-        """Set home and broadcast it. With ``lock``, later arming does not move home."""
+        """Set home and broadcast its position. With ``lock``, arming no longer moves home."""
         self.home = point
         self.home_is_locked = self.home_is_locked or lock
         self._vehicle.missions.commands.add_home()
         self._vehicle.call_later(0.0, self._vehicle.send_home)
 
     def set_origin(self, point: Ned) -> bool:
-        """Set the estimator's origin; return False if it is already set or the vehicle is still booting."""
+        """Set the estimator's origin. Return False if the origin is already set or the vehicle is still booting."""
         if self.origin is not None or not self._vehicle.is_initialised:
             return False
         self.origin = point
@@ -123,7 +124,7 @@ class ArduPilotNavigation:
         self._vehicle.every(_GPS_CHECK_INTERVAL_S, self._check_external)
 
     def _check_external(self) -> None:
-        """Follow external navigation. Positions are relative until the origin is set."""
+        """Update the estimator flags from external navigation. Positions are relative until the origin is set."""
         if not self.uses_external or not self.has_attitude:
             return
         age = self._vehicle.external.navigation_age_s
@@ -186,7 +187,7 @@ class ArduPilotNavigation:
 
     def _use_gps(self) -> None:
         if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX or self.uses_external:
-            self._vehicle.call_later(1.0, self._use_gps)
+            self._vehicle.call_later(1.0, self._use_gps)  # Check again in a second.
             return
         self.flags = _WITH_POSITION
         self._report_cores("is using GPS")
@@ -197,17 +198,17 @@ class ArduPilotNavigation:
         if self.gps_is_lost or not self.is_gps_detected:
             self._follow_gps_loss()
         elif self.fix_type < GpsFixType.TYPE_3D_FIX:
-            self._lost_at, self.fix_type = math.nan, GpsFixType.RTK_FIXED
+            self._gps_lost_at, self.fix_type = math.nan, GpsFixType.RTK_FIXED
             if self.origin is not None and not self.has_position and not self.uses_external:
                 self._use_gps()
 
     def _follow_gps_loss(self) -> None:
-        """Lose the fix at once and the position after 7 s; stop aiding the estimator after 15 s."""
-        if math.isnan(self._lost_at):
-            self._lost_at, self.fix_type = self._vehicle.now, GpsFixType.NO_FIX
+        """Report no fix at once, and no position after 7 s. After 15 s, GPS stops aiding the estimator."""
+        if math.isnan(self._gps_lost_at):
+            self._gps_lost_at, self.fix_type = self._vehicle.now, GpsFixType.NO_FIX
             return
-        lost_for = self._vehicle.now - self._lost_at
-        if self.uses_external:
+        lost_for = self._vehicle.now - self._gps_lost_at
+        if self.uses_external:  # External navigation provides the position, even without GPS.
             return
         if self.has_position and lost_for >= _POSITION_TIMEOUT_S:
             self.flags = _DEAD_RECKONING | (Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0)
@@ -219,8 +220,8 @@ class ArduPilotNavigation:
 def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable[[Ned], bool] = lambda _: True) -> Ned:
     """Return the place where RTL ends: the nearest allowed rally point at its own height, or home.
 
-    Rally points farther away than RALLY_LIMIT_KM are ignored (0: no limit). With RALLY_INCL_HOME the result is home if
-    it is nearer than the rally points.
+    Rally points farther away than RALLY_LIMIT_KM are ignored (0: no limit). With RALLY_INCL_HOME, home is chosen if
+    home is nearer than all rally points.
     """
     current = (vehicle.motion.north, vehicle.motion.east)
     parameters = vehicle.parameters
@@ -243,15 +244,16 @@ def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable
 _PERIOD_S, _FAILURE_TIMEOUT_S, _LOW_SPACE_REPORT_INTERVAL_S = 1.0 / 3.0, 15.0, 10.0
 _CLEAN_UP_AFTER_POINTS = 50
 _LOW_SPACE_POINTS = 9
-# Shares of SRTL_ACCURACY: bends below _BEND are removed; segments closer to each other than _LOOP are joined.
+# Tolerances as multiples of SRTL_ACCURACY. Points that bend the path by less than `_BEND` are removed. Segments that
+# come closer to each other than `_LOOP` are joined.
 _BEND, _LOOP = 0.5, 0.99
 
 
 class SmartPath:
     """Recorded path of SMART_RTL: at most SRTL_POINTS points, SRTL_ACCURACY metres apart.
 
-    The path starts where the vehicle was armed or first had a position. After 15 s without a position or without free
-    space it is deactivated, and SMART_RTL is refused.
+    The path starts where the vehicle was armed or first had a position. After 15 s without a position, or without
+    space for another point, the path is deactivated and SMART_RTL is refused.
     """
 
     def __init__(self, vehicle: ArduPilotHost, *, only_armed: bool) -> None:
@@ -259,7 +261,7 @@ class SmartPath:
         self._only_armed = only_armed
         self._points: list[Ned] = []
         self._cleaned_count = 0  # Number of points after the last simplification.
-        # Times of the last known position, recorded point and warning.
+        # Times at which the position was good, a point was recorded and a warning was sent for the last time.
         self._good_at = self._saved_at = self._warned_at = -math.inf
         self._is_started = False
         self.is_active: bool = False  # True while SMART_RTL is possible.
@@ -272,7 +274,7 @@ class SmartPath:
         self._vehicle.every(_PERIOD_S, self.update)
 
     def reset(self) -> None:
-        """Discard the path and start a new path at the vehicle; without a position, the path is inactive."""
+        """Discard the path and start a new path at the vehicle. Without a position, the path stays inactive."""
         parameters = self._vehicle.parameters
         self._points.clear()
         self._cleaned_count, self.is_active, self._is_started = 0, False, True
@@ -284,7 +286,7 @@ class SmartPath:
             self.is_active = True
 
     def take_way_back(self) -> list[Ned]:
-        """Return the simplified path, last point first, and clear the recorded path."""
+        """Return the simplified path, starting with its last point, and clear the recorded path."""
         accuracy = self._vehicle.parameters["SRTL_ACCURACY"]
         path = prune(simplify(self._points, _BEND * accuracy), _LOOP * accuracy)
         self._points.clear()
@@ -292,7 +294,7 @@ class SmartPath:
         return path[::-1]
 
     def restore(self, way_back: Sequence[Ned]) -> None:
-        """Record again those points of `take_way_back` that were not reached."""
+        """Record those points again that `take_way_back` returned and that the vehicle has not reached."""
         self._points[:] = list(way_back)[::-1]
         self._cleaned_count = len(self._points)
 
@@ -316,7 +318,7 @@ class SmartPath:
             self._deactivate("buffer full")
 
     def _add(self, place: Ned) -> bool:
-        """Record a place if it is far enough from the last point; return False if there is no space for it."""
+        """Record a place if it is far enough from the last point. Return False if there is no space for the place."""
         parameters = self._vehicle.parameters
         accuracy, maximum = parameters["SRTL_ACCURACY"], int(parameters["SRTL_POINTS"])
         if self._points and math.dist(self._points[-1], place) < accuracy:
@@ -341,7 +343,7 @@ class SmartPath:
 
 
 def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
-    """Return the path without points within ``tolerance`` metres of the line between their neighbours."""
+    """Return the path without those points that are within ``tolerance`` metres of the simplified path."""
     if len(path) < 3:
         return list(path)
     distances = [_distance_to_line(point, path[0], path[-1]) for point in path[1:-1]]
@@ -353,7 +355,7 @@ def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
 
 
 def prune(path: Sequence[Ned], tolerance: float) -> list[Ned]:
-    """Return the path without loops: segments within ``tolerance`` metres of each other are joined.
+    """Return the path without loops. A loop ends where two segments are within ``tolerance`` metres of each other.
 
     Loops are removed in the order of their starts. If several loops have the same start, only the longest is removed.
     """
@@ -387,7 +389,7 @@ def _along(start: Ned, line: Ned, share: float) -> Ned:
 def _distance_to_line(point: Ned, start: Ned, end: Ned) -> float:
     line = _vector(start, end)
     squared_length = _dot(line, line)
-    share = 0.0  # Part of the line before the place that is nearest to the point.
+    share = 0.0  # Place on the line that is nearest to the point: 0 is the start, 1 the end.
     if squared_length != 0.0:
         share = max(0.0, min(1.0, _dot(_vector(start, point), line) / squared_length))
     return math.dist(point, _along(start, line, share))
@@ -401,7 +403,8 @@ def _closest_approach(start1: Ned, end1: Ned, start2: Ned, end2: Ned) -> tuple[f
     determinant = dot11 * dot22 - dot12 * dot12
     if determinant < 1e-6 * max(dot11 * dot22, 1e-9):
         return None
-    # The nearest places as shares of the segments. Each is found for the other, limited to its segment.
+    # The nearest place on each segment, as a number from 0 (start) to 1 (end). Limiting one place to its segment moves
+    # the nearest place on the other segment, so the first place is calculated again at the end.
     share1 = max(0.0, min(1.0, (dot12 * dot2 - dot22 * dot1) / determinant))
     share2 = max(0.0, min(1.0, (dot12 * share1 + dot2) / dot22))
     share1 = max(0.0, min(1.0, (dot12 * share2 - dot1) / dot11))

@@ -33,7 +33,7 @@ _MIN_ANGLE_DEG, _MIN_AIRSPEED_M_S = 3.0, 5
 
 
 class PlaneArming(ArduPilotArming[PlaneHost]):
-    """ArduPlane's arming checks: GPS in every mode, plausible limits, and a mode that can start on the ground."""
+    """ArduPlane's arming checks. Every mode needs GPS, limits must be plausible, and the mode must be armable."""
 
     def own_reasons(self) -> list[str]:
         parameters, mode = self.vehicle.parameters, self.vehicle.mode
@@ -59,7 +59,7 @@ _FULL_AMPERES = 25.0
 
 
 class PlaneEngine(ArduPilotMotors):
-    """Engine of a plane, with the throttle of the motion model."""
+    """The engine of a plane, whose throttle is that of the motion model."""
 
     @property
     def current_a(self) -> float:
@@ -125,7 +125,7 @@ class SimulatedPlane(PlaneHost):
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def make_commands(self) -> dict[int, CommandHandler]:
-        # NAV_TAKEOFF needs the lifting rotors of a QuadPlane; ArduPlane has no command to land.
+        # NAV_TAKEOFF fails, because it needs the lifting rotors of a QuadPlane. ArduPlane has no command to land.
         return {
             **common_commands(self),
             MavCmd.NAV_TAKEOFF: lambda _: MavResult.FAILED,
@@ -170,7 +170,7 @@ class SimulatedPlane(PlaneHost):
             wing.settle()
 
     def _terminate(self, command: ReceivedCommand) -> int:
-        # Termination needs the advanced failsafe, which is not simulated.
+        # Termination is refused, because it needs the advanced failsafe, which is not simulated.
         if command.param1 > 0.5:
             self.failsafes.refuse_termination()
         return MavResult.FAILED
@@ -181,8 +181,8 @@ class SimulatedPlane(PlaneHost):
         return self.change_to(PlaneMode.AUTO)
 
     def _reposition(self, command: ReceivedCommand) -> int:
-        """Fly to a place and circle there. Param 3 is the radius; param 4 other than 0 means anticlockwise."""
-        if command.is_long:  # COMMAND_LONG does not specify the altitude frame that ArduPilot requires here.
+        """Fly to a place and circle there. Param 3 is the radius. Any param 4 but 0 and NaN means anticlockwise."""
+        if command.is_long:  # ArduPilot requires an altitude frame here, and COMMAND_LONG has none.
             return MavResult.UNSUPPORTED
         point = self.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:
@@ -198,7 +198,7 @@ class SimulatedPlane(PlaneHost):
         return MavResult.ACCEPTED
 
     def _change_speed(self, command: ReceivedCommand) -> int:
-        """Set the airspeed of GUIDED or AUTO; a ground speed is accepted but not simulated."""
+        """Set the airspeed of GUIDED or AUTO. A ground speed is accepted, but has no effect."""
         mode = self.mode
         if not isinstance(mode, PlaneNavigatingMode) or not mode.can_change_speed:
             return MavResult.FAILED

@@ -28,7 +28,7 @@ _ON_CIRCLE_SHARE = 1.3
 
 
 class PlaneAuto(PlaneNavigatingMode, MissionMode):
-    """AUTO: `MissionRun` selects the commands; after the last command the mode changes to RTL."""
+    """AUTO: flies the mission. `MissionRun` selects the commands. After the last command, the mode changes to RTL."""
 
     number: int = PlaneMode.AUTO
     name = "AUTO"
@@ -38,9 +38,9 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._manoeuvre = _LOITER
         self._landing: PlaneLanding | None = None
         self._on_circle_since = math.nan
-        self._turned = 0.0
+        self._turned_rad = 0.0
         self._last_bearing = 0.0
-        self._condition_from = 0.0
+        self._condition_started_at = 0.0
         self._leg_start: Ned = (0.0, 0.0, 0.0)
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             Cmd.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
@@ -64,10 +64,10 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         return self._manoeuvre == _LAND
 
     def enter(self, *, force: bool) -> bool:
-        """Start or resume the mission; without a mission change to RTL."""
+        """Start or resume the mission. Without a mission, change to RTL."""
         plane = self.vehicle
         if plane.mode is self and plane.is_armed and plane.mission.is_running:
-            return True  # Arming in AUTO enters the mode again.
+            return True  # Arming enters the current mode again, which must not restart the mission.
         super().enter(force=force)
         self._manoeuvre = _LOITER
         plane.call_later(0.0, self._begin if plane.mission.is_present else self._return_at_once)
@@ -78,7 +78,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self.vehicle.mission.start_or_resume()
 
     def on_disarmed(self) -> None:
-        """Does nothing: disarming has already reset the progress."""
+        """Do nothing, because disarming has already reset the progress."""
 
     def update(self, dt: float) -> None:
         plane = self.vehicle
@@ -97,13 +97,13 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self._count_turns()
 
     def _count_turns(self) -> None:
-        """Add up the angle that the plane has turned around the place since it reached the circle."""
+        """Add up the angle by which the plane has moved around the place since it reached the circle."""
         wing = self.vehicle.wing
         if self._place is None:
             return
         bearing = math.atan2(wing.east - self._place[1], wing.north - self._place[0])
         if not math.isnan(self._on_circle_since):
-            self._turned += abs(wrap_pi(bearing - self._last_bearing))
+            self._turned_rad += abs(wrap_pi(bearing - self._last_bearing))
         elif self._is_on_circle:
             self._on_circle_since = self.vehicle.now
         self._last_bearing = bearing
@@ -140,38 +140,38 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if command == Cmd.NAV_LOITER_TIME:
             return self._report_if(plane.now - self._on_circle_since >= item.param1, "Loiter time complete")
         if command == Cmd.NAV_LOITER_TURNS:
-            return self._report_if(self._turned >= 2 * math.pi * item.param1, "Loiter orbits complete")
+            return self._report_if(self._turned_rad >= 2 * math.pi * item.param1, "Loiter orbits complete")
         if command == Cmd.NAV_LOITER_TO_ALT:
             assert self._place is not None
             is_at_height = abs(plane.wing.down - self._place[2]) < _REACHED_HEIGHT_M
             return self._report_if(is_at_height and self._is_on_circle, "Loiter to alt complete")
         if command == Cmd.CONDITION_DELAY:
-            return plane.now - self._condition_from > max(0.0, item.param1)
+            return plane.now - self._condition_started_at > max(0.0, item.param1)
         if command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH):
             return False
         self.warn_if_unknown(item)
         return True
 
     def _report_if(self, is_done: bool, text: str) -> bool:
-        """Send the text if the command is done; return ``is_done``."""
+        """Send the text if ``is_done``, and return ``is_done``."""
         if is_done:
             self.vehicle.info(text)
         return is_done
 
     def _has_passed(self, index: int) -> bool:
-        """Return True within WP_RADIUS of the waypoint, or once the plane has passed it."""
+        """Return True if the plane is within WP_RADIUS of the waypoint or has passed the waypoint."""
         assert self._place is not None
         wing, (north, east, _), start = self.vehicle.wing, self._place, self._leg_start
         distance = horizontal_distance(self.vehicle, self._place)
         if distance <= self.vehicle.parameters["WP_RADIUS"]:
             self.vehicle.info(f"Reached waypoint #{index} dist {int(distance)}m")
             return True
-        # The dot product of the leg and the way from the waypoint to the plane is positive beyond the waypoint.
+        # The plane has passed the waypoint if its offset from the waypoint points along the leg (dot product above 0).
         beyond = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
         return self._report_if(beyond > 0, f"Passed waypoint #{index} dist {int(distance)}m")
 
     def _go(self, item: MissionItem, manoeuvre: int) -> None:
-        """Start a leg. Zero coordinates mean those of the plane; a zero altitude means that of the previous leg."""
+        """Start a leg. Zero coordinates mean the plane's coordinates, a zero altitude that of the previous leg."""
         self._leg_start = self.vehicle.wing.place
         point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or self._leg_start
         north, east = self._leg_start[:2] if (item.x, item.y) == (0, 0) else point[:2]
@@ -179,7 +179,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if item.z == 0:
             down = self._leg_start[2] if self._place is None else self._place[2]
         self._place, self._manoeuvre = (north, east, down), manoeuvre
-        self._on_circle_since, self._turned, self.radius = math.nan, 0.0, 0.0
+        self._on_circle_since, self._turned_rad, self.radius = math.nan, 0.0, 0.0
 
     def _loiter(self, item: MissionItem) -> None:
         self._go(item, _LOITER)
@@ -194,11 +194,11 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
 
     def _return(self, _: MissionItem) -> None:
-        # ArduPlane changes the mode (`start_command` in commands_logic.cpp). This stops the mission.
+        # ArduPlane changes the mode to RTL (commands_logic.cpp, start_command). The mode change stops the mission.
         self.vehicle.set_mode(PlaneMode.RTL)
 
     def _wait(self, _: MissionItem) -> None:
-        self._condition_from = self.vehicle.now
+        self._condition_started_at = self.vehicle.now
 
     def _change_speed(self, item: MissionItem) -> None:
         if self.vehicle.is_valid_airspeed(item.param2):
@@ -208,7 +208,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
     def _set_home(self, item: MissionItem) -> None:
         plane = self.vehicle
         point: Ned | None = plane.wing.place
-        if item.param1 != 1:  # On Plane, unlike on Copter, zeros are a position.
+        if item.param1 != 1:  # On Plane, unlike on Copter, the coordinates 0, 0 are an ordinary position.
             point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
         if point is not None:
             plane.navigation.set_home(point, lock=False)
@@ -222,7 +222,7 @@ _INVALID_ALTITUDES = (0.0, -1.0)
 
 @dataclass(frozen=True)
 class _TimedValue:
-    """A value of a set-point, and when it was received."""
+    """A value of a set-point, and the time at which the set-point was received."""
 
     value: float
     since: float
@@ -231,8 +231,8 @@ class _TimedValue:
 class PlaneGuided(PlaneNavigatingMode):
     """GUIDED: flies to the target and circles there.
 
-    A commanded course is valid until the next target, or until it is cancelled. Bank, pitch and throttle of
-    SET_ATTITUDE_TARGET expire separately after three seconds.
+    A commanded course is valid until it is cancelled or the next target arrives. Bank, pitch and throttle of
+    SET_ATTITUDE_TARGET expire after three seconds each.
     """
 
     number: int = PlaneMode.GUIDED
@@ -255,11 +255,14 @@ class PlaneGuided(PlaneNavigatingMode):
             self._climb_limit = climb_m_s
 
     def change_course(self, course: float | None) -> None:
-        """Fly on a course (radians from north); None circles again."""
+        """Fly on a course in radians from north. None ends this, so that the plane circles again."""
         self._course = course
 
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
-        """Follow bank, pitch and throttle if the mask selects them. The mask bit of a rate selects the angle."""
+        """Follow those of bank, pitch and throttle that the mask selects.
+
+        ArduPlane has no rate control here: if the mask selects the roll rate alone, the bank angle is followed.
+        """
         mask, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
         selects_all_angles = not mask & Mask.ATTITUDE_IGNORE and mask & _RATES == _RATES
@@ -310,7 +313,7 @@ class PlaneSetpoints:
         return self._plane.mode is self._guided
 
     def _on_local(self, message: m.SetPositionTargetLocalNed, _: Channel) -> None:
-        """Lower the target by ``z`` metres."""
+        """Lower the altitude of the target by ``z`` metres. Other frames than LOCAL_OFFSET_NED are ignored."""
         plane, target = self._plane, self._guided.destination
         if not self._is_guided or message.coordinate_frame != MavFrame.LOCAL_OFFSET_NED or target is None:
             return
@@ -322,7 +325,7 @@ class PlaneSetpoints:
         plane = self._plane
         if not self._is_guided:
             return
-        point = plane.world_point(0, 0, message.alt, message.coordinate_frame)
+        point = plane.world_point(0, 0, message.alt, message.coordinate_frame)  # Only the altitude is used.
         if point is None:
             plane.info(f"Unknown mavlink coordinate frame {message.coordinate_frame}")
             plane.send_text(MavSeverity.WARNING, "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT")
@@ -362,11 +365,8 @@ def _change_speed(plane: PlaneHost, guided: PlaneGuided, command: ReceivedComman
 
 
 def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    """Change the altitude. Param 3 is the climb rate in m/s, 0 for the maximum.
-
-    The firmware refuses the altitudes 0 and -1.
-    """
-    point = plane.world_point(0, 0, command.z, command.altitude_frame)
+    """Change the altitude (the firmware refuses 0 and -1). Param 3 is the climb rate in m/s; 0 is the maximum."""
+    point = plane.world_point(0, 0, command.z, command.altitude_frame)  # Only the altitude is used.
     if command.z in _INVALID_ALTITUDES or point is None:
         return MavResult.DENIED
     guided.change_altitude(point[2], abs(command.param3) or _UNLIMITED_M_S)
@@ -374,7 +374,7 @@ def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCom
 
 
 def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    """Fly a course: param 1 is a HEADING_TYPE (heading and course are treated alike), param 2 is in degrees."""
+    """Fly a course of param 2 degrees. Param 1 is a HEADING_TYPE. Heading and course have the same effect."""
     if not 0.0 <= command.param2 < 360.0:
         return MavResult.DENIED
     if command.param1 == HeadingType.DEFAULT:
@@ -387,8 +387,8 @@ def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand)
 
 
 def _change_target_altitude(plane: PlaneHost, command: ReceivedCommand) -> int:
-    """Change the altitude: param 1 in metres, param 2 a MAV_FRAME. Accepted in every mode, but only GUIDED uses it."""
-    point = plane.world_point(0, 0, command.param1, whole(command.param2))
+    """Change the altitude to param 1 metres (MAV_FRAME param 2). Only GUIDED uses the altitude; all modes accept it."""
+    point = plane.world_point(0, 0, command.param1, whole(command.param2))  # Only the altitude is used.
     if point is None:
         return MavResult.DENIED
     guided = plane.mode_of(PlaneGuided)

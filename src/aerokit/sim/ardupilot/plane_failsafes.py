@@ -16,7 +16,7 @@ from aerokit.sim.motion import Ned
 _NONE, _SHORT, _LONG, _GCS = range(4)
 # The throttle failsafe starts 0.2 s after the throttle is low, or after 1 s without pulses.
 _SILENT_S, _COUNT_S = 1.0, 0.2
-# FS_SHORT_ACTN, FS_LONG_ACTN, FS_GCS_ENABL and the battery actions.
+# Values of FS_SHORT_ACTN, FS_LONG_ACTN and FS_GCS_ENABL, and of the battery actions.
 _SHORT_BEST_GUESS, _SHORT_FBWA, _SHORT_DISABLED, _SHORT_FBWB = 0, 2, 3, 4
 _LONG_RTL, _LONG_GLIDE, _LONG_PARACHUTE, _LONG_AUTO, _LONG_AUTOLAND = range(1, 6)
 _HEARTBEAT, _HEARTBEAT_OR_RSSI, _IN_AUTO = 1, 2, 3
@@ -39,8 +39,8 @@ _LONG_MODES: dict[int, tuple[int, ...]] = {
 class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     """Failsafes of radio, ground station and battery, which act on armed and disarmed planes.
 
-    FS_SHORT_ACTN is executed a second after the radio is lost, FS_LONG_ACTN after a further FS_LONG_TIMEOUT. The
-    previous mode is restored if the radio returns before that. Not simulated: the weak signal of FS_GCS_ENABL 2,
+    FS_SHORT_ACTN is executed a second after the radio is lost, FS_LONG_ACTN after a further FS_LONG_TIMEOUT. If the
+    radio returns before FS_LONG_ACTN, the previous mode is restored. Not simulated: the weak signal of FS_GCS_ENABL 2,
     parachutes, termination.
     """
 
@@ -48,11 +48,12 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
-        self.state: int = _NONE  # 0 none, 1 short and 2 long failsafe of the radio, 3 ground station.
+        # The active failsafe: none, the short or the long failsafe of the radio, or that of the ground station.
+        self.state: int = _NONE
         self._short_since = math.nan
         self._radio_bad = ConditionTimer()
         self._mode_before = self._mode_after = 0
-        self._is_pending = False
+        self._is_long_pending = False
 
     @property
     def is_any_active(self) -> bool:
@@ -61,7 +62,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     @property
     def is_radio_healthy(self) -> bool:
         """True while pulses are received and the throttle is above THR_FS_VALUE."""
-        return not (self.radio or self._is_radio_bad())
+        return not (self.is_radio_lost or self._is_radio_bad())
 
     def update(self) -> None:
         self._check_radio()
@@ -82,21 +83,21 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         is_bad = self._is_radio_bad()
         bad_for = self._radio_bad.seconds(is_bad, plane.now)
         if not is_bad:
-            self._set_radio(is_lost=False)
-        elif plane.parameters["THR_FAILSAFE"] == 1 and bad_for >= _COUNT_S - 1e-6:
-            self._set_radio(is_lost=True)
+            self._set_radio_lost(is_lost=False)
+        elif plane.parameters["THR_FAILSAFE"] == 1 and bad_for >= _COUNT_S - 1e-6:  # tolerates rounding errors
+            self._set_radio_lost(is_lost=True)
 
-    def _set_radio(self, *, is_lost: bool) -> None:
-        if is_lost != self.radio:
-            self.radio = is_lost
+    def _set_radio_lost(self, *, is_lost: bool) -> None:
+        if is_lost != self.is_radio_lost:
+            self.is_radio_lost = is_lost
             self.warn(f"Throttle failsafe {'on' if is_lost else 'off'}")
 
     def _check_short(self) -> None:
         action = int(self.vehicle.parameters["FS_SHORT_ACTN"])
         is_landing = self.vehicle.mode.is_landing
-        if self.state == _NONE and self.radio and action != _SHORT_DISABLED and not is_landing:
+        if self.state == _NONE and self.is_radio_lost and action != _SHORT_DISABLED and not is_landing:
             self._start_short(action)
-        elif self.state == _SHORT and (not self.radio or action == _SHORT_DISABLED):
+        elif self.state == _SHORT and (not self.is_radio_lost or action == _SHORT_DISABLED):
             self._end_short()
 
     def _start_short(self, action: int) -> None:
@@ -104,7 +105,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         self.state, self._short_since = _SHORT, plane.now
         mode = self._mode_before = plane.mode.number
         if mode in _PILOTED or (mode in _NAVIGATING and action != _SHORT_BEST_GUESS):
-            plane.set_mode(_SHORT_MODES.get(action, PlaneMode.CIRCLE))
+            plane.set_mode(_SHORT_MODES.get(action, PlaneMode.CIRCLE))  # Every other action circles.
         self._mode_after = plane.mode.number
         if self._mode_after != self._mode_before:
             self.warn(f"RC Short Failsafe: switched to {plane.mode.name}")
@@ -132,10 +133,10 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         checks_gcs = gcs_option in (_HEARTBEAT, _HEARTBEAT_OR_RSSI)
         if gcs_option == _IN_AUTO:
             checks_gcs = plane.mode.number == PlaneMode.AUTO
-        if self.radio and plane.now - lost_since > timeout:
+        if self.is_radio_lost and plane.now - lost_since > timeout:
             self._start_long(_LONG)
         elif checks_gcs and self.ground_station_silence > timeout:
-            self.ground_station = True
+            self.is_ground_station_lost = True
             self._start_long(_GCS)
 
     def _check_end_of_long(self) -> None:
@@ -143,27 +144,27 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         has_short = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
         timeout = parameters["FS_SHORT_TIMEOUT" if has_short else "FS_LONG_TIMEOUT"]
         if self.state == _GCS and self.ground_station_silence < timeout:
-            self.ground_station: bool = False
+            self.is_ground_station_lost: bool = False
             self._end_long("GCS Failsafe Off")
-        elif self.state == _LONG and not self.radio:
+        elif self.state == _LONG and not self.is_radio_lost:
             self._end_long("RC Long Failsafe Cleared")
 
     def _end_long(self, text: str) -> None:
-        self.state, self._is_pending = _NONE, False
+        self.state, self._is_long_pending = _NONE, False
         self.warn(text)
 
     def _start_long(self, state: int) -> None:
-        """Execute FS_LONG_ACTN, which has other effects in piloted modes, in RTL and in missions."""
+        """Execute FS_LONG_ACTN. Its effect depends on the mode: a piloted mode, RTL, or AUTO and GUIDED."""
         plane = self.vehicle
         plane.rc.release_overrides()
         self.state = state
         mode = plane.mode.number
         action = int(plane.parameters["FS_LONG_ACTN"])
         if mode in _LONG_AS_PILOTED:
-            glides = action in (_LONG_GLIDE, _LONG_PARACHUTE)
-            if self._is_in_take_off and not glides:
-                self._is_pending = True
-            else:  # Action 0 continues in AUTO and GUIDED, but returns in these modes.
+            acts_in_take_off = action in (_LONG_GLIDE, _LONG_PARACHUTE)
+            if self._is_in_take_off and not acts_in_take_off:
+                self._is_long_pending = True
+            else:  # In these modes, action 0 returns to launch; only in AUTO and GUIDED it continues.
                 self.change_to(*_LONG_MODES.get(action or _LONG_RTL, ()))
         elif mode == PlaneMode.RTL:
             if action in (_LONG_AUTO, _LONG_AUTOLAND):
@@ -178,8 +179,8 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def _resume_pending(self) -> None:
         """Start a long failsafe that was postponed until the end of a take-off."""
-        if self._is_pending and not self._is_in_take_off:
-            self._is_pending = False
+        if self._is_long_pending and not self._is_in_take_off:
+            self._is_long_pending = False
             if self.vehicle.mode.number == PlaneMode.TAKEOFF:
                 self._start_long(_LONG)
 
@@ -195,14 +196,14 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self.change_to(*preferred, PlaneMode.RTL)
 
     def refuse_termination(self) -> None:
-        """Send the reason why the flight is not terminated: AFS_ENABLE is 0, or AFS_TERM_ACTION is not set."""
+        """Report why the flight cannot be terminated: AFS_ENABLE is 0 or AFS_TERM_ACTION is not set."""
         text = "AFS not enabled, can't terminate the vehicle"
         if self.vehicle.parameters["AFS_ENABLE"]:
             text = "Unable to terminate, termination is not configured"
         self.warn(text, MavSeverity.INFO)
 
     def _land_by_mission(self) -> bool:
-        """Change to AUTO at DO_LAND_START; return False if the mission does not contain it."""
+        """Start the landing sequence of the mission. Return False if the mission has no DO_LAND_START."""
         plane = self.vehicle
         items = enumerate(plane.missions.commands.items())
         land_start = next((index for index, item in items if item.command == MavCmd.DO_LAND_START), None)
@@ -214,13 +215,13 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         return plane.set_mode(PlaneMode.AUTO)
 
 
-# FENCE_ACTION.
+# Values of FENCE_ACTION.
 _RTL, _GUIDED, _GUIDED_THROTTLE, _AUTOLAND = 1, 6, 7, 8
 _RETURNS = frozenset({_RTL, _GUIDED, _GUIDED_THROTTLE, _AUTOLAND})
 
 
 class PlaneFence(ArduPilotFence[PlaneHost]):
-    """Fence. FENCE_ACTION: report only (0), RTL (1), GUIDED to the return point (6, 7), AUTOLAND or RTL (8).
+    """ArduPlane's fence. Values of FENCE_ACTION: report only (0), RTL (1), fly to the return point (6, 7), land (8).
 
     Further breaches are ignored during a return. Disabling the fence on the way to the return point restores the
     previous mode.
@@ -255,7 +256,11 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             plane.guided.go_to(self.return_place())
 
     def return_place(self) -> Ned:
-        """Return the uploaded return point or home, at FENCE_RET_ALT or half-way between the altitude limits."""
+        """Return the place to which the plane returns after a breach.
+
+        With FENCE_RET_RALLY, this is a rally point. Otherwise it is the uploaded return point or home, at FENCE_RET_ALT
+        or half-way between the altitude limits.
+        """
         plane, parameters = self.vehicle, self.vehicle.parameters
         home = plane.home_or_ground
         if parameters["FENCE_RET_RALLY"]:

@@ -17,7 +17,7 @@ class PlaneHost(ArduPilotVehicle):
 
     def make_motion(self, wind: SimulatedWind | None) -> Motion:
         self.wing: FixedWing = FixedWing(self.rng, wind=wind)
-        """The motion model; the same object as ``motion``."""
+        """The motion model, which is the same object as ``motion``."""
         self._read_limits()
         return self.wing
 
@@ -49,7 +49,7 @@ class PlaneHost(ArduPilotVehicle):
         return self.parameters["AIRSPEED_MIN"] <= airspeed <= self.parameters["AIRSPEED_MAX"]
 
     def lift_off(self) -> None:
-        """Leave the landed state at the start of a take-off roll."""
+        """Set ``is_landed`` to False at the start of a take-off roll."""
         if self.is_landed:
             self._read_limits()
             self.is_landed: bool = False
@@ -57,7 +57,7 @@ class PlaneHost(ArduPilotVehicle):
             self.take_off_yaw = self.wing.yaw
 
     def climb_out(self) -> None:
-        """Keep the take-off heading at cruise speed, and climb once the airspeed suffices."""
+        """Fly in the take-off direction at cruise speed, and climb as soon as the airspeed suffices."""
         wing = self.wing
         self.lift_off()
         if wing.is_on_ground:
@@ -74,15 +74,15 @@ _CORRECTION_LENGTH_M = 80.0
 
 
 class PlaneLanding:
-    """Landing on ``point``: approach, flare, roll-out, disarming.
+    """Landing on ``point``, with the approach, the flare, the roll-out and disarming.
 
-    The approach begins at ``start``; None begins it at the current position.
+    The approach begins at ``start``, or at the current position if ``start`` is None.
     """
 
     def __init__(self, plane: PlaneHost, point: Ned, start: Ned | None = None) -> None:
         self._plane = plane
         self.point: Ned = point
-        self._fly_to_first = start  # None once the approach has begun.
+        self._fly_to_first = start  # Place to fly to before the approach; None once the approach has begun.
         self._approach_start: Ned = plane.wing.place
         self._is_flaring = self._is_reported = False
         self._stopped_at = math.nan
@@ -90,7 +90,7 @@ class PlaneLanding:
     def update(self, dt: float) -> None:
         plane, wing = self._plane, self._plane.wing
         if plane.is_landed:
-            self._wait()
+            self._disarm_after_stop()
         elif wing.is_on_ground:
             wing.roll_out()
         elif self._fly_to_first is not None:
@@ -110,7 +110,8 @@ class PlaneLanding:
         plane, wing, (north, east, down) = self._plane, self._plane.wing, self.point
         course = math.atan2(east - self._approach_start[1], north - self._approach_start[0])
         cos_course, sin_course = math.cos(course), math.sin(course)
-        # Metres to the point along the approach line (negative beyond the point), and metres beside that line.
+        # Distances in metres from the landing point: along the approach line (negative once the plane has passed the
+        # point), and across that line.
         remaining = (north - wing.north) * cos_course + (east - wing.east) * sin_course
         aside = (east - wing.east) * cos_course - (north - wing.north) * sin_course
         flare_time = wing.velocity_down * plane.parameters["LAND_FLARE_SEC"]
@@ -133,7 +134,7 @@ class PlaneLanding:
         speed, sink = wing.ground_speed_m_s, wing.velocity_down
         self._plane.info(f"Flare {height:.1f}m sink={sink:.2f} speed={speed:.1f} dist={remaining:.1f}")
 
-    def _wait(self) -> None:
+    def _disarm_after_stop(self) -> None:
         """Disarm LAND_DISARMDELAY seconds after the plane has stopped."""
         plane, wing = self._plane, self._plane.wing
         if math.isnan(self._stopped_at):
@@ -168,7 +169,7 @@ class PlaneModeBase(ArduPilotMode):
 
 
 class PlanePilotedMode(PlaneModeBase):
-    """Base of the piloted modes: sticks control bank, climb and speed; with a low throttle the plane glides."""
+    """Base of the piloted modes: sticks control bank, climb and speed. With a low throttle, the plane glides."""
 
     has_manual_throttle = True
 
@@ -179,15 +180,15 @@ class PlanePilotedMode(PlaneModeBase):
             wing.roll_out()
             return
         plane.lift_off()
-        climb = self.stick(1) * wing.wing_limits.climb_m_s  # Pulling the stick gives positive values.
+        climb = self.stick(1) * wing.wing_limits.climb_m_s  # A pulled stick has a positive value, and climbs.
         if plane.rc[2] <= _LOW_THROTTLE:
             climb = min(climb, 0.0) - wing.wing_limits.glide_sink_m_s
-        speed = max(0.0, throttle * 2 * plane.cruise_m_s)  # Half throttle is cruise speed.
+        speed = max(0.0, throttle * 2 * plane.cruise_m_s)  # Half throttle flies at cruise speed.
         wing.bank_and_climb(speed, self.stick(0) * wing.wing_limits.bank_rad, climb)
 
 
 class PlaneAltitudeMode(PlaneModeBase):
-    """FBWB, and base of modes that hold altitude and speed; on the ground the plane rolls to a stop."""
+    """FBWB, and base of the modes that hold altitude and speed. On the ground, the plane rolls to a stop."""
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
@@ -210,13 +211,13 @@ class PlaneAltitudeMode(PlaneModeBase):
         return self.stick(1) * self.vehicle.parameters["FBWB_CLIMB_RATE"]
 
     def steer(self, climb: float) -> None:
-        """Bank as the roll stick commands, with this climb rate."""
+        """Bank as the roll stick commands, and climb at ``climb`` m/s."""
         wing = self.vehicle.wing
         wing.bank_and_climb(self.vehicle.cruise_m_s, self.stick(0) * wing.wing_limits.bank_rad, climb)
 
 
 class PlaneCruise(PlaneAltitudeMode):
-    """CRUISE: like FBWB, but holds the course over ground while the roll stick is centred."""
+    """CRUISE: works like FBWB, and holds the course over ground while the roll stick is centred."""
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
@@ -247,14 +248,14 @@ class PlaneCircle(PlaneAltitudeMode):
 
 
 class PlaneNavigatingMode(PlaneModeBase):
-    """LOITER, and base of modes that fly to a place (by default where the mode was entered) and circle there."""
+    """LOITER, and base of the modes that fly to a place (by default, that of the mode change) and circle there."""
 
     flags: int = _NAVIGATES
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
-        self.speed: float = 0.0  # Commanded airspeed in m/s; 0 means AIRSPEED_CRUISE.
-        self.radius: float = 0.0  # Radius of the circle in metres; 0 means WP_LOITER_RAD.
+        self.speed: float = 0.0  # Commanded airspeed in m/s; 0 selects AIRSPEED_CRUISE.
+        self.radius: float = 0.0  # Radius of the circle in metres; 0 selects WP_LOITER_RAD.
         self._place: Ned | None = None
 
     def enter(self, *, force: bool) -> bool:
@@ -280,7 +281,7 @@ class PlaneNavigatingMode(PlaneModeBase):
 
 
 class PlaneRtl(PlaneNavigatingMode):
-    """RTL: flies to a rally point or home and circles there, at RTL_ALTITUDE (negative: the current altitude)."""
+    """RTL: circles above a rally point or home at RTL_ALTITUDE, or at the current altitude if that is negative."""
 
     can_arm = False
 
@@ -295,7 +296,7 @@ class PlaneRtl(PlaneNavigatingMode):
 
 
 class PlaneTakeOff(PlaneNavigatingMode):
-    """TAKEOFF: takes off once armed, climbs to TKOFF_ALT and circles TKOFF_DIST ahead of the start."""
+    """TAKEOFF: takes off after arming, climbs to TKOFF_ALT, and circles TKOFF_DIST metres ahead of the start."""
 
     def enter(self, *, force: bool) -> bool:
         super().enter(force=force)
@@ -334,14 +335,14 @@ class PlaneTakeOff(PlaneNavigatingMode):
 class PlaneAutoland(PlaneNavigatingMode):
     """AUTOLAND: lands at home in the direction of the take-off. The mode can only be entered in flight.
 
-    If the plane is armed again after landing, it disarms at once.
+    A plane that is armed again after the landing disarms at once.
     """
 
     is_landing = True
 
     def enter(self, *, force: bool) -> bool:
         plane = self.vehicle
-        if plane.mode is self and plane.is_landed:  # Arming in AUTOLAND enters the mode again.
+        if plane.mode is self and plane.is_landed:  # Arming enters the current mode again.
             return True
         if plane.is_landed:
             plane.send_text(MavSeverity.WARNING, "Must already be flying!")

@@ -18,15 +18,15 @@ _OVERRIDABLE, _CHANNELS = 16, 18
 # Values of SIM_RC_FAIL.
 _NO_PULSES, _LOW_THROTTLE = 1, 2
 _LOW_THROTTLE_PWM = 950
-# Values of RC_CHANNELS_OVERRIDE; _RELEASE_UPPER releases one of the channels 9 to 18.
+# Special values of channels in RC_CHANNELS_OVERRIDE. `_RELEASE_UPPER` releases one of the channels 9 to 18.
 _UNCHANGED, _RELEASE_UPPER = 0xFFFF, 0xFFFE
 _ROLL, _PITCH, _THROTTLE, _YAW, _FORWARD, _LATERAL = range(6)
 
 
 class ArduPilotRadio:
-    """RC channels: pulse widths in microseconds by index (``radio[2]`` is the throttle), with overrides applied.
+    """The RC channels. ``radio[2]`` is the pulse width of the throttle in microseconds, with overrides applied.
 
-    Assigning an item moves one of the transmitter's eight sticks and switches.
+    Assigning an item moves a stick or switch of the simulated transmitter, which has eight channels.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
@@ -39,7 +39,7 @@ class ArduPilotRadio:
 
     def __getitem__(self, index: int) -> int:
         if index in self._overrides:
-            value, since = self._overrides[index]  # The value 0 releases the channel.
+            value, since = self._overrides[index]  # The value 0 means that the channel is released.
             if value and self._vehicle.now - since < self._override_time():
                 return value
         if index == _THROTTLE and self._failure == _LOW_THROTTLE:
@@ -54,7 +54,7 @@ class ArduPilotRadio:
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """The 18 channels of RC_CHANNELS; 0 for channels that the transmitter lacks."""
+        """Pulse widths of the 18 channels of RC_CHANNELS. A channel that the transmitter lacks is 0."""
         if not self._overrides and self._failure != _LOW_THROTTLE:
             return (*self._sticks, *(0,) * (_CHANNELS - len(self._sticks)))
         return tuple(self[index] for index in range(_CHANNELS))
@@ -69,7 +69,7 @@ class ArduPilotRadio:
         return any(value and since > expired_before for value, since in self._overrides.values())
 
     def override(self, pulses: Mapping[int, int]) -> None:
-        """Override channels (index → µs) for RC_OVERRIDE_TIME; 0 releases a channel."""
+        """Override channels for RC_OVERRIDE_TIME. ``pulses`` maps a channel index to µs; 0 releases the channel."""
         for index, value in pulses.items():
             self._overrides[index] = (value, self._vehicle.now)
 
@@ -85,19 +85,19 @@ class ArduPilotRadio:
         self._vehicle.on(m.RcChannelsOverride, self._on_override)
 
     def _override_time(self) -> float:
-        """Return the seconds for which an override is valid; a negative RC_OVERRIDE_TIME means no limit."""
+        """Return the seconds for which an override is valid; infinity for a negative RC_OVERRIDE_TIME."""
         seconds = self._vehicle.parameters["RC_OVERRIDE_TIME"]
         return math.inf if seconds < 0 else seconds
 
     def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
-        """Apply overrides of the ground station MAV_GCS_SYSID. 0 releases channels 1 to 8 only."""
+        """Apply overrides of the ground station MAV_GCS_SYSID. The value 0 releases only the channels 1 to 8."""
         vehicle = self._vehicle
         if sender_of(override)[0] != vehicle.parameters["MAV_GCS_SYSID"]:
             return
         vehicle.failsafes.ground_station_seen_at = vehicle.now
         for index in range(_OVERRIDABLE):
             value, is_upper = getattr(override, f"chan{index + 1}_raw"), index >= len(self._sticks)
-            if value == _UNCHANGED or (value == 0 and is_upper):  # In an upper channel, 0 means unchanged, too.
+            if value == _UNCHANGED or (value == 0 and is_upper):  # In an upper channel, 0 also means unchanged.
                 continue
             if value == _RELEASE_UPPER and is_upper:
                 value = 0
@@ -112,7 +112,7 @@ class ArduPilotJoystick:
     """MANUAL_CONTROL of Copter and Plane: x is pitch, y roll, z throttle (0 to 1000), r yaw (-1000 to 1000).
 
     Only messages from the ground station MAV_GCS_SYSID to this vehicle are used. They also count as heartbeats of that
-    station. Axes become overrides like those of RC_CHANNELS_OVERRIDE; an axis without a value releases its channel.
+    station. An axis overrides its channel like RC_CHANNELS_OVERRIDE. An axis without a value releases its channel.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
@@ -127,8 +127,8 @@ class ArduPilotJoystick:
         vehicle.failsafes.ground_station_seen_at = vehicle.now
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
-        """Return pulses in microseconds by channel index; 0 releases a channel."""
-        if axes.z < 0:  # Copter has no negative thrust (GCS_MAVLink_Copter.cpp).
+        """Return the pulses that the axes command, in microseconds by channel index; 0 releases a channel."""
+        if axes.z < 0:  # Copter ignores a message with negative thrust (GCS_MAVLink_Copter.cpp).
             return {}
         return {
             _ROLL: self.pulse(_ROLL, axes.y),
@@ -138,14 +138,15 @@ class ArduPilotJoystick:
         }
 
     def pulse(self, channel: int, value: int, *, lowest: int = -1000, reverse: bool = False) -> int:
-        """Scale an axis to RCn_MIN … RCn_MAX; return 0 for an axis without a value."""
+        """Scale the value of an axis to RCn_MIN … RCn_MAX. Return 0 if the message has no value for the axis."""
         if value == _NO_VALUE:
             return 0
         low, high = self.setting(f"RC{channel + 1}_MIN", 1100.0), self.setting(f"RC{channel + 1}_MAX", 1900.0)
         if reverse:
             value = -value
         share = (value - lowest) / (1000 - lowest)
-        return int(low + (high - low) * share) & 0xFFFF  # The firmware does not check the range of an axis.
+        # The result may be out of range, because the firmware does not check the range of an axis.
+        return int(low + (high - low) * share) & 0xFFFF
 
     def setting(self, name: str, default: float) -> float:
         """Return a parameter, or the default if the parameter table lacks it."""
@@ -153,7 +154,7 @@ class ArduPilotJoystick:
 
 
 class RoverJoystick(ArduPilotJoystick):
-    """MANUAL_CONTROL of Rover: y steers, z is the throttle, -1000 to 1000."""
+    """MANUAL_CONTROL of Rover: y is the steering and z the throttle, both from -1000 to 1000."""
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
         return {_ROLL: self.pulse(_ROLL, axes.y), _THROTTLE: self.pulse(_THROTTLE, axes.z)}
@@ -181,7 +182,7 @@ _SERVOS = 32
 _RELAYS = {"rover": 2}
 _FUNCTIONS = 320
 _SAVE_WAYPOINT = 7
-# Auxiliary functions that the firmwares refused in SITL.
+# Numbers of the auxiliary functions that each firmware refused in SITL.
 _REFUSED_FUNCTIONS: dict[Kind, tuple[int, ...]] = {
     "copter": (0,),
     "plane": (0, _SAVE_WAYPOINT),
@@ -197,9 +198,9 @@ class AuxiliaryOutputs:
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
-        self.servos: dict[int, int] = {}  # Output number, from 1 → pulse in microseconds.
+        self.servos: dict[int, int] = {}  # Pulses in microseconds by output number, which counts from 1.
         self.relays: int = 0  # Bit mask of the relays that are on.
-        self.functions: dict[int, int] = {}  # RC option → switch position: 0 low, 1 middle, 2 high.
+        self.functions: dict[int, int] = {}  # Switch positions (0 low, 1 middle, 2 high) by auxiliary function.
 
     @property
     def relay_count(self) -> int:
@@ -210,7 +211,7 @@ class AuxiliaryOutputs:
         return self._vehicle.parameters.get(f"SERVO{output}_FUNCTION", 0) in _FREE_FUNCTIONS
 
     def set_servo(self, command: ReceivedCommand) -> int:
-        """Execute DO_SET_SERVO, or the first pulse of DO_REPEAT_SERVO."""
+        """Set a servo output for DO_SET_SERVO, or for the first pulse of DO_REPEAT_SERVO."""
         output = whole(command.param1)
         if not 1 <= output <= _SERVOS:
             return MavResult.FAILED
@@ -228,12 +229,12 @@ class AuxiliaryOutputs:
         return MavResult.ACCEPTED
 
     def repeat_relay(self, command: ReceivedCommand) -> int:
-        """Execute DO_REPEAT_RELAY, after which the relay has its previous state."""
+        """Accept DO_REPEAT_RELAY. At the end of the repetitions, the relay has its previous state again."""
         is_valid = 0 <= command.param1 < self.relay_count
         return MavResult.ACCEPTED if is_valid else MavResult.FAILED
 
     def switch(self, command: ReceivedCommand) -> int:
-        """Execute DO_AUX_FUNCTION; its effect is not simulated."""
+        """Record the switch position of DO_AUX_FUNCTION. The function itself is not simulated."""
         function = whole(command.param1)
         if command.param2 not in _AUX_POSITIONS:
             return MavResult.DENIED

@@ -12,14 +12,15 @@ from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import ReceivedCommand, whole
 
-# Suffix of the parameter with the rate of a stream: MAV1_EXTRA1 for the first port.
+# Suffixes of the parameters that hold the stream rates. On the first port, EXTRA1 stands for MAV1_EXTRA1.
 _RATE_PARAMETERS: dict[int, str] = {
     Stream.RAW_SENSORS: "RAW_SENS", Stream.EXTENDED_STATUS: "EXT_STAT", Stream.RC_CHANNELS: "RC_CHAN",
     Stream.RAW_CONTROLLER: "RAW_CTRL", Stream.POSITION: "POSITION", Stream.EXTRA1: "EXTRA1",
     Stream.EXTRA2: "EXTRA2", Stream.EXTRA3: "EXTRA3",
 }  # fmt: skip
 
-# Ids that can be requested. Others are DENIED as a stream and FAILED as a single message.
+# Ids of the messages that a client can request. A request to stream another message is DENIED, and a request to send
+# another message once is FAILED.
 _ALL_KINDS: frozenset[int] = frozenset(
     {
         0, 1, 2, 22, 24, 26, 27, 29, 30, 31, 32, 33, 35, 36, 42, 46, 49, 62, 65, 74, 83, 85, 87, 100, 105, 108, 116,
@@ -35,39 +36,42 @@ _SUPPORTED_MESSAGES: dict[Kind, frozenset[int]] = {
     "sub": _ALL_KINDS,
 }
 
-# Streams use at most 80 % of the main loop of 400 Hz (GCS_Common.cpp, cap_message_interval).
+# A stream may have at most 80 % of the rate of the main loop, which is 400 Hz (GCS_Common.cpp, cap_message_interval).
 _MIN_INTERVAL_S, _MAX_INTERVAL_S = 0.0025 / 0.8, 60.0
-_MESSAGE_INTERVAL_IDS = 1 << 16  # Ids that fit the field of MESSAGE_INTERVAL.
+_MESSAGE_INTERVAL_IDS = 1 << 16  # The 16-bit message id in MESSAGE_INTERVAL is below this number.
 _MIN_TERRAIN_REQUEST_INTERVAL_S = 2.0
 
 DISPLAY_VALUES: dict[str, float] = {
     "CamTilt": 0.5, "CamPan": 0.5, "TetherTrn": 0.0, "Lights1": 0.5, "Lights2": 0.5, "PilotGain": 0.5,
     "InputHold": 0.0, "RollPitch": 0.0, "RFTarget": -0.01,
 }  # fmt: skip
-"""NAMED_VALUE_FLOATs that ArduSub sends with EXTENDED_STATUS, one after the other."""
+"""Names and values of NAMED_VALUE_FLOAT, which ArduSub sends one after the other with EXTENDED_STATUS."""
 
 
 class ArduPilotMessageRequests:
     """SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL, REQUEST_MESSAGE and REQUEST_DATA_STREAM.
 
-    Stream rates are parameters of the port (MAV1_EXTRA1 …), which take effect at boot. REQUEST_DATA_STREAM changes
-    these parameters. Plane saves and broadcasts the change; the other firmwares undo it at the next reboot.
+    Parameters of the port (MAV1_EXTRA1 …) hold the stream rates at boot. REQUEST_DATA_STREAM changes these parameters.
+    Plane saves and broadcasts the new values. The other firmwares restore the old values at the next reboot.
     """
 
     def __init__(self, vehicle: ArduPilotHost, *, stream_groups: bool = True) -> None:
         self._vehicle = vehicle
         self._supported = _SUPPORTED_MESSAGES[vehicle.KIND]
-        # Stream group → ids of its messages; some messages are sent only under conditions.
+        # Message ids by stream group. Some of the messages are sent only under certain conditions.
         self._groups: dict[int, tuple[int, ...]] = dict.fromkeys(_RATE_PARAMETERS, ())
         for stream, message_id, _ in rows_of(vehicle.KIND, "stream_groups.csv"):
             self._groups[Stream[stream]] += (int(message_id),)
-        # Rate parameter → value after the next reboot, and the value until then.
+        # Two values by rate parameter: the value after the next reboot, and the value until then.
         self._saved: dict[str, tuple[float, int]] = {}
         if stream_groups:
             vehicle.on(m.RequestDataStream, self._on_group)
 
     def set_interval(self, command: ReceivedCommand) -> int:
-        """Set an interval in microseconds; -1 is off, 0 is the default (one second for HEARTBEAT, else off)."""
+        """Set the interval of a message in microseconds. -1 turns the stream off.
+
+        0 selects the default, which is one second for HEARTBEAT and off for other messages.
+        """
         message_id, interval_us = whole(command.param1), whole(command.param2)
         if command.param3 != 0.0:
             return MavResult.DENIED
@@ -110,7 +114,7 @@ class ArduPilotMessageRequests:
         return MavResult.ACCEPTED
 
     def send_soon(self, message_id: int, channel: Channel) -> None:
-        """Send a message after the acknowledgement that is sent now."""
+        """Send a message directly after the acknowledgement of the command that is being handled."""
 
         def send() -> None:
             message = self._vehicle.build(message_id)
@@ -120,7 +124,10 @@ class ArduPilotMessageRequests:
         self._vehicle.call_later(0.0, send)
 
     def _send_modes(self, index: int, channel: Channel) -> None:
-        """Send the mode with this index (from 1; 0 for all), and AVAILABLE_MODES_MONITOR every 5 s from now on."""
+        """Send AVAILABLE_MODES of the mode with this index (1 is the first), or of all modes if the index is 0.
+
+        From then on, AVAILABLE_MODES_MONITOR is sent every 5 s.
+        """
         vehicle = self._vehicle
         modes = vehicle.available_modes()
         for message in modes if index == 0 else modes[index - 1 : index]:
@@ -136,11 +143,11 @@ class ArduPilotMessageRequests:
             if stream in self._groups:
                 self._stream_group(stream, rate, channel, self._vehicle.now)
                 self._store_rate(f"{self._prefix(channel)}{_RATE_PARAMETERS[stream]}", rate)
-        if requested == Stream.ALL:  # ADSB is a further group, without messages in the simulation.
+        if requested == Stream.ALL:  # The group ADSB has a rate, but no messages in the simulation.
             self._store_rate(f"{self._prefix(channel)}ADSB", rate)
 
     def start_channel(self, channel: Channel, first: float) -> None:
-        """Start the streams that the port's parameters select; ``first`` is the time of the first messages."""
+        """Start the streams that the port's parameters select. ``first`` is the time of the first messages."""
         for stream, suffix in _RATE_PARAMETERS.items():
             rate = self._vehicle.parameters.get(f"{self._prefix(channel)}{suffix}", 0.0)
             if rate > 0:
@@ -150,10 +157,10 @@ class ArduPilotMessageRequests:
         return f"MAV{self._vehicle.channels.index(channel) + 1}_"
 
     def restart(self) -> None:
-        """Restore the saved rates, because of a reboot."""
+        """Restore the stream rates that REQUEST_DATA_STREAM has changed, because of a reboot."""
         parameters = self._vehicle.parameters
         for name, (saved, changed) in self._saved.items():
-            if parameters[name] == changed:  # else PARAM_SET has set and saved another value meanwhile
+            if parameters[name] == changed:  # A value that PARAM_SET has set in the meantime stays.
                 parameters[name] = saved
         self._saved.clear()
 
@@ -161,7 +168,8 @@ class ArduPilotMessageRequests:
         vehicle, parameters = self._vehicle, self._vehicle.parameters
         if name not in parameters or parameters[name] == rate:
             return
-        saved, _ = self._saved.get(name, (parameters[name], rate))  # The value before the first change since boot.
+        # The value to restore is that before the first change since boot.
+        saved, _ = self._saved.get(name, (parameters[name], rate))
         parameters[name] = rate
         if vehicle.KIND == "plane":
             vehicle.announce_parameter(name)
@@ -174,11 +182,11 @@ class ArduPilotMessageRequests:
             interval = group_interval
             if message_id == m.TerrainRequest.ID and rate > 0:
                 interval = max(interval, _MIN_TERRAIN_REQUEST_INTERVAL_S)
-            elif message_id == m.NamedValueFloat.ID:
+            elif message_id == m.NamedValueFloat.ID:  # Each message has one of the values in turn.
                 interval /= len(DISPLAY_VALUES)
             self._stream(message_id, interval, channel, first)
 
     def _stream(self, message_id: int, interval: float, channel: Channel, first: float) -> None:
-        # RC_CHANNELS_RAW is sent in MAVLink 1 only, for old displays.
+        # The firmware sends RC_CHANNELS_RAW only in MAVLink 1, for old on-screen displays.
         if message_id != m.RcChannelsRaw.ID or channel.version == 1:
             channel.streams.set_interval(message_id, interval, first)

@@ -33,20 +33,20 @@ _NEEDS_LOCATION = 1
 
 
 class RoverArming(ArduPilotArming[RoverHost]):
-    """ArduRover's arming checks: a position only in modes that use it, or in all modes with ARMING_NEED_LOC."""
+    """ArduRover's arming checks. Only modes that use a position require it, unless ARMING_NEED_LOC is set."""
 
     def ahrs_reasons(self) -> Sequence[str]:
-        return ()  # `position_reasons` checks the estimator after GPS.
+        return ()  # `position_reasons` includes these checks, because ArduRover runs them after those of GPS.
 
     def position_reasons(self) -> Sequence[str]:
-        """Check GPS, then the estimator and its position."""
+        """Return the failures of the checks of GPS, then of the estimator and its position."""
         rover = self.vehicle
         if not rover.mode.needs_position and rover.parameters["ARMING_NEED_LOC"] != _NEEDS_LOCATION:
             return ()
         reasons = super().position_reasons() or super().ahrs_reasons()
         if reasons:
             return reasons
-        if rover.failsafes.estimator:
+        if rover.failsafes.has_estimator_failed:
             return ("EKF failsafe",)
         return () if rover.navigation.has_position else ("Need Position Estimate",)
 
@@ -71,7 +71,7 @@ class RoverArming(ArduPilotArming[RoverHost]):
         return True
 
 
-# FS_ACTION, FENCE_ACTION and the battery actions.
+# Values of FS_ACTION, of FENCE_ACTION and of the battery actions.
 _NONE, _RTL, _HOLD, _SMART_RTL, _SMART_RTL_OR_HOLD, _TERMINATE, _LOITER_OR_HOLD = range(7)
 _MODES: dict[int, tuple[int, ...]] = {
     _RTL: (RoverMode.RTL, RoverMode.HOLD),
@@ -93,10 +93,11 @@ _DRIVES_ITSELF = frozenset(
 
 
 class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
-    """Failsafes. FS_ACTION is executed FS_TIMEOUT after radio or ground station are lost, except in RTL and HOLD.
+    """ArduRover's failsafes.
 
-    The action is also executed on a disarmed rover. The firmware treats both links as one failsafe. If the check of the
-    radio is enabled, the firmware reports a lost ground station as "Radio Failsafe", too.
+    FS_TIMEOUT seconds after the loss of the radio or the ground station, the rover executes FS_ACTION, even while
+    disarmed, but not in RTL and HOLD. The firmware treats both links as one failsafe. If the radio check is enabled,
+    the firmware also reports a lost ground station as "Radio Failsafe".
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
@@ -112,7 +113,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     @property
     def is_any_active(self) -> bool:
-        return bool(self._triggered) or self.estimator  # On Rover, a low battery does not cause MAV_STATE_CRITICAL.
+        # A low battery does not count, because it does not cause MAV_STATE_CRITICAL on Rover.
+        return bool(self._triggered) or self.has_estimator_failed
 
     def update(self) -> None:
         self._check_radio()
@@ -126,30 +128,30 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         if rover.rc.is_receiving:
             self.radio_received_at: float = rover.now
         if not parameters["FS_THR_ENABLE"]:
-            self.radio = False
+            self.is_radio_lost = False
             return
         is_throttle_low = rover.rc[2] < parameters["FS_THR_VALUE"]
-        self.radio: bool = is_throttle_low or rover.now - self.radio_received_at > _SILENT_S
-        self._update_link(_RADIO, is_lost=self.radio)
+        self.is_radio_lost: bool = is_throttle_low or rover.now - self.radio_received_at > _SILENT_S
+        self._update_link(_RADIO, is_lost=self.is_radio_lost)
 
     def _check_ground_station(self) -> None:
         parameters = self.vehicle.parameters
         if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
             return
-        self.ground_station: bool = self.ground_station_silence >= parameters["FS_GCS_TIMEOUT"]
-        self._update_link(_GCS, is_lost=self.ground_station)
+        self.is_ground_station_lost: bool = self.ground_station_silence >= parameters["FS_GCS_TIMEOUT"]
+        self._update_link(_GCS, is_lost=self.is_ground_station_lost)
 
     def _update_link(self, name: str, *, is_lost: bool) -> None:
         """Record whether a link is lost, and start or end the common failsafe of both links."""
-        rover, was_any_lost = self.vehicle, bool(self._lost)
+        rover, was_any_link_lost = self.vehicle, bool(self._lost)
         self._lost = self._lost | {name} if is_lost else self._lost - {name}
-        if self._lost and not was_any_lost:
+        if self._lost and not was_any_link_lost:
             self._lost_since = rover.now
         if self._triggered and not self._lost:
             self.warn(f"{name} Failsafe Cleared", MavSeverity.INFO)
         self._triggered &= self._lost
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
-        if self._triggered or not self._lost or is_waiting or not self._may_act():
+        if not self._lost or self._triggered or is_waiting or not self._may_act():
             return
         self._triggered = set(self._lost)
         self.warn(f"{name} Failsafe")
@@ -158,6 +160,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         if rover.mode.number == RoverMode.AUTO and enabled == _CONTINUE_MISSION:
             self.warn("Failsafe - Continuing Auto Mode")
         else:
+            # The values of FS_ACTION have the same meanings as the battery actions.
             self.act_on_battery(int(rover.parameters["FS_ACTION"]))
 
     def _may_act(self) -> bool:
@@ -178,13 +181,13 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         is_lost = rover.is_armed and not rover.navigation.has_position
         lost_for = self._position_lost.seconds(is_lost, rover.now)
         if not is_lost:
-            if self.estimator:
-                self.estimator = False
+            if self.has_estimator_failed:
+                self.has_estimator_failed = False
                 self.warn("EKF failsafe cleared", MavSeverity.CRITICAL)
             return
-        if self.estimator or lost_for < _ESTIMATOR_TIMEOUT_S:
+        if self.has_estimator_failed or lost_for < _ESTIMATOR_TIMEOUT_S:
             return
-        self.estimator: bool = True
+        self.has_estimator_failed: bool = True
         self.warn("EKF variance", MavSeverity.CRITICAL)
         action = int(rover.parameters["FS_EKF_ACTION"])
         if action and rover.mode.needs_position:
@@ -193,7 +196,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self.warn("EKF failsafe", MavSeverity.CRITICAL)
 
     def _check_wheels(self) -> None:
-        """Detect a rover that does not move although its mode drives it (FS_CRASH_CHECK)."""
+        """Detect that the rover does not move although its mode drives (FS_CRASH_CHECK)."""
         rover, action = self.vehicle, int(self.vehicle.parameters["FS_CRASH_CHECK"])
         tries_to_drive = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
         is_stuck = bool(action) and tries_to_drive and rover.motion.ground_speed_m_s < _STUCK_M_S
@@ -209,9 +212,9 @@ _HOLD_BEYOND_M = 100.0
 
 
 class RoverFence(ArduPilotFence[RoverHost]):
-    """Fence. FENCE_ACTION has the actions of FS_ACTION. A rover more than 100 m outside changes to HOLD.
+    """ArduRover's fence, which has no altitude limits and sends no texts.
 
-    It has no altitude limits and sends no texts.
+    FENCE_ACTION has the values of FS_ACTION. A rover more than 100 m outside the fence changes to HOLD.
     """
 
     PERIOD_S: ClassVar[float] = 0.1
@@ -229,7 +232,8 @@ class RoverFence(ArduPilotFence[RoverHost]):
             vehicle.arming.disarm()
         else:
             modes = _MODES.get(action, ())
-            self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)  # until one is not refused
+            # Try the modes in turn, until one of them is not refused.
+            self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
 
     def on_mode_changed(self) -> None:
         super().on_mode_changed()
@@ -237,9 +241,9 @@ class RoverFence(ArduPilotFence[RoverHost]):
 
 
 class RoverSetpoints(GuidedSetpoints):
-    """Handlers of set-point messages. ArduRover also accepts a heading or a turn rate without a velocity.
+    """Handlers of the set-point messages. ArduRover also accepts a heading or a turn rate without a velocity.
 
-    Thrust is a share of the waypoint speed.
+    A thrust of 1 means the waypoint speed.
     """
 
     vehicle: RoverHost  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -248,20 +252,22 @@ class RoverSetpoints(GuidedSetpoints):
         self.vehicle.info(f"Ignoring {message.NAME}; set ACC_IGNORE in mask")
 
     def is_complete(self, target: GuidedTarget) -> bool:
-        # Without a velocity, either a heading or a turn rate is accepted, but not both.
+        # A target without a velocity must have either a heading or a turn rate, but not both.
         return super().is_complete(target) or (target.yaw is None) != (target.yaw_rate is None)
 
     def steer(self, message: SetAttitudeTarget) -> None:
-        """Drive at the speed of the thrust; a turn rate has precedence over the heading."""
+        """Drive at the speed that the thrust commands. A turn rate has precedence over the heading."""
         if message.type_mask & AttitudeMask.THROTTLE_IGNORE:
             return
         speed = self.vehicle.waypoint_speed * max(-1.0, min(1.0, message.thrust))
         heading = euler_from_quaternion(*message.q)[2]
         velocity = (abs(speed) * math.cos(heading), abs(speed) * math.sin(heading), 0.0)
+        backwards = speed < 0
         if message.type_mask & AttitudeMask.BODY_YAW_RATE_IGNORE:
-            self.mode.set_target(GuidedTarget(None, velocity, speed < 0, heading))
+            target = GuidedTarget(velocity=velocity, backwards=backwards, yaw=heading)
         else:
-            self.mode.set_target(GuidedTarget(None, velocity, speed < 0, None, message.body_yaw_rate))
+            target = GuidedTarget(velocity=velocity, backwards=backwards, yaw_rate=message.body_yaw_rate)
+        self.mode.set_target(target)
 
 
 _AMPERES_AT_FULL = 16.0
@@ -309,7 +315,7 @@ class SimulatedRover(RoverHost):
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = RoverJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
-        """Create the motion model with the limits of the parameters; wind is reported but has no effect."""
+        """Create the motion model with limits from the parameters. Wind is reported, but does not move the rover."""
         parameters = self.parameters
         limits = GroundLimits(
             acceleration_m_s2=parameters["ATC_ACCEL_MAX"] or 1.0,

@@ -1,4 +1,4 @@
-"""Flight modes of a simulated ArduRover. FOLLOW, DOCK and INITIALISING are refused; SIMPLE drives like MANUAL."""
+"""Flight modes of a simulated ArduRover. FOLLOW, DOCK and INITIALISING are refused. SIMPLE drives like MANUAL."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class RoverHost(RoverSubVehicle):
 
     @property
     def top_speed(self) -> float:
-        """SPEED_MAX in m/s; if that is 0, CRUISE_SPEED extrapolated from CRUISE_THROTTLE to full throttle."""
+        """Top speed in m/s: SPEED_MAX or, if SPEED_MAX is 0, CRUISE_SPEED extrapolated to full throttle."""
         parameters = self.parameters
         return parameters["SPEED_MAX"] or 100.0 * parameters["CRUISE_SPEED"] / parameters["CRUISE_THROTTLE"]
 
@@ -42,7 +42,7 @@ class RoverHost(RoverSubVehicle):
         return self.parameters["WP_SPEED"] or self.parameters["CRUISE_SPEED"]
 
     def has_arrived(self, place: Ned) -> bool:
-        """Return True if the rover has reached a place where it stops, or just passed it."""
+        """Return True if the rover has reached, or just passed, a place at which it should stop."""
         motion = self.motion
         north, east = place[0] - motion.north, place[1] - motion.east
         distance = math.hypot(north, east)
@@ -52,7 +52,7 @@ class RoverHost(RoverSubVehicle):
         return distance <= _ARRIVED_M or has_just_passed
 
     def has_passed(self, place: Ned) -> bool:
-        """Return True within WP_RADIUS of a place that the rover only passes."""
+        """Return True if the rover is within WP_RADIUS of a place that it passes without a stop."""
         motion = self.motion
         distance = math.hypot(place[0] - motion.north, place[1] - motion.east)
         return distance <= self.parameters["WP_RADIUS"]
@@ -72,7 +72,7 @@ class _Manual(_Mode):
 
 
 class _Hold(_Mode):
-    """HOLD, LOITER and CIRCLE: stops and stays there."""
+    """HOLD, LOITER and CIRCLE: the rover stops and stays."""
 
     def update(self, dt: float) -> None:
         self.vehicle.motion.stop()
@@ -167,12 +167,12 @@ class RoverAuto(RoverSubAuto):
         return f"{text}. Loiter for {seconds:.0f} seconds" if seconds > 0 else text
 
     def finish(self) -> None:
-        # Only MIS_DONE_BEHAVE 0 (HOLD) is simulated.
+        # The rover stops here, because only MIS_DONE_BEHAVE 0 (hold) is simulated.
         self.vehicle.send_text(MavSeverity.NOTICE, "Mission Complete")
 
 
 class RoverGuided(_Mode):
-    """GUIDED: drives to a place, or for three seconds with a velocity and turn rate."""
+    """GUIDED: drives to a place, or with a velocity and a turn rate, which expire after three seconds."""
 
     number: int = RoverMode.GUIDED
     name = "GUID"
@@ -202,7 +202,7 @@ class RoverGuided(_Mode):
         self.speed = self.vehicle.waypoint_speed
 
     def set_target(self, target: GuidedTarget) -> None:
-        """Follow a target; a position has precedence over a velocity."""
+        """Follow a target. A position has precedence over a velocity."""
         if target.position is not None:
             self.go_to(target.position)
             return

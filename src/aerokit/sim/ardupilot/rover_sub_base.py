@@ -29,16 +29,16 @@ _FIXED = frozenset({MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED})
 
 @dataclass(frozen=True)
 class GuidedTarget:
-    """Target of a set-point message, in the world frame; None means not given."""
+    """Target of a set-point message in the world frame. A value that the message does not give is None."""
 
     position: Ned | None = None
     velocity: Ned | None = None
     backwards: bool = False
-    """True for reverse: the velocity's first component is negative, and a heading or turn rate is given."""
+    """True to drive backwards: the message has a negative vx, and a heading or a turn rate."""
     yaw: float | None = None
     yaw_rate: float | None = None
     timeout_s: float = 3.0
-    """Seconds for which a velocity is valid; a position does not expire."""
+    """Seconds after which a target without a position expires."""
 
 
 class GuidedTargetMode(Protocol):
@@ -50,14 +50,14 @@ class GuidedTargetMode(Protocol):
 
 
 class GuidedSetpoints:
-    """Handlers of the set-point messages; invalid messages are ignored. Subclasses select what a firmware supports."""
+    """Handlers of the set-point messages. Invalid messages are ignored. A subclass selects what a firmware supports."""
 
     BODY_FRAMES: ClassVar[frozenset[int]] = _BODY
     """MAV_FRAMEs whose vectors are relative to the heading."""
     RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = _BODY
     """MAV_FRAMEs whose yaw is relative to the heading."""
     GLOBAL_YAW: ClassVar[bool] = True
-    """True if the firmware uses yaw and turn rate of global targets."""
+    """True if the firmware uses the yaw and the turn rate of SET_POSITION_TARGET_GLOBAL_INT."""
 
     def __init__(self, vehicle: ArduPilotVehicle, mode: GuidedTargetMode) -> None:
         self.vehicle: ArduPilotVehicle = vehicle
@@ -139,7 +139,7 @@ class RoverSubVehicle(ArduPilotVehicle):
 
     @is_landed.setter
     def is_landed(self, _: bool) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Ignore the value, because these vehicles do not take off."""
+        """Ignore the assigned value, because these vehicles do not take off."""
 
     def stick(self, index: int) -> float:
         """Return a stick position, -1 to 1."""
@@ -202,7 +202,7 @@ class RoverSubAuto(MissionMode):
         raise NotImplementedError
 
     def refuse(self) -> None:
-        """Report that there is no mission, by a text if the firmware sends one."""
+        """Report that there is no mission, if the firmware sends a text for this case."""
 
     def travel(self, place: Ned, *, stops: bool) -> None:
         raise NotImplementedError
@@ -224,7 +224,7 @@ class RoverSubAuto(MissionMode):
         return self._place
 
     def enter(self, *, force: bool) -> bool:
-        if self.vehicle.mode is self:
+        if self.vehicle.mode is self:  # Arming enters the current mode again, which must not restart the mission.
             return True
         if not self.vehicle.mission.is_present:
             self.refuse()
@@ -283,7 +283,7 @@ class RoverSubAuto(MissionMode):
         if item.command == Cmd.NAV_RETURN_TO_LAUNCH:
             self._place, self._stops = vehicle.navigation.home or current, True
             return
-        # Zero coordinates and an invalid position mean the current place.
+        # An invalid position, or zero coordinates, mean the place at which the previous command ended.
         point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or current
         north, east = current[:2] if (item.x, item.y) == (0, 0) else point[:2]
         self._place = (north, east, current[2] if item.z == 0 else point[2])

@@ -28,7 +28,7 @@ _SYSTEM_TEXTS = {
     "timers.txt": "TIMERV1\n",
 }
 
-# Bytes of a MAVLink 2 frame, without signature.
+# Sizes of three kinds of MAVLink 2 frames in bytes, without a signature.
 _PARAM_VALUE_FRAME, _FTP_FRAME, _LOG_DATA_FRAME = 37, 266, 109
 _PARAMETERS_SHARE, _BURST_SHARE, _LOG_SHARE = 0.3, 1 / 3, 0.5
 
@@ -36,8 +36,8 @@ _PARAMETERS_SHARE, _BURST_SHARE, _LOG_SHARE = 0.3, 1 / 3, 0.5
 class ArduPilotStorage:
     """Protocol servers of files, logs and parameters.
 
-    ``link_bytes_per_s`` is the data rate of a port without flow control, of which a parameter list uses 30 %, a file
-    burst a third and a log download half. None means flow control, as on USB and in a network.
+    ``link_bytes_per_s`` is the data rate of a port without flow control. A parameter list uses 30 % of this rate, a
+    file burst a third, and a log download half. None means flow control, as on USB and in a network.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class ArduPilotStorage:
             self.parameters.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Drop transfers and sessions because of a reboot; files stay."""
+        """Drop transfers and sessions because of a reboot. Files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()
@@ -103,12 +103,12 @@ _SIGNING_OFF = 1
 
 
 class ArduPilotSigning(VehicleSigning):
-    """Message signing of ArduPilot. The time stamp is stored every 30 seconds. After a boot, it is a minute ahead.
+    """Message signing of ArduPilot. The time stamp is stored every 30 s. A boot sets it a minute ahead.
 
     The first port is considered secure, like USB on a flight controller: it signs, but accepts unsigned frames. Set
     ``trusts_first_port`` to False, and call `load`, for a vehicle whose only link is a radio. Bit 0 of MAV1_OPTIONS,
-    MAV2_OPTIONS … turns signing off on the first, second … port at the next boot or SETUP_SIGNING. A new key is not
-    announced.
+    MAV2_OPTIONS … turns signing off on the first, second … port at the next boot or SETUP_SIGNING. No text reports a
+    new key.
     """
 
     AHEAD: ClassVar[int] = ONE_MINUTE

@@ -19,7 +19,7 @@ from aerokit.mavlink.enums import (
     SubMode,
 )
 from aerokit.mavlink.messages import SetAttitudeTarget
-from aerokit.sim.ardupilot.commands import relative_heading
+from aerokit.sim.ardupilot.commands import commanded_heading
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors
 from aerokit.sim.ardupilot.kinds import Kind
@@ -33,15 +33,15 @@ from aerokit.sim.motion import SimulatedWind, euler_from_quaternion
 from aerokit.sim.vehicle_motion import UnderwaterMotion
 
 _BUTTONS = range(16)
-# BTNn_FUNCTION.
+# Values of the parameters BTNn_FUNCTION.
 _SHIFT, _ARM_TOGGLE, _DISARM = 1, 2, 4
 _DISARMS = frozenset({_ARM_TOGGLE, _DISARM})
 
 
 class SubArming(ArduPilotArming[SubHost]):
-    """ArduSub's arming checks: by default radio and battery (ARMING_CHECK 448), never a position.
+    """ArduSub's arming checks, by default of radio and battery (ARMING_CHECK 448). No check requires a position.
 
-    A joystick button must have a disarm function.
+    One of the joystick buttons must have a function that disarms.
     """
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
@@ -64,7 +64,7 @@ class SubArming(ArduPilotArming[SubHost]):
         return _SHIFT in functions and any(int(parameters[f"{prefix}SFUNCTION"]) in _DISARMS for prefix in prefixes)
 
 
-# Actions of FS_GCS_ENABLE; 1 only warns.
+# Values of FS_GCS_ENABLE. The value 1 only warns.
 _FAILSAFE_DISARM, _HOLD, _SURFACE = 2, 3, 4
 _GCS_MODES = {_HOLD: SubMode.ALT_HOLD, _SURFACE: SubMode.SURFACE}
 _BATTERY_DISARM, _BATTERY_SURFACE = 2, 3
@@ -76,23 +76,24 @@ _STICKS, _STICK_MIDDLE = 6, 1500
 
 
 class SubFailsafes(ArduPilotFailsafes[SubHost]):
-    """ArduSub's failsafes, most of which act only while armed. Terrain, estimator and crash are not simulated."""
+    """ArduSub's failsafes. Most of them act only while armed. Not simulated: terrain, estimator, crash."""
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_BATTERY_DISARM, _BATTERY_SURFACE, 1, 0)
 
     def __init__(self, sub: SubHost) -> None:
         super().__init__(sub)
-        self.pilot: bool = False  # True without RC pulses and MANUAL_CONTROL for FS_PILOT_TIMEOUT.
-        self.leak: bool = False
+        # True while neither RC pulses nor MANUAL_CONTROL have arrived for FS_PILOT_TIMEOUT.
+        self.is_pilot_lost: bool = False
+        self.is_leak_detected: bool = False
         self.pressure: _HullLimit = _HullLimit("pressure", "FS_PRESS")
         self.temperature: _HullLimit = _HullLimit("temperature", "FS_TEMP")
         self._gcs_reported_at = self._leak_reported_at = -math.inf
 
     @property
     def is_any_active(self) -> bool:
-        # On Sub, a lost radio alone does not cause MAV_STATE_CRITICAL.
+        # A lost radio is missing here, because it alone does not cause MAV_STATE_CRITICAL on Sub.
         hull = self.pressure.is_exceeded or self.temperature.is_exceeded
-        return self.pilot or self.battery_is_low or self.ground_station or self.leak or hull
+        return self.is_pilot_lost or self.battery_is_low or self.is_ground_station_lost or self.is_leak_detected or hull
 
     def update(self) -> None:
         self._check_radio()
@@ -104,7 +105,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         super().update()
 
     def _check_radio(self) -> None:
-        """Apply FS_THR_ENABLE: 1 warns, 2 surfaces."""
+        """Detect the loss of the radio and apply FS_THR_ENABLE: 1 warns, 2 surfaces."""
         sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_THR_ENABLE"])
         is_receiving = sub.rc.is_receiving
         if is_receiving:
@@ -115,9 +116,9 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
             is_lost = False
         elif not is_receiving and not is_lost:  # A short silence neither starts nor ends the failsafe.
             return
-        if is_lost == self.radio:
+        if is_lost == self.is_radio_lost:
             return
-        self.radio = is_lost
+        self.is_radio_lost = is_lost
         self.warn("RC Failsafe" if is_lost else "Radio Failsafe Cleared")
         if is_lost and enabled == _RADIO_SURFACE:
             sub.set_mode(SubMode.SURFACE)
@@ -126,11 +127,11 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_PILOT_INPUT"])
         silence = sub.now - self.radio_received_at
         if not enabled or not silence >= sub.parameters["FS_PILOT_TIMEOUT"]:
-            self.pilot = False
+            self.is_pilot_lost = False
             return
-        if self.pilot:
+        if self.is_pilot_lost:
             return
-        self.pilot = True
+        self.is_pilot_lost = True
         self.warn("Lost manual control", MavSeverity.CRITICAL)
         for index in range(_STICKS):
             sub.rc[index] = _STICK_MIDDLE
@@ -142,16 +143,16 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         if not action or math.isnan(self.ground_station_seen_at):
             return
         if self.ground_station_silence < sub.parameters["FS_GCS_TIMEOUT"]:
-            if self.ground_station:
-                self.ground_station = False
+            if self.is_ground_station_lost:
+                self.is_ground_station_lost = False
                 self.warn("GCS Failsafe Cleared")
             return
         if sub.now - self._gcs_reported_at > _GCS_REPORT_INTERVAL_S:
             self._gcs_reported_at = sub.now
             self.warn(f"MYGCS: {int(sub.parameters['MAV_GCS_SYSID'])}, heartbeat lost")
-        if self.ground_station or not sub.is_armed:
+        if self.is_ground_station_lost or not sub.is_armed:
             return
-        self.ground_station: bool = True
+        self.is_ground_station_lost: bool = True
         if action == _FAILSAFE_DISARM or (action in _GCS_MODES and not sub.set_mode(_GCS_MODES[action])):
             sub.arming.disarm()
 
@@ -164,19 +165,22 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
     def _check_leak(self) -> None:
         sub, action = self.vehicle, int(self.vehicle.parameters["FS_LEAK_ENABLE"])
         if not sub.faults.leak or not action:
-            self.leak = False
+            self.is_leak_detected = False
             return
         if sub.now - self._leak_reported_at > _LEAK_REPORT_INTERVAL_S:
             self._leak_reported_at = sub.now
             self.warn("Leak Detected", MavSeverity.CRITICAL)
-        if not self.leak:
-            self.leak = True
+        if not self.is_leak_detected:
+            self.is_leak_detected = True
             if action == _LEAK_SURFACE and sub.is_armed:
                 sub.set_mode(SubMode.SURFACE)
 
 
 class _HullLimit:
-    """Limit FS_PRESS_MAX (Pa) or FS_TEMP_MAX (°C): its failsafe triggers after two seconds and warns every 30 s."""
+    """A limit of the hull, FS_PRESS_MAX (Pa) or FS_TEMP_MAX (°C).
+
+    The failsafe triggers when the limit was exceeded for two seconds, and then warns every 30 s.
+    """
 
     def __init__(self, quantity: str, prefix: str) -> None:
         self.is_exceeded: bool = False
@@ -198,9 +202,9 @@ class _HullLimit:
 
 
 class SubSetpoints(GuidedSetpoints):
-    """Handlers of set-point messages. Thrust is a climb rate, 0.5 holds the depth; roll and pitch have no effect.
+    """Handlers of the set-point messages. Yaw is relative to the heading only in BODY_OFFSET_NED.
 
-    Yaw is relative to the heading only in BODY_OFFSET_NED.
+    In SET_ATTITUDE_TARGET, thrust sets a climb rate (0.5 holds the depth). Roll and pitch have no effect.
     """
 
     BODY_FRAMES: ClassVar[frozenset[int]] = GuidedSetpoints.BODY_FRAMES | {MavFrame.BODY_FRD}
@@ -208,14 +212,14 @@ class SubSetpoints(GuidedSetpoints):
     GLOBAL_YAW: ClassVar[bool] = False
 
     def steer(self, message: SetAttitudeTarget) -> None:
-        """Follow attitude and thrust together for one second."""
+        """Follow the yaw and the thrust for one second. The message must have both an attitude and a thrust."""
         if message.type_mask & (AttitudeMask.ATTITUDE_IGNORE | AttitudeMask.THROTTLE_IGNORE):
             return
         climb_share = 2.0 * (max(0.0, min(1.0, message.thrust)) - 0.5)
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * self.vehicle.parameters[max_climb_parameter] / 100.0
         _, _, yaw = euler_from_quaternion(*message.q)
-        self.mode.set_target(GuidedTarget(None, (0.0, 0.0, -climb), False, yaw, timeout_s=1.0))
+        self.mode.set_target(GuidedTarget(velocity=(0.0, 0.0, -climb), yaw=yaw, timeout_s=1.0))
 
 
 _HOLDING_THROTTLE, _THROTTLE_PER_CLIMB_M_S = 0.45, 0.44
@@ -224,7 +228,7 @@ _THROTTLE = 2
 
 
 class SubMotors(ArduPilotMotors):
-    """Thrusters, which hold the depth or follow the throttle stick; a throttle of 0.5 is no thrust."""
+    """The thrusters, which hold the depth or follow the throttle stick. At a throttle of 0.5 they do not push."""
 
     @property
     def current_a(self) -> float:
@@ -246,12 +250,12 @@ _BASE = MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavMod
 class SimulatedSub(SubHost):
     """ArduSub, as far as a client can observe it. `UnderwaterMotion` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`; ``home`` is at the surface, so altitudes above home are negative. It has
+    Takes the arguments of `ArduPilotVehicle`. ``home`` is at the surface, so altitudes above home are negative. It has
     1,386 parameters. Simulated modes: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD (driven by the sticks), GUIDED,
-    AUTO and SURFACE. It can be armed without a position in modes that need none. Take-off is UNSUPPORTED.
+    AUTO and SURFACE. A mode that needs no position can be armed without a position. Take-off is UNSUPPORTED.
 
-    Not simulated: currents; CIRCLE, SURFTRAK and MOTORDETECT, which behave like ALT_HOLD. A reboot moves the vehicle
-    to the surface.
+    Not simulated: currents, CIRCLE, SURFTRAK and MOTORDETECT. These modes behave like ALT_HOLD. A reboot moves the
+    vehicle to the surface.
     """
 
     KIND: ClassVar[Kind] = "sub"
@@ -266,7 +270,7 @@ class SimulatedSub(SubHost):
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = SubJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> UnderwaterMotion:
-        """Create the motion model. SIM_BUOYANCY 1 is an upward acceleration of 0.1 m/s²; wind has no effect."""
+        """Create the motion model. A SIM_BUOYANCY of 1 accelerates upwards by 0.1 m/s². Wind has no effect."""
         return UnderwaterMotion(self.rng, buoyancy_m_s2=self.parameters["SIM_BUOYANCY"] / 10.0)
 
     def listen_for_setpoints(self) -> None:
@@ -317,7 +321,7 @@ class SimulatedSub(SubHost):
         }
 
     def _change_speed_at_any_time(self, command: ReceivedCommand) -> int:
-        """Accept a speed in every mode; only GUIDED and AUTO use it."""
+        """Accept a speed in every mode, although only GUIDED and AUTO use the speed."""
         if not command.param2 > 0 or command.param1 not in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
             return MavResult.DENIED
         if isinstance(self.mode, SubGuided | SubAuto):
@@ -325,7 +329,7 @@ class SimulatedSub(SubHost):
         return MavResult.ACCEPTED
 
     def _turn(self, command: ReceivedCommand) -> int:
-        heading = relative_heading(command, self.motion.yaw)
+        heading = commanded_heading(command, self.motion.yaw)
         if heading is None:
             return MavResult.FAILED
         if self.mode is self.guided:

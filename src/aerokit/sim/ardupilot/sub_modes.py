@@ -39,14 +39,14 @@ class SubHost(RoverSubVehicle):
         return math.dist(self._below_surface(place), self.motion.place)
 
     def travel(self, place: Ned, speed: float, *, looks_ahead: bool = True) -> None:
-        """Move towards a place at a speed in m/s; WPNAV_SPEED_UP and WPNAV_SPEED_DN limit the vertical speed."""
+        """Move towards a place at a speed in m/s. WPNAV_SPEED_UP and WPNAV_SPEED_DN limit the vertical speed."""
         motion, parameters = self.motion, self.parameters
         north, east, down = self._below_surface(place)
         max_climb, max_descent = parameters["WPNAV_SPEED_UP"] / 100.0, parameters["WPNAV_SPEED_DN"] / 100.0
         distance = math.hypot(north - motion.north, east - motion.east)
         if looks_ahead and distance > _MIN_LOOK_AHEAD_M:
             motion.face(math.atan2(east - motion.east, north - motion.north))
-        # The two speeds have the ratio of the two distances, so that the path is straight.
+        # The horizontal and the vertical speed have the ratio of the distances, so that the path is straight.
         depth_difference = abs(down - motion.down)
         horizontal = max(speed * min(1.0, distance / max(depth_difference, 1e-3)), 0.05)
         vertical = speed * min(1.0, depth_difference / max(distance, 1e-3))
@@ -66,7 +66,7 @@ class _Mode(ArduPilotMode):
         return 0.0 if abs(share) < _DEADZONE else share
 
     def horizontal_velocity_from_sticks(self) -> tuple[float, float]:
-        """Turn as the yaw stick commands; return the commanded velocity north and east in m/s."""
+        """Turn as the yaw stick commands, and return the velocity north and east (m/s) that the sticks command."""
         motion = self.vehicle.motion
         motion.turn(self.stick(_YAW) * _FULL_STICK_TURN_RAD_S)
         forward, right = self.stick(_FORWARD) * _FULL_STICK_M_S, self.stick(_LATERAL) * _FULL_STICK_M_S
@@ -79,7 +79,7 @@ class _Mode(ArduPilotMode):
 
 
 class _Manual(_Mode):
-    """MANUAL, STABILIZE and ACRO: sticks control the thrust; with a centred throttle the vehicle drifts up."""
+    """MANUAL, STABILIZE and ACRO: sticks control the thrust. With a centred throttle stick the vehicle drifts up."""
 
     needs_position = False
     has_manual_throttle = True
@@ -93,7 +93,7 @@ class _Manual(_Mode):
 
 
 class _AltHold(_Mode):
-    """ALT_HOLD and similar modes: hold the depth, which the throttle stick changes."""
+    """ALT_HOLD and similar modes: the submarine holds its depth, which the throttle stick changes."""
 
     needs_position = False
 
@@ -139,7 +139,7 @@ class SubAuto(RoverSubAuto):
 
 
 class SubGuided(_Mode):
-    """GUIDED: moves to a place, or for three seconds with a velocity; without a target it holds still."""
+    """GUIDED: moves to a place, or with a velocity, which expires after three seconds. Without a target it stops."""
 
     number: int = SubMode.GUIDED
     name = "GUIDED"
@@ -163,11 +163,11 @@ class SubGuided(_Mode):
         return True
 
     def go_to(self, position: Ned) -> None:
-        """Go to a place and stay there; a place above the surface is lowered to the surface."""
+        """Go to a place and stay there. A place above the surface is lowered to the surface."""
         self._place, self._target, self._heading = position, None, None
 
     def set_target(self, target: GuidedTarget) -> None:
-        """Follow a target; a position has precedence over a velocity. In SITL a new position starts from rest."""
+        """Follow a target. A position has precedence over a velocity. As in SITL, a new position starts from rest."""
         if target.position is not None:
             motion = self.vehicle.motion
             motion.velocity_north = motion.velocity_east = motion.velocity_down = 0.0

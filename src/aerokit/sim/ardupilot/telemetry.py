@@ -33,7 +33,7 @@ from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 Builders = Mapping[int, Callable[[Any], "Message | None"]]
 
-# Plain integers, because operators of flags take ten times as long.
+# These bits are plain integers, because operators of enum flags take ten times as long.
 _FENCE, _PREARM = int(Sensor.MAV_SYS_STATUS_GEOFENCE), int(Sensor.MAV_SYS_STATUS_PREARM_CHECK)
 _AHRS, _LOGGING = int(Sensor.MAV_SYS_STATUS_AHRS), int(Sensor.MAV_SYS_STATUS_LOGGING)
 _RATE, _ATTITUDE = int(Sensor.ANGULAR_RATE_CONTROL), int(Sensor.ATTITUDE_STABILIZATION)
@@ -74,7 +74,7 @@ _SENSORS: dict[Kind, _Sensors] = {
     "sub": _Sensors(_BODY | _LASER, always=_RATE | _ATTITUDE | _YAW),
 }
 
-# Kinds of control that are off in a mode: firmware → (bits, modes).
+# By firmware: control bits of SYS_STATUS, and the modes in which these kinds of control are off.
 _UNCONTROLLED: dict[Kind, tuple[tuple[int, tuple[int, ...]], ...]] = {
     "copter": (
         (_HEIGHT | _PLACE, (CopterMode.STABILIZE, CopterMode.ACRO)),
@@ -141,9 +141,10 @@ _UNKNOWN_TEMPERATURE = 32767
 _RSSI = 255
 _NOTHING_REACHED = 0xFFFF
 _AIR_DENSITY = 1.225
-# Output indices of the motors with ESC telemetry.
+# Output indices of the motors that have ESC telemetry, by firmware.
 _MOTORS = {"copter": (0, 1, 2, 3), "plane": (2,)}
-# Base mode and custom mode until the vehicle is initialised; Copter and Sub report their real mode.
+# Base mode and custom mode that Plane and Rover report until they are initialised. Copter and Sub report their real
+# mode from the beginning.
 _BOOT_MODE: dict[str, tuple[int, int]] = {
     "plane": (MavModeFlag.STABILIZE_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED, PlaneMode.INITIALIZING),
     "rover": (MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED, RoverMode.INITIALIZING),
@@ -151,7 +152,7 @@ _BOOT_MODE: dict[str, tuple[int, int]] = {
 
 
 def heartbeat(vehicle: ArduPilotVehicle) -> m.Heartbeat:
-    """Build HEARTBEAT. Until the boot ends, the state is BOOT, or CALIBRATING while a boot mode is reported."""
+    """Build HEARTBEAT. During the boot, the state is BOOT, or CALIBRATING if the firmware reports a boot mode."""
     base_mode, mode, state = vehicle.base_mode, vehicle.mode.number, MavState.BOOT
     if not vehicle.is_initialised and vehicle.KIND in _BOOT_MODE:
         base_mode, mode = _BOOT_MODE[vehicle.KIND]
@@ -160,7 +161,7 @@ def heartbeat(vehicle: ArduPilotVehicle) -> m.Heartbeat:
         state = MavState.STANDBY if vehicle.is_landed else MavState.ACTIVE
         if vehicle.failsafes.is_any_active:
             state = MavState.CRITICAL
-    return m.Heartbeat(vehicle.MAV_TYPE, MavAutopilot.ARDUPILOTMEGA, base_mode, mode, state, 3)
+    return m.Heartbeat(vehicle.MAV_TYPE, MavAutopilot.ARDUPILOTMEGA, base_mode, mode, state, mavlink_version=3)
 
 
 def _sys_status(vehicle: ArduPilotVehicle) -> m.SysStatus:
@@ -188,7 +189,7 @@ def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
     if vehicle.failsafes.battery_is_critical:
         charge = MavBatteryChargeState.CRITICAL
     current, consumed = round(battery.current_a * 100), round(battery.consumed_mah)
-    hectojoules, percent = round(battery.consumed_wh * 36), int(battery.percent)
+    hectojoules, percent = round(battery.consumed_wh * 36), int(battery.percent)  # 1 Wh is 36 hJ.
     return m.BatteryStatus(0, 0, 0, _UNKNOWN_TEMPERATURE, voltages, current, consumed, hectojoules, percent, 0, charge)
 
 
@@ -220,8 +221,8 @@ def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
         return [value if fitted else 0 for fitted in has_motor]
 
     voltages = per_motor(round(vehicle.battery.voltage_v * 100))
-    currents = per_motor(round(vehicle.battery.current_a * 25))  # A quarter of the current, in 0.01 A.
-    rpms = per_motor(round(vehicle.motors.throttle * 15000))
+    currents = per_motor(round(vehicle.battery.current_a * 25))  # A quarter of the battery current, in 0.01 A.
+    rpms = per_motor(round(vehicle.motors.throttle * 15000))  # Full throttle is 15,000 rpm.
     counts = per_motor(int(vehicle.uptime * 100) & 0xFFFF)
     temperatures = bytes(per_motor(32))
     return m.EscTelemetry1To4(temperatures, voltages, currents, (0,) * 4, rpms, counts)
@@ -255,7 +256,7 @@ def _display_value(sub: SubHost) -> m.NamedValueFloat:
 
 
 def _rover_hud(rover: RoverHost) -> m.VfrHud:
-    # ArduRover sends neither airspeed nor climb rate, and a positive throttle in reverse.
+    # ArduRover sends no airspeed and no climb rate. The throttle is positive even in reverse.
     motion, place = rover.motion, rover.navigation.position
     heading = int(math.degrees(motion.yaw) % 360.0)
     throttle = round(abs(rover.motors.throttle) * 100)
@@ -264,7 +265,7 @@ def _rover_hud(rover: RoverHost) -> m.VfrHud:
 
 
 _MIDDLE, _STICK_RANGE = 1500, 500
-# Control surfaces and thrusters use 1100 to 1900 µs.
+# The pulses of control surfaces and thrusters deviate by up to this many µs from the middle of 1500 µs.
 _SURFACE_RANGE = 400
 _ROVER_DEADZONE = 30
 _OUTPUTS = 16
@@ -277,7 +278,7 @@ def _copter_outputs(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
 
 
 def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
-    """Build SERVO_OUTPUT_RAW with aileron, elevator, throttle and rudder, which follow the sticks in MANUAL."""
+    """Build SERVO_OUTPUT_RAW with aileron, elevator, throttle and rudder. In MANUAL they follow the sticks."""
     wing, is_armed = plane.wing, plane.motors.is_armed
     throttle = 1000 + (round(1000 * plane.motors.throttle) if is_armed else 0)
     if plane.mode.number == PlaneMode.MANUAL:
@@ -291,7 +292,7 @@ def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
 
 
 def _rover_outputs(rover: RoverHost) -> m.ServoOutputRaw:
-    """Build SERVO_OUTPUT_RAW with steering on output 1 (also while disarmed) and the motor on output 3."""
+    """Build SERVO_OUTPUT_RAW with the steering on output 1, even while disarmed, and the motor on output 3."""
     if rover.mode.has_manual_throttle:
         deflection = rover.rc[0] - _MIDDLE
         beyond_deadzone = max(0, abs(deflection) - _ROVER_DEADZONE)
@@ -395,9 +396,9 @@ BUILDERS_OF_KIND: dict[Kind, Builders] = {
         **_without(m.Wind.ID, m.TerrainRequest.ID, m.EscTelemetry1To4.ID, *_COPTER_TARGETS),
         m.ServoOutputRaw.ID: _sub_outputs,
         m.NamedValueFloat.ID: _display_value,
-        # ArduSub sends SCALED_PRESSURE3 for a thermometer, without a pressure.
+        # ArduSub uses SCALED_PRESSURE3 to report a thermometer, so the pressure is 0.
         m.ScaledPressure3.ID: lambda sub: m.ScaledPressure3(sub.time_boot_ms, 0.0, 0.0, 3620, 0),
         m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
     },
 }
-"""Functions that build messages, by firmware and message id. Other messages are not sent."""
+"""Functions that build messages, by firmware and message id. The firmware sends no other messages."""

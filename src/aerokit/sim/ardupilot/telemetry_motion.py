@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import EkfStatusFlags, GpsFixType, PlaneMode
+from aerokit.mavlink.enums import EkfStatusFlags, GpsFixType, MavFrame, PlaneMode
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.message import Message
 from aerokit.sim.ardupilot.copter_guided import CopterGuided
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
-from aerokit.sim.motion import GRAVITY_M_S2, Motion, Ned, quaternion_from_euler
+from aerokit.sim.motion import GRAVITY_M_S2, Motion, Ned, centidegrees, quaternion_from_euler
 
 Three = tuple[int, int, int]
 
@@ -99,6 +99,7 @@ def _int16(value: float) -> int:
 def _highres_imu(vehicle: ArduPilotVehicle) -> m.HighresImu:
     motion = vehicle.motion
     x, y, z = (value * (GRAVITY_M_S2 / 1000.0) for value in _acceleration(vehicle))
+    # The firmware multiplies milligauss by 1000, although the fields are in gauss (GCS_Common.cpp).
     north, east, down = (value * 1000.0 for value in _magnetic_field(vehicle))
     altitude = vehicle.navigation.frame.origin.altitude_m - motion.down
     sensors = (x, y, z, *_angular_rates(motion), north, east, down, _pressure_hpa(vehicle))
@@ -126,9 +127,9 @@ _VELOCITY_ONLY = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE | _NO_YAW
 _POSITION_ONLY = (
     Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE | Mask.AX_IGNORE | Mask.AY_IGNORE | Mask.AZ_IGNORE | _NO_YAW
 )  # fmt: skip
-# Undefined bits that ArduPilot sets in the global message only (GCS_MAVLink_Copter.cpp).
+# ArduPilot sets these undefined mask bits in the global message, but not in the local one (GCS_MAVLink_Copter.cpp).
 _LAST_BYTE = 0xF000
-# Size and lower left corner of the terrain block around the vehicle, in metres and degrees.
+# Spacing of the terrain grid in metres, and the offset in degrees from the vehicle to the corner of its terrain block.
 _GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
 _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which the vehicle stands.
 
@@ -137,7 +138,7 @@ def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
     motion, nav = vehicle.motion, vehicle.navigation
     place, time = nav.position, vehicle.time_boot_ms
     relative = round(nav.altitude_above_home * 1000)
-    heading = round(math.degrees(motion.yaw) % 360.0 * 100) % 36000 if nav.has_attitude else 0
+    heading = centidegrees(motion.yaw) if nav.has_attitude else 0
     if place is None:
         return m.GlobalPositionInt(time, 0, 0, 0, relative, 0, 0, 0, heading)
     altitude = round(place.altitude_m * 1000)
@@ -157,15 +158,17 @@ def _local_position(vehicle: ArduPilotVehicle) -> m.LocalPositionNed | None:
 def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
     motion, nav = vehicle.motion, vehicle.navigation
     if not nav.is_gps_detected:
-        return m.GpsRawInt(0, GpsFixType.NO_GPS, 0, 0, 0, 65535, 65535, 0, 0, 0)
+        return m.GpsRawInt(0, GpsFixType.NO_GPS, 0, 0, 0, eph=65535, epv=65535, vel=0, cog=0, satellites_visible=0)
     if nav.fix_type < GpsFixType.TYPE_3D_FIX:
-        return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, 9999, 9999, 0, 0, 3)
+        return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, eph=9999, epv=9999, vel=0, cog=0, satellites_visible=3)
     place = nav.frame.to_global(*motion.place)
     altitude, speed = round(place.altitude_m * 1000), round(motion.ground_speed_m_s * 100)
-    track = math.degrees(math.atan2(motion.velocity_east, motion.velocity_north))
-    course = round(track % 360.0 * 100) % 36000
+    course = centidegrees(math.atan2(motion.velocity_east, motion.velocity_north))
     position = (place.latitude_e7, place.longitude_e7, altitude)
-    return m.GpsRawInt(vehicle.time_boot_us, nav.fix_type, *position, 121, 200, speed, course, 10, altitude, 300, 300)
+    precision, satellites, accuracies_mm = (121, 200), 10, (300, 300)
+    return m.GpsRawInt(
+        vehicle.time_boot_us, nav.fix_type, *position, *precision, speed, course, satellites, altitude, *accuracies_mm
+    )
 
 
 def _ekf_status(vehicle: ArduPilotVehicle) -> m.EkfStatusReport | None:
@@ -182,7 +185,7 @@ def _home_position(vehicle: ArduPilotVehicle) -> m.HomePosition | None:
         return None
     place, local = vehicle.navigation.frame.to_global(*home), vehicle.navigation.local(home)
     position = (place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000))
-    # ArduPilot sends NaN as the quaternion.
+    # ArduPilot sends NaN as the quaternion of home.
     return m.HomePosition(*position, *local, _NAN4, 0.0, 0.0, 0.0, vehicle.time_boot_us)
 
 
@@ -202,7 +205,7 @@ def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | Non
     place = vehicle.navigation.frame.to_global(*target)
     position = (place.latitude_e7, place.longitude_e7, place.altitude_m)
     mask = _POSITION_ONLY | _LAST_BYTE
-    return m.PositionTargetGlobalInt(vehicle.time_boot_ms, 0, mask, *position, *(0.0,) * 8)
+    return m.PositionTargetGlobalInt(vehicle.time_boot_ms, MavFrame.GLOBAL, mask, *position, *(0.0,) * 8)
 
 
 def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
@@ -212,13 +215,13 @@ def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
     target = guided.destination
     if target is None:
         vectors = (0.0, 0.0, 0.0, *guided.velocity, *guided.acceleration)
-        return m.PositionTargetLocalNed(time, 1, _VELOCITY_ONLY, *vectors, 0.0, 0.0)
+        return m.PositionTargetLocalNed(time, MavFrame.LOCAL_NED, _VELOCITY_ONLY, *vectors, 0.0, 0.0)
     local = vehicle.navigation.local(target)
-    return m.PositionTargetLocalNed(time, 1, _POSITION_ONLY, *local, *(0.0,) * 8)
+    return m.PositionTargetLocalNed(time, MavFrame.LOCAL_NED, _POSITION_ONLY, *local, *(0.0,) * 8)
 
 
 def _is_navigating(vehicle: ArduPilotVehicle) -> bool:
-    """Return True in modes with NAV_CONTROLLER_OUTPUT: on Plane all but MANUAL, on Rover the navigating modes."""
+    """Return True if the firmware sends NAV_CONTROLLER_OUTPUT in the present mode."""
     mode = vehicle.mode
     if vehicle.KIND == "plane":
         return mode.number != PlaneMode.MANUAL
@@ -233,7 +236,7 @@ def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput | None:
     bearing, distance, altitude_error = 0, 0, 0.0
     if target is not None:
         north, east = target[0] - motion.north, target[1] - motion.east
-        bearing = round(math.degrees(math.atan2(east, north)) % 360.0) % 360
+        bearing = round(math.degrees(math.atan2(east, north)) % 360.0) % 360  # Rounding may give 360, which is 0.
         distance, altitude_error = min(65535, int(math.hypot(north, east))), motion.down - target[2]
     return m.NavControllerOutput(roll, pitch, round(yaw), bearing, distance, altitude_error, 0.0, 0.0)
 
@@ -247,7 +250,7 @@ def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
 
 
 def _terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
-    """Build a request for all terrain data around the vehicle, because no data is stored."""
+    """Build TERRAIN_REQUEST for all data around the vehicle, because the simulated vehicle stores no terrain data."""
     place = vehicle.navigation.position
     if place is None:
         return None
@@ -305,4 +308,4 @@ MOTION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.Rangefinder.ID: _rangefinder,
     m.DistanceSensor.ID: _distance_sensor,
 }
-"""Functions that build messages, by message id; a function returns None if there is nothing to send."""
+"""Functions that build messages, by message id. A function returns None if there is nothing to send."""

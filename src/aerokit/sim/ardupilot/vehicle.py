@@ -1,7 +1,7 @@
 """`ArduPilotVehicle`: base of the simulated ArduPilots, which creates their parts, boots and changes modes."""
 
 # pyright: reportIncompatibleVariableOverride=false
-# `ArduPilotHost` declares protocols; here each part has its concrete type.
+# `ArduPilotHost` declares the parts as protocols, but here each part has its concrete type.
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ class ArduPilotVehicle(ArduPilotHost):
     - ``version``: version in AUTOPILOT_VERSION and the banner; ``parameters``: values that differ from the defaults;
       ``parameter_count``: reduces the number of parameters, for quick tests; ``parameter_errors``: sends PARAM_ERROR
     - ``logs``: logs of earlier runs; ``link_bytes_per_s``: see `ArduPilotStorage`
-    - ``battery_percent``: initial charge; ``battery_capacity_mah``: size of the pack
-    - ``wind``: constant wind and gusts; ``rangefinder_reach_m``: 0 means no range finder
+    - ``battery_percent``: initial charge; ``battery_capacity_mah``: capacity of the battery
+    - ``wind``: constant wind and gusts; ``rangefinder_reach_m``: range of the range finder, 0 without one
     - ``unsupported_commands``: MAV_CMDs to answer UNSUPPORTED, such as SET_MESSAGE_INTERVAL for an old firmware;
       ``stream_groups``: False ignores REQUEST_DATA_STREAM
     - ``components``: further components: `SimulatedCamera`, `SimulatedGimbal`, or `ExtraComponent`
@@ -65,7 +65,7 @@ class ArduPilotVehicle(ArduPilotHost):
 
     MAV_TYPE: ClassVar[int]
     BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]]
-    """Functions that build messages, by message id; a function returns None if there is nothing to send."""
+    """Functions that build messages, by message id. A function returns None if there is nothing to send."""
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]]
     """Factories of the modes, in the order of AVAILABLE_MODES."""
     ARMING: ClassVar[type[ArduPilotArming[Any]]]
@@ -106,7 +106,7 @@ class ArduPilotVehicle(ArduPilotHost):
         signing_key: SigningKey | None = None,
     ) -> None:
         self.parameters: SimParameters = parameters_of(self.KIND, parameter_count)
-        """Parameters by name. A test may change them; they survive a reboot."""
+        """Parameters by name. A test may change them, and they survive a reboot."""
         self.parameters["MAV_SYSID"] = system_id
         self.parameters.change(parameters or {})
         super().__init__(
@@ -124,7 +124,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.motion: Motion = self.make_motion(wind)
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
         self.rangefinder_reach_m = rangefinder_reach_m
-        self.rc: ArduPilotRadio = ArduPilotRadio(self)  # RC channels; the throttle (index 2) rests at 1000.
+        self.rc: ArduPilotRadio = ArduPilotRadio(self)  # RC channels. The throttle stick (index 2) rests at 1000.
         self.calibrations: Calibrations = Calibrations(self)
         self._boot_text = boot_text
         self._stream_groups = stream_groups
@@ -132,7 +132,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.external: ArduPilotExternal = ArduPilotExternal(self)
         """Measurements received from companion computers."""
         self.missions: ArduPilotMissionServer = ArduPilotMissionServer(self)
-        """Mission, fence and rally points; they survive a reboot."""
+        """Mission, fence and rally points, which survive a reboot."""
         self._reset()
         self._listen()
         self.storage: ArduPilotStorage = ArduPilotStorage(
@@ -192,15 +192,15 @@ class ArduPilotVehicle(ArduPilotHost):
         """Register the handlers of set-point messages."""
 
     def look_at(self, place: Ned | None) -> None:
-        """Point the gimbal, if there is one, at a place; None stops that."""
+        """Point the gimbal, if there is one, at a place. None ends this."""
         self.gimbal.look_at(place)
 
     def may_go_to(self, place: Ned) -> bool:
-        """Prepare DO_REPOSITION to a place; return False to refuse it."""
+        """Prepare the execution of DO_REPOSITION. Return False to refuse the command."""
         return True
 
     def reset_controllers(self) -> None:
-        """Create the controllers of this kind of vehicle; called at power-on, after the modes are created."""
+        """Create the controllers of this kind of vehicle. Called at power-on, after the modes were created."""
 
     def unknown_mode(self, number: int) -> tuple[int, str]:
         """Return severity and text for a mode number that does not exist."""
@@ -235,7 +235,7 @@ class ArduPilotVehicle(ArduPilotHost):
         return self.storage.ftp
 
     def is_addressed(self, message: Message) -> bool:
-        """Return True also for absent components of this system, as in the firmware (MAVLink_routing.cpp)."""
+        """Return True for this system. As in the firmware (MAVLink_routing.cpp), absent components are included."""
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         return system in (0, self.system_id) and all(component != present.component_id for present in self.components)
 
@@ -256,7 +256,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.info("AHRS: DCM active")
         self.arming.start()
         self.failsafes.start()
-        # Half a second in SITL; a shorter boot scales it.
+        # This takes half a second with SITL's boot timeline; a shorter timeline shortens the delay, too.
         self.call_later(0.25 * self.timeline.ready, self._leave_boot)
 
     def _leave_boot(self) -> None:
@@ -271,16 +271,16 @@ class ArduPilotVehicle(ArduPilotHost):
         self.requests.start_channel(channel, max(self.now, ready))
 
     def restart(self) -> None:
-        """Reboot: send nothing for a while, then boot again with default stream rates and estimates."""
+        """Reboot: send nothing for a while, then boot again. Stream rates and estimates are reset."""
         self.parameters["STAT_BOOTCNT"] += 1
-        self.motion.settle()  # The fall after a reboot in flight is not simulated.
+        self.motion.settle()  # After a reboot in flight, the vehicle is on the ground at once.
         self._reset()
         for channel in self.channels:
-            channel.closes_clients = True  # The TCP server of the firmware ends, too.
+            channel.closes_clients = True  # The reboot also ends the TCP server of the firmware.
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Queue a text, so that the reason of a refusal follows the acknowledgement, as in the firmware."""
+        """Queue a text. As in the firmware, the reason of a refusal is thus sent after the acknowledgement."""
         if self.is_initialised:
             self.call_later(0.0, lambda: super(ArduPilotVehicle, self).send_text(severity, text))
         else:
@@ -298,7 +298,7 @@ class ArduPilotVehicle(ArduPilotHost):
             self.send_text(*refusal_by_fence)
             return False
         is_armed = self.motors.is_armed
-        has_position = self.navigation.has_position and not self.failsafes.estimator
+        has_position = self.navigation.has_position and not self.failsafes.has_estimator_failed
         if is_armed and mode.needs_position and not has_position:
             self.send_text(MavSeverity.WARNING, self.refusal(mode, "requires position"))
             return False
@@ -337,7 +337,7 @@ class ArduPilotVehicle(ArduPilotHost):
         ]
 
     def build(self, message_id: int) -> Message | None:
-        """Build a message for streaming; None if it is not sent now."""
+        """Build the message with this id. Return None if the firmware does not send the message at present."""
         builder = self.BUILDERS.get(message_id)
         if builder is not None:
             return builder(self) if self.is_initialised or message_id in _BEFORE_READY else None
@@ -355,7 +355,7 @@ class ArduPilotVehicle(ArduPilotHost):
             self.move(dt)
         self.battery.drain(self.motors.current_a, dt)
         if not self.motors.is_armed and self.is_landed and self.motors.is_idle:
-            self.set_ticking(False)  # Nothing moves until the vehicle is armed.
+            self.set_ticking(False)  # Ticks are not needed until the vehicle is armed, because nothing moves.
 
     def _on_set_mode(self, request: m.SetMode, _: Channel) -> None:
         self.set_mode_from(request.base_mode, request.custom_mode)

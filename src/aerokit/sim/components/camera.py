@@ -21,14 +21,14 @@ MAX_VIDEO_ISO = 400
 
 
 class CameraParameters(ExtendedParameters):
-    """Camera settings (PARAM_EXT). Setting the mode during a capture or recording fails."""
+    """The settings of the camera (PARAM_EXT). During a capture or a recording, the mode cannot be set."""
 
     def __init__(self, camera: CameraBody) -> None:
         self._camera = camera
         super().__init__(camera, camera.definition)
 
     def refresh(self) -> None:
-        """Update values that commands or automatic exposure change."""
+        """Update the values that commands or the automatic exposure have changed."""
         values, camera = self.values, self._camera
         if MODE in values:
             values[MODE] = int(camera.mode)
@@ -52,7 +52,7 @@ _FORMAT_S, _FORMAT_PERCENTS = 0.5, (0, 25, 50, 75)
 
 
 def _format(camera: CameraBody, command: ReceivedCommand) -> int | CommandProgress:
-    """Format the card, which takes two seconds. Param 3 is 1 to reset the image log."""
+    """Format the card, which takes two seconds. Param 2 is 1 to format, param 3 is 1 to reset the image log."""
     captures = camera.captures
     if command.param1 not in (0.0, 1.0) or not camera.card.is_inserted:
         return MavResult.DENIED
@@ -70,14 +70,14 @@ def _format(camera: CameraBody, command: ReceivedCommand) -> int | CommandProgre
 
 
 def _at_once(handler: AsyncHandler) -> CommandHandler:
-    """Execute a handler in one call, because a simulated camera completes every step at once."""
+    """Return a synchronous version of an ``async`` handler, which works because the handler never has to wait."""
 
     def execute(command: ReceivedCommand) -> int:
         try:
             handler(command).send(None)
         except StopIteration as end:
             return int(end.value)
-        raise AssertionError("the handler of a simulated camera awaited something")
+        raise AssertionError("a command handler of the simulated camera must not wait, but it did")
 
     return execute
 
@@ -89,8 +89,8 @@ class SimulatedCamera(CameraBody):
     - ``vendor``, ``model``, ``definition_uri``, ``capabilities`` (CAMERA_CAP_FLAGS), ``resolution`` (pixels):
       content of CAMERA_INFORMATION. Without HAS_MODES it takes images and videos at any time.
     - ``streams``: addresses of video streams, such as ``rtsp://192.168.0.10:8554/main``; no video is sent
-    - ``thermal_celsius``: lowest and highest temperature in the image, for a thermal camera, whose last stream is
-      thermal; None for a visible-light camera
+    - ``thermal_celsius``: lowest and highest temperature in the image of a thermal camera, whose last stream is the
+      thermal one; None for a visible-light camera
     - ``picture``: content of image files (JPEG), or a function of the capture that returns it; the files are in
       ``/DCIM`` and served by MAVFTP
     - ``gimbal``: the gimbal that carries the camera and determines the direction of images
@@ -111,7 +111,7 @@ class SimulatedCamera(CameraBody):
         | CameraCapFlags.HAS_TRACKING_RECTANGLE
         | CameraCapFlags.HAS_TRACKING_GEO_STATUS
     )
-    """Value for ``capabilities`` that adds survey mode and tracking."""
+    """Value for ``capabilities`` that adds survey mode and tracking to the default."""
 
     def listen(self) -> None:
         """Serve files by MAVFTP and settings by PARAM_EXT."""

@@ -38,12 +38,12 @@ def own_definition() -> bytes:
 
 
 class CameraBody(SimulatedComponent, CameraDevice):
-    """Lens, card, shutter and settings; see `SimulatedCamera` for the arguments."""
+    """Base of `SimulatedCamera`, with lens, card, shutter and settings. See that class for the arguments."""
 
     TYPE: ClassVar[int] = MavType.CAMERA
 
     parameters: ExtendedParameters
-    """Settings; available once the camera has joined a vehicle."""
+    """Settings, which exist once the camera has joined a vehicle."""
 
     def __init__(
         self,
@@ -139,7 +139,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
         return None if pose is None else (pose.roll, pose.pitch, pose.yaw)
 
     async def stop_video(self) -> None:
-        """Store the video."""
+        """Stop the recording and store the video on the card."""
         seconds = self.captures.stop_recording()
         self.card.store(min(self.card.free_mib, seconds * self.video_mib_s))
 
@@ -150,7 +150,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
         return self.lens.set_focus(kind, value)
 
     async def set_source(self, source: int) -> bool:
-        """Accept RGB, and IR on a thermal camera."""
+        """Select the sensor. RGB is accepted, and on a thermal camera also IR."""
         is_thermal = self.thermal_celsius is not None
         return source in (CameraSource.DEFAULT, CameraSource.RGB) or (source == CameraSource.IR and is_thermal)
 
@@ -165,7 +165,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
         self.lens.focus.set(0.0)
 
     def start(self) -> None:
-        """Called at power-on; streams start at once."""
+        """Called at power-on. All video streams start at once."""
         self.captures.switch_off()
         self.reset_lens()
         self.parameters.restart()
@@ -185,14 +185,17 @@ class CameraBody(SimulatedComponent, CameraDevice):
         self.call_later(self.shutter_s, lambda: done(shot))
 
     def _shoot(self) -> Shot:
-        """Return CAMERA_IMAGE_CAPTURED with time, position and attitude, still without index and result."""
+        """Return a function that makes CAMERA_IMAGE_CAPTURED with the present time, position and attitude.
+
+        The index and the result of the image are arguments of that function.
+        """
         pose, angles = pose_of(self.vehicle), self.angles()
         place = None if pose is None else pose.place
         return partial(
             CameraImageCaptured,
             self.time_boot_ms,
             round(getattr(self.vehicle, "unix_time", 0.0) * 1e6),
-            0,  # camera_id of a camera that is a separate component
+            0,  # The camera_id is 0 for a camera that is a separate component.
             0 if place is None else place.latitude_e7,
             0 if place is None else place.longitude_e7,
             0 if place is None else round(place.altitude_m * 1000),

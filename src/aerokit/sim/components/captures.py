@@ -31,7 +31,7 @@ _NUMBER = 1
 
 
 class MemoryCard:
-    """A memory card; sizes are in MiB. Set ``is_inserted`` to False to remove it, assign ``used_mib`` to fill it."""
+    """A memory card with sizes in MiB. Set ``is_inserted`` to False to remove the card, ``used_mib`` to fill it."""
 
     def __init__(self, capacity_mib: float) -> None:
         self.capacity_mib = capacity_mib
@@ -44,7 +44,7 @@ class MemoryCard:
         return max(0.0, self.capacity_mib - self.used_mib) if self.is_inserted else 0.0
 
     def store(self, size_mib: float) -> bool:
-        """Store data; return False if it does not fit or there is no card."""
+        """Store data of this size. Return False if there is no card or not enough free space."""
         if size_mib > self.free_mib:
             return False
         self.used_mib += size_mib
@@ -86,7 +86,7 @@ _AUTO = (SetFocusType.AUTO, SetFocusType.AUTO_SINGLE, SetFocusType.AUTO_CONTINUO
 
 
 class Axis:
-    """A lens setting from 0 to 100 percent, at rest or moving at constant speed."""
+    """A lens setting from 0 to 100 percent, which rests or changes at a constant speed."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
@@ -101,7 +101,7 @@ class Axis:
         self._from, self._speed = max(0.0, min(100.0, percent)), 0.0
 
     def move(self, speed: float) -> None:
-        """Move at this speed, -1 to 1; 0 stops."""
+        """Move at this speed, from -1 to 1. 0 stops the movement."""
         self._from, self._since = self.percent, self._now()
         self._speed = max(-1.0, min(1.0, speed)) * _PERCENT_S
 
@@ -111,7 +111,7 @@ class Axis:
 
 
 class Lens:
-    """Zoom (up to ten times) and focus of a camera; automatic focus sets 50 percent."""
+    """Zoom (up to ten times) and focus of a camera. Automatic focus sets the focus to 50 percent."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self.zoom: Axis = Axis(now)
@@ -123,7 +123,7 @@ class Lens:
         return FOCAL_LENGTH_MM * (1.0 + (_ZOOM_FACTOR - 1.0) * self.zoom.percent / 100.0)
 
     def set_zoom(self, kind: int, value: float) -> bool:
-        """Apply SET_CAMERA_ZOOM; return False if type or value is not supported."""
+        """Apply SET_CAMERA_ZOOM. Return False if the type or the value is not supported."""
         if kind == CameraZoomType.STEP:
             self.zoom.step(value)
         elif kind == CameraZoomType.CONTINUOUS:
@@ -137,7 +137,7 @@ class Lens:
         return True
 
     def set_focus(self, kind: int, value: float) -> bool:
-        """Apply SET_CAMERA_FOCUS; return False if type or value is not supported."""
+        """Apply SET_CAMERA_FOCUS. Return False if the type or the value is not supported."""
         if kind == SetFocusType.STEP:
             self.focus.step(value)
         elif kind == SetFocusType.CONTINUOUS:
@@ -153,13 +153,16 @@ class Lens:
         return True
 
 
-# Above this pitch the optical axis meets the ground too far away, or never.
+# With a pitch above this limit, the optical axis meets the ground too far away or not at all.
 _MAX_GROUND_PITCH_RAD = -math.radians(5)
 _UNKNOWN, _ACCURACY_M = math.nan, 1.0
 
 
 def tracked_place(component: SimulatedComponent, flags: int, angles: Angles | None) -> list[m.CameraTrackingGeoStatus]:
-    """Return CAMERA_TRACKING_GEO_STATUS with the intersection of optical axis and ground at home altitude."""
+    """Return CAMERA_TRACKING_GEO_STATUS with the point where the optical axis meets the ground.
+
+    The ground is level, at the altitude of home. The list is empty if the point is unknown or too far away.
+    """
     pose = pose_of(component.vehicle)
     if pose is None or angles is None or angles[1] > _MAX_GROUND_PITCH_RAD:
         return []
@@ -174,12 +177,12 @@ def tracked_place(component: SimulatedComponent, flags: int, angles: Angles | No
             place.altitude_m,
             _ACCURACY_M,
             _ACCURACY_M,
-            0.0,  # velocity north, east and down
+            0.0,  # The velocity north, east and down of the tracked point is zero.
             0.0,
             0.0,
-            _UNKNOWN,  # accuracy of the velocity
+            _UNKNOWN,  # The accuracy of the velocity.
             math.hypot(distance, pose.height_m),
-            _UNKNOWN,  # heading and its accuracy
+            _UNKNOWN,  # The heading and its accuracy.
             _UNKNOWN,
         )
     ]

@@ -45,12 +45,12 @@ def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
 
 
 def serve_files(component: SimulatedComponent, files: FileTree) -> SessionFtpServer[FileTree]:
-    """Serve files by MAVFTP like PX4, under the component's address. Call this function in ``listen()``.
+    """Serve files of a component by MAVFTP, as PX4 does. Call this function in ``listen()``.
 
-    The files may change at any time, see `FileTree.put`. Power-off ends sessions and keeps files. The component's
-    ``faults.no_ftp`` turns the server off.
+    The files may change at any time, see `FileTree.put`. Power-off ends the sessions, but keeps the files. The
+    component's ``faults.no_ftp`` turns the server off.
     """
-    from aerokit.sim.px4.ftp import Px4Ftp  # Imported here because most components serve no files.
+    from aerokit.sim.px4.ftp import Px4Ftp  # imported only when needed, because most components serve no files
 
     server = Px4Ftp(component, files)
     component.vehicle.on_power_on(server.restart)
@@ -62,12 +62,13 @@ _MAVLINK_VERSION = 3
 
 
 class SimulatedComponent:
-    """A device on a vehicle's links that is switched on and rebooted with the vehicle.
+    """Base of a device on a vehicle's links. The device is switched on and rebooted together with the vehicle.
 
-    The component receives broadcasts and messages addressed to it. It ignores an unknown broadcast command and answers
-    UNSUPPORTED to an unknown command with its address. Its `faults` apply in addition to those of the vehicle.
+    The component receives broadcasts, and messages that are addressed to it. An unknown command is UNSUPPORTED if it is
+    addressed to the component, and ignored if it is a broadcast. The component's `faults` apply in addition to those of
+    the vehicle.
 
-    A component belongs to one vehicle; adding it to a second vehicle raises InvalidArgument.
+    A component belongs to one vehicle. Adding it to a second vehicle raises InvalidArgument.
     """
 
     TYPE: ClassVar[int]
@@ -83,11 +84,11 @@ class SimulatedComponent:
         self._streams: MessageStreams = MessageStreams(self)
 
     def commands(self) -> dict[int, CommandHandler]:
-        """Return handlers by MAV_CMD, in addition to the message requests."""
+        """Return the handlers of the component's commands by MAV_CMD, without the message requests."""
         return {}
 
     def builders(self) -> dict[int, Builder]:
-        """Return builders by message id, for REQUEST_MESSAGE and streams."""
+        """Return the functions that build messages for REQUEST_MESSAGE and for streams, by message id."""
         return {}
 
     def listen(self) -> None:
@@ -98,14 +99,16 @@ class SimulatedComponent:
 
     @property
     def vehicle(self) -> SimulatedVehicle:
-        """The vehicle that carries the component; raises InvalidArgument before it is added to a vehicle."""
+        """The vehicle that carries the component. Raises InvalidArgument if there is none yet."""
         if self._vehicle is None:
-            raise InvalidArgument("the component is not on a vehicle yet; pass it in components= of a vehicle")
+            raise InvalidArgument(
+                "the component is not on a vehicle yet; pass the component in components= of a vehicle"
+            )
         return self._vehicle
 
     @property
     def system_id(self) -> int:
-        """The system id passed to the component, or else the vehicle's."""
+        """The system id that was passed to the component or, if none was passed, that of the vehicle."""
         return self.vehicle.system_id if self._system_id is None else self._system_id
 
     @property
@@ -119,9 +122,9 @@ class SimulatedComponent:
         return self.vehicle.time_boot_ms
 
     def join(self, vehicle: SimulatedVehicle) -> None:
-        """Join a vehicle; the vehicle calls this."""
+        """Add the component to a vehicle. The vehicle calls this method."""
         if self._vehicle is not None:
-            raise InvalidArgument("the component is on another vehicle already; create one for each vehicle")
+            raise InvalidArgument("the component is already on another vehicle; create a component for each vehicle")
         self._vehicle = vehicle
         self._streams.builders = self.builders()
         self._commands = {**self._streams.commands(), **self.commands()}
@@ -150,7 +153,7 @@ class SimulatedComponent:
         self.vehicle.observe(message_class, on_message)
 
     def send(self, message: Message, channel: Channel | None = None) -> None:
-        """Send on one channel, or on all if ``channel`` is None."""
+        """Send a message on one channel, or on all channels if ``channel`` is None."""
         if not (self.faults.frozen or self.faults.drops_outgoing(message, self.vehicle.rng)):
             self.vehicle.send(message, channel, (self.system_id, self.component_id))
 
@@ -159,15 +162,15 @@ class SimulatedComponent:
         self.send(Statustext(severity, text[:50], 0, 0))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
-        """Call a function after ``delay`` simulated seconds; a reboot cancels the call."""
+        """Call a function after ``delay`` simulated seconds. A reboot cancels the call."""
         self.vehicle.call_later(delay, action)
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Call a function at a simulated time; a reboot cancels the call."""
+        """Call a function at a simulated time. A reboot cancels the call."""
         self.vehicle.call_at(when, action)
 
     def stream(self, message_id: int, interval_s: float, channel: Channel | None = None) -> None:
-        """Stream messages of this id on one channel, or on all if None; an interval of 0 stops the stream."""
+        """Stream messages on one channel, or on all channels if ``channel`` is None. The interval 0 stops them."""
         self._streams.stream(message_id, interval_s, channel)
 
     def _is_addressed(self, message: Message) -> bool:
@@ -175,16 +178,16 @@ class SimulatedComponent:
         if system not in (0, self.system_id) or component not in (0, self.component_id):
             return False
         if component == 0 and isinstance(message, CommandLong | CommandInt):
-            return message.command in self._commands  # An unknown broadcast command is for other components.
+            return message.command in self._commands  # Leave an unknown broadcast command to other components.
         return True
 
     def answer_with(self, message_id: int, command: ReceivedCommand) -> int:
-        """Send the requested messages; return DENIED for an unknown id, FAILED if there is no message."""
+        """Send the requested messages. Return DENIED for an unknown id, FAILED if there is no message at present."""
         return self._streams.answer_with(message_id, command)
 
 
 class ExtendedParameters(DefinedParameterServer):
-    """Settings that a camera definition defines and PARAM_EXT serves; create it in ``listen()``.
+    """Serves the settings of a camera definition by PARAM_EXT. Create the server in ``listen()``.
 
     Values survive a reboot. ``mute_parameters`` and ``parameter_limits`` of the component's faults apply.
     """

@@ -30,10 +30,10 @@ _ZERO: Angles = (0.0, 0.0, 0.0)
 
 
 class SimulatedGimbal(SimulatedComponent, GimbalMount):
-    """A gimbal device and its gimbal manager; it turns at a limited rate and can point at positions.
+    """A gimbal device and its gimbal manager. The gimbal turns at a limited rate and can point at positions.
 
     Only the component in control can command the gimbal. Initially, no component is in control. Take control with
-    MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Commands of other components are DENIED, their messages are ignored.
+    MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. The gimbal denies commands of other components and ignores their messages.
 
     - ``component_id``: MAVLink reserves 154 and 171 to 175 for gimbals; ``system_id``: None uses that of the vehicle
     - ``roll_deg``, ``pitch_deg``, ``yaw_deg``: minimum and maximum angle; roll and pitch relative to the horizon
@@ -74,7 +74,8 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         """Position to point at; None without a region of interest."""
         self.followed: int = 0
         """System id of the followed vehicle; 0 if none."""
-        # The gimbal turns from these angles, at this time, towards the target, which moves at these rates.
+        # The gimbal had the angles `_from` at the time `_since`. Since then, it turns towards `_target`, and the
+        # target itself turns at `_rates`.
         self._from: Angles = _ZERO
         self._since = 0.0
         self._target: Angles = _ZERO
@@ -137,7 +138,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         return (self._limited(0, roll), self._limited(1, pitch), self._limited(2, yaw))
 
     def _angles_to(self, region: GlobalPoint) -> Angles:
-        """Return the angles to a position, yaw from north; the current target if the vehicle has no position."""
+        """Return the angles to a position (yaw from north), or the present target if the vehicle has no position."""
         pose = pose_of(self.vehicle)
         if pose is None:
             return self._target
@@ -153,12 +154,12 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         return max(low, min(high, angle))
 
     def point(self, angles: Angles, flags: int, *, locked: bool) -> None:
-        """Turn to angles in radians; yaw is relative to north if ``locked``, otherwise to the nose."""
+        """Turn to angles in radians. Yaw is relative to north if ``locked``, otherwise to the vehicle's nose."""
         self._begin(flags)
         self._target, self._is_locked = angles, locked
 
     def turn(self, rates: Angles, flags: int, *, locked: bool) -> None:
-        """Turn at these rates in radians per second, limited to the slew rate."""
+        """Turn at these rates in radians per second. The slew rate limits them."""
         current = self.angles_from_north() if locked else self.angles()
         self._begin(flags)
         limit = self.slew_rad_s
@@ -166,12 +167,12 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         self._target, self._rates, self._is_locked = current, (roll, pitch, yaw), locked
 
     def look_at(self, place: Place | None) -> None:
-        """Point at a position; None points ahead again."""
+        """Point at a position. None points ahead again."""
         self._begin(0)
         self.region = None if place is None else GlobalPoint(*place)
 
     def follow(self, system_id: int) -> None:
-        """Point at another vehicle once its position is received; keeps the direction until then."""
+        """Point at another vehicle as soon as its position is received. Until then, keep the direction."""
         current = self.angles_from_north()
         self.point(current, Flags.YAW_LOCK, locked=True)
         self.followed = system_id

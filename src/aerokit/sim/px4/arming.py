@@ -13,7 +13,7 @@ from aerokit.sim.commands import ReceivedCommand
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.host import Px4Host
 
-# Sensor → reported percentages, and seconds between two reports.
+# Percentages that each sensor's calibration reports, and the seconds between two reports.
 _AUTOMATIC_CALIBRATIONS: dict[str, tuple[Sequence[int], float]] = {
     "gyro": (range(0, 101, 10), 0.3),
     "baro": ((), 0.5),
@@ -27,7 +27,7 @@ _PERCENT_PER_SIDE = 17
 
 
 def _side_texts(sensor: str, sides_done: int) -> list[str]:
-    """Return the texts before the measurement of the next side, after ``sides_done`` (calibration_routines.cpp)."""
+    """Return the texts before the measurement of a side, after ``sides_done`` sides (calibration_routines.cpp)."""
     side = _SIDES[-1 - sides_done]
     return [
         f"pending: {' '.join(_SIDES[: len(_SIDES) - sides_done])}",
@@ -40,10 +40,10 @@ def _side_texts(sensor: str, sides_done: int) -> list[str]:
 
 
 class Px4Calibration:
-    """Sensor calibration on the ground; one calibration runs at a time.
+    """Sensor calibration on the ground. Only one calibration runs at a time.
 
-    ``side_s``: seconds in each of six poses, until the vehicle is measured and placed in the next. With infinity, as in
-    SIH, the first pose is never completed.
+    ``side_s``: seconds that the measurement of each of the six poses takes. With infinity, as in SIH, the measurement
+    of the first pose never ends.
     """
 
     def __init__(self, px4: Px4Host) -> None:
@@ -54,11 +54,11 @@ class Px4Calibration:
 
     @property
     def is_running(self) -> bool:
-        """True during a calibration, which HEARTBEAT reports and during which arming is denied."""
+        """True during a calibration. Meanwhile, HEARTBEAT reports CALIBRATING and arming is denied."""
         return bool(self._sensor)
 
     def command(self, command: ReceivedCommand) -> int:
-        """Handle PREFLIGHT_CALIBRATION; return the MAV_RESULT."""
+        """Handle PREFLIGHT_CALIBRATION and return the MAV_RESULT."""
         sensor = _sensor_of(command)
         if self._px4.is_armed:
             return MavResult.TEMPORARILY_REJECTED
@@ -72,7 +72,8 @@ class Px4Calibration:
             self._start(sensor)
             self._begin_side(0, self._run_number)
         elif sensor == "esc":
-            # As check_battery_disconnected in esc_calibration.cpp, because the simulated battery is always connected.
+            # The simulated battery is always connected, so the check fails (esc_calibration.cpp,
+            # check_battery_disconnected).
             self._px4.send_text(MavSeverity.CRITICAL, "[cal] calibration failed: Disconnect battery and try again")
             return MavResult.DENIED
         elif sensor == "airspeed":
@@ -146,13 +147,13 @@ _MODES_ENDED_BY_DISARMING = frozenset({modes.TAKEOFF, modes.LAND, modes.PRECISIO
 
 
 class Px4Arming:
-    """Arming and disarming, with the arming checks and the log that each arming starts."""
+    """Arming and disarming, with the arming checks. Each arming starts a log."""
 
     def __init__(self, px4: Px4Host, calibration: Px4Calibration) -> None:
         self._px4, self._calibration = px4, calibration
-        self.since: float = -math.inf  # Time of the last arming.
+        self.since: float = -math.inf  # Time at which the vehicle was armed last.
         self.is_terminated: bool = False
-        """True from DO_FLIGHTTERMINATION, which stops the motors, until a restart."""
+        """True after a flight termination, which stops the motors until a restart."""
         self._is_logging = False
         self._reported_failures: list[str] = []
 
@@ -172,7 +173,7 @@ class Px4Arming:
             self._px4.send_text(MavSeverity.CRITICAL, reason)
 
     def report_changes(self) -> None:
-        """Report the failed checks when the failures of `Faults` have changed while the vehicle is disarmed."""
+        """Report the failed checks of a disarmed vehicle if ``prearm_failures`` of `Faults` has changed."""
         failures = list(self._px4.faults.prearm_failures)
         if self._px4.is_ready and not self._px4.is_armed and failures != self._reported_failures:
             self._reported_failures = failures
@@ -180,22 +181,22 @@ class Px4Arming:
 
     @property
     def is_possible(self) -> bool:
-        """True if all checks pass; HEARTBEAT (STANDBY) and SYS_STATUS (pre-arm bit) report it."""
+        """True if all checks pass. HEARTBEAT then reports STANDBY, and SYS_STATUS the pre-arm bit."""
         return self._px4.is_ready and self._mode_allows and not self.reasons()
 
     @property
     def _mode_allows(self) -> bool:
-        """False in RETURN, LAND and ORBIT, and in modes that lack sticks, set-points or a mission."""
+        """False in RETURN, LAND and ORBIT, and in a mode whose sticks, set-points or mission are missing."""
         mode = self._px4.mode
         return modes.MODES[mode].can_arm and self._px4.can_run(mode)
 
     def arm(self, by: str = "external command") -> bool:
-        """Arm and return True, or report the failed checks."""
+        """Arm and return True. If a check fails, report the failure and return False."""
         px4 = self._px4
         if px4.is_armed:
             return True
         if not px4.is_ready and not px4.faults.prearm_failures:
-            return False  # PX4 sends no text here.
+            return False  # During the boot, PX4 refuses without a text.
         if self._calibration.is_running:
             px4.send_text(MavSeverity.CRITICAL, "Arming denied: calibrating")
             return False
@@ -217,12 +218,12 @@ class Px4Arming:
         px4 = self._px4
         if px4.mode not in modes.STICK_MODES:
             return True
-        if px4.mode in _CLIMB_MODES:  # The throttle stick controls the climb rate.
+        if px4.mode in _CLIMB_MODES:  # A centred stick is safe where the throttle stick controls the climb rate.
             return px4.sticks.throttle <= _CENTRE_THROTTLE
         return px4.sticks.throttle < _LOW_THROTTLE
 
     def disarm(self, by: str, *, force: bool = False) -> bool:
-        """Stop the motors and return True; without ``force`` return False in flight."""
+        """Stop the motors and return True. Without ``force``, a flying vehicle stays armed (False)."""
         px4 = self._px4
         if not px4.is_armed:
             return True
@@ -246,7 +247,7 @@ class Px4Arming:
         px4.send(CommandLong(px4.system_id, MavComponent.PARACHUTE, MavCmd.DO_PARACHUTE, 0, 2.0, *(0.0,) * 6))
 
     def start_first_log(self) -> None:
-        """Start the log at boot, which also records the first flight."""
+        """Start a log at the boot. This log also records the first flight."""
         self._start_log()
 
     def _start_log(self) -> None:

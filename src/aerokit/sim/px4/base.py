@@ -1,7 +1,7 @@
 """`Px4Vehicle`: boot, state, modes and flight of a simulated PX4."""
 
 # pyright: reportIncompatibleVariableOverride=false
-# `Px4Host` declares protocols; the attributes here have the concrete types.
+# `Px4Host` declares the modules as protocols, but here the attributes have the concrete types.
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _MODES_ENDED_BY_LANDING = frozenset({modes.TAKEOFF, modes.LAND, modes.PRECISION_
 
 
 class Px4Vehicle(Px4Host):
-    """Base of the simulated PX4, without commands and telemetry; see `SimulatedPx4` for the arguments."""
+    """Base of the simulated PX4, without commands and telemetry. See `SimulatedPx4` for the arguments."""
 
     CAPABILITIES: ClassVar[int] = 0xE8FF
     VEHICLE_TYPE: ClassVar[int] = MavType.QUADROTOR
@@ -109,7 +109,7 @@ class Px4Vehicle(Px4Host):
         self._pings = 0
         self.home: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self.missions: Px4MissionServer = Px4MissionServer(self)
-        """Mission, fence and rally points; they survive a reboot."""
+        """Mission, fence and rally points, which survive a reboot."""
         self.camera_trigger: Px4CameraTrigger = Px4CameraTrigger(self)
         """Camera trigger, enabled while the parameter TRIG_MODE is not 0."""
         self._reset()
@@ -148,11 +148,11 @@ class Px4Vehicle(Px4Host):
         self.calibration: Px4Calibration = Px4Calibration(self)
         self.arming: Px4Arming = Px4Arming(self, self.calibration)
         self.throttle: float = 0.0
-        # Arming does not move a home that a client has set.
-        self.home_is_set_by_hand = False
+        # True if a client has set home. Arming does not move such a home.
+        self.home_is_set_by_client = False
         self.mode_after_landing: Px4Mode = modes.HOLD
         self.vtol_state: int = 0
-        """MAV_VTOL_STATE that is reported; assign it to simulate a VTOL, whose motion stays that of this vehicle."""
+        """MAV_VTOL_STATE to report. Assign a value to simulate a VTOL. The motion of the vehicle does not change."""
         self._touchdown_at = math.nan
         self._landed_at = math.nan
         self._has_flown = False
@@ -186,7 +186,7 @@ class Px4Vehicle(Px4Host):
 
     @property
     def airspeed_m_s(self) -> float:
-        """Measured airspeed; NaN without a sensor."""
+        """Airspeed that the vehicle measures, in m/s; NaN without an airspeed sensor."""
         return math.nan
 
     @property
@@ -211,7 +211,7 @@ class Px4Vehicle(Px4Host):
         self.gimbal.start()
         self.call_later(0.3 * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
-        self.failsafes.listen()  # again, because a restart has created new failsafes
+        self.failsafes.listen()  # A restart has created a new object, which has to listen, too.
         self.failsafes.start()
         self.call_later(self._boot_time_s, self._set_ready)
 
@@ -228,7 +228,7 @@ class Px4Vehicle(Px4Host):
         first = max(self.now, self.booted_at + _HEARTBEAT_BOOT_SHARE * self._boot_time_s)
         self.rates.start(channel, self.channels.index(channel), first)
         ready_at = max(self.now, self.booted_at + self._boot_time_s)
-        # PX4 sends the origin only once, and again when it changes.
+        # PX4 does not stream the origin, but sends it once, and again after a change.
         self.call_at(ready_at, lambda: self.send_built(m.GpsGlobalOrigin.ID, channel))
 
     def restart(self) -> None:
@@ -244,7 +244,7 @@ class Px4Vehicle(Px4Host):
         self.reboot(math.inf)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Queue a text with an id and usually a final tab. The text follows the answer that is being sent."""
+        """Queue a status text, with an id and usually a final tab, which is sent after the answer to the command."""
         self.call_later(0.0, partial(self.events.send_for, text))
         text = on_the_wire(text)
         number, self._next_text_id = self._next_text_id, (self._next_text_id + 1) & 0xFFFF
@@ -255,7 +255,7 @@ class Px4Vehicle(Px4Host):
 
     def on_armed(self) -> None:
         self.is_armed, self._has_flown, self._landed_at = True, False, math.nan
-        if not self.home_is_set_by_hand:
+        if not self.home_is_set_by_client:
             self.home = self.motion.place
         self.failsafes.on_armed()
         if self.mode == modes.MISSION:
@@ -275,7 +275,7 @@ class Px4Vehicle(Px4Host):
         self.switch_to(modes.TERMINATION)
 
     def change_mode(self, mode: Px4Mode) -> bool:
-        """Handle a mode request. While armed, modes that cannot run are refused, except LAND."""
+        """Handle a mode request. An armed vehicle refuses a mode that cannot run, except LAND (returns False)."""
         if self.is_armed and mode != modes.LAND and not self.can_run(mode):
             return False
         if mode not in _MODES_ENDED_BY_LANDING:
@@ -283,7 +283,7 @@ class Px4Vehicle(Px4Host):
         self.is_in_failsafe = False
         self.intended_mode = mode
         self.failsafes.override()
-        # A request for the current mode restarts the mission, or holds the current position.
+        # A request for the current mode restarts the mission or, in another mode, holds the current position.
         if mode == self.mode == modes.MISSION:
             self.mission.enter()
         elif mode == self.mode:
@@ -308,10 +308,10 @@ class Px4Vehicle(Px4Host):
         return self.has_position or not traits.needs_position
 
     def switch_to(self, mode: Px4Mode) -> None:
-        """Change the mode; the next heartbeat reports it."""
+        """Change the mode, which the next heartbeat reports."""
         self.mode = mode
         self.flight.enter(mode)
-        if mode == modes.RTL and self.is_armed:  # PX4 informs the other components of the vehicle.
+        if mode == modes.RTL and self.is_armed:  # PX4 informs the other components of the vehicle about a return.
             self.send(m.CommandLong(self.system_id, 0, MavCmd.NAV_RETURN_TO_LAUNCH, 0, *(0.0,) * 7))
 
     def leave_ground(self) -> None:
@@ -319,7 +319,7 @@ class Px4Vehicle(Px4Host):
         self.info("Takeoff detected")
 
     def on_sticks_moved(self, size: float) -> None:
-        """Switch to POSITION if the sticks moved by COM_RC_STICK_OV per cent and COM_RC_OVERRIDE includes the mode."""
+        """Switch to POSITION if the sticks moved far enough and the present mode can be overridden."""
         if self.is_armed and not self.is_landed and self.failsafes.can_be_overridden(size):
             self.info("Pilot took over using sticks")
             self.change_mode(modes.POSITION)
@@ -379,6 +379,6 @@ class Px4Vehicle(Px4Host):
             self.arming.disarm("auto preflight disarming")
 
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
-        """Answer a broadcast PING; an addressed PING is itself an answer."""
+        """Answer a broadcast PING. A PING with an address is an answer itself, so it is not answered."""
         if ping.target_system == ping.target_component == 0:
             self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)

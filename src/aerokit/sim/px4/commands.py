@@ -25,13 +25,13 @@ from aerokit.sim.px4.modes import Px4Mode
 from aerokit.sim.px4.payload import gimbal_commands
 from aerokit.sim.px4.telemetry import available_modes
 
-# Commands that are accepted without a visible effect.
+# Commands that PX4 accepts, without an effect that a client could see.
 _ACCEPTED = (
     Cmd.NAV_ROI, Cmd.NAV_VTOL_TAKEOFF, Cmd.DO_SET_ACTUATOR, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_WPNEXT_OFFSET,
     Cmd.DO_SET_ROI_NONE, Cmd.DO_SET_ROI, Cmd.DO_SET_SAFETY_SWITCH_STATE,
 )  # fmt: skip
 
-# Commands without an answer, because their modules do not run in this configuration.
+# Commands that PX4 does not answer, because the modules that handle them do not run in this configuration.
 _UNANSWERED = (
     Cmd.NAV_DELAY, Cmd.DO_DIGICAM_CONTROL, Cmd.DO_MOUNT_CONFIGURE, Cmd.DO_MOUNT_CONTROL, Cmd.DO_SET_CAM_TRIGG_DIST,
     Cmd.DO_SET_CAM_TRIGG_INTERVAL, Cmd.PREFLIGHT_UAVCAN, Cmd.REQUEST_CAMERA_INFORMATION, Cmd.SET_CAMERA_MODE,
@@ -61,7 +61,8 @@ def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     return handlers
 
 
-# Parts of SIH that can fail: the motors (FailureInjector.cpp) and the battery (BatterySimulator.cpp).
+# Units that can fail in SIH, with their failure types: the motors (FailureInjector.cpp) and the battery
+# (BatterySimulator.cpp).
 _FAILURES = {
     FailureUnit.SYSTEM_MOTOR: (FailureType.OK, FailureType.OFF, FailureType.STUCK, FailureType.WRONG),
     FailureUnit.SYSTEM_BATTERY: (FailureType.OK, FailureType.OFF),
@@ -69,7 +70,7 @@ _FAILURES = {
 
 
 def _inject_failure(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Acknowledge a failure of the motors or the battery, like SIH. The failure has no effect."""
+    """Acknowledge a failure of the motors or the battery, as SIH does, but without an effect."""
     if not px4.parameters.get("SYS_FAILURE_EN", 0):
         return MavResult.DENIED
     unit, failure_type = whole(command.param1), whole(command.param2)
@@ -84,7 +85,7 @@ def _refuse_high_latency(px4: Px4Vehicle) -> int:
 
 
 def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Accept a motor, a servo or (from 1000) an output function as param 5; the test has no visible effect."""
+    """Accept a test of a motor, a servo or (numbers from 1000 on) an output function, without a visible effect."""
     if px4.is_armed:
         return MavResult.DENIED
     function = whole(command.x)
@@ -93,7 +94,7 @@ def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
 
 
 def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Accept known actions without a visible effect; unknown actions are not answered."""
+    """Accept known storage actions, without a visible effect. Unknown actions are not answered."""
     if px4.is_armed:
         return MavResult.TEMPORARILY_REJECTED
     return MavResult.ACCEPTED if whole(command.param1) in _STORAGE_ACTIONS else None
@@ -101,7 +102,7 @@ def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
 
 _FORCE_MAGIC = 21196.0
 _ALIASES: dict[Px4Mode, Px4Mode] = {(modes.AUTO, 0): modes.MISSION, modes.ORBIT: modes.POSITION}
-# _NAN_AS_INT: the upper half of a double NaN.
+# `_NAN_AS_INT` is the upper half of a NaN of type double.
 _INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
 
 
@@ -136,9 +137,9 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
 
 
 def refusal_by_place(command: ReceivedCommand, *, checks_frame: bool) -> int | None:
-    """Return the MAV_RESULT of an invalid position or frame; None if the command is valid."""
+    """Return the MAV_RESULT with which an invalid position or frame is refused; None for a valid command."""
     if command.is_long:
-        # INT32_MAX as float32, which is rounded to a multiple of 128.
+        # COMMAND_LONG has floats, so an INT32_MAX arrives rounded to a multiple of 128.
         is_int32_max = all(_INT32_MAX - 128 < value <= _INT32_MAX + 256 for value in (command.x, command.y))
         return MavResult.DENIED if is_int32_max else None
     if command.x == command.y == _NAN_AS_INT:
@@ -155,7 +156,7 @@ def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
     if mode not in modes.SELECTABLE:
         level = "auto" if mode[0] == modes.AUTO else "main"
         px4.send_text(MavSeverity.CRITICAL, f"Unsupported {level} mode")
-        # PX4 1.16 accepts an unknown mode, but does not enter it.
+        # PX4 1.16 accepts an unknown mode, but does not enter the mode.
         return MavResult.ACCEPTED if px4.version.startswith("1.16") else MavResult.TEMPORARILY_REJECTED
     return _change(px4, mode)
 
@@ -176,7 +177,7 @@ class _Flight:
         force = command.param2 == _FORCE_MAGIC
         arm = round(command.param1) if math.isfinite(command.param1) else None
         if arm == 1:
-            is_done = self._px4.arming.arm()  # PX4 checks external arm commands even if they are forced.
+            is_done = self._px4.arming.arm()  # `force` is not passed, because PX4 checks even forced arm commands.
         elif arm == 0:
             is_done = self._px4.arming.disarm("external command", force=force)
         else:
@@ -185,7 +186,7 @@ class _Flight:
         return MavResult.ACCEPTED if is_done else MavResult.TEMPORARILY_REJECTED
 
     def set_mode(self, command: ReceivedCommand) -> int:
-        """Set a mode and acknowledge twice: PX4's link module always accepts, then the commander sends the result."""
+        """Set a mode and acknowledge twice. PX4's link module always accepts. Then the commander sends the result."""
         self._px4.commands.answer(command, MavResult.ACCEPTED)
         return set_mode(self._px4, whole(command.param1), (whole(command.param2), whole(command.param3)))
 
@@ -202,7 +203,7 @@ class _Flight:
         return result
 
     def take_off(self, command: ReceivedCommand) -> int:
-        """Take off to param 7 (AMSL); NaN uses MIS_TAKEOFF_ALT above home."""
+        """Take off to the altitude in param 7 (AMSL), or to MIS_TAKEOFF_ALT above home if param 7 is NaN."""
         result = self._change(modes.TAKEOFF)
         if result == MavResult.ACCEPTED and math.isfinite(command.z):
             self._plan_take_off(self._px4.frame.origin.altitude_m - command.z)
@@ -237,8 +238,11 @@ class _Flight:
         return result
 
     def reposition(self, command: ReceivedCommand) -> int:
-        """Go to a position. Latitude or longitude NaN or INT32_MAX keeps the place, altitude NaN keeps the height."""
-        if whole(command.param2) != 1:
+        """Go to a position.
+
+        A latitude or longitude that is NaN or INT32_MAX keeps the place, and an altitude that is NaN keeps the height.
+        """
+        if whole(command.param2) != 1:  # The flag CHANGE_MODE is required.
             return MavResult.UNSUPPORTED
         result = self._change(modes.HOLD)
         if result != MavResult.ACCEPTED:
@@ -267,13 +271,13 @@ class _Flight:
             px4.flight.speed_m_s = command.param1
 
     def orbit(self, command: ReceivedCommand) -> int:
-        """Circle a position; NaN params keep the previous values."""
+        """Circle a position. Params that are NaN keep the previous radius and speed."""
         px4, orbit = self._px4, self._px4.flight.orbit
         north, east, down = self._destination(command)
         radius = command.param1 if math.isfinite(command.param1) else orbit.radius_m
         speed = abs(command.param2) if math.isfinite(command.param2) else orbit.speed_m_s
-        if px4.VEHICLE_TYPE == MavType.FIXED_WING:  # A plane circles its target in HOLD.
-            result = self._change(modes.HOLD)  # sets the target to the current position
+        if px4.VEHICLE_TYPE == MavType.FIXED_WING:  # A plane has no ORBIT, but circles its target in HOLD.
+            result = self._change(modes.HOLD)  # This sets the target to the current position.
             px4.flight.target, px4.flight.radius_m = (north, east, down), radius
             return result
         if not orbit.plan(radius, speed, (north, east), down):
@@ -282,7 +286,7 @@ class _Flight:
         return self._change(modes.ORBIT)
 
     def tune(self, command: ReceivedCommand) -> int | None:
-        """Start tuning, or report its progress. A complete tuning waits for disarming, as with MC_AT_APPLY 1."""
+        """Start the autotuning, or report its progress. At the end, it waits for disarming (MC_AT_APPLY 1)."""
         px4 = self._px4
         if command.param1 != 1.0 or command.param2 != 0.0:
             return MavResult.DENIED
@@ -297,7 +301,7 @@ class _Flight:
         return None
 
     def transition(self, command: ReceivedCommand) -> int | None:
-        """Report a transition, then the state of param 1. A vehicle that is not a VTOL does not answer."""
+        """Change to the VTOL state in param 1, after a transition. A vehicle that is no VTOL does not answer."""
         px4, requested_state = self._px4, whole(command.param1)
         if not px4.vtol_state:
             return None
@@ -337,7 +341,7 @@ class _Flight:
         else:
             north, east = px4.frame.to_local(*command.place())
             px4.home = (north, east, px4.frame.origin.altitude_m - command.z)
-        px4.home_is_set_by_hand = True
+        px4.home_is_set_by_client = True
         return MavResult.ACCEPTED
 
     def run_prearm_checks(self, _: ReceivedCommand) -> int:
@@ -350,7 +354,7 @@ class _Flight:
         if self._px4.is_armed or command.param1 not in (1.0, 2.0):
             return MavResult.DENIED
         action = self._px4.restart if command.param1 == 1.0 else self._px4.shut_down
-        self._px4.call_later(0.2, action)  # The acknowledgement is sent first.
+        self._px4.call_later(0.2, action)  # later, so that the acknowledgement is still sent
         return MavResult.ACCEPTED
 
 
@@ -370,7 +374,7 @@ def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     return handlers
 
 
-# Commands that request a single message.
+# The message that each of these older commands requests.
 _LEGACY_REQUESTS = {
     Cmd.REQUEST_AUTOPILOT_CAPABILITIES: m.AutopilotVersion.ID,
     Cmd.REQUEST_PROTOCOL_VERSION: m.ProtocolVersion.ID,
@@ -385,7 +389,7 @@ class _Requests:
         self._px4 = px4
 
     def send_now(self, message_id: int, command: ReceivedCommand) -> int:
-        """Send a message before the acknowledgement; return DENIED if it cannot be sent."""
+        """Send a message before the acknowledgement. Return DENIED if the message cannot be sent."""
         message = None if message_id in _NOT_ON_REQUEST else self._px4.build(message_id)
         self._px4.rates.on_requested(command.channel, message_id)
         if message is None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
     from aerokit.sim.vehicle import SimulatedVehicle
 
-# Size of the data fields of SERIAL_CONTROL and of LOGGING_DATA.
+# Sizes of the data fields of SERIAL_CONTROL and of LOGGING_DATA, in bytes.
 _PIECE, _DATA = 70, 249
 _STEP_S, _MAX_TRIES = 0.05, 50
 _DEFINITION_BLOCKS = 2
@@ -21,7 +21,7 @@ _HEADER = b"ULog\x01\x12\x35\x01" + bytes(8)
 
 
 class Px4Shell:
-    """Echoes each line and answers with its output and the prompt, to the station that wrote last."""
+    """Answers each line with an echo, its output and the prompt. The answer goes to the sender of the line."""
 
     def __init__(self, px4: SimulatedVehicle) -> None:
         self._px4, self._line = px4, b""
@@ -53,7 +53,7 @@ class Px4Shell:
 
 
 class Px4LogStream:
-    """Streams a log: first the definitions, each of which must be acknowledged, then data without acknowledgements."""
+    """Streams a log. The definitions come first and must be acknowledged. Data follows without acknowledgements."""
 
     def __init__(self, px4: SimulatedVehicle) -> None:
         self._px4 = px4

@@ -21,19 +21,19 @@ _HORIZONTAL, _GPS_POSITION = 1, 1
 
 
 class Px4External:
-    """The newest measurement of each kind. External vision (EKF2_EV_CTRL) and landing targets have effects."""
+    """The newest measurement of each kind. Only external vision (EKF2_EV_CTRL) and landing targets have effects."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.latest: dict[type[Message], Message] = {}
         self.clock_answers: int = 0
-        """Number of answers to TIMESYNC requests."""
+        """Number of answers to the vehicle's TIMESYNC requests."""
         self.origin: GlobalPoint | None = None
         """Origin set by SET_GPS_GLOBAL_ORIGIN."""
         self._vision_at = self._target_at = -math.inf
         self._target: tuple[float, float] = (0.0, 0.0)
         self.wind: tuple[float, float] | None = None
-        """Speed in m/s, and direction in degrees that the wind comes from, by EXTERNAL_WIND_ESTIMATE."""
+        """Wind of EXTERNAL_WIND_ESTIMATE: the speed in m/s, and the direction in degrees from which it comes."""
         px4.on(m.Odometry, self._on_vision)
         px4.on(m.VisionPositionEstimate, self._on_vision)
         px4.on(m.LandingTarget, self._on_target)
@@ -49,18 +49,18 @@ class Px4External:
 
     @property
     def has_vision(self) -> bool:
-        """True if the estimator uses external vision, received within five seconds."""
+        """True if the estimator uses external vision, and the latest measurement is at most five seconds old."""
         is_used = int(self._px4.parameters["EKF2_EV_CTRL"]) & _HORIZONTAL
         return bool(is_used) and self._px4.now - self._vision_at <= _VISION_TIMEOUT_S
 
     @property
     def target(self) -> tuple[float, float] | None:
-        """Landing target (north, east) in the world frame; None if the target was lost for PLD_BTOUT seconds."""
+        """Landing target (north, east) in the world frame; None if it was not seen for PLD_BTOUT seconds."""
         is_fresh = self._px4.now - self._target_at <= self._px4.parameters["PLD_BTOUT"]
         return self._target if is_fresh else None
 
     def set_wind(self, command: ReceivedCommand) -> int:
-        """Execute EXTERNAL_WIND_ESTIMATE; the wind has no effect."""
+        """Record the wind of EXTERNAL_WIND_ESTIMATE. It has no effect on the flight."""
         self.wind = (command.param1, command.param3)
         return MavResult.ACCEPTED
 
@@ -88,20 +88,23 @@ class Px4External:
 
 
 class PrecisionLanding:
-    """Approach above the target, descent, and PLD_MAX_SRCH climbs to PLD_SRCH_ALT while the target is lost."""
+    """Precision landing: approaches the target from above, then descends.
+
+    If the target is lost, the vehicle climbs to PLD_SRCH_ALT to search for it, at most PLD_MAX_SRCH times.
+    """
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._search_began_at: float | None = None
-        self._searches = 0
+        self._search_count = 0
 
     def enter(self) -> None:
-        self._search_began_at, self._searches = None, 0
+        self._search_began_at, self._search_count = None, 0
 
     def update(self) -> None:
         px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
         target = px4.external.target
-        if target is None or self._searches > limits["PLD_MAX_SRCH"]:
+        if target is None or self._search_count > limits["PLD_MAX_SRCH"]:
             self._search()
             return
         self._search_began_at = None
@@ -113,9 +116,9 @@ class PrecisionLanding:
     def _search(self) -> None:
         px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
         if self._search_began_at is None:
-            self._search_began_at, self._searches = px4.now, self._searches + 1
+            self._search_began_at, self._search_count = px4.now, self._search_count + 1
         is_over = px4.now - self._search_began_at > limits["PLD_SRCH_TOUT"]
-        if is_over or self._searches > limits["PLD_MAX_SRCH"]:
+        if is_over or self._search_count > limits["PLD_MAX_SRCH"]:
             px4.flight.descend()
             return
         search_down = px4.home[2] - limits["PLD_SRCH_ALT"]

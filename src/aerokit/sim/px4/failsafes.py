@@ -28,14 +28,17 @@ _NO_ACTION, _WARNING = 0, 1
 
 
 class Px4Fence:
-    """Geofence, checked while GF_ACTION is not 0. The vehicle must be inside at least one inclusion."""
+    """Geofence, which is checked while GF_ACTION is not 0.
+
+    The vehicle must be inside at least one inclusion area, if there are any, and outside all exclusion areas.
+    """
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._is_valid = True
 
     def on_uploaded(self) -> None:
-        """Use the uploaded areas; a fence that excludes home is reported and ignored."""
+        """Use the uploaded areas. If they exclude home, send a text and ignore them."""
         home = self._px4.home
         self._is_valid = self._areas_allow(home[0], home[1])
         if not self._is_valid:
@@ -57,7 +60,8 @@ class Px4Fence:
     def breaches_at(self, place: Ned) -> list[str]:
         """Return the texts of breaches at a point (metres north, east, down)."""
         px4, (north, east, down) = self._px4, place
-        max_distance, max_height = px4.parameters["GF_MAX_HOR_DIST"], px4.parameters["GF_MAX_VER_DIST"]  # 0: no limit
+        # The value 0 of these parameters means that there is no limit.
+        max_distance, max_height = px4.parameters["GF_MAX_HOR_DIST"], px4.parameters["GF_MAX_VER_DIST"]
         breaches = []
         if 0 < max_distance < math.hypot(north - px4.home[0], east - px4.home[1]):
             breaches.append(TOO_FAR)
@@ -81,7 +85,7 @@ class Px4Fence:
         return not is_inside_inclusions or any(is_inside_inclusions)
 
     def _areas(self, north: float, east: float) -> Iterator[tuple[bool, bool]]:
-        """Yield two values for each area: True if it is an inclusion, and True if the point is inside it."""
+        """Yield for each area whether it is an inclusion area, and whether the point is inside the area."""
         items, index = self._items(), 0
         while index < len(items):
             item = items[index]
@@ -152,18 +156,18 @@ class Px4Failsafes:
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.fence: Px4Fence = Px4Fence(px4)
-        self.action: FailsafeAction = Action.NONE  # Current action.
+        self.action: FailsafeAction = Action.NONE  # The action that is being executed.
         self.battery_state = MavBatteryChargeState.OK
-        """State of charge; it never improves while armed."""
+        """MAV_BATTERY_CHARGE_STATE, which never improves while the vehicle is armed."""
         self.has_station: bool = False  # True while heartbeats of a ground station are received.
         self._station_at = -math.inf
         self._had_manual_control = False
         self._battery_at_arming = MavBatteryChargeState.OK
         self._reported_battery_level = MavBatteryChargeState.OK
         self._breaches: list[str] = []
-        # Actions by cause. A cause that has ended stays here while its action lasts.
+        # Actions by cause. A cause that has ended stays in this dictionary while its action lasts.
         self._active: dict[str, FailsafeAction] = {}
-        self._failing: frozenset[str] = frozenset()  # Causes that exist at present.
+        self._failing: frozenset[str] = frozenset()  # The causes that exist at present.
         self._holds_until = -math.inf
         self._is_overridden = False  # True after the user has changed the mode during a failsafe.
 
@@ -210,7 +214,10 @@ class Px4Failsafes:
         return MavBatteryChargeState.LOW if share < limits["BAT_LOW_THR"] else MavBatteryChargeState.OK
 
     def _battery_action(self) -> FailsafeAction:
-        """Return the action of COM_LOW_BAT_ACT: 0 warns, 2 lands, 3 returns (and lands in an emergency)."""
+        """Return the action for the state of the battery.
+
+        COM_LOW_BAT_ACT is 0 to warn, 2 to land, and 3 to return (in an emergency, to land).
+        """
         state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
         if state == MavBatteryChargeState.OK:
             return Action.NONE
@@ -231,7 +238,7 @@ class Px4Failsafes:
         return reasons
 
     def on_armed(self) -> None:
-        """Reset all actions; failures that exist at arming do not trigger a failsafe."""
+        """Reset all actions. A failure that exists at arming does not trigger a failsafe."""
         self._had_manual_control = self._px4.sticks.are_fresh
         self._battery_at_arming = self._reported_battery_level = self.battery_state = self._battery_level()
         self._reset()
@@ -255,7 +262,7 @@ class Px4Failsafes:
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_DLL_ACT"]), Action.NONE)
 
     def _sticks_action(self) -> FailsafeAction:
-        """Return the action for lost sticks, if they have been received since arming."""
+        """Return the action for lost sticks, or NONE if sticks were never received since arming."""
         sticks = self._px4.sticks
         self._had_manual_control = self._had_manual_control or sticks.are_fresh
         is_lost = self._had_manual_control and not sticks.are_fresh
@@ -264,9 +271,9 @@ class Px4Failsafes:
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_RCL_ACT"]), Action.NONE)
 
     def can_be_overridden(self, moved: float) -> bool:
-        """Return True if a stick movement of this size (2 is end to end) ends the current mode."""
+        """Return True if a stick movement ends the current mode. ``moved`` is its size: 2 is from end to end."""
         parameters, mode = self._px4.parameters, self._px4.mode
-        mode_bit = 0  # of COM_RC_OVERRIDE
+        mode_bit = 0  # Bit of COM_RC_OVERRIDE that allows an override in the present mode.
         if mode[0] == AUTO or mode == ORBIT:
             mode_bit = 1
         elif mode == OFFBOARD:
@@ -275,7 +282,10 @@ class Px4Failsafes:
         return is_allowed and moved * 100 >= parameters["COM_RC_STICK_OV"]
 
     def _is_excepted(self, parameter: str) -> bool:
-        """Return True if the parameter excludes this mode: bit 1 MISSION, 2 other automatic modes, 4 OFFBOARD."""
+        """Return True if a bit of the parameter excludes the intended mode from the failsafe.
+
+        The bits are 1 for MISSION, 2 for other automatic modes and 4 for OFFBOARD.
+        """
         mode = self._px4.intended_mode
         mode_bit = 0
         if mode == MISSION:
@@ -294,10 +304,10 @@ class Px4Failsafes:
         self._breaches = breaches
         if not breaches:
             return Action.NONE
-        return _FENCE_ACTIONS.get(round(self._px4.parameters["GF_ACTION"]), Action.WARN)
+        return _FENCE_ACTIONS.get(round(self._px4.parameters["GF_ACTION"]), Action.WARN)  # Other values only warn.
 
     def check(self) -> None:
-        """Check for failures and execute the action; does nothing after a flight termination."""
+        """Check for failures and execute the action. After a flight termination, do nothing."""
         if self._px4.arming.is_terminated:
             return
         self._watch_station()
@@ -312,7 +322,8 @@ class Px4Failsafes:
     def _update(self, failing: dict[str, FailsafeAction]) -> None:
         """Update the active failures.
 
-        A new failure starts the delay and ends an override. An action stays active until the mode is changed.
+        A new failure starts the delay of its action, and ends an override by the user. An action stays active until
+        the user changes the mode.
         """
         for cause, action in failing.items():
             if cause not in self._active and action >= Action.HOLD:
@@ -324,7 +335,10 @@ class Px4Failsafes:
         self._active, self._failing = {**still_acting, **failing}, frozenset(failing)
 
     def _choose(self) -> FailsafeAction:
-        """Return the most severe action, reduced while it is overridden, already under way or delayed."""
+        """Return the action to execute: the most severe one of the active failures, or a reduced action.
+
+        The action is reduced while the user has overridden it, while it is under way already, and during its delay.
+        """
         worst = max(self._active.values(), default=Action.NONE)
         intended = self._px4.intended_mode
         if self._is_overridden and worst < Action.DISARM:
@@ -340,7 +354,8 @@ class Px4Failsafes:
             return
         px4, previous, self.action = self._px4, self.action, action
         px4.is_in_failsafe = action > Action.WARN
-        if max(previous, Action.WARN) < action < Action.TERMINATE:
+        is_escalation = action > max(previous, Action.WARN)
+        if is_escalation and action < Action.TERMINATE:  # A termination sends its own texts.
             self._report(action)
         if action == Action.DISARM:
             px4.arming.disarm("failsafe", force=True)
@@ -348,7 +363,7 @@ class Px4Failsafes:
             px4.arming.terminate()
         elif action in _MODES:
             px4.switch_to(_MODES[action])
-        elif previous > Action.WARN:
+        elif previous > Action.WARN:  # The failsafe has ended.
             px4.switch_to(px4.intended_mode)
 
     def _report(self, action: FailsafeAction) -> None:
@@ -359,7 +374,7 @@ class Px4Failsafes:
         self._px4.send_text(MavSeverity.CRITICAL, text)
 
     def override(self) -> None:
-        """Handle a mode change by the user: drop failures that have ended, and reduce the action to a warning."""
+        """Handle a mode change by the user: forget failures that have ended, and reduce the action to a warning."""
         self._active = {cause: action for cause, action in self._active.items() if cause in self._failing}
         if self.action > Action.WARN:
             self._is_overridden = bool(self._active)

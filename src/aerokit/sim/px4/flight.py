@@ -19,7 +19,7 @@ _BACK_TO_CIRCLE_PER_S = 0.5
 
 
 class Px4Orbit:
-    """Circle of ORBIT; a negative radius is counter-clockwise."""
+    """The circle of the mode ORBIT. A negative radius is counter-clockwise."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -29,7 +29,7 @@ class Px4Orbit:
         self.speed_m_s: float = 1.0
 
     def plan(self, radius_m: float, speed_m_s: float, place: tuple[float, float], down: float) -> bool:
-        """Set a new circle; if its radius is out of range, keep the old circle and return False."""
+        """Set a new circle. If the radius is out of range, keep the old circle and return False."""
         if not _RADII_M[0] <= abs(radius_m) <= _RADII_M[1]:
             return False
         self.radius_m = radius_m
@@ -41,7 +41,8 @@ class Px4Orbit:
     def update(self) -> None:
         motion = self._px4.motion
         north, east = motion.north - self.middle[0], motion.east - self.middle[1]
-        angle, distance = math.atan2(east, north), math.hypot(north, east)  # from the middle to the vehicle
+        # Bearing and distance of the vehicle, seen from the middle of the circle.
+        angle, distance = math.atan2(east, north), math.hypot(north, east)
         turn_sign = math.copysign(1.0, self.radius_m)
         tangent = angle + turn_sign * math.pi / 2
         speed = self.speed_m_s
@@ -51,7 +52,7 @@ class Px4Orbit:
             speed * math.sin(tangent) + outwards * math.sin(angle),
             max(-1.0, min(1.0, self.down - motion.down)),
         )
-        motion.face(angle + math.pi)  # towards the middle
+        motion.face(angle + math.pi)  # The nose points to the middle.
 
     def status(self) -> m.OrbitExecutionStatus:
         px4 = self._px4
@@ -67,7 +68,7 @@ _RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def return_destination(px4: Px4Host) -> Ned:
-    """Return the destination of a return: north, east, and the down coordinate that its heights refer to."""
+    """Return the destination of RTL: north, east, and the down coordinate from which the heights of RTL count."""
     rtl_type = round(px4.parameters["RTL_TYPE"])
     rally_points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
     if rtl_type not in (*_NEAREST, _RALLY_FIRST) or not rally_points:
@@ -89,17 +90,17 @@ _YAW_FROM_M_S = 0.5
 
 
 class Px4Flight:
-    """Navigator: target, speeds, and the phase of a take-off or return."""
+    """Navigator of a multicopter, with the target, the speeds, and the phase of a take-off or return."""
 
     def __init__(self, vehicle: Px4Host) -> None:
         self._vehicle = vehicle
-        self.target: Ned = (0.0, 0.0, 0.0)  # Target of HOLD, TAKEOFF and RTL in the local frame.
-        self.destination: Ned = (0.0, 0.0, 0.0)  # Landing point of RTL: home or a rally point.
+        self.target: Ned = (0.0, 0.0, 0.0)  # Point of the local frame to which HOLD, TAKEOFF and RTL fly.
+        self.destination: Ned = (0.0, 0.0, 0.0)  # Landing point of RTL, which is home or a rally point.
         self.heading: float | None = None
         self.speed_m_s: float = 0.0
-        self.radius_m: float = 0.0  # Radius of the circle of a plane.
-        self.lifts_off: bool = False  # True if the mode requests to leave the ground.
-        self.by_hand: Px4ManualFlight = Px4ManualFlight(vehicle)
+        self.radius_m: float = 0.0  # Radius of the circle that a plane flies.
+        self.lifts_off: bool = False  # True if the mode wants to leave the ground.
+        self.manual_flight: Px4ManualFlight = Px4ManualFlight(vehicle)
         self.precision_landing: PrecisionLanding = PrecisionLanding(vehicle)
         self.orbit: Px4Orbit = Px4Orbit(vehicle)
         self._phase = ""
@@ -121,7 +122,7 @@ class Px4Flight:
         self.heading = None
         self._phase = "climb"
         self.stay_here()
-        self.by_hand.enter()
+        self.manual_flight.enter()
         self.precision_landing.enter()
         if mode == modes.RTL and self._vehicle.is_armed:
             self._plan_return()
@@ -137,7 +138,7 @@ class Px4Flight:
         mode = vehicle.mode
         self.lifts_off = (
             mode == modes.TAKEOFF
-            or self.by_hand.wants_up
+            or self.manual_flight.wants_up
             or (mode == modes.OFFBOARD and vehicle.offboard.wants_up)
             or (mode == modes.MISSION and vehicle.mission.wants_up)
         )
@@ -157,7 +158,7 @@ class Px4Flight:
         elif mode == modes.MISSION:
             vehicle.mission.update()
         elif mode in modes.STICK_MODES:
-            self.by_hand.update()
+            self.manual_flight.update()
         elif mode == modes.ORBIT:
             self.orbit.update()
         elif mode == modes.TERMINATION:
@@ -178,11 +179,11 @@ class Px4Flight:
         vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=climb, descent=1.0)
         if abs(vehicle.motion.down - self.target[2]) < _ARRIVED_M:
             target = self.target
-            vehicle.switch_to(modes.HOLD)  # replaces the target by the current position
+            vehicle.switch_to(modes.HOLD)  # This sets the target to the current position.
             self.target = target
 
     def plan_take_off(self, down: float | None = None) -> None:
-        """Plan a vertical climb to ``down``; None is MIS_TAKEOFF_ALT above home, but not below the current height."""
+        """Plan a vertical climb to ``down``. None selects MIS_TAKEOFF_ALT above home, if the vehicle is not higher."""
         vehicle, motion = self._vehicle, self._vehicle.motion
         self._is_default_height = down is None
         if down is None:
@@ -192,7 +193,7 @@ class Px4Flight:
             vehicle.call_later(0.0, self.announce_take_off)
 
     def announce_take_off(self) -> None:
-        """Send the text of the take-off, at arming or in flight."""
+        """Send the text about the take-off."""
         if self._is_default_height:
             altitude = self._vehicle.parameters["MIS_TAKEOFF_ALT"]
             self._vehicle.info(f"Using default takeoff altitude: {altitude:.1f} m")
@@ -223,7 +224,7 @@ class Px4Flight:
         return slow + (fast - slow) * share
 
     def _plan_return(self) -> None:
-        """Plan a return at RTL_RETURN_ALT above the landing point, or at RTL_DESCEND_ALT if this point is near."""
+        """Plan a return at RTL_RETURN_ALT above the landing point, or at RTL_DESCEND_ALT to a near landing point."""
         vehicle = self._vehicle
         self.destination = return_destination(vehicle)
         north, east, down = vehicle.motion.north, vehicle.motion.east, vehicle.motion.down
@@ -235,7 +236,7 @@ class Px4Flight:
         self.target = (north, east, min(down, self.destination[2] - height))
         amsl = vehicle.frame.origin.altitude_m - self.target[2]
         text = f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)"
-        vehicle.call_later(0.0, lambda: vehicle.info(text))  # PX4 sends this text after that of the command.
+        vehicle.call_later(0.0, lambda: vehicle.info(text))  # PX4 sends this text after the text of the command.
 
     def _return(self) -> None:
         vehicle, motion = self._vehicle, self._vehicle.motion
@@ -254,5 +255,5 @@ class Px4Flight:
 
 
 def velocity_towards(offset: float, limit: float, acceleration: float) -> float:
-    """Return a signed speed along one axis towards a point ``offset`` metres away."""
+    """Return the speed along one axis towards a point ``offset`` metres away. It has the sign of ``offset``."""
     return math.copysign(min(limit, approach_speed(abs(offset), 1.0, BRAKING_SHARE * acceleration)), offset)

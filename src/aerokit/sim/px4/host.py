@@ -122,12 +122,12 @@ class Px4ExternalInterface(Protocol):
 
 
 class Px4Host(SimulatedAutopilot):
-    """State and operations of a PX4 that its modules use; `Px4Vehicle` implements them."""
+    """Interface of a simulated PX4 for its modules. `Px4Vehicle` implements it."""
 
     VEHICLE_TYPE: ClassVar[int]
 
     parameters: SimParameters
-    """Parameters; they survive a reboot."""
+    """Parameters, which survive a reboot."""
     frame: LocalFrame
     battery: SimulatedBattery
     home: Ned
@@ -163,11 +163,11 @@ class Px4Host(SimulatedAutopilot):
         raise NotImplementedError
 
     def change_mode(self, mode: Px4Mode) -> bool:
-        """Handle a mode request; return False if it is refused."""
+        """Handle a mode request. Return False if the mode is refused."""
         raise NotImplementedError
 
     def switch_to(self, mode: Px4Mode) -> None:
-        """Change the mode; the next heartbeat reports it."""
+        """Change the mode, which the next heartbeat reports."""
         raise NotImplementedError
 
     def leave_ground(self) -> None:
@@ -183,5 +183,5 @@ class Px4Host(SimulatedAutopilot):
         raise NotImplementedError
 
     def on_sticks_moved(self, size: float) -> None:
-        """Called with the distance by which the sticks moved; 2 is end to end."""
+        """Called with the distance by which a stick has moved. 2 is the distance from end to end."""
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""Output of a simulated PX4 by link: stream rates, status texts, and the events that correspond to texts.
+"""Output of a simulated PX4 on each link: stream rates, status texts, and events with the content of texts.
 
 https://mavlink.io/en/services/events.html. Event ids and log levels are those of a recording of a real PX4. Not
 simulated: events without a text, the health report of the components, REQUEST_EVENT.
@@ -36,7 +36,7 @@ _RETURN_TEXT = re.compile(r"RTL: start return at (-?\d+) m \((-?\d+) m above des
 
 
 class Px4Events:
-    """Sends events. The sequence starts ten below its overflow, so that tests of clients cover the overflow."""
+    """Sends events. Their sequence number soon overflows, so that tests of clients cover the overflow."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -46,7 +46,7 @@ class Px4Events:
         return CurrentEventSequence((self._next_sequence - 1) & 0xFFFF, 0)
 
     def send_for(self, text: str) -> None:
-        """Send the event that corresponds to a status text, if there is one."""
+        """Send the event with the content of a status text, if there is such an event."""
         event = _event_of(text)
         if event is None:
             return
@@ -57,7 +57,7 @@ class Px4Events:
 
 
 def _event_of(text: str) -> tuple[int, bytes] | None:
-    """Return id and arguments of the event that corresponds to a status text; None if there is none."""
+    """Return the id and the arguments of the event with the content of a status text; None if there is none."""
     if text in _EVENT_IDS:
         return _EVENT_IDS[text], b""
     if text.startswith("Armed by "):
@@ -76,7 +76,7 @@ TOO_FAR = "Geofence: exceeding maximum distance to Home"
 TOO_HIGH = "Geofence: exceeding maximum altitude above Home"
 OUTSIDE = "Geofence: approaching or outside geofence"
 
-# Texts that PX4 sends without the final tab, which tells clients that an event has the same content.
+# PX4 marks a text whose content an event also reports by a final tab. It sends these texts without the tab.
 _WITHOUT_TAB = (
     "Preflight Fail: ",
     "Geofence: ",
@@ -93,7 +93,7 @@ _MAX_QUEUED, _MAX_AGE_S = 8, 5.0
 
 
 class Px4TextLinks:
-    """Sends texts on links with a ground station (streams/STATUSTEXT.hpp); on other links queues them for 5 s."""
+    """Sends status texts (streams/STATUSTEXT.hpp). On a link without a ground station, texts are queued for 5 s."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -101,14 +101,14 @@ class Px4TextLinks:
         self._waiting: dict[Channel, deque[tuple[float, list[Statustext]]]] = {}
 
     def on_station_heartbeat(self, channel: Channel) -> None:
-        """Handle a ground station's HEARTBEAT: send the texts queued in the last 5 s."""
+        """Handle the HEARTBEAT of a ground station: send the texts that were queued in the last 5 s."""
         self._station_at[channel] = self._px4.now
         for sent_at, chunks in self._waiting.pop(channel, ()):
             if self._px4.now - sent_at < _MAX_AGE_S:
                 self._send(chunks, channel)
 
     def send(self, chunks: list[Statustext]) -> None:
-        """Send a text on links with a ground station; queue it on others."""
+        """Send a text on the links with a ground station, and queue the text on the other links."""
         now = self._px4.now
         for channel in self._px4.channels:
             if now - self._station_at.get(channel, -math.inf) <= _STATION_TIMEOUT_S:
@@ -126,7 +126,7 @@ def on_the_wire(text: str) -> str:
 
 
 LINK_MODES = ("normal", "onboard", "config", "minimal")
-"""Names of MAV_n_MODE: Normal, Onboard, Config and Minimal."""
+"""Link modes, which PX4 names Normal, Onboard, Config and Minimal (MAV_n_MODE)."""
 
 _FAST_MESSAGES = (
     m.Attitude.ID,
@@ -138,14 +138,14 @@ _FAST_MESSAGES = (
     m.ServoOutputRaw.ID,
 )
 _SIMULATION_RATES_HZ = {m.RcChannels.ID: 20.0, m.OpticalFlowRad.ID: 10.0, m.Statustext.ID: 20.0}
-# Rates that are the same on every link and cannot be changed.
+# Rates of the messages that have the same rate on every link, which cannot be changed.
 _ALWAYS_HZ = {m.Heartbeat.ID: 1.0, m.MissionCurrent.ID: 1.0, m.CurrentEventSequence.ID: 0.3}
 
 _OFF, _ON_CHANGE = -1, 0
 
 
 class Px4StreamRates:
-    """Stream rates by link. ``modes`` are the modes of the first, second … link; further links use the last mode.
+    """Stream rates of each link. ``modes`` lists the modes of the links. Further links have the last mode of the list.
 
     The "normal" link is the ground-station link of PX4's simulation, on which some messages are sent at ``fast_hz``.
     """
@@ -153,8 +153,8 @@ class Px4StreamRates:
     def __init__(self, modes: Sequence[str], is_built: Callable[[int], bool], fast_hz: float) -> None:
         unknown = sorted(set(modes) - set(LINK_MODES))
         if unknown or not modes:
-            reason = f"unknown mode {unknown[0]!r}" if unknown else "no entry"
-            raise ValueError(f"link_modes has {reason}; modes: {', '.join(LINK_MODES)}")
+            reason = f"contains the unknown mode {unknown[0]!r}" if unknown else "is empty"
+            raise ValueError(f"link_modes {reason}; modes: {', '.join(LINK_MODES)}")
         self._modes, self._is_built, self._fast_hz = tuple(modes), is_built, fast_hz
         self._intervals_us: dict[Channel, dict[int, int]] = {}
         self._mode_of: dict[Channel, str] = {}
@@ -179,13 +179,13 @@ class Px4StreamRates:
         return {**rates, **fast, **_SIMULATION_RATES_HZ}
 
     def interval_us(self, channel: Channel, message_id: int) -> int:
-        """Return the interval for MESSAGE_INTERVAL: -1 means off or unknown, 0 means sent on change."""
+        """Return the interval to report in MESSAGE_INTERVAL: -1 means off or unknown, 0 means sent on change."""
         if message_id == m.Heartbeat.ID:
             return 1_000_000
         return self._intervals_us.get(channel, {}).get(message_id, _OFF)
 
     def set_interval_us(self, channel: Channel, message_id: int, interval_us: float, now: float) -> int:
-        """Set an interval and return the MAV_RESULT; 0 restores the rate of the link mode."""
+        """Set the interval of a message and return the MAV_RESULT. 0 restores the rate of the link mode."""
         rates = _table()[self._mode_of[channel]]
         if message_id not in rates:
             return MavResult.FAILED
@@ -197,7 +197,7 @@ class Px4StreamRates:
         return MavResult.ACCEPTED
 
     def on_requested(self, channel: Channel, message_id: int) -> None:
-        """Handle a single request, after which MESSAGE_INTERVAL reports the message as sent on change."""
+        """Record a request of a single message. MESSAGE_INTERVAL then reports the message as sent on change."""
         intervals_us = self._intervals_us.get(channel, {})
         if intervals_us.get(message_id) == _OFF:
             intervals_us[message_id] = _ON_CHANGE
@@ -209,7 +209,7 @@ def _interval_us(rate_hz: float) -> int:
 
 @lru_cache(maxsize=1)
 def _table() -> dict[str, dict[int, float]]:
-    """Return the rates in Hz by link mode and message id; messages with rate 0 are sent only on request."""
+    """Return the rates in Hz by link mode and message id. A message with the rate 0 is sent only on request."""
     data = pkgutil.get_data(__name__, "stream_rates.csv")
     assert data is not None
     rows = list(csv.DictReader(data.decode().splitlines()))

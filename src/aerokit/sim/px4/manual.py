@@ -18,7 +18,7 @@ _CHANNEL_PARAMETERS = ("RC_MAP_ROLL", "RC_MAP_PITCH", "RC_MAP_YAW", "RC_MAP_THRO
 
 
 class Px4Sticks:
-    """Latest stick positions, -1 to 1; right, forward, clockwise and up are positive."""
+    """The latest stick positions, from -1 to 1. Right, forward, clockwise and up are positive."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -26,7 +26,7 @@ class Px4Sticks:
         self.pitch: float = 0.0
         self.yaw: float = 0.0
         self.throttle: float = -1.0
-        self.channels: tuple[int, ...] = ()  # Pulses of the last RC_CHANNELS_OVERRIDE in µs.
+        self.channels: tuple[int, ...] = ()  # Pulses of the latest RC_CHANNELS_OVERRIDE in µs.
         self._moved_at = self._channels_at = -math.inf
         px4.on(m.ManualControl, self._on_manual_control)
         px4.on(m.RcChannelsOverride, self._on_override)
@@ -69,13 +69,13 @@ class Px4Sticks:
         self.yaw = yaw
         self.throttle = throttle
         self._moved_at = self._px4.now
-        if were_fresh:  # The first positions after a silence are no movement.
+        if were_fresh:  # The first positions after a silence do not count as a movement.
             largest = max(abs(new - old) for new, old in zip((roll, pitch, yaw, throttle), previous, strict=True))
             self._px4.on_sticks_moved(largest)
 
 
 def _stick_position(pulse_us: int) -> float:
-    """Scale a pulse of 1000 to 2000 µs to -1 to 1; return 0 for an unused channel."""
+    """Scale a pulse of 1000 to 2000 µs to the range from -1 to 1. Return 0 for an unused channel."""
     if pulse_us in (0, _UNUSED):
         return 0.0
     return max(-1.0, min(1.0, (pulse_us - 1500) / 500))
@@ -94,7 +94,7 @@ _EXPO, _DEAD_ZONE = 0.6, 0.1
 _SLOW_SHARE = 0.3
 _LIFTS_OFF_ABOVE = 0.05
 _AT_REST_M_S = 0.3
-# Time constant of the velocity control in `Motion`.
+# The velocity control of `Motion` has this time constant.
 _THRUST_AHEAD_S = 0.3
 
 _HOLDS_HEIGHT = frozenset({ALTITUDE, ALTITUDE_CRUISE, POSITION, POSITION_SLOW})
@@ -102,7 +102,7 @@ _HOLDS_PLACE = frozenset({POSITION, POSITION_SLOW})
 
 
 class Px4ManualFlight:
-    """Converts stick positions to motion targets; `update` runs at 50 Hz in manual modes."""
+    """Converts stick positions to motion targets. In manual modes, `update` is called at 50 Hz."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -159,7 +159,7 @@ class Px4ManualFlight:
         motion.seek_velocity(offset_north, offset_east, down)
 
     def _height_velocity(self) -> float:
-        """Return the commanded vertical velocity (m/s down); a centred stick holds the height."""
+        """Return the vertical velocity (m/s down) that the throttle stick commands. The centre holds the height."""
         px4, motion = self._px4, self._px4.motion
         throttle = curved(px4.sticks.throttle, _EXPO, _DEAD_ZONE)
         if throttle > 0:
@@ -176,14 +176,14 @@ class Px4ManualFlight:
 
     @property
     def _thrust(self) -> float:
-        """Thrust relative to hovering: 1 for a centred stick; the lowest stick commands MPC_MANTHR_MIN."""
+        """Thrust divided by the thrust of hovering. A centred stick commands 1, the lowest stick MPC_MANTHR_MIN."""
         parameters, throttle = self._px4.parameters, self._px4.sticks.throttle
         hover, min_thrust = parameters["MPC_THR_HOVER"], parameters["MPC_MANTHR_MIN"]
         range_ = 1.0 - hover if throttle > 0 else hover - min_thrust
         return (hover + throttle * range_) / hover
 
     def _velocity_of_thrust(self) -> float:
-        """Return the vertical velocity (m/s down) to which the thrust accelerates."""
+        """Return the target velocity (m/s down) with which `Motion` accelerates as the thrust does."""
         motion = self._px4.motion
         lift = self._thrust * math.cos(motion.roll) * math.cos(motion.pitch)
         return motion.velocity_down + (1.0 - lift) * GRAVITY_M_S2 * _THRUST_AHEAD_S

@@ -1,7 +1,7 @@
 """Mission mode (AUTO.MISSION) of a simulated PX4.
 
 Simulated: take-off, waypoints with hold time, acceptance radius and heading, loitering, delays, landing, return,
-speed, jumps; other commands are skipped. Not simulated: regions of interest, circles.
+speed, jumps. Other commands are skipped. Not simulated: regions of interest, circles.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _WITH_PLACE = (
     *_TAKE_OFFS,
     *_LANDINGS,
 )
-# Commands that can be uploaded, but make a mission invalid.
+# Commands that PX4 stores, but that make a mission invalid.
 _STORED_ONLY = (Cmd.CONDITION_DELAY, Cmd.CONDITION_DISTANCE, Cmd.NAV_FENCE_RETURN_POINT)
 _VTOL = (Cmd.NAV_VTOL_TAKEOFF, Cmd.NAV_VTOL_LAND)
 _MAX_FIRST_DISTANCE_M = 10_000.0
 
 
 def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return the reason why a mission cannot be flown, or None. Glide slopes of landings are not checked."""
+    """Return PX4's text about why a mission cannot be flown, or None. The glide slope of a landing is not checked."""
     if px4.VEHICLE_TYPE == MavType.QUADROTOR and any(item.command in _VTOL for item in items):
         return "Mission contains VTOL items but vehicle is not a VTOL"
     has_place = False
@@ -52,8 +52,11 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
 
 
 def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Check MIS_TKO_LAND_REQ: 1 requires a take-off, 2 (a plane's default) a landing, 3 both, 4 both or none."""
-    if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # The multicopter's table lacks this parameter.
+    """Return PX4's text about a missing take-off or landing, or None.
+
+    MIS_TKO_LAND_REQ is 1 to require a take-off, 2 (the default) a landing, 3 both, 4 both or none.
+    """
+    if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # Only planes have this parameter.
         return None
     takes_off = any(item.command in _TAKE_OFFS for item in items)
     lands = any(item.command in _LANDINGS for item in items)
@@ -77,8 +80,9 @@ def _height_above_home(px4: Px4Host, item: MissionItem) -> float:
 
 
 def _landing_problem(items: Sequence[MissionItem]) -> str | None:
-    """Check the order of DO_LAND_START, landing and return; return the firmware's text about a problem."""
-    land_start = approach = -1  # Indices of DO_LAND_START and of the item before the landing; -1 without one.
+    """Return PX4's text about a wrong order of DO_LAND_START, landing and return, or None."""
+    # Indices of DO_LAND_START and of the item before the landing; -1 if there is no such item.
+    land_start = approach = -1
     for index, item in enumerate(items):
         if item.command == Cmd.DO_LAND_START:
             if land_start >= 0:
@@ -90,11 +94,12 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
             approach = index - 1
         elif item.command == Cmd.NAV_RETURN_TO_LAUNCH and land_start >= 0:
             return "land start item before RTL item not possible."
+    # DO_LAND_START must not be after the item before the landing.
     return "invalid land start." if land_start > approach else None
 
 
 def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
-    """Return the number (from 1) of the first item outside the geofence, or None."""
+    """Return the number of the first item outside the geofence, or None. The first item has the number 1."""
     for number, item in enumerate(items, start=1):
         if item.command in _WITH_PLACE:
             north, east = px4.frame.to_local(round(item.x), round(item.y))
@@ -124,23 +129,23 @@ _ACTIVE_MODES = (MISSION, TAKEOFF, LAND)
 
 
 class Px4Mission:
-    """Mission mode; `update` runs at every tick in flight."""
+    """Mission mode. In flight, `update` is called at every tick."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.current: int = 0  # Index of the item that is flown now or next.
-        self.reached: int = -1  # Index of the item that was reached last; -1 before the first.
-        self.is_finished: bool = False  # True after the last item.
-        self.is_valid: bool = False  # True if there is a mission that can be flown.
-        self._phase = ""  # "climb", "go" or "land".
+        self.reached: int = -1  # Index of the item that was reached last; -1 if there is none.
+        self.is_finished: bool = False  # True after the last item was completed.
+        self.is_valid: bool = False  # True if there is a mission and it can be flown.
+        self._phase = ""  # Phase of the current item: "climb", "go" or "land".
         self._arrived_at = math.nan
-        self._jumps: dict[int, int] = {}  # Number of jumps done, by index of the DO_JUMP.
+        self._jumps: dict[int, int] = {}  # Number of jumps that each DO_JUMP has done, by its index.
         self._state = int(MissionState.NO_MISSION)
         self._repeats_left = 0
         self._is_report_scheduled = False
 
     def start(self) -> None:
-        """Called at boot: check the mission, and report the last item reached once a second."""
+        """Called at boot. Check the mission, and from then on report the last reached item once a second."""
         self.is_valid = bool(self.count) and rejection(self._px4, self._px4.missions.commands) is None
         self._px4.every(1.0, self._repeat_reached)
 
@@ -159,7 +164,7 @@ class Px4Mission:
 
     @property
     def state(self) -> int:
-        """MISSION_STATE. Out of mission mode, the state stays the same until an item is reached."""
+        """MISSION_STATE. While the mission is not flown, the state does not change until an item was reached."""
         if not self.is_valid:
             self._state = MissionState.NO_MISSION
         elif self.is_finished:
@@ -177,7 +182,7 @@ class Px4Mission:
         return self._item is not None and not self.is_finished and self._phase != "land"
 
     def on_replaced(self, current: int) -> None:
-        """Handle an uploaded mission. In mission mode, start the new mission."""
+        """Handle the upload of a mission. In mission mode, start the new mission at once."""
         self.current, self.is_finished = max(0, current), False
         self.forget_reached()
         self._jumps.clear()
@@ -191,7 +196,7 @@ class Px4Mission:
             self._px4.change_mode(HOLD)
 
     def _check(self) -> None:
-        """Check the stored mission and send the problems; an invalid mission stays stored, but is not flown."""
+        """Check the stored mission and report its problems. An invalid mission stays stored, but is not flown."""
         items = self._px4.missions.commands
         problem, warning_text = rejection(self._px4, items), warning(self._px4, items)
         outside_number = outside_fence(self._px4, items)
@@ -204,7 +209,7 @@ class Px4Mission:
             self._px4.send_text(MavSeverity.CRITICAL, warning_text)
 
     def forget_reached(self) -> None:
-        """Reset the item that was reached last."""
+        """Forget which item was reached last."""
         self.reached, self._repeats_left = -1, 0
 
     def set_current(self, seq: int) -> None:
@@ -215,7 +220,7 @@ class Px4Mission:
             self._begin_item()
 
     def enter(self) -> None:
-        """Enter the mode; a finished mission starts again."""
+        """Enter mission mode. A finished mission starts again."""
         if not self.is_valid:
             return
         if self.is_finished or self.current >= self.count:
@@ -227,8 +232,8 @@ class Px4Mission:
         self._begin_item()
 
     def _begin_item(self) -> None:
-        """Make the item the target; commands without a position are executed and skipped."""
-        for _ in range(_MAX_JUMPS + self.count):  # DO_JUMPs can form an endless loop.
+        """Make the current item the target. Execute commands without a position, until an item has a position."""
+        for _ in range(_MAX_JUMPS + self.count):  # The number of steps is limited, because DO_JUMPs can form a loop.
             item, self._arrived_at = self._item, math.nan
             if item is None:
                 self._finish()
@@ -258,7 +263,7 @@ class Px4Mission:
             self._px4.info("Returning to launch")
 
     def _index_after_jump(self, item: MissionItem) -> int:
-        """Return the next index. PX4 counts the repetitions, and sends the changed item to the last client."""
+        """Return the index of the item after a DO_JUMP. PX4 counts its jumps, and sends the item to the last client."""
         jumps_done, index = self._jumps.get(self.current, 0), self.current
         if jumps_done >= item.param2:
             self._jumps.pop(index, None)
@@ -283,7 +288,7 @@ class Px4Mission:
             px4.flight.target = target
 
     def _climb(self, down: float | None) -> None:
-        """Start a vertical climb to ``down``; None is MIS_TAKEOFF_ALT above home."""
+        """Start a vertical climb to ``down``. None selects MIS_TAKEOFF_ALT above home."""
         px4, motion = self._px4, self._px4.motion
         if down is None:
             down = px4.home[2] - px4.parameters["MIS_TAKEOFF_ALT"]
@@ -354,7 +359,7 @@ class Px4Mission:
                 self._begin_item()
 
     def _advance(self) -> bool:
-        """Select the next item; after the last item finish the mission and return False."""
+        """Select the next item and return True. After the last item, finish the mission and return False."""
         if self.current + 1 < self.count:
             self.current += 1
             return True
@@ -378,7 +383,7 @@ class Px4Mission:
             self._px4.change_mode(HOLD)
 
     def _reach(self) -> None:
-        """Report the current item as reached; of several items in the same tick only the last is reported."""
+        """Report the current item as reached. Of several items in the same tick, only the last is reported."""
         if self.reached == self.current:
             return
         self.reached = self.current

@@ -1,4 +1,4 @@
-"""Storage of mission items in PX4: a download has 0 for params that the storage has no field for."""
+"""Storage of mission items in PX4. A param without a field in the storage is 0 in a download."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from aerokit.sim.missions import float32
 _DATA = pkgutil.get_data(__name__, "mission_commands.csv")
 assert _DATA is not None
 _ROWS = list(csv.DictReader(_DATA.decode().splitlines()))
-# Command in a global frame → storage types of params 1 to 4, see `_CONVERSIONS`.
+# Storage types (see `_CONVERSIONS`) of params 1 to 4 of each command that is allowed in a global frame.
 _PLACES = {int(Cmd[row["command"]]): row["with_place"] for row in _ROWS if row["with_place"]}
-# Commands in MAV_FRAME_MISSION, of which all seven params are stored.
+# Commands that are allowed in MAV_FRAME_MISSION. All their seven params are stored.
 _WITHOUT_PLACE = frozenset(int(Cmd[row["command"]]) for row in _ROWS if row["without_place"] == "1")
 
 _ROI_COMMANDS = (Cmd.NAV_ROI, Cmd.DO_SET_ROI)
@@ -42,9 +42,9 @@ _RADIANS_PER_DEGREE, _DEGREES_PER_RADIAN = float32(_PI / 180.0), float32(180.0 /
 
 
 def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> MissionItem | int:
-    """Return the item as stored (in frames 0, 2 and 3), or the MAV_MISSION_RESULT that refuses it.
+    """Return the item as PX4 stores it (with frame 0, 2 or 3), or the MAV_MISSION_RESULT of a refusal.
 
-    ``is_int`` is True for a MISSION_ITEM_INT, the only message in which PX4 accepts the frames 5 and 6.
+    ``is_int`` is True for an item of a MISSION_ITEM_INT. PX4 accepts the frames 5 and 6 only in this message.
     """
     frame = _INT_FRAMES.get(item.frame, item.frame) if is_int else item.frame
     if frame in (Frame.GLOBAL, Frame.GLOBAL_RELATIVE_ALT):
@@ -65,28 +65,28 @@ def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> Miss
 
 
 def as_downloaded(item: MissionItem, *, as_int: bool) -> MissionItem:
-    """Return the item that a download sends, with the frame that matches the kind of message."""
+    """Return the stored item with the frame for a MISSION_ITEM_INT (``as_int``) or a MISSION_ITEM."""
     return item.replace(frame=_AS_INT.get(item.frame, item.frame)) if as_int else item
 
 
 def checksum(items: Sequence[MissionItem], previous: int = 0) -> int:
     """Return the opaque id of a list of items: a CRC-32 over the uploaded messages.
 
-    ``previous`` is the CRC of the items before these.
+    ``previous`` is the CRC of the items that precede these items.
     """
     crc = previous
     for item in items:
         params = (item.param1, item.param2, item.param3, item.param4)
         header = struct.pack("<BHB4f", item.frame, item.command, item.autocontinue, *params)
-        # MISSION_ITEM_INT has integers as x and y, MISSION_ITEM has floats.
+        # x and y are integers in MISSION_ITEM_INT, and floats in MISSION_ITEM.
         place = struct.pack("<iif" if isinstance(item.x, int) else "<3f", item.x, item.y, item.z)
-        # zlib inverts the CRC at start and end, PX4 does not.
+        # zlib inverts the CRC at the start and at the end. PX4 does not, so the inversion is undone here.
         crc = zlib.crc32(header + place, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
     return crc
 
 
 def _as_fence_point(item: MissionItem) -> MissionItem:
-    """Return position, size and altitude of a fence item; PX4 does not store its altitude frame."""
+    """Return a fence item as stored: with position, size and altitude, but without the altitude frame."""
     if item.frame == Frame.MISSION:
         return MissionItem(item.command, item.frame, item.param1, z=item.z, autocontinue=False)
     place = {"x": item.x, "y": item.y, "z": item.z}
@@ -111,7 +111,7 @@ def _without_place(item: MissionItem) -> MissionItem | int:
     if item.command not in _WITHOUT_PLACE:
         return MavMissionResult.UNSUPPORTED
     p1, p2, command = item.param1, item.param2, item.command
-    if command == Cmd.DO_JUMP:  # The target is stored as int16, the number of repetitions as uint16.
+    if command == Cmd.DO_JUMP:  # PX4 stores the target as int16 and the number of repetitions as uint16.
         target = _whole(p1) & 0xFFFF
         if target & 0x8000:
             target -= 0x10000
@@ -133,7 +133,7 @@ def _rounded(value: float) -> int:
 
 
 def _heading(degrees: float) -> float:
-    """Convert a heading in degrees to its storage (radians, single precision) and back to 0 to 360."""
+    """Return a heading in degrees as it is after PX4 stored it in radians and read it again, from 0 to 360."""
     if not math.isfinite(degrees):
         return math.nan
     radians = float32(degrees * _RADIANS_PER_DEGREE)
@@ -143,7 +143,7 @@ def _heading(degrees: float) -> float:
     return float32(radians * _DEGREES_PER_RADIAN)
 
 
-# Conversions of a value to its storage and back, by storage type.
+# Functions that return a value as it is after it was stored and read again, by storage type.
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
     "-": lambda _: 0.0,
     "f": float32,

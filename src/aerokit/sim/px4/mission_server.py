@@ -46,7 +46,7 @@ class TransferState(Enum):
 
 @dataclass(eq=False)
 class _Link(ListUpload):
-    """The latest upload or download of a link. The firmware uses this state even after the transfer has ended."""
+    """State of the latest upload or download of a link, which the firmware also uses after the end of the transfer."""
 
     state: TransferState = TransferState.IDLE
     opaque_id: int = 0
@@ -58,7 +58,7 @@ class _Link(ListUpload):
 
 
 class Px4MissionServer(MissionServer):
-    """Server of mission, fence and rally points, which all links share. Texts and results are the firmware's."""
+    """Server of mission, fence and rally points, which all links share. Texts and results are those of the firmware."""
 
     retry_interval_s: ClassVar[float] = 0.26
 
@@ -86,7 +86,7 @@ class Px4MissionServer(MissionServer):
         return [as_downloaded(item, as_int=True) for item in self.lists.get(mission_type, ())]
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Store a whole list and return the MAV_MISSION_RESULT. PX4 has no such operation."""
+        """Store a whole list at once, and return the MAV_MISSION_RESULT. PX4 itself has no such operation."""
         if mission_type not in _CAPACITIES or start or not clear:
             return Result.ERROR
         stored_items: list[MissionItem] = []
@@ -112,7 +112,7 @@ class Px4MissionServer(MissionServer):
         return self.lists[MavMissionType.MISSION]
 
     def _store(self, mission_type: int, items: list[MissionItem], opaque_id: int, current: int = -1) -> None:
-        """Store a list; an identical list changes nothing."""
+        """Store a list, unless a list with the same opaque id is stored already."""
         if mission_type not in self.lists or (items and opaque_id == self.id(mission_type)):
             return
         self.store(mission_type, items)
@@ -123,7 +123,7 @@ class Px4MissionServer(MissionServer):
             self._px4.failsafes.fence.on_uploaded()
 
     def on_item_changed(self, seq: int) -> None:
-        """Send a changed item to the last partner on each link, except during a transfer."""
+        """Send a changed item to the last client of each link, except during a transfer."""
         for link in self._links.values():
             if link.state is TransferState.IDLE and link.client != _NO_PARTNER:
                 link.mission_type = 0
@@ -136,7 +136,7 @@ class Px4MissionServer(MissionServer):
         self._acknowledge(to or link.client, link.mission_type, result, link.channel)
 
     def _begin_transfer(self, state: TransferState, message: AnyListMessage, channel: Channel, count: int) -> _Link:
-        """Start a transfer. It replaces the latest transfer of the link, which is then no longer retried."""
+        """Start a transfer, which replaces the previous transfer of the link. The previous one is no longer retried."""
         client, kind, now = sender_of(message), message.mission_type, self._px4.now
         link = replace(
             self._link(channel), state=state, client=client, mission_type=kind, next=0, end=count, received_at=now
@@ -192,9 +192,9 @@ class Px4MissionServer(MissionServer):
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         """Start or restart a download.
 
-        A download counts as complete once all items were sent. The firmware applies this rule to an upload, too, once
-        the number of received items equals the number of stored items. This upload then ends, but other uploads are
-        refused until a download times out.
+        A download counts as complete once all items were sent. The firmware also applies this rule to an upload, if the
+        number of received items equals the number of stored items. The upload then ends, but other uploads are refused
+        until a download times out.
         """
         link = self._link(channel)
         if link.next == self.count(link.mission_type):
@@ -207,7 +207,7 @@ class Px4MissionServer(MissionServer):
         self._send_count(self._begin_transfer(TransferState.SENDING, request, channel, count))
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
-        """Send the next item, or the previous item again; any other index ends the download."""
+        """Send the next item, or the previous item again. A request for any other index ends the download."""
         link = self._link(channel)
         link.uses_int = isinstance(request, m.MissionRequestInt)
         if sender_of(request) != link.client:
@@ -228,7 +228,7 @@ class Px4MissionServer(MissionServer):
             self._warn("WPM: REJ. CMD: Req. WP was unexpected")
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
-        """End a download; cancel an upload, or change the kind of its requests (UNSUPPORTED)."""
+        """End a download, or cancel an upload. UNSUPPORTED changes the kind of the requests of an upload."""
         link = self._link(channel)
         if sender_of(ack) != link.client:
             self._warn("REJ. WP CMD: partner id mismatch")
@@ -259,7 +259,7 @@ class Px4MissionServer(MissionServer):
             self._request_item(link)
 
     def _accept(self, link: _Link, count: m.MissionCount) -> None:
-        """Start an upload, refuse it, or store an empty list."""
+        """Start an upload or refuse it. An upload of no items stores an empty list at once."""
         if self._uploads:
             self._answer(link, Result.ERROR, sender_of(count))
             return
@@ -277,7 +277,7 @@ class Px4MissionServer(MissionServer):
             self._request_item(link)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
-        """Handle an item of an upload; an unexpected item is ignored."""
+        """Handle an item of an upload. An unexpected item is not stored."""
         link = self._link(channel)
         link.uses_int = isinstance(message, m.MissionItemInt)
         if sender_of(message) != link.client:
@@ -288,7 +288,7 @@ class Px4MissionServer(MissionServer):
             link.received_at = self._px4.now
             if message.seq == link.next:
                 self._receive_item(link, message)
-        elif link.state is TransferState.IDLE and link.next == message.seq + 1:  # The client missed the answer.
+        elif link.state is TransferState.IDLE and link.next == message.seq + 1:  # The client missed the last answer.
             self._acknowledge(link.client, link.mission_type, Result.ACCEPTED, channel, link.opaque_id)
         else:
             reason = "No transfer" if link.state is TransferState.IDLE else "Busy"
@@ -298,7 +298,7 @@ class Px4MissionServer(MissionServer):
     def _put(self, upload: ListUpload, message: AnyItem) -> int:
         link, item = self._link(upload.channel), item_from(message)
         is_int = isinstance(message, m.MissionItemInt)
-        item_in_e7 = item
+        item_in_e7 = item  # The item with latitude and longitude in degrees times 1e7.
         if not is_int and item.frame != MavFrame.MISSION:
             item_in_e7 = item.replace(x=_e7(item.x), y=_e7(item.y))
         stored_item = stored(item_in_e7, link.mission_type, is_int=is_int)
@@ -306,7 +306,7 @@ class Px4MissionServer(MissionServer):
             if stored_item != Result.ERROR:
                 self._warn("IGN MISSION_ITEM: Invalid item")
             return stored_item
-        # The checksum covers the values as received, which are floats in a MISSION_ITEM.
+        # The checksum covers the item as it was received. In a MISSION_ITEM, x and y are floats.
         received = item if is_int else item.replace(x=float(item.x), y=float(item.y))
         link.opaque_id = checksum([received], link.opaque_id)
         link.items.append(stored_item)
@@ -320,7 +320,7 @@ class Px4MissionServer(MissionServer):
         self._end(link, Result.ACCEPTED)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
-        """Clear a list, or all lists for MAV_MISSION_TYPE_ALL. During a transfer, only send a text."""
+        """Clear a list, or all lists for MAV_MISSION_TYPE_ALL. During a transfer, send a text instead."""
         link = self._link(channel)
         if link.state is not TransferState.IDLE:
             self._warn("WPM: IGN CLEAR CMD: Busy")
@@ -341,5 +341,5 @@ class Px4MissionServer(MissionServer):
 
 
 def _e7(degrees: float) -> int:
-    """Convert to degrees times 1e7; 0 for values that may not fit 32 bits."""
+    """Convert degrees to degrees times 1e7. Return 0 for values that may not fit 32 bits."""
     return round(degrees * 1e7) if abs(degrees) < 200 else 0

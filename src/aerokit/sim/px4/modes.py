@@ -45,7 +45,7 @@ class Px4ModeTraits:
     name: str
     """Name in the status text "Switching to … is currently not available"."""
     base_mode: int
-    """MAV_MODE_FLAG while disarmed."""
+    """MAV_MODE_FLAGs that HEARTBEAT reports in this mode while the vehicle is disarmed."""
     needs_sticks: bool = False
     needs_position: bool = True
     can_arm: bool = True
@@ -78,10 +78,10 @@ MODES: Final[dict[Px4Mode, Px4ModeTraits]] = {
 """The simulated modes."""
 
 SELECTABLE: Final = frozenset(MODES) - {ORBIT, TERMINATION, VTOL_TAKEOFF}
-"""Modes accepted by DO_SET_MODE and SET_MODE; ORBIT is started by DO_ORBIT."""
+"""Modes that DO_SET_MODE and SET_MODE accept. ORBIT, for example, is started by DO_ORBIT instead."""
 
 STICK_MODES: Final = frozenset(mode for mode, traits in MODES.items() if traits.needs_sticks)
-"""Manual modes, which need sticks."""
+"""The manual modes, which need stick positions."""
 
 STANDARD_MODES: Final[dict[int, Px4Mode]] = {
     1: POSITION,
@@ -92,7 +92,7 @@ STANDARD_MODES: Final[dict[int, Px4Mode]] = {
     7: LAND,
     8: TAKEOFF,
 }
-"""Maps MAV_STANDARD_MODE to the mode, for DO_SET_STANDARD_MODE."""
+"""The mode for each MAV_STANDARD_MODE, as DO_SET_STANDARD_MODE selects it."""
 
 
 def custom_mode(mode: Px4Mode) -> int:

@@ -23,7 +23,7 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import OFFBOARD, POSITION, RTL
 
 _NAN3: Ned = (math.nan, math.nan, math.nan)
-# The simulated ground is level, so that altitudes above terrain are treated as altitudes above home.
+# The simulated ground is level, so altitudes above terrain are treated as altitudes above home.
 _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFrame.GLOBAL_TERRAIN_ALT_INT)
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
 
@@ -34,7 +34,7 @@ def _vector(components: Iterable[float]) -> Ned:
 
 
 class Px4Offboard:
-    """The latest set-point. It is stored in every mode, and followed in OFFBOARD."""
+    """The latest set-point, which is stored in every mode, but followed only in OFFBOARD."""
 
     def __init__(self, vehicle: Px4Host) -> None:
         self._vehicle = vehicle
@@ -73,7 +73,8 @@ class Px4Offboard:
             self._warn(f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {frame} unsupported")
             return
         is_body = frame == MavFrame.BODY_NED
-        position = _NAN3 if is_body else (target.x, target.y, target.z)  # PX4 ignores a position in the body frame.
+        # PX4 ignores a position in the body frame.
+        position = _NAN3 if is_body else (target.x, target.y, target.z)
         if not self._store(target, position, is_body=is_body):
             self._warn("SET_POSITION_TARGET_LOCAL_NED invalid")
 
@@ -93,7 +94,7 @@ class Px4Offboard:
         self._vehicle.send_text(MavSeverity.CRITICAL, text)
 
     def _store(self, target: PositionTarget, position: Ned, *, is_body: bool) -> bool:
-        """Store a set-point; return False if position, velocity and acceleration are all missing."""
+        """Store a set-point. Return False if it has no position, velocity or acceleration on any axis."""
         setpoint = Setpoint.of(target)
         position, velocity, acceleration = setpoint.axes(position)
         if all(map(math.isnan, (*position, *velocity, *acceleration))):
@@ -120,8 +121,8 @@ class Px4Offboard:
         self.updated_at = self._vehicle.now
 
     def _on_actuators(self, target: SetActuatorControlTarget, _: Channel) -> None:
-        """Apply the thrust of group 0; PX4 1.14 and later ignore the message."""
-        if self._vehicle.version_number >= 1 << 24 | 14 << 16:
+        """Apply the thrust of actuator group 0. PX4 1.14 and later ignore the message."""
+        if self._vehicle.version_number >= 1 << 24 | 14 << 16:  # version 1.14
             return
         motion = self._vehicle.motion
         self._attitude, self._body_rates = (motion.roll, motion.pitch, motion.yaw), None
@@ -130,7 +131,7 @@ class Px4Offboard:
         self.updated_at = self._vehicle.now
 
     def watch(self) -> None:
-        """Switch to RTL (1.16: POSITION) when set-points stop, and back to OFFBOARD when they resume."""
+        """Switch to RTL (in version 1.16, to POSITION) when the set-points stop, and back when they resume."""
         vehicle = self._vehicle
         if vehicle.intended_mode != OFFBOARD or vehicle.failsafes.acts:
             return
@@ -144,7 +145,7 @@ class Px4Offboard:
 
     def fly(self) -> None:
         motion = self._vehicle.motion
-        # The first call after another mode counts as one tick, which lasts at most 0.1 s.
+        # After another mode, the last call may be long ago, so the elapsed time is limited to that of a tick.
         elapsed, self._flown_at = min(0.1, self._vehicle.now - self._flown_at), self._vehicle.now
         if self._attitude is not None:
             self._fly_attitude(self._attitude, elapsed)
@@ -169,7 +170,7 @@ class Px4Offboard:
         motion.face(yaw)
 
     def _wanted_velocity(self) -> Ned:
-        """Return the target velocity, plus the velocity towards the target position on axes that have one."""
+        """Return the target velocity. On axes with a target position, add the velocity towards that position."""
         motion, limits = self._vehicle.motion, self._vehicle.parameters
         place = motion.place
         max_speeds = (limits["MPC_XY_VEL_MAX"],) * 2 + (limits["MPC_Z_V_AUTO_UP"],)

@@ -3,8 +3,8 @@
 MNT_MODE_IN 0 or 4 enables a gimbal on the AUX outputs (MNT_MODE_OUT 0) and its gimbal manager.
 
 Servos have no feedback, so telemetry reports the set-point. Only the component in control can command the gimbal, but
-every component can set a region of interest. The gimbal has no secondary control and no retracted position, and
-ignores GIMBAL_MANAGER_SET_PITCHYAW. When a return starts, PX4 takes control briefly and centres the gimbal.
+every component can set a region of interest. There is no secondary control and no retracted position, and
+GIMBAL_MANAGER_SET_PITCHYAW is ignored. When a return starts, PX4 briefly takes control and centres the gimbal.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import RTL
 from aerokit.sim.vehicle import sender_of
 
-# Values of MNT_MODE_IN that enable the gimbal: input by radio and MAVLink, or by MAVLink only.
+# Values of MNT_MODE_IN that enable the gimbal. It is then controlled by radio and MAVLink, or by MAVLink only.
 _FITTED_BY = frozenset({0, 4})
 _DEVICE_ID = 1
 _LIMITS = ((-45.0, 45.0), (-45.0, 45.0), (-180.0, 180.0))
 _TAU_S, _STEP_S = 0.3, 0.0187
-# PX4 filters the integrated angle, so that the gimbal turns more slowly than commanded.
+# PX4 filters the angle that it integrates from the rate. The gimbal therefore turns more slowly than commanded.
 _RATE_FACTOR = _STEP_S / (_TAU_S + _STEP_S)
 _RATE_TIMEOUT_S = 2.0
 _POLL_INTERVAL_S = 0.25
@@ -46,7 +46,8 @@ class Px4Gimbal:
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self.in_control: tuple[int, int] = (0, 0)  # System and component id in control; zeros if none.
+        # System id and component id of the component in control; zeros if there is none.
+        self.in_control: tuple[int, int] = (0, 0)
         self._target, self._rates, self._since = _NEUTRAL, _NEUTRAL, 0.0
         self._flags = 0
         self._place: tuple[int, int, float] | None = None
@@ -55,7 +56,7 @@ class Px4Gimbal:
         px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
 
     def start(self) -> None:
-        """Called at power-on: reset direction and control."""
+        """Called at power-on. Centre the gimbal and release its control."""
         parameters = self._px4.parameters
         self.is_fitted = "MNT_MODE_IN" in parameters and parameters["MNT_MODE_IN"] in _FITTED_BY
         self.rest()
@@ -80,7 +81,7 @@ class Px4Gimbal:
         return locks | yaw_flag
 
     def angles(self) -> Angles:
-        """Return roll, pitch and yaw of the set-point in radians."""
+        """Return roll, pitch and yaw (radians) to which the gimbal is set at present."""
         if self._place is not None:
             return self._angles_to(self._place)
         seconds = min(self._px4.now - self._since, _RATE_TIMEOUT_S) * _RATE_FACTOR
@@ -92,7 +93,7 @@ class Px4Gimbal:
         return (roll, pitch, yaw)
 
     def _angles_to(self, place: tuple[int, int, float]) -> Angles:
-        """Return the angles to a position: latitude and longitude in degrees times 1e7, and altitude AMSL."""
+        """Return the angles to a place, given as latitude and longitude (degrees times 1e7) and altitude AMSL."""
         latitude_e7, longitude_e7, altitude_m = place
         motion = self._px4.motion
         place_north, place_east = self._px4.frame.to_local(latitude_e7, longitude_e7)
@@ -102,7 +103,7 @@ class Px4Gimbal:
         return (0.0, max(math.radians(_LIMITS[1][0]), pitch), math.atan2(east, north))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
-        """Apply angles, which the rates then change; RETRACT is accepted without an effect."""
+        """Turn to angles (NaN: stay), then turn on at rates. The flag RETRACT is accepted, but has no effect."""
         if flags & Flags.RETRACT:
             return
         current = self.angles()
@@ -125,7 +126,7 @@ class Px4Gimbal:
         is_going_home = self._px4.mode == RTL
         if is_going_home and not self._was_returning:
             self.rest()
-            self.in_control = (0, 0)  # PX4 takes control and releases it at once.
+            self.in_control = (0, 0)  # PX4 takes control and releases it at once, which ends the control of others.
         self._was_returning = is_going_home
 
     def _on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
@@ -160,7 +161,7 @@ _SELF, _RELEASE = -2, -3
 
 
 def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
-    """Return handlers by MAV_CMD; without a gimbal, most commands are not answered."""
+    """Return the handlers of gimbal commands by MAV_CMD. Without a gimbal, most commands are not answered."""
 
     def if_fitted(handler: Callable[[Px4Gimbal, ReceivedCommand], int]) -> CommandHandler:
         return lambda command: handler(gimbal, command) if gimbal.is_fitted else None
@@ -176,8 +177,11 @@ def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
 
 
 def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
-    """Set the ids in control. In PX4, -2 is the autopilot rather than the sender; -3 releases control."""
-    # The firmware handles the system id (param 1) and the component id (param 2) separately.
+    """Set the system id and the component id that are in control.
+
+    In PX4, unlike in the standard, -2 gives control to the autopilot instead of the sender. -3 releases control.
+    """
+    # The firmware applies special values to the system id (param 1) and to the component id (param 2) separately.
     system, component = (
         _id_in_control(whole(requested), present, own, sender)
         for requested, present, own, sender in zip(
@@ -206,7 +210,7 @@ def _pitch_and_yaw(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _control_mount(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
-    """Handle DO_MOUNT_CONTROL; unknown modes are accepted without an effect."""
+    """Handle DO_MOUNT_CONTROL. Unknown modes are accepted, but have no effect."""
     mode = whole(command.z)
     if mode in (MavMountMode.RETRACT, MavMountMode.NEUTRAL):
         gimbal.rest()
@@ -218,7 +222,7 @@ def _control_mount(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _set_roi(gimbal: Px4Gimbal, command: ReceivedCommand | None) -> int:
-    """Point at a position, or reset without a command. PX4 uses the altitude as AMSL in every frame."""
+    """Point at the position of a command (AMSL in every frame), or reset the gimbal if ``command`` is None."""
     if command is None:
         gimbal.rest()
     elif math.isfinite(command.z):
@@ -232,7 +236,7 @@ _GEOTAG_DELAY_S = 0.02
 
 
 class Px4CameraTrigger:
-    """Camera trigger, which sends CAMERA_TRIGGER, and with ``sends_image_captured`` also CAMERA_IMAGE_CAPTURED.
+    """Camera trigger. Each image sends CAMERA_TRIGGER and, with ``sends_image_captured``, CAMERA_IMAGE_CAPTURED.
 
     As on the real vehicle, commands to a disabled trigger are not answered.
     """
@@ -242,8 +246,8 @@ class Px4CameraTrigger:
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.sequence = 0  # Sequence number of the next image.
-        self.interval_s: float = 1.0  # Interval of a series.
-        self.sends_image_captured = True  # True if the geotag module runs.
+        self.interval_s: float = 1.0  # Seconds between two images of a series.
+        self.sends_image_captured = True  # False simulates a PX4 without the geotag module.
         self._is_enabled = False
         self._is_paused = False
         self._series_number = 0
@@ -279,7 +283,10 @@ class Px4CameraTrigger:
         return MavResult.ACCEPTED
 
     def _enable_or_pause(self, command: ReceivedCommand) -> int | None:
-        """Handle DO_TRIGGER_CONTROL: param 1 enables, 2 resets the sequence, 3 pauses; -1 changes nothing."""
+        """Handle DO_TRIGGER_CONTROL. Param 1 enables (1) or disables (0) the trigger, and param 3 pauses it.
+
+        Param 2 is 1 to reset the sequence number of the images. A param of -1 changes nothing.
+        """
         if not self.is_fitted:
             return None
         was_running = self.is_running
@@ -330,7 +337,7 @@ class Px4CameraTrigger:
                 round(pose.height_m * 1000),
                 quaternion_from_euler(pose.roll, pose.pitch, pose.yaw),
                 number,
-                1,  # success
+                1,  # The capture was successful.
                 "",
             )
         )

@@ -21,7 +21,7 @@ from aerokit.sim.parameters import ParameterPackMount, SimParameters
 from aerokit.sim.px4.ftp import Px4Ftp
 from aerokit.sim.px4.host import Px4Host
 
-# Parameters that the simulation reads or clients expect.
+# Names of the parameters that the simulation reads or that clients expect.
 _USED_PARAMETERS = """
 BAT1_CAPACITY BAT1_N_CELLS BAT1_SOURCE BAT_CRIT_THR BAT_EMERGEN_THR BAT_LOW_THR CAL_ACC0_ID
 CBRK_SUPPLY_CHK COM_ARM_WO_GPS COM_DISARM_LAND COM_DISARM_PRFLT COM_DL_LOSS_T COM_FAIL_ACT_T
@@ -40,9 +40,9 @@ RTL_LOITER_RAD RTL_MIN_DIST RTL_RETURN_ALT RTL_TYPE RWTO_RAMP_TIME SDLOG_MODE SY
 
 
 def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimParameters:
-    """Return the parameters of a "quadrotor" (910) or an "airplane" (978).
+    """Return the 910 parameters of a "quadrotor" or the 978 parameters of an "airplane".
 
-    ``count`` limits the number of parameters. All parameters that the simulation reads are kept.
+    ``count`` limits the number of parameters, but all parameters that the simulation reads are kept.
     """
     data = pkgutil.get_data(__name__, f"{table}.param.csv")
     assert data is not None
@@ -52,23 +52,23 @@ def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimPar
 class Px4ParameterMount(ParameterPackMount):
     """``@PARAM`` files of PX4.
 
-    Differences from ArduPilot: opening the file reports the exact size; neither a value nor a default extends over the
-    end of a block of 239 bytes; uploaded parameters are applied as they arrive.
+    They differ from those of ArduPilot. Opening the file reports the exact size. Neither a value nor a default extends
+    over the end of a block of 239 bytes. Uploaded parameters are applied as they arrive.
     """
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
         super().__init__(parameters, apply, block=DATA_SIZE)
 
     def open(self, path: str, *, writing: bool) -> FileHandle:
-        reader = super().open(path, writing=False)  # checks the path, also for writing
+        reader = super().open(path, writing=False)  # This also checks the path of a file to write.
         return _Writer(self._parameters, self._apply) if writing else reader
 
 
 class _Writer(FileHandle):
     """Upload of parameters, which are applied as they arrive.
 
-    Repeated bytes are acknowledged again. A gap makes the upload fail. Closing an incomplete upload fails, too.
-    Parameters applied until then are kept.
+    Repeated bytes are acknowledged again. A gap makes the upload fail, and closing an incomplete upload also fails.
+    Parameters that were applied before the failure are kept.
     """
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
@@ -76,7 +76,7 @@ class _Writer(FileHandle):
         self._apply = apply
         self._pending = b""  # Received bytes that are not yet a complete entry.
         self._written = 0
-        self._header: tuple[int, int] | None = None  # Number of entries and size of the file.
+        self._header: tuple[int, int] | None = None  # Number of entries and file size; None before the header.
         self._count = 0
         self._previous_name = b""
         self._is_rejected = False
@@ -88,44 +88,44 @@ class _Writer(FileHandle):
         new_bytes = data[max(0, self._written - offset) :]
         has_gap = offset > self._written
         if self._is_rejected or has_gap:
-            self._reject()
+            self._raise_rejected()
         self._pending += new_bytes
         self._written += len(new_bytes)
         self._parse()
         if self._header is not None and self._written > self._header[1]:
-            self._reject()
+            self._raise_rejected()
 
     def close(self) -> None:
         if self._is_rejected or self._pending or self._header != (self._count, self._written):
             raise FileFault(EINVAL)
 
-    def _reject(self) -> NoReturn:
+    def _raise_rejected(self) -> NoReturn:
         self._is_rejected = True
         raise FileFault(EINVAL)
 
     def _parse(self) -> None:
-        """Apply all complete entries."""
+        """Apply the entries of which all bytes were received."""
         if self._header is None:
             if len(self._pending) < HEADER.size:
                 return
             magic, count, size = read_header(self._pending)
             if magic != MAGIC or size < HEADER.size:
-                self._reject()
+                self._raise_rejected()
             self._header, self._pending = (count, size), self._pending[HEADER.size :]
         while self._parse_row():
             pass
 
     def _parse_row(self) -> bool:
-        """Apply the next entry; return False if it is not complete yet."""
+        """Apply the next entry. Return False if not all of its bytes were received yet."""
         pending = self._pending = self._pending.lstrip(b"\0")
         try:
             entry = read_entry(pending, 0, self._previous_name) if pending else None
         except RemoteProtocolError:
-            self._reject()
+            self._raise_rejected()
         if entry is None:
             return False
         if entry.default is not None:
-            self._reject()
+            self._raise_rejected()
         name = entry.name.decode("ascii", "replace")
         if name in self._parameters:
             self._apply(name, entry.value)
@@ -144,7 +144,7 @@ class Px4Storage:
     """Protocol servers of files, logs and parameters.
 
     ``parameter_file`` serves ``@PARAM/param.pck``, as PX4 does since August 2026. ``link_bytes_per_s`` is the
-    configured data rate of the port; None is the rate of a network link.
+    configured data rate of the port. None selects the rate of a network link.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class Px4Storage:
             self.parameters.burst = self.ftp.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Drop transfers and sessions because of a reboot; files stay."""
+        """Drop transfers and sessions because of a reboot. Files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()
@@ -185,7 +185,7 @@ class Px4Storage:
         for number, log in enumerate(logs):
             self.files.put(_log_path(number), log.make, size=log.size)
         if not logs:
-            # Creates the empty folder.
+            # Creating and removing a file leaves the empty folder.
             self.files.put(f"{LOG_FOLDER}/.keep", b"").remove_file(f"{LOG_FOLDER}/.keep")
 
     def _erase_logs(self) -> None:
@@ -208,7 +208,7 @@ _UNSIGNED = frozenset((Heartbeat.ID, AdsbVehicle.ID, Collision.ID))
 
 
 class Px4Signing(VehicleSigning):
-    """Message signing of PX4, which reports a new key by a text and accepts unsigned heartbeats.
+    """Message signing of PX4. A text reports a new key, and unsigned heartbeats are accepted.
 
     The time stamp is stored only when a key is set. Version 1.16 does not support signing.
     """

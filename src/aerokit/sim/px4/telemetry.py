@@ -12,6 +12,7 @@ from aerokit.mavlink.enums import (
     MavAutopilot,
     MavBatteryFunction,
     MavBatteryType,
+    MavFrame,
     MavLandedState,
     MavModeFlag,
     MavModeProperty,
@@ -20,19 +21,19 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.message import Message
 from aerokit.sim.missions import INVALID_INDEX
-from aerokit.sim.motion import quaternion_from_euler
+from aerokit.sim.motion import centidegrees, quaternion_from_euler
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.telemetry_details import IDENTITY_BUILDERS, SENSOR_BUILDERS
 
-# Sensor bits of SYS_STATUS: present, enabled, healthy, and healthy during the boot.
+# Masks of sensor bits in SYS_STATUS: the present, the enabled, the healthy, and those healthy during the boot.
 _PRESENT, _ENABLED = 0x0300402F, 0x0301402F
 _HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
 _GPS_BIT, _RC_BIT = int(MavSysStatusSensor.GPS), int(MavSysStatusSensor.RC_RECEIVER)
 _PREARM_BIT = int(MavSysStatusSensor.MAV_SYS_STATUS_PREARM_CHECK)
-# Mode → MAV_STANDARD_MODE.
+# The MAV_STANDARD_MODE of each mode that has one.
 _STANDARD = {mode: number for number, mode in modes.STANDARD_MODES.items()}
-# Modes in the order of AVAILABLE_MODES; eight external modes follow.
+# Modes in the order of AVAILABLE_MODES. After these modes, PX4 lists eight external modes.
 _AVAILABLE_MODES = (
     modes.MANUAL, modes.ALTITUDE, modes.POSITION, modes.MISSION, modes.HOLD, modes.RTL, modes.POSITION_SLOW,
     modes.ALTITUDE_CRUISE, modes.ACRO, modes.TERMINATION, modes.OFFBOARD, modes.STABILIZED, modes.TAKEOFF,
@@ -59,7 +60,8 @@ def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
         base_mode |= MavModeFlag.SAFETY_ARMED
     if mode == modes.OFFBOARD and px4.offboard.is_fresh:
         base_mode |= MavModeFlag.STABILIZE_ENABLED
-    return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base_mode, modes.custom_mode(px4.mode), _state(px4), 3)
+    custom_mode = modes.custom_mode(px4.mode)
+    return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base_mode, custom_mode, _state(px4), mavlink_version=3)
 
 
 def _state(px4: Px4Vehicle) -> MavState:
@@ -85,7 +87,8 @@ def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
     present, enabled = _PRESENT, _ENABLED
     if px4.sticks.are_fresh:
         health |= _RC_BIT
-    return m.SysStatus(present, enabled, health, 120, voltage, -100, percent, 0, 0, 0, 0, 0, 0, 0, 0, 1)
+    load, current = 120, -100  # A load of 12 %, and a current that is not measured (-1 A).
+    return m.SysStatus(present, enabled, health, load, voltage, current, percent, 0, 0, 0, 0, 0, 0, 0, 0, 1)
 
 
 def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
@@ -97,7 +100,7 @@ def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
         flags |= Ekf.POS_HORIZ_REL if px4.external.has_vision else 0
     if not px4.is_ready:
         flags = _BOOT_FLAGS
-    ratio = 0.02 if px4.is_ready else math.nan  # Test ratio of velocity, position and magnetometer.
+    ratio = 0.02 if px4.is_ready else math.nan  # The test ratio of velocity, position and magnetometer.
     return m.EstimatorStatus(px4.time_boot_us, flags, ratio, ratio, 0.003, ratio, 0.002, math.nan, 0.3, 0.3)
 
 
@@ -119,7 +122,7 @@ def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
         id=0,
         battery_function=MavBatteryFunction.ALL,
         type=MavBatteryType.LIPO,
-        temperature=32767,  # Unknown. Current and energy are not measured either.
+        temperature=32767,  # The temperature is unknown. Current and energy are not measured either.
         voltages=voltages,
         current_battery=-100,
         current_consumed=0,
@@ -156,7 +159,7 @@ def _attitude_target(px4: Px4Vehicle) -> m.AttitudeTarget:
 
 
 def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
-    """Build GLOBAL_POSITION_INT; without a position PX4 does not send it, whereas ArduPilot sends zeros."""
+    """Build GLOBAL_POSITION_INT. Without a position, PX4 does not send the message, whereas ArduPilot sends zeros."""
     if not px4.has_position:
         return None
     motion = px4.motion
@@ -170,7 +173,7 @@ def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
         round(motion.velocity_north * 100),
         round(motion.velocity_east * 100),
         round(motion.velocity_down * 100),
-        round(math.degrees(motion.yaw) % 360.0 * 100) % 36000,
+        centidegrees(motion.yaw),
     )
 
 
@@ -204,23 +207,25 @@ def _vfr_hud(px4: Px4Vehicle) -> m.VfrHud:
 def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
     motion = px4.motion
     if px4.faults.gps_lost:
-        return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, 9999, 9999, 65535, 65535, 0)
+        return m.GpsRawInt(
+            0, GpsFixType.NO_FIX, 0, 0, 0, eph=9999, epv=9999, vel=65535, cog=65535, satellites_visible=0
+        )
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
     altitude = round(place.altitude_m * 1000)
-    course = round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0 * 100) % 36000
+    course = centidegrees(math.atan2(motion.velocity_east, motion.velocity_north))
     return m.GpsRawInt(
         px4.time_boot_us,
         GpsFixType.RTK_FIXED if px4.corrections.is_recent else GpsFixType.TYPE_3D_FIX,
         place.latitude_e7,
         place.longitude_e7,
         altitude,
-        70,  # dilution of precision times 100, horizontal and vertical
+        70,  # Horizontal and vertical dilution of precision, times 100.
         110,
         round(motion.ground_speed_m_s * 100),
         course,
-        10,  # satellites
+        10,  # Number of satellites.
         altitude,
-        900,  # accuracy of position and altitude in mm, and of the speed in mm/s
+        900,  # Accuracy of the position and of the altitude in mm, and of the speed in mm/s.
         1780,
         400,
     )
@@ -231,14 +236,14 @@ def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
         return None
     place = px4.frame.to_global(*px4.home)
     altitude = round(place.altitude_m * 1000)
-    quaternion = (math.nan,) * 4 if px4.home_is_set_by_hand else (1.0, 0.0, 0.0, 0.0)
+    quaternion = (math.nan,) * 4 if px4.home_is_set_by_client else (1.0, 0.0, 0.0, 0.0)
     return m.HomePosition(
         place.latitude_e7, place.longitude_e7, altitude, *px4.home, quaternion, 0.0, 0.0, 0.0, px4.time_boot_us
     )
 
 
 def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin | None:
-    """Return GPS_GLOBAL_ORIGIN, the origin of the local frame; None without an origin."""
+    """Return GPS_GLOBAL_ORIGIN with the origin of the local frame; None without an origin."""
     if not px4.has_origin:
         return None
     origin = px4.external.origin or px4.frame.origin
@@ -246,13 +251,19 @@ def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin | None:
     return m.GpsGlobalOrigin(origin.latitude_e7, origin.longitude_e7, altitude, px4.time_boot_us)
 
 
+_IGNORE_POSITION_AND_VELOCITY = 0b111111
+
+
 def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
-    """Build POSITION_TARGET_LOCAL_NED; while disarmed, PX4 sends only a downward acceleration of 100 m/s²."""
+    """Build POSITION_TARGET_LOCAL_NED. While disarmed, PX4 sends only a downward acceleration of 100 m/s²."""
     motion = px4.motion
     yaw = motion.yaw
     if not px4.is_armed:
         unknown, acceleration = (math.nan, math.nan, math.nan), (0.0, 0.0, 100.0)
-        return m.PositionTargetLocalNed(px4.time_boot_ms, 1, 63, *unknown, *unknown, *acceleration, yaw, 0.0)
+        mask = _IGNORE_POSITION_AND_VELOCITY
+        return m.PositionTargetLocalNed(
+            px4.time_boot_ms, MavFrame.LOCAL_NED, mask, *unknown, *unknown, *acceleration, yaw, 0.0
+        )
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     acceleration = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down)
     return m.PositionTargetLocalNed(
@@ -289,7 +300,7 @@ def _ping(px4: Px4Vehicle) -> m.Ping:
 
 
 def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
-    """Return AVAILABLE_MODES. PX4 sends no name for a standard mode (RETURN, LAND …)."""
+    """Return the messages AVAILABLE_MODES. PX4 sends no name for a standard mode (RETURN, LAND …)."""
     count = len(_AVAILABLE_MODES) + _EXTERNAL_MODES
     messages = []
     for index, mode in enumerate(_AVAILABLE_MODES, start=1):
@@ -337,4 +348,4 @@ BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.GimbalManagerInformation.ID: lambda px4: px4.gimbal.manager_information(),
     m.GimbalManagerStatus.ID: lambda px4: px4.gimbal.manager_status(),
 }
-"""Builders by message id; a builder returns None if there is nothing to send."""
+"""Functions that build messages, by message id. A function returns None if there is nothing to send."""

@@ -57,6 +57,7 @@ def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
         return None
     motion = px4.motion
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
+    # The course in hundredths of a degree, rounded to whole degrees. Rounding may give 360, which is 0.
     course = round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0) % 360 * 100
     return m.OpenDroneIdLocation(
         target_system=0,
@@ -115,7 +116,7 @@ IDENTITY_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.ProtocolVersion.ID: _protocol_version,
     m.ComponentMetadata.ID: _component_metadata,
 }
-"""Builders by message id; a builder returns None if there is nothing to send."""
+"""Functions that build messages, by message id. A function returns None if there is nothing to send."""
 
 
 _SEA_LEVEL_HPA, _SEA_LEVEL_C, _LAPSE_C_PER_M = 1013.25, 15.0, 0.0065
@@ -147,7 +148,7 @@ def _distance_sensor(px4: Px4Vehicle) -> m.DistanceSensor:
 
 
 def _measured_acceleration(px4: Px4Vehicle) -> tuple[float, float, float]:
-    """Return the measured acceleration in m/s² forward, right, down."""
+    """Return the acceleration that the accelerometers measure, in m/s² forward, right and down."""
     motion = px4.motion
     north, east, down = (
         motion.acceleration_north,
@@ -156,6 +157,7 @@ def _measured_acceleration(px4: Px4Vehicle) -> tuple[float, float, float]:
     )
     cos_yaw, sin_yaw = math.cos(motion.yaw), math.sin(motion.yaw)
     forward, right = north * cos_yaw + east * sin_yaw, east * cos_yaw - north * sin_yaw
+    # The products of roll and pitch are small, and are left out.
     return (
         forward * math.cos(motion.pitch) - down * math.sin(motion.pitch),
         right * math.cos(motion.roll) + down * math.sin(motion.roll),
@@ -187,7 +189,7 @@ def _highres_imu(px4: Px4Vehicle) -> m.HighresImu:
 
 def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
     motion = px4.motion
-    # In milli-g, mrad/s and milligauss.
+    # The fields of SCALED_IMU are in milli-g, mrad/s and milligauss.
     force_x, force_y, force_z = (round(axis / GRAVITY_M_S2 * 1000) for axis in _measured_acceleration(px4))
     rate_x, rate_y, rate_z = (round(rate * 1000) for rate in (motion.roll_rate, motion.pitch_rate, motion.yaw_rate))
     field_x, field_y, field_z = (round(axis * 1000) for axis in _magnetic_field_gauss(px4))
@@ -253,7 +255,7 @@ def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None
 
 
 def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:
-    """Build TIME_ESTIMATE_TO_TARGET with the time of a return: change of height, flight home, descent."""
+    """Build TIME_ESTIMATE_TO_TARGET with the duration of a return: the climb, the flight home and the descent."""
     if px4.is_landed:
         return m.TimeEstimateToTarget(-1, -1, -1, -1, -1)
     motion, flight = px4.motion, px4.flight
@@ -285,4 +287,4 @@ SENSOR_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.TimeEstimateToTarget.ID: _time_estimate,
     m.OrbitExecutionStatus.ID: _orbit_status,
 }
-"""Builders by message id; a builder returns None if there is nothing to send."""
+"""Functions that build messages, by message id. A function returns None if there is nothing to send."""

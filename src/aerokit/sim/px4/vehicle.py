@@ -29,13 +29,13 @@ class SimulatedPx4(Px4Vehicle):
     """PX4 v1.16 or v1.17 multicopter, as far as a client can observe it. `Motion` is the motion model.
 
     Not simulated: REQUEST_EVENT, returning along a mission (RTL_TYPE 2), estimator failures other than a lost GPS,
-    follow-me, external modes. A camera is a separate component; without it, camera commands are not answered.
+    follow-me, external modes. A camera is a separate component, without which camera commands are not answered.
     MNT_MODE_IN 4 enables a gimbal.
 
     - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: initial heading
     - ``boot_time_s``: seconds until the vehicle can be armed
     - ``version``: 1.16 accepts unknown modes, and switches to POSITION when offboard set-points stop. 1.17 refuses
-      unknown modes, switches to RTL when these stop, and refuses a COMMAND_INT in a frame other than GLOBAL_INT
+      unknown modes, switches to RTL when set-points stop, and refuses a COMMAND_INT in a frame other than GLOBAL_INT
     - ``fast_rate_hz``: rate of attitude, position and targets on "normal" links
     - ``link_modes``: MAV_n_MODE of the first link, the second …: "normal", "onboard", "config" or "minimal"
     - ``parameters``: values that differ from the defaults; ``parameter_count``: limits their number, for quick tests;
@@ -48,7 +48,7 @@ class SimulatedPx4(Px4Vehicle):
         return px4_commands(self)
 
     def can_build(self, message_id: int) -> bool:
-        """Return True if the vehicle can send this message; gimbal messages require a gimbal."""
+        """Return True if the vehicle can send this message. Gimbal messages require a gimbal."""
         return message_id in BUILDERS and (message_id not in GIMBAL_MESSAGES or self.gimbal.is_fitted)
 
     def build(self, message_id: int) -> Message | None:
@@ -57,7 +57,7 @@ class SimulatedPx4(Px4Vehicle):
         return None if builder is None else builder(self)
 
     def refusal_of_command(self, command: ReceivedCommand) -> int | None:
-        """Refuse unsupported frames, NaN sent as integer and INT32_MAX sent as float (mavlink_receiver.cpp)."""
+        """Refuse unsupported frames, a NaN sent as integer and an INT32_MAX sent as float (mavlink_receiver.cpp)."""
         return refusal_by_place(command, checks_frame=not self.version.startswith("1.16"))
 
     def _on_set_mode(self, request: m.SetMode, channel: Channel) -> None:
@@ -71,20 +71,21 @@ class SimulatedPx4(Px4Vehicle):
 
 _FLARE_M = 3.0
 _GLIDE_SPEED_FACTOR = 1.3
-# A target this far ahead makes `FixedWing.climb_to` descend at the wanted sink rate.
+# The target of a descent is as far below the plane as it sinks in this time, so that `FixedWing.climb_to` returns the
+# wanted sink rate.
 _SINK_TARGET_S = 2.5
 _FLARE_SINK_M_S = 0.5
 _HEIGHT_REACHED_M = 10.0
 
 
 class Px4PlaneFlight(Px4Flight):
-    """Navigator of a plane. ``target`` is the centre of a circle, or the end of a straight line."""
+    """Navigator of a plane. ``target`` is the centre of the circle or the end of the straight line that it flies."""
 
     def __init__(self, plane: SimulatedPx4Plane, motion: FixedWing) -> None:
         super().__init__(plane)
         self._motion = motion
-        self.radius_m: float = 0.0  # Radius of the circle; negative is counter-clockwise.
-        self.course: float = 0.0  # Course of the climb-out in radians.
+        self.radius_m: float = 0.0  # Radius of the circle; a negative radius is counter-clockwise.
+        self.course: float = 0.0  # Course of the climb after take-off, in radians.
         self._plane = plane
 
     @property
@@ -129,7 +130,7 @@ class Px4PlaneFlight(Px4Flight):
             self.circle()
 
     def _follow_sticks(self) -> None:
-        """Control bank, climb and airspeed by the sticks in every manual mode; forward is down."""
+        """Control bank, climb and airspeed by the sticks, in every manual mode. A stick pushed forward descends."""
         sticks, parameters = self._plane.sticks, self._plane.parameters
         climb = -sticks.pitch * parameters["FW_T_CLMB_MAX" if sticks.pitch < 0 else "FW_T_SINK_MAX"]
         min_speed, max_speed = parameters["FW_AIRSPD_MIN"], parameters["FW_AIRSPD_MAX"]
@@ -151,12 +152,12 @@ class Px4PlaneFlight(Px4Flight):
         self._motion.head(self.course, self.speed_m_s, climb)
 
     def _take_off(self) -> None:
-        """Climb out; once the altitude is reached, circle that point."""
+        """Climb straight on, and circle the point at which the altitude is reached."""
         self.climb_out()
         if self._motion.down > self.target[2]:
             return
         place = (self._motion.north, self._motion.east, self.target[2])
-        self._plane.switch_to_hold()  # sets the target to the current altitude
+        self._plane.switch_to_hold()  # This sets the target to the current altitude.
         self.target = place
 
     def circle_down(self) -> None:
@@ -186,7 +187,7 @@ class Px4PlaneFlight(Px4Flight):
         motion.head(math.atan2(east, north), self._plane.parameters["FW_AIRSPD_MIN"] * _GLIDE_SPEED_FACTOR, climb)
 
     def _return(self) -> None:
-        """Climb, fly to the destination, circle down to RTL_DESCEND_ALT; land unless RTL_LAND_DELAY is negative."""
+        """Climb, fly to the destination, circle down to RTL_DESCEND_ALT, and land unless RTL_LAND_DELAY is negative."""
         motion, plane = self._motion, self._plane
         if self._phase == "land":
             self.circle_down()
@@ -296,7 +297,7 @@ class Px4PlaneMission(Px4Mission):
         return is_near and abs(down - motion.down) <= plane.parameters["NAV_FW_ALT_RAD"]
 
     def _hold(self) -> None:
-        """Change to HOLD after the mission, and keep the target."""
+        """Change to HOLD after the mission, without a change of the target."""
         target = self._plane.flight.target
         super()._hold()
         if self._plane.mode == modes.HOLD:
@@ -307,12 +308,12 @@ _AMPERES_AT_FULL = 20.0
 
 
 class SimulatedPx4Plane(SimulatedPx4):
-    """PX4 plane (MAV_TYPE 1, airframe 10041). `FixedWing` is the motion model; see `SimulatedPx4` for the arguments.
+    """PX4 plane (MAV_TYPE 1, airframe 10041). `FixedWing` is the motion model. See `SimulatedPx4` for the arguments.
 
-    The plane takes off from a runway along its heading, and circles at NAV_LOITER_RAD where a multicopter hovers. RTL
-    ends in a circle above home without landing (RTL_LAND_DELAY is -1). LAND descends in circles; a mission ends with a
-    straight glide path, and must contain a landing (MIS_TKO_LAND_REQ). Sticks control bank, climb and speed in every
-    manual mode; OFFBOARD circles a position. The plane is not disarmed automatically before take-off.
+    The plane takes off from a runway along its heading. Where a multicopter hovers, it circles at NAV_LOITER_RAD. RTL
+    ends in a circle above home, without a landing (RTL_LAND_DELAY is -1). LAND descends in circles, whereas a mission
+    ends with a straight glide path, and must contain a landing (MIS_TKO_LAND_REQ). OFFBOARD circles a position. Sticks
+    control bank, climb and speed in every manual mode. The plane is not disarmed automatically before take-off.
 
     Not simulated, in addition to `SimulatedPx4`: hand launch, stalls, aborted landings, figures of eight.
     """
