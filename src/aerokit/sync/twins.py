@@ -247,12 +247,12 @@ class StateCell(CellTwin[T]):
 
     @property
     def value(self) -> T:
-        """The latest value, of any age; raises :class:`ValueUnknownError` before the first."""
+        """The latest value, of any age. Raises :class:`ValueUnknownError` before the first value."""
         return self.aio.value
 
     @property
     def latest(self) -> T | None:
-        """The latest value, or None before the first."""
+        """The latest value, of any age; None before the first value."""
         return self.aio.latest
 
     @property
@@ -262,17 +262,17 @@ class StateCell(CellTwin[T]):
 
     @property
     def updated_at(self) -> float:
-        """Time of the latest value, in seconds of the cell's clock; −inf before the first."""
+        """Time of the latest value, in seconds of the cell's clock; −inf before the first value."""
         return self.aio.updated_at
 
     @property
     def age(self) -> float:
-        """Seconds since the latest value was received; inf before the first."""
+        """Seconds since the latest value was received; inf before the first value."""
         return self.aio.age
 
     @property
     def source(self) -> Source | None:
-        """Sender and message of the latest value; None before the first."""
+        """Sender and message of the latest value; None before the first value."""
         return self.aio.source
 
     def fresh(self, within: float) -> T:
@@ -310,14 +310,14 @@ class StateCell(CellTwin[T]):
         )
 
     def changes(self) -> Changes[T]:
-        """Iterate over values that differ from their predecessor, starting with the current value if there is one.
+        """Iterate over the current value, if there is one, and all later values that differ from the value before.
 
         A slow reader gets only the latest value. The loop can be left at any time.
         """
         return Changes(self._loop, self._loop.call(self.aio.changes))
 
     def updates(self) -> Changes[T]:
-        """Like :meth:`changes`, but yield each received value, even if it equals its predecessor."""
+        """Like :meth:`changes`, but yield each received value, even if it equals the value before."""
         return Changes(self._loop, self._loop.call(self.aio.updates))
 
 
@@ -330,7 +330,7 @@ class Changes(ChangesTwin[T]):
 
     @property
     def missed(self) -> int:
-        """Number of values that were replaced before this reader got them."""
+        """Number of values that this reader did not get, because newer values had already replaced them."""
         return self.aio.missed
 
 
@@ -343,7 +343,7 @@ class Subscription(SubscriptionTwin[ItemT]):
 
     @property
     def missed(self) -> int:
-        """Number of items dropped because the reader was slow."""
+        """Number of items that were dropped because the reader was too slow."""
         return self.aio.missed
 
     def get(self, timeout: float | None = None) -> ItemT:
@@ -361,7 +361,7 @@ class Subscription(SubscriptionTwin[ItemT]):
         return self._loop.call(self.aio.get_nowait)
 
     def close(self, error: Exception | None = None) -> None:
-        """Stop taking items. A waiting reader raises ``error``; without an error, its iteration ends."""
+        """Stop collecting items. A waiting reader raises ``error``; without an error, its iteration ends."""
         self._loop.call(self.aio.close, error)
 
 
@@ -407,7 +407,7 @@ class Connection(ConnectionTwin):
 
     @property
     def unsent_bytes(self) -> int:
-        """Number of written bytes that have not left this machine, if the link can measure that number.
+        """Number of written bytes that have not left this machine; 0 if the link cannot measure the number.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
         control asserted); see :class:`LinkStalled`. Always 0 for UDP.
@@ -415,7 +415,7 @@ class Connection(ConnectionTwin):
         return self._loop.call(lambda: self.aio.unsent_bytes)
 
     def discard_unsent(self) -> None:
-        """Discard data that was sent but has not left this program, e.g. an outdated command.
+        """Discard written data that has not left this program yet, e.g. an outdated command.
 
         The call discards all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
         stays in :attr:`unsent_bytes`.
