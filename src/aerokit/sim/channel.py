@@ -34,6 +34,7 @@ def fitted(message: MessageT) -> MessageT:
 
 
 def _fit_field(field: Field, value: Any) -> Any:
+    """Return the value of a field, fitted as `fitted` describes."""
     if field.type == "char" and isinstance(value, str) and field.is_text:
         max_bytes = field.array_length or 1
         return value.encode(errors="replace")[:max_bytes].decode(errors="ignore")

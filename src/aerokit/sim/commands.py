@@ -35,6 +35,7 @@ class CommandServer(commands.CommandDispatcher):
         self._vehicle = vehicle
 
     def dispatch(self, command: ReceivedCommand) -> None:
+        """Execute a command and answer it. A fault may ignore or refuse the command, or change the answer."""
         fault = self._vehicle.faults.next_command_fault(command.command)
         if fault is not None and fault.ignore:
             return

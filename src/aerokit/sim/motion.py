@@ -294,6 +294,7 @@ class Motion:
         self._gust_east = self._gust_east * decay + self._rng.gauss(0.0, kick)
 
     def _commanded_acceleration(self) -> tuple[float, float, float]:
+        """Return the acceleration (north, east, down) towards the target, limited as the motion limits require."""
         limits = self.limits
         north, east, down = self._target
         if not self._target_is_acceleration:
@@ -339,7 +340,7 @@ class Motion:
         self.velocity_north += north * dt
         self.velocity_east += east * dt
         self.velocity_down += down * dt
-        if self.is_on_ground and self.velocity_down >= 0.0:
+        if self.is_on_ground and self.velocity_down >= 0.0:  # A copter that climbs must be able to leave the ground.
             if not was_on_ground:
                 self.impact_speed_m_s = self.velocity_down
             self.down = self.ground_down
@@ -368,7 +369,7 @@ class Motion:
         rate = 0.0
         if powered and not self.is_on_ground:
             rate = self._wanted_yaw_rate
-            if self._wanted_yaw is not None:
+            if self._wanted_yaw is not None:  # A heading replaces the turn rate.
                 rate = _TURN_GAIN_PER_S * wrap_pi(self._wanted_yaw - self.yaw)
             rate = _clamp(rate, self.limits.turn_rate_rad_s)
         self.yaw_rate = rate

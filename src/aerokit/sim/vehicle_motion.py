@@ -135,6 +135,7 @@ class FixedWing(Motion):
         return powered and self._wanted_climb > 0.0 and self._speed >= self.wing_limits.airspeed_min_m_s
 
     def _roll_on_ground(self, dt: float, *, powered: bool) -> None:
+        """Roll along the nose on the level ground. Without power, the plane brakes."""
         wanted_speed = self._wanted_airspeed if powered else 0.0
         self._approach_speed(wanted_speed, dt)
         self.throttle = 1.0 if powered and wanted_speed > self._speed else 0.0

@@ -196,12 +196,14 @@ def _frames(source: str | PathLike[str] | BinaryIO) -> list[tuple[float, Frame]]
 
 
 def _autopilot(frames: list[tuple[float, Frame]], system_id: int | None) -> tuple[int, int]:
+    """Return system id and component id of the first autopilot, or of the autopilot with this system id."""
     for _, frame in frames:
         if frame.message_id != m.Heartbeat.ID or system_id not in (None, frame.system_id):
             continue
         heartbeat = STANDARD.decode(frame)
         assert isinstance(heartbeat, m.Heartbeat)
-        if heartbeat.autopilot != MavAutopilot.INVALID and heartbeat.type != MavType.GCS:
+        is_vehicle = heartbeat.autopilot != MavAutopilot.INVALID and heartbeat.type != MavType.GCS
+        if is_vehicle:
             return frame.system_id, frame.component_id
     wanted = "an autopilot" if system_id is None else f"an autopilot with system id {system_id}"
     raise InvalidArgument(f"the recording contains no vehicle to play: it has no HEARTBEAT of {wanted}")

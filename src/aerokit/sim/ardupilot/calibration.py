@@ -72,6 +72,7 @@ class AccelerometerCalibration:
         self._request(self._run_number, result)
 
     def _request(self, run_number: int, position: int) -> None:
+        """Request a position every second, until the client confirms the position or another calibration starts."""
         self._requested = position
 
         def request_until_confirmed() -> None:

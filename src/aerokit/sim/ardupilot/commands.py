@@ -124,16 +124,18 @@ class _CommonCommands:
 
     def arm_or_disarm(self, command: ReceivedCommand) -> int:
         vehicle = self._vehicle
-        if command.param1 == 1.0:
+        must_arm, must_disarm = command.param1 == 1.0, command.param1 == 0.0
+        if must_arm:
             force = command.param2 in (_FORCE_ARM, _FORCE_ARM_OR_DISARM)
             is_done = vehicle.motors.is_armed or vehicle.arming.arm(force=force)
-        elif command.param1 == 0.0:
+        elif must_disarm:
             is_done = vehicle.arming.disarm(force=command.param2 == _FORCE_ARM_OR_DISARM)
         else:
             return Result.UNSUPPORTED
         return Result.ACCEPTED if is_done else Result.FAILED
 
     def set_mission_current(self, command: ReceivedCommand) -> int:
+        # A reset sets the counters of jumps to 0. It restarts a complete mission, too.
         vehicle, resets_mission = self._vehicle, command.param2 == 1.0
         if not 0 <= command.param1 < vehicle.missions.commands.count:
             return Result.DENIED

@@ -151,6 +151,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             self.warn("Radio Failsafe Cleared")
 
     def _check_ground_station(self) -> None:
+        """Detect the loss of the ground station, and its return. Only an armed copter executes FS_GCS_ENABLE."""
         copter, parameters = self.vehicle, self.vehicle.parameters
         if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
             return
@@ -161,7 +162,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         if not is_lost:
             self.warn("GCS Failsafe Cleared")
             return
-        copter.rc.release_overrides()
+        copter.rc.release_overrides()  # The pilot's radio takes over from the lost ground station.
         if copter.is_armed:
             action = self._configured_action("FS_GCS_ENABLE", _RTL)
             self._execute(self._action_after_loss("GCS", action, _GCS_OPTIONS))
@@ -222,7 +223,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         copter = self.vehicle
         self.warn("EKF variance", MavSeverity.CRITICAL)
         self.has_estimator_failed: bool = True
-        self._acted_on_estimator = copter.is_armed
+        self._acted_on_estimator = copter.is_armed  # Only then, the end of the failsafe is reported.
         if not copter.is_armed:
             return
         if not copter.mode.needs_position:

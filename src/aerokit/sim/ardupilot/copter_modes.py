@@ -188,7 +188,7 @@ class CopterTakeOff:
     def update(self, climb_m_s: float) -> None:
         copter, motion = self._copter, self._copter.motion
         copter.motors.spool_up_requested = True
-        if copter.is_landed:
+        if copter.is_landed:  # Leave the ground as soon as the motors have spooled up.
             copter.is_landed = not copter.motors.can_lift
             return
         motion.seek_position(
@@ -238,6 +238,7 @@ class CopterPilotedMode(CopterModeBase):
                 self._take_off, self.is_taking_off = None, False
             return
         climb = self.climb_from_stick()
+        # On the ground, a throttle stick above its middle starts the copter.
         copter.motors.spool_up_requested = not copter.is_landed or climb > 0
         if copter.is_landed and climb > 0 and copter.motors.can_lift:
             copter.is_landed = False

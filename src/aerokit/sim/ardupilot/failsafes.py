@@ -268,11 +268,12 @@ class ArduPilotArming(Generic[HostT]):
     def _check(self) -> None:
         self._follow_requirement()
         vehicle = self.vehicle
-        if vehicle.motors.is_armed:
+        if vehicle.motors.is_armed:  # The checks run only while disarmed.
             self.passes = True
             return
         reasons = self.reasons()
         passes_common = not self.common_reasons()
+        # A new failure is reported earlier than a failure that was reported before.
         self._has_new_failure |= self._passed_common and not passes_common
         self._passed_common, self.passes = passes_common, not reasons
         waited = vehicle.now - self._reported_at

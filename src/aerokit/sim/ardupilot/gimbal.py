@@ -119,6 +119,7 @@ class ArduPilotGimbal:
         return self._stabilized(self._target)
 
     def _stabilized(self, target: MountTarget) -> MountTarget:
+        """Return the target as its rates have moved it until now. Angles relative to the vehicle are limited."""
         if not any(target.rates):
             return target
         seconds = self._vehicle.now - target.since

@@ -244,7 +244,7 @@ class FenceList(ItemList):
         self._uploaded = list(self._stored)
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        assert self._uploaded is not None
+        assert self._uploaded is not None  # `begin` has created the list with the announced number of items.
         if seq >= len(self._uploaded):
             return MavMissionResult.INVALID_SEQUENCE
         stored_item = _stored_fence_item(item)

@@ -175,7 +175,8 @@ class ArduPilotMissionServer(MissionServer):
             self._acknowledge(sender_of(request), kind, refusal, channel)
             return
         self._lists[kind].begin_update()
-        self._start(self._begin(request, channel, start, end + 1))
+        first, after_last = start, end + 1
+        self._start(self._begin(request, channel, first, after_last))
 
     def _start(self, upload: ListUpload) -> None:
         self._warnings -= {(kind, upload.mission_type) for kind in (m.MissionItem, m.MissionRequest)}
@@ -199,7 +200,8 @@ class ArduPilotMissionServer(MissionServer):
         if isinstance(item, int):
             self._answer_item(message, item, channel)
         elif kind == MavMissionType.MISSION and message.current in (_GUIDED_TARGET, _ALTITUDE_CHANGE):
-            self._answer_item(message, self._guide(item, message.current), channel)
+            result = self._guide(item, message.current)  # The item is a target, and not part of a list.
+            self._answer_item(message, result, channel)
         elif kind not in self._lists:
             self._answer_item(message, Result.UNSUPPORTED, channel)
         else:

@@ -40,6 +40,7 @@ class PlaneArming(ArduPilotArming[PlaneHost]):
         max_roll = parameters["ROLL_LIMIT_DEG"]
         max_pitch, min_pitch = parameters["PTCH_LIM_MAX_DEG"], parameters["PTCH_LIM_MIN_DEG"]
         airspeed = int(parameters["AIRSPEED_MIN"])
+        # The long failsafe follows the short one, so its timeout must not be shorter.
         is_long_shorter = parameters["FS_LONG_TIMEOUT"] < parameters["FS_SHORT_TIMEOUT"]
         checks = (
             (
@@ -169,7 +170,7 @@ class SimulatedPlane(PlaneHost):
         rested_for_s = self.rest_timer.seconds(is_resting, self.now)
         if rested_for_s >= _REST_S:
             self.is_landed: bool = True
-            wing.settle()
+            wing.settle()  # stops the motion model
 
     def _terminate(self, command: ReceivedCommand) -> int:
         # Termination is refused, because it needs the advanced failsafe, which is not simulated.

@@ -84,7 +84,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
     def update(self, dt: float) -> None:
         plane = self.vehicle
         plane.mission.update()
-        if plane.mode is not self:
+        if plane.mode is not self:  # The mission has changed the mode.
             return
         if self._manoeuvre == _CLIMB:
             plane.climb_out()

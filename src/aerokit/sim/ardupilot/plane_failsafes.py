@@ -142,6 +142,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self._start_long(_GCS)
 
     def _check_end_of_long(self) -> None:
+        """End the long failsafe once its link has returned: the ground station, or the radio."""
         parameters = self.vehicle.parameters
         has_short = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
         timeout = parameters["FS_SHORT_TIMEOUT" if has_short else "FS_LONG_TIMEOUT"]

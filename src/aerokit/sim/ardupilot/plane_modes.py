@@ -91,7 +91,7 @@ class PlaneLanding:
         plane, wing = self._plane, self._plane.wing
         if plane.is_landed:
             self._disarm_after_stop()
-        elif wing.is_on_ground:
+        elif wing.is_on_ground:  # The plane has touched down, but still rolls.
             wing.roll_out()
         elif self._fly_to_first is not None:
             self._fly_to_start(self._fly_to_first)

@@ -185,12 +185,12 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
                 self.has_estimator_failed = False
                 self.warn("EKF failsafe cleared", MavSeverity.CRITICAL)
             return
-        if self.has_estimator_failed or lost_for < _ESTIMATOR_TIMEOUT_S:
+        if self.has_estimator_failed or lost_for < _ESTIMATOR_TIMEOUT_S:  # Act only once, after the timeout.
             return
         self.has_estimator_failed: bool = True
         self.warn("EKF variance", MavSeverity.CRITICAL)
         action = int(rover.parameters["FS_EKF_ACTION"])
-        if action and rover.mode.needs_position:
+        if action and rover.mode.needs_position:  # Other modes can continue.
             if action != _EKF_REPORT_ONLY:
                 rover.set_mode(RoverMode.HOLD)
             self.warn("EKF failsafe", MavSeverity.CRITICAL)

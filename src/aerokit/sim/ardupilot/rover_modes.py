@@ -114,6 +114,7 @@ class _Rtl(_Mode):
                 rover.info("Reached destination")
             return
         next_place, is_last = self._path[0], len(self._path) == 1
+        # The rover stops only at the last place.
         is_reached = rover.has_arrived(next_place) if is_last else rover.has_passed(next_place)
         if is_reached:
             del self._path[0]
@@ -218,7 +219,7 @@ class RoverGuided(_Mode):
         elif rover.now - self._target_at <= target.timeout_s:
             self._follow(target)
         else:
-            self._target = None
+            self._target = None  # so that the text is sent only once
             rover.send_text(MavSeverity.WARNING, "target not received last 3secs, stopping")
             rover.motion.stop()
 

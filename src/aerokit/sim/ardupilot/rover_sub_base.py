@@ -238,7 +238,7 @@ class RoverSubAuto(MissionMode):
         self.start_if_waiting()
         if not self.is_waiting:
             self.vehicle.mission.update()
-        if self.vehicle.mode is not self:
+        if self.vehicle.mode is not self:  # The mission has changed the mode.
             return
         if self._place is None:
             self.stay()
@@ -270,6 +270,7 @@ class RoverSubAuto(MissionMode):
         return True
 
     def _has_stayed(self, index: int, item: MissionItem) -> bool:
+        """Return True if the vehicle has reached a waypoint and has waited there for param 1 seconds."""
         if self._place is None or (self._reached_at is None and not self.has_arrived(self._place)):
             return False
         now = self.vehicle.now

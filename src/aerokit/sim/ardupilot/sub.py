@@ -140,6 +140,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
             sub.arming.disarm()
 
     def _check_ground_station(self) -> None:
+        """Detect the loss of the ground station. The loss is reported repeatedly, but FS_GCS_ENABLE acts only once."""
         sub, action = self.vehicle, int(self.vehicle.parameters["FS_GCS_ENABLE"])
         if not action or math.isnan(self.ground_station_seen_at):
             return
@@ -172,7 +173,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         if sub.now - self._leak_reported_at > _LEAK_REPORT_INTERVAL_S:
             self._leak_reported_at = sub.now
             self.warn("Leak Detected", MavSeverity.CRITICAL)
-        if not self.is_leak_detected:
+        if not self.is_leak_detected:  # Surface only once, so that the pilot can change the mode afterwards.
             self.is_leak_detected = True
             if action == _LEAK_SURFACE and sub.is_armed:
                 sub.set_mode(SubMode.SURFACE)
@@ -190,6 +191,7 @@ class _HullLimit:
         self._good_at = self._reported_at = 0.0
 
     def update(self, sub: SubHost, value: float) -> None:
+        """Compare a measured value with its maximum. Values above the maximum must last for `_HULL_TIMEOUT_S`."""
         if not sub.parameters[f"{self._prefix}_ENABLE"]:
             return
         if value < sub.parameters[f"{self._prefix}_MAX"]:

@@ -185,7 +185,7 @@ class SubGuided(_Mode):
     def update(self, dt: float) -> None:
         motion, target = self.vehicle.motion, self._target
         if target is not None and self.vehicle.now - self._target_at > target.timeout_s:
-            target = None
+            target = None  # An expired target stops the vehicle.
         if self._place is not None:
             self.vehicle.travel(self._place, self.speed, looks_ahead=False)
         elif target is not None and target.velocity is not None:
@@ -197,7 +197,7 @@ class SubGuided(_Mode):
         elif target is not None and target.yaw_rate is not None:
             motion.turn(target.yaw_rate)
         else:
-            motion.turn(0.0)
+            motion.turn(0.0)  # Hold the heading.
 
 
 SUB_MODES: tuple[Callable[[SubHost], ArduPilotMode], ...] = (

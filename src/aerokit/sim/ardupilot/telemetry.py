@@ -173,6 +173,7 @@ def _sys_status(vehicle: ArduPilotVehicle) -> m.SysStatus:
 
 
 def _extended_sys_state(vehicle: ArduPilotVehicle) -> m.ExtendedSysState:
+    """Build EXTENDED_SYS_STATE. ArduPilot reports a copter as a VTOL that is in multicopter state."""
     state = MavLandedState.IN_AIR
     if vehicle.is_landed:
         state = MavLandedState.ON_GROUND

@@ -136,7 +136,7 @@ _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which th
 
 def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
     motion, nav = vehicle.motion, vehicle.navigation
-    place, time = nav.position, vehicle.time_boot_ms
+    place, time = nav.position, vehicle.time_boot_ms  # The position is None until the estimator knows it.
     relative = round(nav.altitude_above_home * 1000)
     heading = centidegrees(motion.yaw) if nav.has_attitude else 0
     if place is None:
@@ -214,7 +214,7 @@ def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
     if not isinstance(guided, CopterGuided):
         return None
     target = guided.destination
-    if target is None:
+    if target is None:  # The submode follows a velocity, not a position.
         vectors = (0.0, 0.0, 0.0, *guided.velocity, *guided.acceleration)
         return m.PositionTargetLocalNed(time, MavFrame.LOCAL_NED, _VELOCITY_ONLY, *vectors, 0.0, 0.0)
     local = vehicle.navigation.local(target)

@@ -302,13 +302,14 @@ class ArduPilotVehicle(ArduPilotHost):
         if is_armed and mode.needs_position and not has_position:
             self.send_text(MavSeverity.WARNING, self.refusal(mode, "requires position"))
             return False
-        if not mode.enter(force=not is_armed):
+        is_entered = mode.enter(force=not is_armed)  # A disarmed vehicle may select a mode that cannot run yet.
+        if not is_entered:
             self.send_text(MavSeverity.WARNING, self.refusal(mode, mode.refused_because))
             return False
         self.mode.leave()
         self.mode = mode
         self.fence.on_mode_changed()
-        self.call_later(0.0, lambda: self.send_built(m.Heartbeat.ID))
+        self.call_later(0.0, lambda: self.send_built(m.Heartbeat.ID))  # The firmware reports a new mode at once.
         return True
 
     def set_mode_from(self, base_mode: int, custom_mode: int) -> int:

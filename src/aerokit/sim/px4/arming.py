@@ -101,14 +101,14 @@ class Px4Calibration:
             self._px4.info(f"[cal] {text}")
 
     def _begin_side(self, sides_done: int, run_number: int) -> None:
-        if not self.is_running or run_number != self._run_number:
+        if not self.is_running or run_number != self._run_number:  # The calibration was cancelled.
             return
         if sides_done == len(_SIDES):
             self._end(run_number)
             return
         texts = _side_texts(self._sensor, sides_done)
         self._send_later(texts, _SIDE_INTERVAL_S)
-        if math.isfinite(self.side_s):
+        if math.isfinite(self.side_s):  # Otherwise the measurement of this side never ends.
             delay_s = len(texts) * _SIDE_INTERVAL_S + self.side_s
             self._px4.call_later(delay_s, lambda: self._end_side(sides_done, run_number))
 
@@ -130,6 +130,7 @@ class Px4Calibration:
 
 
 def _sensor_of(command: ReceivedCommand) -> str:
+    """Return the sensor whose calibration a PREFLIGHT_CALIBRATION requests; empty if there is none."""
     requests = {
         "gyro": command.param1 == 1,
         "mag": command.param2 == 1,

@@ -258,6 +258,7 @@ class Px4Vehicle(Px4Host):
         if not self.home_is_set_by_client:
             self.home = self.motion.place
         self.failsafes.on_armed()
+        # These modes were entered while disarmed, and start now.
         if self.mode == modes.MISSION:
             self.mission.enter()
         elif self.mode == modes.TAKEOFF:
@@ -361,6 +362,7 @@ class Px4Vehicle(Px4Host):
         self.battery.drain(self.throttle * _AMPERES_AT_FULL, dt)
 
     def _detect_landing(self) -> None:
+        """Detect the landing `_LAND_DETECTOR_S` after the touchdown or, without running motors, at once."""
         is_lifting_off = self.is_armed and self.flight.lifts_off
         if not self._is_down() or is_lifting_off or self.arming.is_terminated:
             self._touchdown_at = math.nan

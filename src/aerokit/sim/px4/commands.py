@@ -48,7 +48,7 @@ _MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000
 
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
-    handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)
+    handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)  # None: send no acknowledgement.
     handlers[Cmd.DO_LAND_START] = lambda _: MavResult.CANCELLED
     handlers[Cmd.CONTROL_HIGH_LATENCY] = lambda _: _refuse_high_latency(px4)
     handlers[Cmd.INJECT_FAILURE] = lambda command: _inject_failure(px4, command)
@@ -230,7 +230,8 @@ class _Flight:
         if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
             return MavResult.DENIED
-        if not -1 <= command.param1 < px4.mission.count:
+        first_item = command.param1  # PX4 checks this index, but then continues at the current item.
+        if not -1 <= first_item < px4.mission.count:
             return MavResult.DENIED
         result = self._change(modes.MISSION)
         if result == MavResult.ACCEPTED and not px4.arming.arm("mission start"):
@@ -254,6 +255,7 @@ class _Flight:
         return result
 
     def _destination(self, command: ReceivedCommand) -> tuple[float, float, float]:
+        """Return the position in a command. Values that are NaN or INT32_MAX mean the vehicle's present position."""
         px4, motion = self._px4, self._px4.motion
         north, east, down = motion.north, motion.east, motion.down
         keeps_place = _INT32_MAX in (command.x, command.y) or not math.isfinite(command.x + command.y)
@@ -405,7 +407,7 @@ class _Requests:
             return self._send_interval(_number(command.param2), command)
         if message_id != m.AvailableModes.ID:
             return self.send_now(message_id, command)
-        messages, index = available_modes(self._px4), _number(command.param2)
+        messages, index = available_modes(self._px4), _number(command.param2)  # The index 0 selects all modes.
         for message in messages if index == 0 else messages[index - 1 : index]:
             self._px4.send(message, command.channel)
         return MavResult.ACCEPTED if 0 <= index <= len(messages) else MavResult.DENIED

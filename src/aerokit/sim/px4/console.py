@@ -29,6 +29,7 @@ class Px4Shell:
         px4.on(m.SerialControl, self._on_input)
 
     def _on_input(self, message: m.SerialControl, channel: Channel) -> None:
+        """Collect the characters of a line. Answer the complete line in pieces that fit SERIAL_CONTROL."""
         if message.device != SerialControlDev.DEV_SHELL or message.flags & SerialControlFlag.REPLY:
             return
         self.is_open = bool(message.flags & SerialControlFlag.RESPOND)

@@ -177,7 +177,7 @@ class Px4Flight:
     def _take_off(self) -> None:
         vehicle = self._vehicle
         ramp = (vehicle.now - self._ramp_began_at) / max(0.1, vehicle.parameters["MPC_TKO_RAMP_T"])
-        climb_share = max(_MIN_CLIMB_SHARE, min(1.0, ramp))  # Without a minimum, the copter would not leave the ground.
+        climb_share = max(_MIN_CLIMB_SHARE, min(1.0, ramp))  # The climb rate grows during MPC_TKO_RAMP_T.
         climb = vehicle.parameters["MPC_TKO_SPEED"] * climb_share
         vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=climb, descent=1.0)
         if abs(vehicle.motion.down - self.target[2]) < _ARRIVED_M:
@@ -251,6 +251,7 @@ class Px4Flight:
         self.go()
         if math.dist(self.target, motion.place) > _ARRIVED_M:
             return
+        # The vehicle has arrived at the target of the phase: above its starting point, then above the destination.
         if self._phase == "climb":
             self._phase = "return"
             self.target = (*self.destination[:2], self.target[2])

@@ -144,7 +144,7 @@ class Px4ManualFlight:
         right = max_speed * curved(sticks.roll, _EXPO, _DEAD_ZONE)
         down = self._height_velocity()
         if forward or right:
-            self._place = None
+            self._place = None  # The pilot moves the vehicle, so no place is held.
             motion.seek_velocity(*rotated((forward, right, down), motion.yaw))
         else:
             self._hold_position(down)

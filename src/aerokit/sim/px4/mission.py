@@ -281,9 +281,10 @@ class Px4Mission:
             return
         target = self._place(item)
         px4.flight.heading = math.radians(item.param4) if self._has_heading(item) else None
-        if px4.is_landed or item.command in _TAKE_OFFS:
+        if px4.is_landed or item.command in _TAKE_OFFS:  # On the ground, every item begins with a climb.
             self._climb(target[2] if item.command in _TAKE_OFFS else None)
         elif item.command in _LANDINGS:
+            # Fly to the landing point at the present height; `update` then descends.
             px4.flight.target = (target[0], target[1], motion.down)
         else:
             px4.flight.target = target
@@ -341,8 +342,9 @@ class Px4Mission:
             return True
         motion, (north, east, down) = self._px4.motion, self._px4.flight.target
         radius = self._px4.parameters["NAV_ACC_RAD"]
-        if item.command == Cmd.NAV_WAYPOINT and item.param2 > 0:
-            radius = item.param2
+        acceptance_radius = item.param2
+        if item.command == Cmd.NAV_WAYPOINT and acceptance_radius > 0:
+            radius = acceptance_radius
         is_near = math.hypot(north - motion.north, east - motion.east) <= radius
         return is_near and abs(down - motion.down) <= _HEIGHT_REACHED_M
 

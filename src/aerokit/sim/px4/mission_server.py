@@ -163,7 +163,7 @@ class Px4MissionServer(MissionServer):
         if link.uses_int:
             message: AnyItem = item_message_int(downloaded, seq, client, kind, current=is_current)
         else:
-            scale = 1.0 if item.frame == MavFrame.MISSION else 1e-7
+            scale = 1.0 if item.frame == MavFrame.MISSION else 1e-7  # Only positions are in degrees times 1e7.
             place = (item.x * scale, item.y * scale)
             message = item_message_float(downloaded, place, seq, client, kind, int(is_current))
         self._px4.send(message, link.channel)
@@ -242,6 +242,7 @@ class Px4MissionServer(MissionServer):
             self._drop(link)
 
     def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
+        """Start an upload. A repeated MISSION_COUNT is answered with the request of the first item again."""
         link, sender = self._link(channel), sender_of(count)
         if link.state is TransferState.SENDING:
             self._warn("WPM: IGN MISSION_COUNT: Busy")

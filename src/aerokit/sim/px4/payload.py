@@ -277,7 +277,7 @@ class Px4CameraTrigger:
     def _control(self, command: ReceivedCommand) -> int | None:
         if not self.is_fitted:
             return None
-        if self._px4.now - self._last_at < _MIN_INTERVAL_S:
+        if self._px4.now - self._last_at < _MIN_INTERVAL_S:  # The camera is not ready for another image.
             return MavResult.TEMPORARILY_REJECTED
         takes_image = command.x == 1
         if takes_image:

@@ -97,7 +97,7 @@ def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
         operator_longitude=home.longitude_e7,
         area_count=1,
         area_radius=0,
-        area_ceiling=-1000.0,
+        area_ceiling=-1000.0,  # unknown, as is the floor
         area_floor=-1000.0,
         category_eu=0,
         class_eu=0,

@@ -109,7 +109,7 @@ class Px4PlaneFlight(Px4Flight):
         plane = self._plane
         mode, mission = plane.mode, plane.mission
         self.lifts_off: bool = mode == modes.TAKEOFF or (mode == modes.MISSION and mission.wants_up)
-        if plane.is_landed and not self.is_rolling:
+        if plane.is_landed and not self.is_rolling:  # The take-off roll has not begun.
             return
         if plane.is_landed and not self._motion.is_on_ground:
             plane.leave_ground()
@@ -175,7 +175,7 @@ class Px4PlaneFlight(Px4Flight):
         height = motion.ground_down - motion.down
         if motion.is_on_ground:
             motion.roll_out()
-        elif height < _FLARE_M:
+        elif height < _FLARE_M:  # Sink slowly at minimum speed, straight on.
             motion.head(motion.yaw, self._plane.parameters["FW_AIRSPD_MIN"], -_FLARE_SINK_M_S)
         else:
             approach()
@@ -289,6 +289,7 @@ class Px4PlaneMission(Px4Mission):
             return True
         plane, motion = self._plane, self._plane.motion
         north, east, down = plane.flight.target
+        # A fast plane must turn earlier.
         radius = max(plane.parameters["NAV_ACC_RAD"], _TURN_S * motion.airspeed_m_s)
         if item.command == Cmd.NAV_WAYPOINT:
             radius = max(radius, item.param2)
