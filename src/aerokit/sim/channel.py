@@ -17,6 +17,7 @@ from aerokit.mavlink.signing import Signing
 
 MessageT = TypeVar("MessageT", bound=Message)
 _MAX_FLOAT32 = 3.4028234663852886e38
+_DUE_DECIMALS = 9
 
 
 def fitted(message: MessageT) -> MessageT:
@@ -152,7 +153,7 @@ class Streams:
                 return ids
             ids.append(message_id)
             # The due time is rounded, so that streams with different rates are due at exactly the same instants.
-            following = round(start + (count + 1) * interval, 9)
+            following = round(start + (count + 1) * interval, _DUE_DECIMALS)
             if following > now:
                 heapreplace(heap, (following, token, message_id, start, count + 1))
             else:  # The stream is late by more than an interval, so it starts again at the present time.

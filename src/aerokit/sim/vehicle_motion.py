@@ -162,7 +162,8 @@ class FixedWing(Motion):
         self.velocity_east: float = east + air_east
         self._advance(dt)
         # A throttle of 45 % holds the altitude, and one of 95 % climbs at the maximum rate.
-        throttle = 0.45 + 0.5 * -self.velocity_down / wing.climb_m_s
+        climb_share = -self.velocity_down / wing.climb_m_s
+        throttle = 0.45 + 0.5 * climb_share
         self.throttle = max(0.0, min(1.0, throttle)) if powered else 0.0
 
     def _touch_down(self) -> None:

@@ -12,6 +12,7 @@ from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED
 
 _SHARES = ("loss", "duplication", "reordering", "corruption")
 _SECONDS = ("delay_s", "jitter_s", "overtaken_s")
+_MAX_SECONDS = 3600.0
 
 
 class FaultModel(Snapshot):
@@ -49,7 +50,7 @@ class FaultModel(Snapshot):
         for name in _SHARES:
             _check_number(name, getattr(self, name), 0.0, 1.0)
         for name in _SECONDS:
-            _check_number(name, getattr(self, name), 0.0, 3600.0)
+            _check_number(name, getattr(self, name), 0.0, _MAX_SECONDS)
         for name in ("bandwidth", "queue_bytes"):
             if not getattr(self, name) > 0:
                 raise InvalidArgument(f"{name} = {getattr(self, name)!r} is not allowed: it must be above 0")

@@ -258,7 +258,7 @@ class _Labels:
             if point.mode == previous_mode:
                 continue
             previous_mode = point.mode
-            shapes.append(_Dot(x, y, colour, 2.5))
+            shapes.append(_Dot(x, y, colour, radius=2.5))
             # Place the label above the point or, if another label is there, up to three lines higher.
             label_levels = (y - above - step * _LABEL_HEIGHT for step in range(4))
             label_y = next((level for level in label_levels if self._is_free(x, level)), None)

@@ -159,8 +159,9 @@ class CompassCalibration:
             return None
         self._progress_compass = self._next_compass(self._progress_compass)
         percent = self.percent
+        # In the simulation, both steps of the calibration take the same time.
         status = MagCalStatus.RUNNING_STEP_ONE if percent < 50 else MagCalStatus.RUNNING_STEP_TWO
-        # The mask has one bit for each of 80 directions in which the vehicle can point.
+        # The mask of ten bytes has one bit for each of 80 directions in which the vehicle can point.
         direction_count = percent * 80 // 100
         directions = ((1 << direction_count) - 1).to_bytes(10, "little")
         return m.MagCalProgress(

@@ -14,6 +14,7 @@ from aerokit.sim.commands import PositionTarget, Setpoint, is_finite, rotated
 from aerokit.sim.motion import Ned, euler_from_quaternion
 
 _ZERO: Ned = (0.0, 0.0, 0.0)
+_UNIT_LENGTH_TOLERANCE = 1e-3
 
 
 class GuidedSubmode(Enum):
@@ -272,9 +273,10 @@ class CopterSetpoints:
             return
         has_attitude, ignored_rates = not mask & AttitudeMask.ATTITUDE_IGNORE, mask & _ALL_RATES
         quaternion_norm = math.sqrt(sum(component * component for component in target.q))
-        has_one_or_two_rates = ignored_rates not in (0, _ALL_RATES)
+        has_one_or_two_rates = ignored_rates not in (0, _ALL_RATES)  # The firmware needs all rates or none.
         is_mask_invalid = mask & AttitudeMask.THROTTLE_IGNORE or has_one_or_two_rates
-        if is_mask_invalid or (has_attitude and not abs(quaternion_norm - 1.0) < 1e-3):
+        is_quaternion_invalid = has_attitude and not abs(quaternion_norm - 1.0) < _UNIT_LENGTH_TOLERANCE
+        if is_mask_invalid or is_quaternion_invalid:
             guided.enter(force=False)  # An invalid message stops the vehicle.
             return
         roll = pitch = 0.0

@@ -406,7 +406,8 @@ def _closest_approach(start1: Ned, end1: Ned, start2: Ned, end2: Ned) -> tuple[f
     dot11, dot12, dot22 = _dot(line1, line1), _dot(line1, line2), _dot(line2, line2)
     dot1, dot2 = _dot(line1, between), _dot(line2, between)
     determinant = dot11 * dot22 - dot12 * dot12
-    if determinant < 1e-6 * max(dot11 * dot22, 1e-9):
+    are_nearly_parallel = determinant < 1e-6 * max(dot11 * dot22, 1e-9)  # 1e-9: segments without a length
+    if are_nearly_parallel:
         return None
     # The nearest place on each segment, as a number from 0 (start) to 1 (end). Limiting one place to its segment moves
     # the nearest place on the other segment, so the first place is calculated again at the end.

@@ -187,13 +187,25 @@ def _extended_sys_state(vehicle: ArduPilotVehicle) -> m.ExtendedSysState:
 
 def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
     battery = vehicle.battery
-    voltages = (round(battery.voltage_v * 1000), *(_UNKNOWN_CELL,) * 9)
+    voltages = (round(battery.voltage_v * 1000), *(_UNKNOWN_CELL,) * 9)  # The first cell has the whole voltage.
     charge = MavBatteryChargeState.LOW if vehicle.failsafes.battery_is_low else MavBatteryChargeState.OK
     if vehicle.failsafes.battery_is_critical:
         charge = MavBatteryChargeState.CRITICAL
-    current, consumed = round(battery.current_a * 100), round(battery.consumed_mah)
+    current, consumed = round(battery.current_a * 100), round(battery.consumed_mah)  # 0.01 A, mAh
     hectojoules, percent = round(battery.consumed_wh * 36), int(battery.percent)  # 1 Wh is 36 hJ.
-    return m.BatteryStatus(0, 0, 0, _UNKNOWN_TEMPERATURE, voltages, current, consumed, hectojoules, percent, 0, charge)
+    return m.BatteryStatus(
+        id=0,
+        battery_function=0,
+        type=0,
+        temperature=_UNKNOWN_TEMPERATURE,
+        voltages=voltages,
+        current_battery=current,
+        current_consumed=consumed,
+        energy_consumed=hectojoules,
+        battery_remaining=percent,
+        time_remaining=0,
+        charge_state=charge,
+    )
 
 
 def _system_time(vehicle: ArduPilotVehicle) -> m.SystemTime:

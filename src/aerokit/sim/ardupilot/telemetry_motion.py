@@ -103,7 +103,15 @@ def _highres_imu(vehicle: ArduPilotVehicle) -> m.HighresImu:
     north, east, down = (value * 1000.0 for value in _magnetic_field(vehicle))
     altitude = vehicle.navigation.frame.origin.altitude_m - motion.down
     sensors = (x, y, z, *_angular_rates(motion), north, east, down, _pressure_hpa(vehicle))
-    return m.HighresImu(vehicle.time_boot_us, *sensors, 0.0, altitude, 28.0, 8191)
+    all_fields = 8191
+    return m.HighresImu(
+        vehicle.time_boot_us,
+        *sensors,
+        diff_pressure=0.0,
+        pressure_alt=altitude,
+        temperature=28.0,
+        fields_updated=all_fields,
+    )
 
 
 def _pressure_hpa(vehicle: ArduPilotVehicle) -> float:
@@ -161,11 +169,13 @@ def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
         unknown = 65535  # dilution of precision
         return m.GpsRawInt(0, GpsFixType.NO_GPS, 0, 0, 0, eph=unknown, epv=unknown, vel=0, cog=0, satellites_visible=0)
     if nav.fix_type < GpsFixType.TYPE_3D_FIX:
-        return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, eph=9999, epv=9999, vel=0, cog=0, satellites_visible=3)
+        worst = 9999
+        return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, eph=worst, epv=worst, vel=0, cog=0, satellites_visible=3)
     place = nav.frame.to_global(*motion.place)
     altitude, speed = round(place.altitude_m * 1000), round(motion.ground_speed_m_s * 100)
     course = centidegrees(math.atan2(motion.velocity_east, motion.velocity_north))
     position = (place.latitude_e7, place.longitude_e7, altitude)
+    # Horizontal and vertical dilution of precision (times 100), and accuracy of position and altitude.
     precision, satellites, accuracies_mm = (121, 200), 10, (300, 300)
     return m.GpsRawInt(
         vehicle.time_boot_us, nav.fix_type, *position, *precision, speed, course, satellites, altitude, *accuracies_mm

@@ -343,6 +343,7 @@ class ArduPilotVehicle(ArduPilotHost):
         if builder is not None:
             return builder(self) if self.is_initialised or message_id in _BEFORE_READY else None
         if message_id == m.Timesync.ID:
+            # A request (tc1 is 0) with the time in nanoseconds. The firmware adds its system id.
             return m.Timesync(0, int(self.uptime * 1e9) + self.system_id)
         if message_id == m.AvailableModesMonitor.ID:
             return m.AvailableModesMonitor(0)

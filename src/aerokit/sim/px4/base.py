@@ -46,7 +46,8 @@ from aerokit.sim.px4.payload import Px4CameraTrigger, Px4Gimbal
 from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Px4Storage, px4_parameters
 from aerokit.sim.vehicle import AttachableComponent, sender_of
 
-_HEARTBEAT_BOOT_SHARE = 0.15
+# Shares of the boot time after which events happen.
+_HEARTBEAT_BOOT_SHARE, _WARNING_SHARE_OF_BOOT = 0.15, 0.3
 _REBOOT_SILENCE_S = 1.5
 _LAND_DETECTOR_S = 1.0
 _HOVER_THROTTLE = 0.5
@@ -209,7 +210,7 @@ class Px4Vehicle(Px4Host):
         self.storage.restart()
         self.camera_trigger.restart()
         self.gimbal.start()
-        self.call_later(0.3 * self._boot_time_s, self._warn_while_booting)
+        self.call_later(_WARNING_SHARE_OF_BOOT * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
         self.failsafes.listen()  # A restart has created a new object, which has to listen, too.
         self.failsafes.start()

@@ -176,7 +176,8 @@ class Px4Flight:
 
     def _take_off(self) -> None:
         vehicle = self._vehicle
-        ramp = (vehicle.now - self._ramp_began_at) / max(0.1, vehicle.parameters["MPC_TKO_RAMP_T"])
+        ramp_duration_s = max(0.1, vehicle.parameters["MPC_TKO_RAMP_T"])  # The parameter may be 0.
+        ramp = (vehicle.now - self._ramp_began_at) / ramp_duration_s
         climb_share = max(_MIN_CLIMB_SHARE, min(1.0, ramp))  # The climb rate grows during MPC_TKO_RAMP_T.
         climb = vehicle.parameters["MPC_TKO_SPEED"] * climb_share
         vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=climb, descent=1.0)

@@ -88,7 +88,9 @@ def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
     if px4.sticks.are_fresh:
         health |= _RC_BIT
     load, current = 120, -100  # A load of 12 %, and a current that is not measured (-1 A).
-    return m.SysStatus(present, enabled, health, load, voltage, current, percent, 0, 0, 0, 0, 0, 0, 0, 0, 1)
+    no_errors = (0,) * 6  # communication: drop rate and errors, then four counters of the autopilot
+    extended = (0, 0, 1)  # present, enabled and healthy sensors of the extended masks
+    return m.SysStatus(present, enabled, health, load, voltage, current, percent, *no_errors, *extended)
 
 
 def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
@@ -101,7 +103,18 @@ def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
     if not px4.is_ready:
         flags = _BOOT_FLAGS
     ratio = 0.02 if px4.is_ready else math.nan  # The test ratio of velocity, position and magnetometer.
-    return m.EstimatorStatus(px4.time_boot_us, flags, ratio, ratio, 0.003, ratio, 0.002, math.nan, 0.3, 0.3)
+    return m.EstimatorStatus(
+        px4.time_boot_us,
+        flags,
+        vel_ratio=ratio,
+        pos_horiz_ratio=ratio,
+        pos_vert_ratio=0.003,
+        mag_ratio=ratio,
+        hagl_ratio=0.002,
+        tas_ratio=math.nan,
+        pos_horiz_accuracy=0.3,
+        pos_vert_accuracy=0.3,
+    )
 
 
 def _extended_sys_state(px4: Px4Vehicle) -> m.ExtendedSysState:
@@ -236,7 +249,7 @@ def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
         return None
     place = px4.frame.to_global(*px4.home)
     altitude = round(place.altitude_m * 1000)
-    # A home that a client has set has no attitude.
+    # The yaw at a home that a client has set is unknown, so the quaternion is NaN.
     quaternion = (math.nan,) * 4 if px4.home_is_set_by_client else (1.0, 0.0, 0.0, 0.0)
     return m.HomePosition(
         place.latitude_e7, place.longitude_e7, altitude, *px4.home, quaternion, 0.0, 0.0, 0.0, px4.time_boot_us

@@ -77,7 +77,7 @@ def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
         vertical_accuracy=5,
         barometer_accuracy=0,
         speed_accuracy=3,
-        timestamp=65535.0,
+        timestamp=65535.0,  # unknown
         timestamp_accuracy=0,
     )
 
