@@ -156,7 +156,7 @@ class SimulatedVehicle:
         if not self._is_on and math.isnan(self.booted_at):  # The vehicle was never switched on.
             self.now = now
             self.power_on()
-        if self.faults.frozen:
+        if self.faults.frozen:  # Nothing runs, but the time passes.
             self._skip_to(now)
             return
         while (due := self.next_due) <= now:

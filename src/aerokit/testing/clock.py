@@ -149,6 +149,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
                 due = next_due()
                 if due < earliest_due:
                     earliest_due, earliest = due, handle
+            # The iteration that runs a timer also runs the event sources of the same instant.
             if earliest_due + self._clock_resolution >= self._next_timer():
                 break
             self._now = max(self._now, earliest_due)

@@ -105,6 +105,6 @@ def _report(path: Path, flight: Flight | ServedFlight, count: int) -> str:
     target = path.with_suffix(f".{system_id}.html" if shares_recording else ".html")
     try:
         write_report(path, target, system_id=system_id, force=True)
-    except ModuleNotFoundError:
+    except ModuleNotFoundError:  # The packages of the extra "report" are not installed.
         return "no report: pip install 'aerokit-mavlink[report]'"
     return f"report in {target}"

@@ -240,6 +240,7 @@ class Calibrations:
         vehicle = self._vehicle
         if command.x == _Accelerometers.FULL:
             vehicle.info("Initialising ArduPilot")
+            # The gyros are calibrated first. Then the vehicle requests the first of the six positions.
             return CommandProgress(percents=(), interval_s=_GYROS_S, finish=self.accelerometers.start)
         if command.x == _Accelerometers.TRIM:
             vehicle.info("Initialising ArduPilot")

@@ -255,7 +255,7 @@ class CopterAuto(MissionMode):
             self._check_upcoming()  # `mission.update` may have started the next command
         if self.vehicle.mode is not self:  # The mission has changed the mode.
             return
-        is_stopped = self.is_paused and isinstance(self._leg, _FlyLeg)
+        is_stopped = self.is_paused and isinstance(self._leg, _FlyLeg)  # A take-off or landing cannot be paused.
         if self._leg is None or is_stopped:
             self.vehicle.hold_position()
         else:

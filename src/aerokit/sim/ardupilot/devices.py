@@ -78,16 +78,16 @@ class ArduPilotDevices:
 
     def move_winch(self, command: ReceivedCommand) -> int:
         """Start or stop the winch (MAV_CMD_DO_WINCH)."""
-        action = whole(command.param2)
+        action, length_m, rate_m_s = whole(command.param2), command.param3, command.param4
         if not self._is_set("WINCH_TYPE") or action > WinchActions.RATE_CONTROL:
             return Result.FAILED
         was_moving = self.line_rate_m_s != 0.0
         self._goal_m, self.line_rate_m_s = None, 0.0
         if action == WinchActions.RATE_CONTROL:
-            self.line_rate_m_s = max(-_WINCH_RATE_M_S, min(_WINCH_RATE_M_S, command.param4))
+            self.line_rate_m_s = max(-_WINCH_RATE_M_S, min(_WINCH_RATE_M_S, rate_m_s))
         elif action == WinchActions.RELATIVE_LENGTH_CONTROL:
-            self._goal_m = self.line_m + command.param3
-            self.line_rate_m_s = _WINCH_RATE_M_S if command.param3 > 0 else -_WINCH_RATE_M_S
+            self._goal_m = self.line_m + length_m
+            self.line_rate_m_s = _WINCH_RATE_M_S if length_m > 0 else -_WINCH_RATE_M_S
         if not was_moving and self.line_rate_m_s:  # A winch that moves already has a scheduled step.
             self._vehicle.call_later(_WINCH_STEP_S, self._run)
         return Result.ACCEPTED

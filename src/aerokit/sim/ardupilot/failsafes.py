@@ -338,7 +338,8 @@ class ArduPilotArming(Generic[HostT]):
         vehicle = self.vehicle
         if not vehicle.motors.is_armed:
             return True
-        if not self.needs_arming or (not force and not vehicle.is_landed):
+        is_in_air = not vehicle.is_landed
+        if not self.needs_arming or (is_in_air and not force):  # ARMING_REQUIRE 0 keeps the vehicle armed for ever.
             return False
         vehicle.fence.on_disarmed()
         vehicle.info(self.DISARMED_TEXT)

@@ -119,7 +119,7 @@ def stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
     frame: int = MavFrame.GLOBAL  # The frame that a download reports for an item without a position.
     if has_location(item.command):
         place_or_result = _stored_place(item)
-        if isinstance(place_or_result, int):
+        if isinstance(place_or_result, int):  # The item is refused with this MAV_MISSION_RESULT.
             return place_or_result
         x, y, z, frame = place_or_result
     return MissionItem(item.command, frame, p1, p2, p3, p4, int(x), int(y), z)

@@ -107,7 +107,7 @@ class CommandList(ItemList):
     def put(self, seq: int, item: MissionItem, last: int) -> int:
         """Replace or append an item. Item 0 is checked, but not stored, because it is home."""
         stored_item = stored(item, self._kind)
-        if isinstance(stored_item, int):
+        if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             return stored_item
         if stored_item.command == Cmd.DO_JUMP and not self._is_jump_target(stored_item.param1, last):
             return MavMissionResult.ERROR
@@ -139,7 +139,7 @@ class CommandList(ItemList):
         """Store the items of an uploaded file, and return the MAV_MISSION_RESULT. Stop at the first refused item."""
         for seq, item in enumerate(items):
             stored_item = stored(item, self._kind)
-            if isinstance(stored_item, int):
+            if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
                 return stored_item
             if stored_item.command == Cmd.DO_JUMP and not 0 < stored_item.param1 < len(items):
                 return MavMissionResult.ERROR
@@ -174,7 +174,7 @@ class RallyList(ItemList):
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
         stored_item = _stored_rally_point(item)
-        if isinstance(stored_item, int):
+        if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             return stored_item
         if seq > len(self._points) or seq >= self.capacity:
             return MavMissionResult.ERROR
@@ -248,7 +248,7 @@ class FenceList(ItemList):
         if seq >= len(self._uploaded):
             return MavMissionResult.INVALID_SEQUENCE
         stored_item = _stored_fence_item(item)
-        if isinstance(stored_item, int):
+        if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             return stored_item
         self._uploaded[seq] = stored_item
         return MavMissionResult.ACCEPTED
@@ -281,7 +281,7 @@ class FenceList(ItemList):
         stored_items: list[MissionItem] = []
         for item in items:
             stored_item = _stored_fence_item(item)
-            if isinstance(stored_item, int):
+            if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
                 return stored_item
             stored_items.append(stored_item)
         return self.store(stored_items, warn)

@@ -186,6 +186,7 @@ class MissionRun:
             self._start()
         else:
             self._state = MissionState.ACTIVE
+            # Resume at the "do" command that was running, which precedes the navigation command.
             self.set_current(self._running_do[0] if self._running_do is not None else self.nav_index)
 
     def _start(self) -> None:

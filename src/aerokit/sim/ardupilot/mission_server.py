@@ -197,7 +197,7 @@ class ArduPilotMissionServer(MissionServer):
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
         item, kind = _without_floats(message), message.mission_type
-        if isinstance(item, int):
+        if isinstance(item, int):  # The position is refused with this MAV_MISSION_RESULT.
             self._answer_item(message, item, channel)
         elif kind == MavMissionType.MISSION and message.current in (_GUIDED_TARGET, _ALTITUDE_CHANGE):
             result = self._guide(item, message.current)  # The item is a target, and not part of a list.
@@ -254,7 +254,7 @@ class ArduPilotMissionServer(MissionServer):
     def _guide(self, item: MissionItem, current: int) -> int:
         """Handle an item that is a target for GUIDED, because of the special value of its field ``current``."""
         stored_item = stored(item, self._vehicle.KIND)
-        if isinstance(stored_item, int):
+        if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             return stored_item
         if current == _ALTITUDE_CHANGE:  # The altitude change has no effect in the simulation.
             return Result.ACCEPTED

@@ -170,9 +170,9 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if distance <= self.vehicle.parameters["WP_RADIUS"]:
             self.vehicle.info(f"Reached waypoint #{index} dist {int(distance)}m")
             return True
-        # The plane has passed the waypoint if its offset from the waypoint points along the leg (dot product above 0).
-        beyond = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
-        return self._report_if(beyond > 0, f"Passed waypoint #{index} dist {int(distance)}m")
+        # The plane has passed the waypoint if its offset from the waypoint points along the leg.
+        dot_product = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
+        return self._report_if(dot_product > 0, f"Passed waypoint #{index} dist {int(distance)}m")
 
     def _go(self, item: MissionItem, manoeuvre: int) -> None:
         """Start a leg. Zero coordinates mean the plane's coordinates, a zero altitude that of the previous leg."""

@@ -184,6 +184,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
             self.region = GlobalPoint(*place)
 
     def _begin(self, flags: int) -> None:
+        """Start a movement at the present angles. Forget the previous target, which the caller then replaces."""
         self._from, self._since = self.angles(), self.now
         self._target = _ZERO
         self._rates = _ZERO

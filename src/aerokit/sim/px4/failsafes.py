@@ -222,7 +222,7 @@ class Px4Failsafes:
         state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
         if state == MavBatteryChargeState.OK:
             return Action.NONE
-        is_known_at_arming = state <= self._battery_at_arming  # A state that arming has accepted causes no action.
+        is_known_at_arming = state <= self._battery_at_arming  # Arming has accepted this state, so it only warns.
         has_action = action in (_BATTERY_LAND, _BATTERY_RETURN)
         if state == MavBatteryChargeState.LOW or is_known_at_arming or not has_action:
             return Action.WARN

@@ -70,8 +70,9 @@ class Px4Sticks:
         self.throttle = throttle
         self._moved_at = self._px4.now
         if were_fresh:  # The first positions after a silence do not count as a movement.
-            largest = max(abs(new - old) for new, old in zip((roll, pitch, yaw, throttle), previous, strict=True))
-            self._px4.on_sticks_moved(largest)
+            present = (roll, pitch, yaw, throttle)
+            largest_movement = max(abs(new - old) for new, old in zip(present, previous, strict=True))
+            self._px4.on_sticks_moved(largest_movement)
 
 
 def _stick_position(pulse_us: int) -> float:

@@ -280,7 +280,7 @@ class Px4Mission:
             px4.flight.stay_here()
             return
         target = self._place(item)
-        px4.flight.heading = math.radians(item.param4) if self._has_heading(item) else None
+        px4.flight.heading = math.radians(item.param4) if self._has_heading(item) else None  # None: look ahead.
         if px4.is_landed or item.command in _TAKE_OFFS:  # On the ground, every item begins with a climb.
             self._climb(target[2] if item.command in _TAKE_OFFS else None)
         elif item.command in _LANDINGS:

@@ -53,7 +53,7 @@ def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> Miss
         stored_item = _without_place(item)
     else:
         return MavMissionResult.UNSUPPORTED_FRAME
-    if isinstance(stored_item, int):
+    if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
         return stored_item
     if mission_type == MavMissionType.MISSION and stored_item.command in _NO_MISSION_COMMANDS:
         return MavMissionResult.ERROR

@@ -92,7 +92,7 @@ class Px4MissionServer(MissionServer):
         stored_items: list[MissionItem] = []
         for item in items:
             stored_item = stored(item, mission_type)
-            if isinstance(stored_item, int):
+            if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
                 return stored_item
             stored_items.append(stored_item)
         self._store(mission_type, stored_items, checksum(items))
@@ -269,7 +269,7 @@ class Px4MissionServer(MissionServer):
         if count.count > self.capacity(link.mission_type):
             self._answer(link, Result.NO_SPACE)
         elif count.count == 0:
-            self._store(link.mission_type, [], 0, 0)
+            self._store(link.mission_type, [], opaque_id=0, current=0)
             self._answer(link, Result.ACCEPTED)
         else:
             link.items, link.opaque_id, link.current = [], 0, -1
@@ -303,7 +303,7 @@ class Px4MissionServer(MissionServer):
         if not is_int and item.frame != MavFrame.MISSION:
             item_in_e7 = item.replace(x=_e7(item.x), y=_e7(item.y))
         stored_item = stored(item_in_e7, link.mission_type, is_int=is_int)
-        if isinstance(stored_item, int):
+        if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             if stored_item != Result.ERROR:
                 self._warn("IGN MISSION_ITEM: Invalid item")
             return stored_item
@@ -329,7 +329,7 @@ class Px4MissionServer(MissionServer):
         link.mission_type = request.mission_type
         for kind in _CAPACITIES:
             if request.mission_type in (kind, MavMissionType.ALL):
-                self._store(kind, [], 0, 0)
+                self._store(kind, [], opaque_id=0, current=0)
         self._answer(link, Result.ACCEPTED, sender_of(request))
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:

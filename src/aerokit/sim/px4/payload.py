@@ -279,7 +279,7 @@ class Px4CameraTrigger:
             return None
         if self._px4.now - self._last_at < _MIN_INTERVAL_S:  # The camera is not ready for another image.
             return MavResult.TEMPORARILY_REJECTED
-        takes_image = command.x == 1
+        takes_image = command.x == 1  # Param 5 of DO_DIGICAM_CONTROL.
         if takes_image:
             self.shoot()
         return MavResult.ACCEPTED

@@ -73,7 +73,7 @@ def _state(px4: Px4Vehicle) -> MavState:
         return MavState.ACTIVE
     if px4.calibration.is_running:
         return MavState.CALIBRATING
-    return MavState.STANDBY if px4.arming.is_possible else MavState.UNINIT
+    return MavState.STANDBY if px4.arming.is_possible else MavState.UNINIT  # A failed arming check is UNINIT, too.
 
 
 def _sys_status(px4: Px4Vehicle) -> m.SysStatus:

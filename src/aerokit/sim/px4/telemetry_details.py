@@ -179,11 +179,11 @@ def _highres_imu(px4: Px4Vehicle) -> m.HighresImu:
         *_measured_acceleration(px4),
         *rates,
         *_magnetic_field_gauss(px4),
-        pressure,
-        0.0,
-        height,
-        _SEA_LEVEL_C,
-        _IMU_FIELDS,
+        abs_pressure=pressure,
+        diff_pressure=0.0,
+        pressure_alt=height,
+        temperature=_SEA_LEVEL_C,
+        fields_updated=_IMU_FIELDS,
     )
 
 
@@ -250,9 +250,11 @@ def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None
         return None
     place, motion = px4.frame.to_global(*px4.flight.target), px4.motion
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
-    rates = (motion.yaw, motion.yaw_rate)
-    frame = MavFrame.GLOBAL_INT
-    return m.PositionTargetGlobalInt(px4.time_boot_ms, frame, 0, *place, *velocity, 0.0, 0.0, 0.0, *rates)
+    yaw_and_rate = (motion.yaw, motion.yaw_rate)
+    frame, no_mask, no_acceleration = MavFrame.GLOBAL_INT, 0, (0.0, 0.0, 0.0)
+    return m.PositionTargetGlobalInt(
+        px4.time_boot_ms, frame, no_mask, *place, *velocity, *no_acceleration, *yaw_and_rate
+    )
 
 
 def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:

@@ -111,7 +111,7 @@ class Px4PlaneFlight(Px4Flight):
         self.lifts_off: bool = mode == modes.TAKEOFF or (mode == modes.MISSION and mission.wants_up)
         if plane.is_landed and not self.is_rolling:  # The take-off roll has not begun.
             return
-        if plane.is_landed and not self._motion.is_on_ground:
+        if plane.is_landed and not self._motion.is_on_ground:  # The wing has lifted the plane.
             plane.leave_ground()
         if mode == modes.TAKEOFF:
             self._take_off()
@@ -132,12 +132,13 @@ class Px4PlaneFlight(Px4Flight):
     def _follow_sticks(self) -> None:
         """Control bank, climb and airspeed by the sticks, in every manual mode. A stick pushed forward descends."""
         sticks, parameters = self._plane.sticks, self._plane.parameters
-        climb = -sticks.pitch * parameters["FW_T_CLMB_MAX" if sticks.pitch < 0 else "FW_T_SINK_MAX"]
+        climbs = sticks.pitch < 0
+        climb = -sticks.pitch * parameters["FW_T_CLMB_MAX" if climbs else "FW_T_SINK_MAX"]
         min_speed, max_speed = parameters["FW_AIRSPD_MIN"], parameters["FW_AIRSPD_MAX"]
         throttle = (sticks.throttle + 1.0) / 2  # from 0 to 1
         speed = min_speed + throttle * (max_speed - min_speed)
         self._motion.bank_and_climb(speed, math.radians(parameters["FW_R_LIM"]) * sticks.roll, climb)
-        self.stay_here()
+        self.stay_here()  # Without sticks, the plane circles the place where they were lost.
 
     def go(self) -> None:
         self.circle()
