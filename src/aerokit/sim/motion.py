@@ -270,7 +270,7 @@ class Motion:
         if powered:
             north, east, down = self._commanded_acceleration()
         else:
-            drag = GRAVITY_M_S2 / _TERMINAL_SPEED_M_S
+            drag = GRAVITY_M_S2 / _TERMINAL_SPEED_M_S  # At the terminal speed, the drag equals the weight.
             north, east = -drag * self.velocity_north, -drag * self.velocity_east
             down = GRAVITY_M_S2 - drag * self.velocity_down
         change = abs(north - self.acceleration_north) + abs(east - self.acceleration_east)

@@ -215,8 +215,11 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
                 self.warn("EKF Failsafe Cleared", MavSeverity.CRITICAL)
             self.has_estimator_failed = self._acted_on_estimator = False
             return
-        may_act = self._had_position and not self.has_estimator_failed
-        if may_act and self._position_lost.seconds(True, copter.now) >= _ESTIMATOR_TIMEOUT_S:
+        # A position that was never known is not lost, and each loss is handled once.
+        if not self._had_position or self.has_estimator_failed:
+            return
+        lost_for_s = self._position_lost.seconds(condition=True, now=copter.now)
+        if lost_for_s >= _ESTIMATOR_TIMEOUT_S:
             self._lose_estimator()
 
     def _lose_estimator(self) -> None:

@@ -323,6 +323,7 @@ class CopterRtl(CopterModeBase):
         self._phase, self.is_landing = "climb", False
         # The value 0 of RTL_SPEED selects WPNAV_SPEED.
         self.speed = copter.speed_limit("RTL_SPEED") or copter.speed_limit("WPNAV_SPEED")
+        # Without home, return to the place of the power-on.
         home = copter.navigation.home or (0.0, 0.0, copter.motion.ground_down)
         self._place = best_return_place(copter, home, is_allowed=copter.fence.contains)
         north, east, down = self._place

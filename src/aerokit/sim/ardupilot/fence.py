@@ -385,6 +385,7 @@ class ArduPilotFence(Generic[HostT]):
         parameters = self.vehicle.parameters
         radius, margin = parameters["FENCE_RADIUS"], parameters["FENCE_MARGIN"]
         high, low = self._value("FENCE_ALT_MAX"), self._value("FENCE_ALT_MIN")
+        # Uploaded circles belong to the kind POLYGON. The kind CIRCLE is the limit of the distance from home.
         has_small_circle = bool(self.configured & _POLYGON) and self.zones.smallest_inclusion_m < margin
         breached = f"Vehicle breaching {_joined_names(self.breached)}" if self.breached else ""
         return (

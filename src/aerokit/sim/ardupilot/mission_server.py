@@ -260,7 +260,8 @@ class ArduPilotMissionServer(MissionServer):
             return Result.ACCEPTED
         vehicle = self._vehicle
         point = vehicle.world_point(int(stored_item.x), int(stored_item.y), stored_item.z, stored_item.frame)
-        if vehicle.mode is not vehicle.guided or stored_item.command != MavCmd.NAV_WAYPOINT or point is None:
+        is_waypoint = stored_item.command == MavCmd.NAV_WAYPOINT
+        if vehicle.mode is not vehicle.guided or not is_waypoint or point is None:
             return Result.ERROR
         vehicle.guided.go_to(point)
         return Result.ACCEPTED

@@ -279,7 +279,8 @@ class SmartPath:
         parameters = self._vehicle.parameters
         self._points.clear()
         self._cleaned_count, self.is_active, self._is_started = 0, False, True
-        if parameters["SRTL_POINTS"] <= 0 or parameters["SRTL_ACCURACY"] <= 0:
+        is_disabled = parameters["SRTL_POINTS"] <= 0 or parameters["SRTL_ACCURACY"] <= 0
+        if is_disabled:
             return
         if self._vehicle.navigation.has_position:
             self._points.append(self._vehicle.motion.place)

@@ -220,8 +220,9 @@ def _vfr_hud(px4: Px4Vehicle) -> m.VfrHud:
 def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
     motion = px4.motion
     if px4.faults.gps_lost:
+        worst, unknown = 9999, 65535
         return m.GpsRawInt(
-            0, GpsFixType.NO_FIX, 0, 0, 0, eph=9999, epv=9999, vel=65535, cog=65535, satellites_visible=0
+            0, GpsFixType.NO_FIX, 0, 0, 0, eph=worst, epv=worst, vel=unknown, cog=unknown, satellites_visible=0
         )
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
     altitude = round(place.altitude_m * 1000)
@@ -232,15 +233,15 @@ def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
         place.latitude_e7,
         place.longitude_e7,
         altitude,
-        70,  # Horizontal and vertical dilution of precision, times 100.
-        110,
-        round(motion.ground_speed_m_s * 100),
-        course,
-        10,  # Number of satellites.
-        altitude,
-        900,  # Accuracy of the position and of the altitude in mm, and of the speed in mm/s.
-        1780,
-        400,
+        eph=70,
+        epv=110,
+        vel=round(motion.ground_speed_m_s * 100),
+        cog=course,
+        satellites_visible=10,
+        alt_ellipsoid=altitude,
+        h_acc=900,
+        v_acc=1780,
+        vel_acc=400,
     )
 
 
