@@ -263,7 +263,7 @@ class FaultyLink(Link):
         if self._incoming_path is not None:
             self._incoming_path.close()
         in_flight = self._in_flight
-        if in_flight is None or in_flight.loop.is_closed() or not in_flight:
+        if in_flight is None or in_flight.loop.is_closed() or not in_flight:  # Nothing is, or can be, in transit.
             self.link.close()
             return
         self._drained.clear()

@@ -241,6 +241,7 @@ class ArduPilotFence(Generic[HostT]):
         """Check the position and react to a new breach."""
         vehicle = self.vehicle
         self._follow_parameters()
+        # A configured lower limit is checked even while disabled, because it may be enabled automatically in flight.
         if not self.enabled and not self.configured & _MIN_ALT:
             return
         is_due = vehicle.now - self._checked_at > self.PERIOD_S - 1e-6  # tolerates rounding errors
@@ -257,7 +258,7 @@ class ArduPilotFence(Generic[HostT]):
     def _check(self) -> int:
         """Compare the position with all active limits, and return the kinds of fences with a new breach."""
         vehicle = self.vehicle
-        may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed
+        may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed  # near the ground on purpose
         if may_be_low and self._floor_enabled_by_command is not True and self.enabled & _MIN_ALT:
             self.report("auto-disabled", self.enable(False, _MIN_ALT, by_command=False))
         new_breaches = 0

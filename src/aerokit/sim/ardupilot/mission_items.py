@@ -85,7 +85,7 @@ def check_place(latitude_e7: float, longitude_e7: float) -> int:
 
     Like the firmware, the function compares in single precision.
     """
-    if not abs(float32(latitude_e7)) <= 900_000_000:
+    if not abs(float32(latitude_e7)) <= 900_000_000:  # `not <=` also refuses NaN.
         return MavMissionResult.INVALID_PARAM5_X
     in_range = abs(float32(longitude_e7)) <= 1_800_000_000
     return MavMissionResult.ACCEPTED if in_range else MavMissionResult.INVALID_PARAM6_Y

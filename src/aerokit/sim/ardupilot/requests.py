@@ -175,7 +175,7 @@ class ArduPilotMessageRequests:
         # The value to restore is that before the first change since boot.
         saved, _ = self._saved.get(name, (parameters[name], rate))
         parameters[name] = rate
-        if vehicle.KIND == "plane":
+        if vehicle.KIND == "plane":  # Only ArduPlane saves stream rates beyond a reboot (persist_streamrates).
             vehicle.announce_parameter(name)
         else:
             self._saved[name] = (saved, rate)
@@ -186,7 +186,7 @@ class ArduPilotMessageRequests:
             interval = group_interval
             if message_id == m.TerrainRequest.ID and rate > 0:
                 interval = max(interval, _MIN_TERRAIN_REQUEST_INTERVAL_S)
-            elif message_id == m.NamedValueFloat.ID:  # Each message has one of the values in turn.
+            elif message_id == m.NamedValueFloat.ID:  # Each message has one value, and each value has the group's rate.
                 interval /= len(DISPLAY_VALUES)
             self._stream(message_id, interval, channel, first)
 

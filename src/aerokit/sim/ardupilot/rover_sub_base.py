@@ -149,7 +149,7 @@ class RoverSubVehicle(ArduPilotVehicle):
     def tick(self, dt: float) -> None:
         if self.motors.is_armed:
             self.mode.update(dt)
-        self.motors.update(self.now, dt, self.motion, landed=False)
+        self.motors.update(self.now, dt, self.motion, landed=False)  # Rovers and submarines do not land.
         self.move(dt)
         self.battery.drain(self.motors.current_a, dt)
         if not self.motors.is_armed and self.is_at_rest:

@@ -330,16 +330,16 @@ class Px4CameraTrigger:
         place = pose.place
         px4.send(
             m.CameraImageCaptured(
-                px4.time_boot_ms,
-                round(px4.unix_time * 1e6),
-                _DEFAULT_CAMERA_ID,
-                place.latitude_e7,
-                place.longitude_e7,
-                round(place.altitude_m * 1000),
-                round(pose.height_m * 1000),
-                quaternion_from_euler(pose.roll, pose.pitch, pose.yaw),
-                number,
-                1,  # The capture was successful.
-                "",
+                time_boot_ms=px4.time_boot_ms,
+                time_utc=round(px4.unix_time * 1e6),
+                camera_id=_DEFAULT_CAMERA_ID,
+                lat=place.latitude_e7,
+                lon=place.longitude_e7,
+                alt=round(place.altitude_m * 1000),
+                relative_alt=round(pose.height_m * 1000),
+                q=quaternion_from_euler(pose.roll, pose.pitch, pose.yaw),
+                image_index=number,
+                capture_result=1,  # successful
+                file_url="",
             )
         )
