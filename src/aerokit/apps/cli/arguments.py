@@ -101,9 +101,7 @@ FAULTS: tuple[str, ...] = (
 
 
 TRANSMITTER_ON_S = 1.0
-"""The fault ``rc_lost`` begins after this time at the earliest, because ArduPilot ignores a transmitter that it has never
-received.
-"""
+"""Earliest time of the fault ``rc_lost``, because ArduPilot ignores a transmitter that it has never received."""
 
 
 def fault(text: str) -> tuple[str, bool | float | list[str], float]:
@@ -232,7 +230,7 @@ def add_vehicle_kind(command: argparse.ArgumentParser, kinds: str) -> None:
 
 
 def add_baud(command: argparse._ActionsContainer) -> None:
-    help_text = "baud rate of serial ports whose address has none (57600)"
+    help_text = "baud rate of serial ports whose address has none (default: 57600)"
     command.add_argument("--baud", type=int, default=57600, help=help_text)
 
 
