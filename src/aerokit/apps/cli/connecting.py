@@ -114,7 +114,8 @@ def add_address(
         type=address,
         default=default_address() if default is None else None,
         metavar="ADDRESS",
-        help=f"{what}udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … (default: {default or usual_default})",
+        help=f"{what}udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 …"
+        f" (default: {default or usual_default})",
         **keywords,
     )
     offer(argument, addresses)
