@@ -10,6 +10,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionType
 from aerokit.missions.item import (
     DEFAULT_XY,
+    DEGREE_SCALE,
     DESTINATIONS,
     FENCE_COMMANDS,
     GLOBAL_FRAMES,
@@ -152,7 +153,7 @@ def _check_place(where: str, item: MissionItem) -> None:
         value = getattr(item, field)
         if not isinstance(value, int) or isinstance(value, bool):
             raise _wrong(where, field, value, "an integer, because MISSION_ITEM_INT has no fraction there")
-        if scale == 10_000_000 and abs(value) > limit * scale and value != DEFAULT_XY:
+        if scale == DEGREE_SCALE and abs(value) > limit * scale and value != DEFAULT_XY:
             allowed = f"a {name} of -{limit} to {limit} degrees in 1e-7 degrees; this is {value / 1e7:g} degrees"
             raise _wrong(where, field, value, allowed)
         if not -0x80000000 <= value <= 0x7FFFFFFF:

@@ -140,6 +140,7 @@ _INTEGERS = {"b": (0, 0xFF), "u": (0, 0xFFFF), "i": (-0x80, 0x7F), "s": (-0x8000
 def _stored_values(item: MissionItem, field: str, storage: ItemStorage) -> Iterator[float]:
     """Yield the values that a field may have when the item is read back."""
     number, value = FIELDS.index(field), getattr(item, field)
+    # The slice of one letter is empty for a field that has none, and `_convert` takes the empty text for "not stored".
     if storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
         for letters in _ARDUPILOT.get(item.command, ("",)):
             yield from _convert(letters[number : number + 1], value)

@@ -15,7 +15,7 @@ from aerokit._internal.files import read_text, write_atomically
 from aerokit._internal.formatting import short_repr
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
-from aerokit.missions.item import MissionItem, canonical_frame, xy_scale
+from aerokit.missions.item import DEGREE_SCALE, MissionItem, canonical_frame, xy_scale
 from aerokit.missions.mission import Mission
 from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps
 from aerokit.position import Position
@@ -125,7 +125,7 @@ class _Row:
         return Position(latitude, longitude, self._number("altitude")) if latitude or longitude else None
 
     def item(self) -> MissionItem:
-        has_degrees = xy_scale(self.command, self.frame) == 10_000_000
+        has_degrees = xy_scale(self.command, self.frame) == DEGREE_SCALE
         latitude = self._number("latitude", 90.0 if has_degrees else math.inf, may_be_nan=True)
         longitude = self._number("longitude", 180.0 if has_degrees else math.inf, may_be_nan=True)
         return MissionItem(
@@ -174,6 +174,7 @@ def _item_row(item: MissionItem, index: int) -> str:
         raise InvalidArgument(f"{item!r} has an infinite number, which a file cannot store")
     if math.isnan(item.z) and item.position is not None:
         raise InvalidArgument(f"{item!r} has a place without an altitude, which a file cannot store")
+    # Mission Planner writes 8 decimal places of each number, but 6 of the altitude.
     columns = [(number, 8) for number in numbers] + [(item.z, 6)]
     texts = (
         *map(str, integers),

@@ -271,6 +271,7 @@ class CameraAdapter(CameraDevice):
                 time_boot_ms=self._host.time_boot_ms,
                 storage_id=1,
                 storage_count=1,
+                # With NOT_SUPPORTED, clients ignore the sizes.
                 status=StorageStatus.READY if storage.is_ready else StorageStatus.NOT_SUPPORTED,
                 total_capacity=storage.total_mib,
                 used_capacity=storage.used_mib,
@@ -366,4 +367,5 @@ def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
         else round(place.altitude_relative_m * 1000),
         q=UNKNOWN_ATTITUDE if len(known_angles) < 3 else quaternion_from_euler(*known_angles),
     )
+    # The caller may replace the URL.
     return lambda **fields: message(**{"file_url": photo.url, **fields})

@@ -102,6 +102,7 @@ STATUS_HZ = 5.0
 def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
     """Execute DO_WINCH by the driver, and send WINCH_STATUS."""
 
+    # The arguments are the parameters of the command, in order. A component has one winch, so `instance` is ignored.
     async def do_winch(
         _: CommandRequest, instance: float | None, action: int, length: float | None, rate: float | None
     ) -> None:
@@ -136,6 +137,7 @@ def add_gripper(
 ) -> None:
     """Execute DO_GRIPPER by the two functions."""
 
+    # The arguments are the parameters of the command. A component has one gripper, so `instance` is ignored.
     async def do_gripper(_: CommandRequest, instance: float | None, action: GripperActions) -> None:
         if action == GripperActions.RELEASE:
             await services.commands.call(release)

@@ -49,7 +49,7 @@ def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapt
         raise InvalidArgument("this component already has a camera: open another component for the second one")
     if camera.definition is not None:
         definition = parse_definition(camera.definition)
-        services.parameters._forbid_parameters()
+        services.parameters._forbid_parameters()  # The camera's settings use the same messages.
         DefinedSettings(host, definition, camera.on_setting)
         services.memory.put(DEFINITION_PATH, camera.definition)
         adapter.definition_version, adapter.definition_uri = definition.version, f"mftp://{DEFINITION_PATH}"

@@ -87,7 +87,7 @@ def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
         RemoteProtocolError: the file is damaged, or its number of parameters differs from that in its header. ArduPilot
             sends such a file once after its list has changed; download the file again.
     """
-    magic, count, total = read_header(data)
+    magic, count, total = read_header(data)  # `total` also counts the parameters before `start`.
     if magic not in (MAGIC, _MAGIC_WITH_DEFAULTS) or count > total:
         raise RemoteProtocolError(f"the file is not a param.pck: its header is {magic:#06x}, {count} of {total}")
     parameters = list(_parameters(data, magic == _MAGIC_WITH_DEFAULTS, start))
@@ -235,15 +235,18 @@ def _code_of(parameter: Parameter) -> int:
 def _entry(name: bytes, previous_name: bytes, code: int, *values: float) -> bytes:
     common, pack = _common_length(name, previous_name), _CODES[code][1].pack
     type_and_flags = code | (_HAS_DEFAULT if len(values) > 1 else 0)
+    # Four bits for the shared characters, and four for the number of own characters minus 1.
     lengths = common | (len(name) - common - 1) << 4
     return bytes((type_and_flags, lengths)) + name[common:] + b"".join(map(pack, values))
 
 
 def _common_length(name: bytes, previous_name: bytes) -> int:
-    """Return how many characters at the beginning of the two names are equal."""
-    # The last character is not compared, because an entry must contain at least one character of its name.
+    """Return the length of the prefix that a name shares with the previous name, without the name's last character.
+
+    The last character is left out, because the format requires at least one character after the prefix.
+    """
     common = 0
-    for char, previous_char in zip(name[:-1], previous_name):  # noqa: B905 - the shorter one ends it
+    for char, previous_char in zip(name[:-1], previous_name):  # noqa: B905 - the lengths may differ
         if char != previous_char:
             break
         common += 1
@@ -268,4 +271,5 @@ def px4_hash(table: ParameterTable, volatile: Container[str] = ()) -> int:
     for name in sorted(table):
         if name not in volatile:
             data += name.encode() + to_bits(table[name].value, table[name].type, bytewise=True)
+    # zlib inverts the CRC before and after the computation; both inversions are undone here.
     return zlib.crc32(data, _ALL_ONES) ^ _ALL_ONES

@@ -103,6 +103,7 @@ class CalibrationRun:
 
     async def command(self, command: int, *params: float, accepts: Collection[int] = ()) -> None:
         """Send a command of the calibration and wait for its answer. The results in ``accepts`` raise no error."""
+        # The start may take longer than the default time-out, which None selects.
         attempt_timeout = START_TIMEOUT_S if command == MavCmd.PREFLIGHT_CALIBRATION else None
         try:
             await self.context.sender.auxiliary_command(command, *params, attempt_timeout=attempt_timeout)
@@ -190,6 +191,7 @@ class CalibrationRun:
                         while not self._is_cancelled(self._cancel_command[0]):  # noqa: ASYNC110
                             await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
                         return
+                # Nothing is sent to a silent vehicle, so wait for a HEARTBEAT since the last attempt.
                 await self.session.wait_for_heartbeat(self._cancel_sent_at)
                 is_taken_over = self._sent_cancel is not None and bool(self._sent_cancel.end)
                 if self._has_rebooted or is_taken_over:

@@ -53,7 +53,7 @@ class _Entry:
         if isinstance(message, m.CameraImageCaptured):
             self.utc_us, self.boot_us = message.time_utc, message.time_boot_ms * 1000
         else:
-            stamp: int = getattr(message, "time_usec", 0)
+            stamp: int = getattr(message, "time_usec", 0)  # UTC, or the time since boot if the sender has no UTC
             is_utc = stamp >= SECONDS_IN_1990 * 1_000_000
             self.utc_us, self.boot_us = (stamp, 0) if is_utc else (0, stamp)
 
@@ -113,8 +113,8 @@ class CaptureLog:
     async def fetch(self, index: int) -> Capture | None:
         """Request a missed capture. Returns None if the camera has deleted it or does not answer."""
         if not self.has(index) and self._link.is_trigger:
-            return None
-        self._requested.add(index)
+            return None  # PX4's trigger cannot send a capture again.
+        self._requested.add(index)  # The answer, an old index, must not count as a reset of the camera.
         try:
             for _ in range(FETCH_ATTEMPTS):
                 if self.has(index) or await self._request(index):
@@ -137,7 +137,7 @@ class CaptureLog:
                     where=lambda message: message.image_index == index,
                     timeout=REQUEST_TIMEOUT_S,
                 )
-                return False
+                return False  # If the answer was lost, another request may succeed.
             newest = await request(  # The autopilot stores only its newest capture.
                 m.CameraFeedback,
                 where=lambda message: message.cam_idx + 1 == self._link.number,
@@ -215,10 +215,13 @@ class CaptureLog:
         if self._shows_reset(entry, previous):
             self._reset()
             previous = None
-        is_new = previous is None or previous.capture.success is False
-        # Repeated messages add nothing, and CAMERA_TRIGGER adds nothing to CAMERA_IMAGE_CAPTURED.
-        if previous is not None and not is_new and previous.kind in (entry.kind, m.CameraImageCaptured):
-            return
+        is_new = previous is None or previous.capture.success is False  # A failed picture's index may be used again.
+        if previous is not None and not is_new:
+            is_repeated = previous.kind is entry.kind
+            # CAMERA_TRIGGER contains nothing that CAMERA_IMAGE_CAPTURED of the same picture does not contain.
+            has_better_message = previous.kind is m.CameraImageCaptured
+            if is_repeated or has_better_message:
+                return
         self._store(entry)
         self._update_highest(entry)
         if isinstance(message, m.CameraImageCaptured):
@@ -242,9 +245,9 @@ class CaptureLog:
 
     def _add_failed(self, message: Message, entry: _Entry) -> None:
         # The index of a failed picture may be used again, so such an entry never replaces a successful one.
-        index, failed = entry.capture.index, self._failed
-        if failed is not None and failed.capture.index == index and failed.reports_same_picture(entry):
-            return
+        index, last_failed = entry.capture.index, self._failed
+        if last_failed is not None and last_failed.capture.index == index and last_failed.reports_same_picture(entry):
+            return  # The message is repeated.
         self._failed = entry
         previous = self._by_index.get(index)
         if previous is None or previous.capture.success is False:

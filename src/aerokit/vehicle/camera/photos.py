@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 START, STOP = MavCmd.IMAGE_START_CAPTURE, MavCmd.IMAGE_STOP_CAPTURE
 TRIGGER, TRIGGER_INTERVAL = MavCmd.DO_TRIGGER_CONTROL, MavCmd.DO_SET_CAM_TRIGG_INTERVAL
+UNCHANGED = -1  # leaves the shutter time, or the sequence number of the trigger, as it is
 # Seconds without a capture after which the status of a series is requested, and seconds to wait for the status.
 CHECK_INTERVAL_S, STATUS_TIMEOUT_S = 1.0, 2.0
 # Number of status requests before an order, for a camera that has answered such a request before, and for all others.
@@ -57,8 +58,9 @@ class Shutter:
 
     async def reliable_status(self) -> CameraStatus | None:
         """Request the status repeatedly, because it decides whether an order was executed and may be sent again."""
-        first_attempts = 1 if self._never_answered else FIRST_STATUS_ATTEMPTS
-        for _ in range(STATUS_ATTEMPTS if self._reports_status else first_attempts):
+        # A camera that has never sent the message may not support it, so do not wait long, and even less the next time.
+        attempts_before_first = 1 if self._never_answered else FIRST_STATUS_ATTEMPTS
+        for _ in range(STATUS_ATTEMPTS if self._reports_status else attempts_before_first):
             status = await self.status(STATUS_TIMEOUT_S)
             if status is not None or self.link.is_trigger or m.CameraCaptureStatus in self.link.unavailable:
                 return status
@@ -94,6 +96,7 @@ class Shutter:
                     was_lost = error is not None and is_series_unchanged and _has_taken_none(before, status)
                     if was_lost and attempts < MAX_ORDER_ATTEMPTS:
                         attempts, error = attempts + 1, await self.order_photo(before, is_repeated=True)
+            # `error` is set if the last order was not acknowledged.
             raise error or self.link.timeout_error(
                 f"accepted the order, but reported no picture within {timeout:g} s; it may have taken one"
             )
@@ -122,13 +125,16 @@ class Shutter:
         A repeated order has the same sequence number as before, so that a camera does not execute it twice.
         """
         if not is_repeated:
-            count = 0 if before is None else before.image_count
-            self._sequence_number = max(count + 1, self._sequence_number + 1)
+            pictures = 0 if before is None else before.image_count
+            # Also above the number of pictures, because an earlier program may have used the numbers up to there.
+            self._sequence_number = max(pictures + 1, self._sequence_number + 1)
         try:
             if self.link.is_trigger:
                 await self._send_digicam_control()
             else:
-                await self.link.command(START, self.link.device, 0, 1, self._sequence_number, attempts=1)
+                interval_s, count = 0, 1  # a single picture
+                params = (self.link.device, interval_s, count, self._sequence_number)
+                await self.link.command(START, *params, attempts=1)
         except CommandTimeout as error:
             return error
         except CommandRejected as error:
@@ -147,8 +153,8 @@ class Shutter:
     async def start_series(self, order: Order, seconds: float, count: int, before: CameraStatus | None) -> None:
         """Start a series; repeat the order only if the camera reports that it has not started."""
         if self.link.is_trigger:
-            await self.link.command(TRIGGER_INTERVAL, seconds * 1000.0, -1)
-            await self.link.command(TRIGGER, 1, -1, 0, 0, order=order)
+            await self.link.command(TRIGGER_INTERVAL, seconds * 1000.0, UNCHANGED)  # milliseconds, shutter time
+            await self.link.command(TRIGGER, 1, UNCHANGED, 0, 0, order=order)  # 1 enables the trigger.
             return
 
         async def has_started() -> bool | None:
@@ -162,7 +168,7 @@ class Shutter:
 
     @property
     def stop_command(self) -> tuple[float, ...]:
-        return (TRIGGER, 0, -1, 0, 0) if self.link.is_trigger else (STOP, self.link.device)
+        return (TRIGGER, 0, UNCHANGED, 0, 0) if self.link.is_trigger else (STOP, self.link.device)
 
 
 def _has_taken_none(before: CameraStatus | None, status: CameraStatus) -> bool:
@@ -212,10 +218,11 @@ class PhotoInterval:
             await self._begin(operation)
         except BaseException as error:
             self._new_captures.__exit__()
-            if operation.commit(error):
+            if operation.may_run_despite(error):
+                # Raise the error without delay: the stop command is sent at once, and retried in the background.
                 await operation.stop(is_awaited=False)
             raise
-        operation.commit()
+        operation.record_start()
         return self
 
     async def _begin(self, operation: ActiveOperation) -> None:
@@ -262,7 +269,8 @@ class PhotoInterval:
             if self._waiting and self._next_index is not None:
                 await self._fetch_missing()
                 continue
-            if await self._new_captures.wait(max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S):
+            patience_s = max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S  # longer than the interval
+            if await self._new_captures.wait(patience_s):
                 silent_checks = 0
                 continue
             silent_checks += 1

@@ -46,7 +46,7 @@ class ComponentSession:
         self.commands: CommandSender = session.commands
         self.on_reboot: list[Callable[[], None]] = session.on_reboot
         self.rates: MessageRates = MessageRates(
-            session.connection, session.commands, session.system_id, component_id, {}
+            session.connection, session.commands, session.system_id, component_id, stream_groups={}
         )
         self.subscriber: ComponentSubscriber = ComponentSubscriber(
             session.connection,

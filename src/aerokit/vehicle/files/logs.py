@@ -401,8 +401,10 @@ async def _list_in(files: Files, directory: str, idle_timeout_s: float) -> tuple
     logs = []
     for number, match in enumerate(matches):
         if match is not None:
-            path_below_directory = match[3].partition("/log/")[2]
-            logs.append(ListedLog(number, int(match[1]), int(match[2]), f"{directory}/{path_below_directory}"))
+            time_utc, size, path = match.groups()
+            # `directory` is PX4's directory "log", seen from the root of MAVFTP.
+            path_below_directory = path.partition("/log/")[2]
+            logs.append(ListedLog(number, int(time_utc), int(size), f"{directory}/{path_below_directory}"))
     if len(logs) < len(matches):  # A file with other lines is not PX4's list.
         return ()
     return tuple(logs)

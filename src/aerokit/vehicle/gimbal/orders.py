@@ -129,7 +129,8 @@ class GimbalOrders:
         if self.session.commands.is_unsupported(PITCHYAW, self.manager_id):
             return False
         pitch_rate, yaw_rate = rates or (NAN, NAN)
-        params = (pitch, yaw, pitch_rate, yaw_rate, flags, 0, self.gimbal_id_param)
+        reserved = 0
+        params = (pitch, yaw, pitch_rate, yaw_rate, flags, reserved, self.gimbal_id_param)
         try:
             await self.send_claiming_control(PITCHYAW, lambda: self.send(order, PITCHYAW, *params))
         except CommandRejected as error:
@@ -171,7 +172,7 @@ class GimbalOrders:
                     raise
             else:
                 return True
-        if not order.is_newest:  # A newer order was given during the wait for the answer.
+        if not order.is_newest:  # A newer order was given during the wait for the answer, so nothing more is sent.
             return True
         stabilized = {"stab_roll": 1, "stab_pitch": 1, "stab_yaw": 1}
         self.session.send(MountConfigure(self.session.system_id, self.manager_id, mode, **stabilized))
@@ -183,7 +184,7 @@ class GimbalOrders:
         heading = 0.0 if attitude is None else attitude.yaw_deg
         yaw_from_nose = yaw if from_nose else math.remainder(yaw - heading, 360.0)
         if not await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, yaw_from_nose):
-            # MOUNT_CONTROL, for older firmware, has a yaw from north.
+            # MOUNT_CONTROL, for older firmware, has a yaw from north, and all angles in centidegrees.
             yaw_from_north = yaw + heading if from_nose else yaw
             message = MountControl(
                 self.session.system_id,
@@ -255,7 +256,7 @@ class GimbalOrders:
         commands, manager_id = self.session.commands, self.manager_id
         if self.device.control_blocks or commands.last_result(command, manager_id) != MavResult.DENIED:
             return False
-        commands.forget_result(command, manager_id)
+        commands.forget_result(command, manager_id)  # One denial must not lead to a second claim.
         params = self._primary_params(self.own_ids)
         commands.send_unconfirmed(CONFIGURE, *params, component_id=manager_id)
         self._claimed = manager_id

@@ -159,7 +159,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
 
     def _zero_rates_command(self) -> ReleaseCommand:
         orders, order = self._orders, self._order
-        params = (NAN, NAN, 0.0, 0.0, self._flags, 0, orders.gimbal_id_param)
+        no_angles, zero_rates, reserved = (NAN, NAN), (0.0, 0.0), 0
+        params = (*no_angles, *zero_rates, self._flags, reserved, orders.gimbal_id_param)
 
         def is_still_due() -> bool:
             return order is not None and order.is_newest and not orders.is_taken

@@ -162,6 +162,7 @@ class PlanChannel:
             message = f"{error}{self._describe_items_on_vehicle(exchange, refused_item=error.item)}"
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:
+            # Only the text changes, so that the error keeps `missing` and its traceback.
             error.args = (f"{error}{self._describe_items_on_vehicle(exchange, is_silent=True)}",)
             raise
         finally:
@@ -280,7 +281,7 @@ class PlanTransfer(Generic[PlanT]):
                 raise NotSupported(f"{self._name}: the vehicle has no file transfer; nothing was sent")
             return True
         # ArduPilot clears the old mission before it reads the file, and refuses to do so while it flies the mission.
-        is_flying = is_upload and self._type == 0 and self._context.is_flying_mission
+        is_flying = is_upload and self._type == MavMissionType.MISSION and self._context.is_flying_mission
         return has_ftp and self._cache.has_file is not False and not is_flying  # `has_file` is None until tried.
 
     def _on_file_error(self, error: Exception, method: str) -> None:

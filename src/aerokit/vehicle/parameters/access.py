@@ -258,7 +258,7 @@ class ParameterAccess:
             is_boosted = True
             self._boosts += 1
             if self._boosts == 1:
-                self._set_interval(interval_s * 1e6)
+                self._set_interval(interval_s * 1e6)  # microseconds
 
         timer = asyncio.get_running_loop().call_later(after_s, boost)
         try:
@@ -290,6 +290,7 @@ class ParameterAccess:
             for name in names:
                 self.written.pop(name, None)
                 self.store.clear_replaced(name)
+            # Recently written parameters are read back, so their answers take as long as those of reads.
             recent = self._recently_written() & set(names)
             exchange = ParameterWrites(
                 transfers.system_id,
@@ -303,7 +304,7 @@ class ParameterAccess:
                 idle_timeout_s=idle_timeout_s,
                 on_progress=on_progress,
             )
-            # Recently written parameters are read back, and many reads need the raised rate.
+            # Many reads need the raised rate.
             boost_after_s = 0.0 if len(recent) > MAX_READS_UNBOOSTED else math.inf
             with self._boosted(after_s=boost_after_s):
                 answers = await transfers.run(exchange)
