@@ -177,13 +177,13 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
     """
     code, flags = data[position] & 0x0F, data[position] & 0xF0
     if code not in _CODES or flags & ~_HAS_DEFAULT:
-        _damaged(position, f"invalid type {code} or flags {flags >> 4}")
+        _raise_damaged(position, f"invalid type {code} or flags {flags >> 4}")
     if position + 1 == len(data):
         return None
     # The name begins with characters of the previous name, which the file does not repeat.
     common, own_length = data[position + 1] & 0x0F, (data[position + 1] >> 4) + 1
     if common > len(previous_name) or common + own_length > NAME_LENGTH:
-        _damaged(position, f"invalid name length {common} + {own_length} after {previous_name!r}")
+        _raise_damaged(position, f"invalid name length {common} + {own_length} after {previous_name!r}")
     kind, format_ = _CODES[code]
     start = position + 2 + own_length
     end = start + format_.size * (2 if flags else 1)
@@ -199,7 +199,7 @@ def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parame
     while position < len(data):
         entry = read_entry(data, position, previous_name)
         if entry is None:
-            _damaged(position, "it ends inside an entry")
+            _raise_damaged(position, "it ends inside an entry")
         default = entry.value if entry.default is None and with_defaults else entry.default
         yield Parameter(_text(entry.name, position), entry.value, entry.type, default, index)
         position, previous_name, index = _skip_padding(data, entry.end), entry.name, index + 1
@@ -213,11 +213,11 @@ def _skip_padding(data: bytes, position: int) -> int:
 
 def _text(name: bytes, position: int) -> str:
     if not all(0x20 < byte < 0x7F for byte in name):
-        _damaged(position, f"invalid name {name!r}")
+        _raise_damaged(position, f"invalid name {name!r}")
     return name.decode("ascii")
 
 
-def _damaged(position: int, problem: str) -> NoReturn:
+def _raise_damaged(position: int, problem: str) -> NoReturn:
     raise RemoteProtocolError(f"param.pck is damaged at byte {position}: {problem}")
 
 

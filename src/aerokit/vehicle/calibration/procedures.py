@@ -57,6 +57,7 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
             if report := parse_report(text):  # None for a text that is not about a calibration
                 reports.append(report)
 
+        # `every_arrival`: a repeated text is a new report.
         cleanup.callback(telemetry.status_text.observe(lambda _, text: on_text(text.text), every_arrival=True))
 
         def has_ended_silently() -> bool:

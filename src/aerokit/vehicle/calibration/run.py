@@ -103,7 +103,7 @@ class CalibrationRun:
 
     async def command(self, command: int, *params: float, accepts: Collection[int] = ()) -> None:
         """Send a command of the calibration and wait for its answer. The results in ``accepts`` raise no error."""
-        # The start may take longer than the default time-out, which None selects.
+        # ArduPilot calibrates its gyroscopes before it acknowledges the start. None selects the usual time-out.
         attempt_timeout = START_TIMEOUT_S if command == MavCmd.PREFLIGHT_CALIBRATION else None
         try:
             await self.context.sender.auxiliary_command(command, *params, attempt_timeout=attempt_timeout)
@@ -123,7 +123,7 @@ class CalibrationRun:
         """Register that the calibration has ended on the vehicle."""
         if not self._ended.is_set():
             self._ended.set()
-            self._cancel_order_stack.close()
+            self._cancel_order_stack.close()  # The cancel command, if one was sent, need not be repeated.
             if self.is_running:
                 self._runs.remove(self)
                 self.context.on_finish.remove(self.abandon)

@@ -83,7 +83,7 @@ def from_image(message: CameraImageCaptured, camera: int, received_at: float) ->
         success=message.capture_result == 1,
         received_at=received_at,
         taken_at=_utc(message.time_utc),
-        place=place_of(message.lat, message.lon, message.alt / 1000, message.relative_alt / 1000),
+        place=place_of(message.lat, message.lon, message.alt / 1000, message.relative_alt / 1000),  # altitudes in mm
         quaternion=quaternion,
         roll_deg=roll,
         pitch_deg=pitch,

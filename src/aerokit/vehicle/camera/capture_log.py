@@ -64,7 +64,7 @@ class _Entry:
             return self.utc_us == other.utc_us
         if self.boot_us and other.boot_us:
             return self.boot_us == other.boot_us
-        return self.capture.place == other.capture.place
+        return self.capture.place == other.capture.place  # Only the place is left to compare.
 
     def was_taken_later(self, other: _Entry) -> bool:
         """Return True if the time stamps show that this picture is later. Returns False if they cannot be compared."""
@@ -225,7 +225,7 @@ class CaptureLog:
         self._store(entry)
         self._update_highest(entry)
         if isinstance(message, m.CameraImageCaptured):
-            self._count_boot_ms = message.time_boot_ms
+            self._count_boot_ms = message.time_boot_ms  # An older CAMERA_CAPTURE_STATUS does not count this picture.
         # If the index is far above the count, the camera does not count as the standard says: leave the count as it is.
         if self._is_count_used and capture.index <= self._count + MAX_COUNT_LEAD:
             self._count = max(self._count, capture.index)

@@ -125,6 +125,7 @@ class CameraOrders:
             order.may_move = True  # From here on, the camera may execute the order.
         session, started_at = self._session, self._session.connection.now()
         arbiter = self._context.arbiter
+        # The arbiter sets `sent.end` when the command must no longer be repeated.
         with arbiter.auxiliary_order(order) as sent_order, arbiter.sending(sent_order) as sent:
             try:
                 await session.commands.send_long(
@@ -155,12 +156,12 @@ class CameraOrders:
                 await send()
                 return
             except CommandTimeout as error:
-                worked = await had_effect() if order.is_newest else None
+                is_executed = await had_effect() if order.is_newest else None
                 if not order.is_newest:  # A newer order may have been given while the camera was asked.
                     raise CommandTimeout(f"{error}; not sent again: {SUPERSEDED}") from None
-                if worked:
+                if is_executed:
                     return
-                if worked is None or attempt == MAX_ORDER_ATTEMPTS:
+                if is_executed is None or attempt == MAX_ORDER_ATTEMPTS:
                     raise
 
     def send_now(self, command: int, *params: float) -> None:

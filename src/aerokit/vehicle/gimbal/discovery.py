@@ -177,6 +177,7 @@ class GimbalRegistry:
         if frame is None:
             return None
         sender = frame.component_id
+        # If several components send messages as the manager of a gimbal, orders go to the one of the highest rank.
         rank = RANK_INFORMATION if isinstance(message, GimbalManagerInformation) else RANK_STATUS
         if sender == self._session.component_id:
             rank = RANK_AUTOPILOT

@@ -117,6 +117,7 @@ async def wait_until_there(
 ) -> None:
     """Wait until an attitude newer than ``since`` shows that the target is reached; errors as for `Gimbal.point`."""
     session, checked_at = orders.session, since
+    # `vehicle.gimbal` has one `public_device` for its state values, even while `attitude_source` and `device` change.
     deadline, reboots = session.connection.now() + timeout, orders.public_device.reboots
     watched = (orders.public_device.attitude, orders.attitude_source.attitude, orders.device.controllers)
     with orders.device.in_use(), ChangeSignal(session, *watched, every_arrival=True) as changes:

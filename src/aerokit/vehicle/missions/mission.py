@@ -8,7 +8,7 @@ import anyio
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavCmd, MavLandedState, MavResult, MissionState
+from aerokit.mavlink.enums import MavCmd, MavLandedState, MavMissionType, MavResult, MissionState
 from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.ground import GroundCheck
@@ -293,7 +293,8 @@ class MissionControl(VehiclePlan["Mission"]):
         """
         vehicle_context, session = self._vehicle_context, self._session
         mode = vehicle_context.sender.mode_for("mission.wait_finished", "mission")
-        items = (self._context.caches[0].items or ())[self._context.offset_of(0) :]
+        items_with_home = self._context.caches[MavMissionType.MISSION].items or ()
+        items = items_with_home[self._context.offset_of(MavMissionType.MISSION) :]
         end = MissionEndDetector(vehicle_context, self._tracker, mode, items)
         with session.streaming("mission_current", "landed_state", "position"), end.ground.watching():
             await await_progress(
@@ -343,7 +344,7 @@ class MissionControl(VehiclePlan["Mission"]):
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
         """Set the current item. Item 0 also resets ArduPilot's jump counts, unless ``keeps_jump_counts``."""
         vehicle_context, session = self._vehicle_context, self._session
-        seq = item + self._context.offset_of(0)
+        seq = item + self._context.offset_of(MavMissionType.MISSION)
         if session.autopilot.sets_current_by_command:
             # ArduPilot also resets the jump counts if it gets the number 0, which is the number of home.
             number = 0 if item == 0 and not keeps_jump_counts else seq
