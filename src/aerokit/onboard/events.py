@@ -44,7 +44,7 @@ class EventSender:
         check_severity(severity)
         is_first = self._sequence < 0
         self._sequence = (self._sequence + 1) & 0xFFFF
-        levels = severity << 4 | severity  # one half byte for logs, the other for other programs
+        levels = severity << 4 | severity  # four bits for logs and four bits for other programs
         time_ms, data = self._host.time_boot_ms, bytes(arguments).ljust(MAX_ARGUMENT_BYTES, b"\0")
         destination = (0, 0)  # the message is for all components
         event = m.Event(*destination, event_id, time_ms, self._sequence, levels, data)

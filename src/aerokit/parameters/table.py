@@ -111,7 +111,9 @@ class ParameterTable(Mapping[str, Parameter]):
         """Return a copy sorted by index. Parameters without an index come last."""
 
         def sort_key(parameter: Parameter) -> int:
-            return 1 << 16 if parameter.index is None else parameter.index  # Indices have 16 bits.
+            return (
+                1 << 16 if parameter.index is None else parameter.index
+            )  # Parameters without an index come last, because indices have 16 bits.
 
         return ParameterTable(sorted(self._by_name.values(), key=sort_key))
 

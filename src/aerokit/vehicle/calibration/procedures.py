@@ -25,9 +25,9 @@ CANCEL_ALL = (MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 0, 0, 0)
 REPORT_HZ = 4.0
 # Value of ESC_CALIBRATION with which ArduCopter calibrates the ESCs at its next boot.
 CALIBRATE_AT_BOOT = 3
-# Seconds to wait for the last text: PX4's HEARTBEAT leaves CALIBRATING before the text arrives.
+# Seconds to wait for the text with the result after HEARTBEAT no longer reports CALIBRATING. PX4 sends the text later.
 END_GRACE_S = 3.0
-# Below two seconds, because a cancelled call must end within that time.
+# Maximum seconds for restoring a parameter. A cancelled call restores it, and must end within two seconds.
 RESTORE_TIMEOUT_S = 1.5
 # ArduPilot repeats its request every second. If a request arrives this soon after our confirmation, ArduPilot sent it
 # before the confirmation arrived.

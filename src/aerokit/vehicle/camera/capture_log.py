@@ -33,7 +33,8 @@ FETCH_ATTEMPTS, REQUEST_TIMEOUT_S = 12, 1.0
 TRIGGER_GRACE_S = 0.3
 # Two messages of different types with the same index report the same picture if they arrive within this time.
 DUPLICATE_WINDOW_S = 10.0
-# A status that is older than the newest one by less than this arrived late. If it is older, the camera has restarted.
+# A status whose time stamp is lower than that of the newest one by less than this arrived late. If the difference is
+# greater, the camera has restarted.
 REORDER_WINDOW_MS = 5000
 # If an index exceeds the reported count by more than this, the camera's count does not follow the standard.
 MAX_COUNT_LEAD = 100

@@ -82,7 +82,7 @@ class MissionEndDetector:
             # ArduPilot reports completion at home, PX4 already when it begins to return.
             at_home = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
             return not self._ends_by_landing or self._is_on_ground or at_home
-        # ArduPlane returns in another mode than its mission mode, which stops the mission.
+        # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.
         if self._ends_in_air and self._is_landing:
             return self._is_on_ground or self._is_home
         self._return_began_at = None  # The vehicle is not returning.
