@@ -405,7 +405,7 @@ def _crc32_in(path: str, reply: FtpMessage) -> int:
 
 
 def _crc32(data: bytes, previous_crc: int = 0) -> int:
-    """Return the CRC-32 of MAVFTP, which does not invert the start value and the result, as zlib does."""
+    """Return the CRC-32 as MAVFTP defines it. Unlike zlib, MAVFTP does not invert the start value and the result."""
     return zlib.crc32(data, previous_crc ^ CRC_INVERSION) ^ CRC_INVERSION
 
 

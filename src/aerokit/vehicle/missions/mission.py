@@ -77,7 +77,7 @@ class MissionEndDetector:
         return has_landed if is_on_ground else is_reported
 
     def _is_end_reported(self) -> bool:
-        """Return True if the vehicle reports the end of the mission, which may also be a fall."""
+        """Return True if the vehicle reports the end of the mission. A vehicle that has fallen may report it too."""
         if self._tracker.is_complete:
             # ArduPilot reports completion at home, PX4 already when it begins to return.
             at_home = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
