@@ -168,7 +168,7 @@ def vtol_transition(to: Literal["multicopter", "fixed_wing"]) -> MissionItem:
 
 
 def land_start() -> MissionItem:
-    """Mark the start of the landing sequence, which returns and failsafes use.
+    """Mark the start of the landing sequence. The vehicle may jump to this item for a return or in a failsafe.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_LAND_START
     """

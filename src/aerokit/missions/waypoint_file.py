@@ -78,8 +78,8 @@ def format_waypoints(mission: Mission, *, version: int = 110) -> str:
     """Format a mission as the text of a file, with Mission Planner's precision, or more where a number needs more.
 
     Values that are not given (NaN) become 0, because Mission Planner rejects a file that contains NaN
-    (https://github.com/ArduPilot/pymavlink/issues/1096). PX4 takes a heading of 0 for north; a .plan file keeps the
-    difference.
+    (https://github.com/ArduPilot/pymavlink/issues/1096). PX4 takes a heading of 0 for north. A .plan file
+    stores such values as null.
 
     Raises:
         InvalidArgument: ``mission`` is no mission, a number is infinite, the altitude of a place is NaN, or the version

@@ -140,7 +140,7 @@ class ComponentCommands:
         self.handlers[command] = partial(self._execute, function, arguments_of(function))
 
     def add_guarded(self, handlers: Mapping[int, CommandHandler]) -> None:
-        """Register handlers of a protocol server that call the program's code. Its exceptions become results."""
+        """Register handlers of a protocol server that call the program's code, whose exceptions become results."""
 
         def guard(handler: CommandHandler) -> CommandHandler:
             def guarded(command: ReceivedCommand) -> int | CommandProgress | None:

@@ -105,7 +105,10 @@ class CameraOrders:
 
     @contextmanager
     def new_order(self, subject: str) -> Iterator[Order]:
-        """Begin an order; withdraw it if the block raises, otherwise commit it."""
+        """Begin an order, which becomes final at the end of the block.
+
+        If the block raises, the order is withdrawn, and the previous order becomes valid again.
+        """
         order = self.begin_order(subject)
         try:
             yield order

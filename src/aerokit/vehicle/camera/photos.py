@@ -58,8 +58,8 @@ class Shutter:
 
     async def reliable_status(self) -> CameraStatus | None:
         """Request the status repeatedly, because it decides whether an order was executed and may be sent again."""
-        # A camera that has never sent its status may not support the message. It gets fewer requests, and only one if it
-        # has left all requests of an earlier order unanswered.
+        # A camera that has never sent its status may not support the message. It gets fewer requests, and only one if
+        # it has left all requests of an earlier order unanswered.
         attempts_before_first = 1 if self._never_answered else FIRST_STATUS_ATTEMPTS
         for _ in range(STATUS_ATTEMPTS if self._reports_status else attempts_before_first):
             status = await self.status(STATUS_TIMEOUT_S)

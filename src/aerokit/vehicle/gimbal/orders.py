@@ -42,7 +42,7 @@ STANDARD_RULES = GimbalRules()
 
 
 class GimbalOrders:
-    """Orders to one gimbal, or to the first one. A new order ends the wait for the previous one."""
+    """Orders to one gimbal, or to the first gimbal. A new order ends the wait for the previous one."""
 
     def __init__(self, context: VehicleContext, registry: GimbalRegistry, device: GimbalDevice | None) -> None:
         self.context: VehicleContext = context

@@ -223,7 +223,7 @@ RETRACT, NEUTRAL = GimbalDeviceFlags.RETRACT, GimbalDeviceFlags.NEUTRAL
 
 @checks_arguments
 class PointingMixin(GimbalMixin):
-    """Orders by angles. A newer order ends the previous one."""
+    """Orders that point the gimbal at angles. A newer order ends the previous one."""
 
     async def point(
         self,

@@ -95,7 +95,10 @@ class MissionEndDetector:
         return not reports_state and last is not None and self._tracker.reached == last
 
     def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
-        """Return the reason why the mission can no longer end. ``order`` is the last order for the mission."""
+        """Return the reason why the vehicle will not fly the mission to its end; None if it may still do so.
+
+        ``order`` is the last order for the mission.
+        """
         session, now = self._session, self._session.connection.now()
         if self._vehicle_context.arbiter.newest not in (self._order, order):
             return "another order was given"
