@@ -180,7 +180,7 @@ class MissionRejected(OperationRejected):
 
 
 class VerificationFailed(OperationRejected):
-    """The vehicle confirmed a change but reads back different values. ``differences`` describes each of them."""
+    """The vehicle confirmed a change, but then reported other values. ``differences`` describes each of them."""
 
     def __init__(self, message: str, *, differences: tuple[str, ...]) -> None:
         super().__init__(message, reasons=differences)
@@ -260,4 +260,4 @@ class SetpointStreamStopped(AerokitError):
 
 
 class BusyError(AerokitError):
-    """The operation is already running and can run only once at a time."""
+    """This operation is already in progress, and cannot run twice at the same time."""

@@ -71,7 +71,7 @@ class Event(Snapshot):
 
 
 class VehicleFound(Event):
-    """The first heartbeat of an autopilot arrived on the connection, even if no `Vehicle` is connected.
+    """The first heartbeat of an autopilot arrived on the connection, whether or not the program has a `Vehicle` for it.
 
     ``vehicle_type`` is the MAV_TYPE, ``autopilot`` the MAV_AUTOPILOT in the heartbeat.
     """
@@ -111,15 +111,15 @@ class VehicleRebooted(Event):
 class DuplicateSender(Event):
     """A second sender uses a system and component id that is already in use. Its messages are ignored.
 
-    The second sender is recognised by its address on the link, or by a second series of sequence numbers from the
-    same address. Published once for each address.
+    The second sender is recognised by its other address, or by a second series of sequence numbers from the same
+    address. Published once for each address.
     """
 
     component_id: int
 
 
 class RouteChanged(Event):
-    """A component moved to another peer of the link. ``before`` and ``after`` are the addresses."""
+    """A component is now received from another peer of the link. ``before`` and ``after`` are the peers' addresses."""
 
     component_id: int
     before: str
@@ -127,10 +127,12 @@ class RouteChanged(Event):
 
 
 class RouteChangeRefused(Event):
-    """Frames of a silent component arrive from ``peer``, but are ignored: their sequence numbers do not continue.
+    """Frames of a silent component arrive from the new address ``peer``, but aerokit ignores them.
 
-    The sender may be another vehicle, or the same vehicle with a new IP address after a reboot.
-    ``aerokit.connect(…, may_move=True)`` accepts frames from either.
+    Their sequence numbers do not continue those of the component.
+
+    The sender may therefore be another vehicle, or the same vehicle after a reboot.
+    ``aerokit.connect(…, may_move=True)`` accepts the frames in both cases.
     """
 
     component_id: int
@@ -151,8 +153,8 @@ class OrderRefused(Event):
     """The program that serves the vehicle on the network did not forward a message of this program (docs/network.md).
 
     ``message`` is the name of the MAVLink message, and ``reason`` a clause that explains the refusal. ``lease_holder``
-    is the client that controls the vehicle, if its control is the reason. Published at most twice a second for each
-    message name.
+    is the client that controls the vehicle if the message was refused for this reason, otherwise None. Published at
+    most twice a second for each message name.
     """
 
     message: str
@@ -190,7 +192,7 @@ class MissionItemReached(Event):
 
 
 class MissionCurrentChanged(Event):
-    """The current mission item changed. An item is None before the mission has started, or if there is no mission."""
+    """The current mission item changed from ``before`` to ``after``; None: no mission, or a mission not started yet."""
 
     before: int | None
     after: int | None
@@ -330,10 +332,11 @@ class LinkRestored(Event):
 
 
 class LinkStalled(Event):
-    """The link has not transmitted anything for a second. ``unsent_bytes`` are queued, so commands may arrive late.
+    """The link has not sent any of its queued data for a second, so commands may arrive late.
 
-    aerokit drops data that waited in its own queue for more than a second, but cannot drop data that the operating
-    system has accepted (``connection.unsent_bytes``). The next event is :class:`LinkDrained`, unless the link ends.
+    ``unsent_bytes`` is the size of the queued data. aerokit drops data that waited in its own queue for more than a
+    second, but cannot drop data that the operating system has accepted (``connection.unsent_bytes``). The next event is
+    :class:`LinkDrained`, unless the link ends.
     """
 
     unsent_bytes: int
@@ -348,10 +351,10 @@ class LinkDrained(Event):
 class LinkSelected(Event):
     """The traffic to this system now uses ``link`` (its address), one of several links.
 
-    ``before`` is the previous link; None if there was none. ``reason`` is "first heard" for the first link. It is
-    "silent", "stalled" or "lost" if that happened to the previous link, "better" or "cheaper" if that is true of the
-    new link, and "another vehicle" if AUTOPILOT_VERSION showed that the previous link leads to another vehicle. aerokit
-    requests message rates again, because autopilots keep separate rates for each link.
+    ``before`` is the previous link; None if there was none. ``reason`` is "first heard" for the first link; "silent",
+    "stalled" or "lost" if the previous link is; "better" or "cheaper" if the new link is; and "another vehicle" if
+    AUTOPILOT_VERSION showed that the previous link leads to another vehicle. aerokit requests message rates again,
+    because autopilots keep separate rates for each link.
     """
 
     link: str
@@ -401,8 +404,7 @@ class LinkState(enum.Enum):
     CONNECTED = "connected"
     """The vehicle sent a heartbeat, or the link delivered any frame, within the last 3.5 seconds."""
     SILENT = "silent"
-    """The link is open, but silent for more than 3.5 seconds: no heartbeat of the vehicle, or no frame at all.
-    """
+    """The link is open, but for more than 3.5 seconds no heartbeat of the vehicle, or no frame at all, has arrived."""
     LOST = "lost"
     """The link failed or the connection was closed. With ``reconnect=True`` the state may become CONNECTED again."""
 
@@ -413,7 +415,7 @@ class LinkStatus(Snapshot):
     link: str
     """Address of the link."""
     state: LinkState
-    """SILENT: no vehicle was received for a second or two. LOST: the link is closed; aerokit reopens it if possible."""
+    """SILENT: no vehicle was heard for a second or two. LOST: the link is closed, and aerokit tries to reopen it."""
     is_costly: bool
     """True if the link is used only when all others fail (``costly=1``)."""
     systems: tuple[int, ...]
@@ -421,6 +423,6 @@ class LinkStatus(Snapshot):
     used_for: tuple[int, ...]
     """Ids of the systems whose traffic uses this link."""
     loss_percent: float | None
-    """Percentage of frames lost in the last seconds, of the system that loses most; None until known."""
+    """Percentage of frames lost in the last seconds, for the system that loses most; None until known."""
     round_trip_s: float | None
     """Round-trip time (TIMESYNC) of the slowest system; None before the first answer."""

@@ -57,7 +57,7 @@ class Position(Snapshot):
 class Home(Snapshot):
     """The home position (HOME_POSITION).
 
-    ``north_m``, ``east_m`` and the like are metres from the local origin; None if not reported. Calls that take a
+    ``north_m``, ``east_m`` and ``down_m`` are metres from the local origin; None if not reported. Calls that take a
     Position also take a Home. With a Home, ``go_to`` keeps the vehicle's present altitude.
     """
 
@@ -70,7 +70,7 @@ class Home(Snapshot):
 
     @property
     def position(self) -> Position:
-        """Home as a target without an altitude: flying there keeps the present altitude."""
+        """The home position without its altitude, so that a vehicle that flies there keeps its present altitude."""
         return Position(self.latitude_deg, self.longitude_deg)
 
 
@@ -80,7 +80,7 @@ def point_at(place: Position | Home) -> Position:
 
 
 def travel_target(place: Position | Home) -> Position:
-    """Return the position to fly to. A Home gets no altitude, so that the vehicle keeps its present one."""
+    """Return the position to fly to. A Home is converted without its altitude: the vehicle keeps its present one."""
     return place.position if isinstance(place, Home) else place
 
 

@@ -28,10 +28,11 @@ if TYPE_CHECKING:
 
 __all__ = ["VideoFrame", "VideoStream", "open_video"]
 
-# FFmpeg options for live streams: no buffering. https://ffmpeg.org/ffmpeg-protocols.html
+# FFmpeg options for live streams, which turn buffering off (https://ffmpeg.org/ffmpeg-protocols.html).
 LIVE_OPTIONS = {"rtsp_transport": "tcp", "fflags": "nobuffer", "flags": "low_delay", "probesize": "500000"}
 
-# Maximum wait for the decoding thread at the end of a block. FFmpeg blocks the thread until the next frame or timeout.
+# Seconds to wait for the decoding thread at the end of the block. FFmpeg may block the thread for longer than that:
+# until its next frame or time-out.
 JOIN_TIMEOUT_S = 1.0
 
 
@@ -41,7 +42,7 @@ class VideoFrame(Snapshot):
     - ``picture``: a PyAV frame: ``picture.to_ndarray(format="rgb24")`` (height, width, 3), ``picture.to_image()``
     - ``received_at``: time of decoding on the loop's clock; ``stream_s``: time in the stream, None if the frame has
       none
-    - ``position``, ``attitude``: the vehicle's latest at ``received_at``; None without a vehicle, or while unknown
+    - ``position``, ``attitude``: the vehicle's latest values at ``received_at``; None without a vehicle, or if unknown
     """
 
     picture: Any
@@ -60,15 +61,16 @@ async def open_video(
     idle_timeout_s: float = 5.0,
     options: Mapping[str, str] | None = None,
 ) -> AsyncIterator[VideoStream]:
-    """Open a video stream for the duration of an ``async with`` block. A slow reader gets the latest frame.
+    """Open a video stream for the duration of an ``async with`` block.
 
-    ``async with open_video(stream.uri, vehicle) as video: async for frame in video: …``. A thread decodes the stream.
-    The thread ends with the block or, if it waits for a frame then, at its next timeout.
+    ``async with open_video(stream.uri, vehicle) as video: async for frame in video: …``. A slow reader always gets the
+    latest frame, and misses earlier ones. A thread decodes the stream. It ends with the block. If it is then waiting
+    for a frame, it ends at its next frame or time-out.
 
     Args:
         uri: anything that FFmpeg reads: ``rtsp://…``, ``udp://0.0.0.0:5600``, the path of a file.
             ``vehicle.camera.streams`` lists the addresses of a camera's streams.
-        vehicle: adds its position and attitude to the frames.
+        vehicle: the vehicle whose position and attitude are added to the frames.
         timeout: seconds until the stream must be open, above 0 and at most 3600.
         idle_timeout_s: seconds without data after which the stream counts as lost, above 0 and at most 3600.
         options: further FFmpeg options.
@@ -79,14 +81,14 @@ async def open_video(
         LinkOpenError: the stream cannot be opened, or has no video.
     """
     if not uri:
-        raise InvalidArgument("uri = '' is not allowed: the address of a stream, or the path of a file")
+        raise InvalidArgument("uri = '' is not allowed: it must be the address of a stream or the path of a file")
     check_range("timeout", timeout, 0, 3600, above=True)
     check_range("idle_timeout_s", idle_timeout_s, 0, 3600, above=True)
     stream = VideoStream(uri, vehicle)
     for name, value in (options or {}).items():
         if not isinstance(name, str) or not isinstance(value, str):
             raise InvalidArgument(
-                f"options: {name!r} = {value!r} is not allowed: names and values of FFmpeg options are strings"
+                f"options: {name!r} = {value!r} is not allowed: names and values of FFmpeg options must be strings"
             )
     defaults = LIVE_OPTIONS if "://" in uri else {}
     thread = _Reader(uri, {**defaults, **(options or {})}, (timeout, idle_timeout_s), stream)
@@ -133,7 +135,7 @@ class VideoStream:
         frame, self._latest = self._latest, None
         if frame is None:
             if isinstance(self._end, LinkLost):
-                # A new exception each time: one that is raised again would collect the tracebacks of all reads.
+                # Each read raises a new exception, because a single one would collect the tracebacks of all reads.
                 raise LinkLost(*self._end.args)
             raise StopAsyncIteration
         return frame
@@ -148,7 +150,7 @@ class VideoStream:
             self._changed.clear()
             await self._changed.wait()
 
-    # Called on the event loop by the reader's thread.
+    # The reader's thread lets the event loop call these methods.
 
     def _on_open(self) -> None:
         self._is_open = True
@@ -169,7 +171,7 @@ class VideoStream:
 
 
 class _Reader(threading.Thread):
-    """Decodes a stream in a thread, because PyAV blocks. ``timeouts_s`` are those of FFmpeg for opening and reading."""
+    """Decodes a stream in a thread, because PyAV blocks. ``timeouts_s`` are FFmpeg's, for opening and for reading."""
 
     def __init__(self, uri: str, options: dict[str, str], timeouts_s: tuple[float, float], stream: VideoStream) -> None:
         super().__init__(name=f"aerokit video {uri}", daemon=True)
@@ -183,7 +185,7 @@ class _Reader(threading.Thread):
             import av
         except ImportError:
             self.ended.set()
-            raise NotSupported('video needs PyAV: pip install "aerokit-mavlink[video]"') from None
+            raise NotSupported('video needs PyAV: run pip install "aerokit-mavlink[video]"') from None
         self._av: Any = av
         super().start()
 
@@ -191,11 +193,11 @@ class _Reader(threading.Thread):
         self._is_stopped = True
 
     def run(self) -> None:
-        # Reported if something other than an Exception, such as SystemExit, ends the thread.
+        # This error is reported if something other than an Exception, such as SystemExit, ends the thread.
         error: Exception = LinkLost(f"the video of {self._uri} ended")
         try:
             self._read()
-            error = EOFError()  # ends the iteration over the frames without an error
+            error = EOFError()  # The iteration over the frames then ends without an error.
         except (LinkOpenError, LinkLost) as caught:
             error = caught
         except Exception as caught:
@@ -212,7 +214,7 @@ class _Reader(threading.Thread):
             raise LinkOpenError(f"the video of {self._uri} cannot be opened: {error}") from None
         with container:
             if not container.streams.video:
-                raise LinkOpenError(f"{self._uri} has no video")
+                raise LinkOpenError(f"the stream {self._uri} contains no video")
             self._call_on_loop(self._stream._on_open)
             try:
                 for picture in container.decode(video=0):
@@ -224,5 +226,5 @@ class _Reader(threading.Thread):
                 raise LinkLost(f"the video of {self._uri} was interrupted: {error}") from None
 
     def _call_on_loop(self, function: Callable[..., object], *args: Any) -> None:
-        with suppress(RuntimeError):  # the loop is closed
+        with suppress(RuntimeError):  # The loop may be closed already.
             self._loop.call_soon_threadsafe(function, *args)

@@ -19,7 +19,7 @@ CALLS = [
     ("armed", True, r"Vehicle\.armed = True is not allowed: .*arm\(\) or disarm\(\)"),
     ("home", None, r"set_home\(place\)"),
     ("heading_deg", 90, r"set_heading\(degrees\)"),
-    ("is_silent", True, r"Vehicle\.is_silent = True is not allowed: it is read-only"),
+    ("is_silent", True, r"Vehicle\.is_silent = True is not allowed: this attribute is read-only"),
 ]
 
 

@@ -156,7 +156,7 @@ async def test_timeout_of_unknown_value_says_so() -> None:
 async def test_timeout_names_held_for() -> None:
     cell = make_cell()
     cell.set(1, HEARTBEAT)
-    with pytest.raises(OperationTimeout, match="it had to hold for 5 s"):
+    with pytest.raises(OperationTimeout, match="the condition had to be true for 5 s without a break"):
         await cell.wait_until(lambda value: value == 1, held_for=5, timeout=1)
 
 

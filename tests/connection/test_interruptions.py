@@ -275,7 +275,7 @@ async def test_link_object_can_be_opened_only_once() -> None:
         async with connect(OneEnd(), reconnect=True):
             pytest.fail("it could not be opened again")
     async with open_connection(OneEnd()) as connection:
-        with pytest.raises(InvalidArgument, match="pass it to open_connection"):
+        with pytest.raises(InvalidArgument, match="pass reconnect to open_connection"):
             async with connect(connection, reconnect=True):
                 pytest.fail("the connection is open already")
 

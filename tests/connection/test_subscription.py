@@ -119,7 +119,7 @@ async def test_second_reader_is_refused() -> None:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(numbers.get)
             await anyio.sleep(1)
-            with pytest.raises(InvalidArgument, match="one reader"):
+            with pytest.raises(InvalidArgument, match="only one reader"):
                 await numbers.get()
             tasks.cancel_scope.cancel()
 

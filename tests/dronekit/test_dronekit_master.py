@@ -119,7 +119,7 @@ def test_message_factory_checks_values_on_send(factory: MessageFactory) -> None:
     message = factory.mission_set_current_encode(1, 1, None)
     with pytest.raises(InvalidArgument, match=r"MISSION_SET_CURRENT\.seq"):
         from_pymavlink(message)
-    with pytest.raises(InvalidArgument, match="play_tune_encode: a text must be"):
+    with pytest.raises(InvalidArgument, match="play_tune_encode: the value of a text field must be"):
         factory.play_tune_encode(1, 1, None)
     with pytest.raises(TypeError):
         factory.mission_set_current_encode(1, 1)

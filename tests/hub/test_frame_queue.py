@@ -86,7 +86,7 @@ def test_bounds_hold_and_every_frame_is_accounted_for(
             now - frame.since <= ORDER_MAX_AGE_S for frame in frames._frames.values() if frame.kind is MessageKind.ORDER
         )
     assert len(taken(frames)) + dropped == len(arrivals)
-    assert frames._bytes == frames._orders == frames._telemetry == 0
+    assert frames._bytes == frames._order_count == frames._telemetry_count == 0
 
 
 @pytest.mark.parametrize(

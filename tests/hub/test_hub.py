@@ -592,7 +592,7 @@ async def test_block_exception_passes_unchanged() -> None:
         ({"address": 5}, "address = 5 is not allowed"),
         (
             {"address": "pty", "only": "HEARTBEAT"},
-            "only = 'HEARTBEAT' is not allowed: a tuple of message names",
+            "only = 'HEARTBEAT' is not allowed: it must be a tuple of message names",
         ),
         ({"address": "pty", "block": [5]}, "block = "),
         ({"address": "pty", "rates": ["ATTITUDE"]}, "rates = "),

@@ -203,10 +203,13 @@ def one_message(id: object, name: str, type: str) -> str:  # noqa: A002
             "is not a MAVLink dialect: KeyError('id')",
         ),
         (one_message(1, "X", "int"), "unknown field type 'int'"),
-        (one_message(1, "import os", "float"), "'import os' is not a name"),
+        (one_message(1, "import os", "float"), "'import os' is not a name of letters"),
         (one_message(1 << 24, "X", "float"), "message id 16777216 is not in 0..16777215"),
         (one_message(1, "X", "double[32]"), "the payload has 256 bytes, but at most 255 fit in a frame"),
-        ("<mavlink><include>nowhere.xml</include></mavlink>", "includes nowhere.xml, which is in none of"),
+        (
+            "<mavlink><include>nowhere.xml</include></mavlink>",
+            "includes nowhere.xml, which is in none of these folders",
+        ),
     ],
 )
 def test_invalid_dialect_file_is_rejected(tmp_path: Path, text: str, complaint: str) -> None:

@@ -27,6 +27,6 @@ def test_message_factory_error_is_raised_and_not_counted() -> None:
     factory: Any = MessageFactory(from_pymavlink, 255, 0)
     with pytest.raises(InvalidArgument, match="param_type"):
         factory.param_set_send(1, 1, b"RTL_ALT", 30, 900)
-    with pytest.raises(InvalidArgument, match="a text must be str or bytes"):
+    with pytest.raises(InvalidArgument, match="a text field must be str or bytes"):
         factory.param_set_send(1, 1, 5, 30, 9)
     assert (factory.seq, factory.total_packets_sent) == (0, 0)

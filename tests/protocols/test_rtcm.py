@@ -72,10 +72,10 @@ def test_several_messages_are_split() -> None:
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"", "not the start of an RTCM 3 message"),
-        (b"no rtcm at all", "not the start of an RTCM 3 message"),
+        (b"", "no RTCM 3 message begins there"),
+        (b"no rtcm at all", "no RTCM 3 message begins there"),
         (EXAMPLE_1005[:-1], "25 bytes, but only 24 were given"),
-        (EXAMPLE_1005 + b"\xd3", "not the start of an RTCM 3 message"),
+        (EXAMPLE_1005 + b"\xd3", "no RTCM 3 message begins there"),
         (EXAMPLE_1005[:-1] + b"\0", "CRC-24Q"),
         (rtcm(721), "721 bytes"),
     ],

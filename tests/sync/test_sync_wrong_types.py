@@ -77,5 +77,5 @@ def test_fleet_checks_literals_by_value() -> None:
     options: dict[str, Any] = {"on_error": "land_others", "on_error_by_group": {"": "continue_others"}}
     with pytest.raises(InvalidArgument, match="count = 0"):  # the arguments before are accepted
         aerokit.sync.fleet("udp:127.0.0.1:0", count=0, min_distance_m=5, on_too_close="report", **options)
-    with pytest.raises(InvalidArgument, match="on_error = 'land' is not allowed: one of hold_others, land_others"):
+    with pytest.raises(InvalidArgument, match="on_error = 'land' is not allowed: it must be one of hold_others,"):
         aerokit.sync.fleet("udp:127.0.0.1:0", on_error="land")  # type: ignore[arg-type]

@@ -70,7 +70,7 @@ def test_asynchronous_connect_used_before_entering_raises(name: str) -> None:
     with pytest.raises(AttributeError) as caught:
         opened.wait_ready()
     assert str(caught.value) == (
-        f"{name}(…) has no 'wait_ready': it is not open yet; write `async with {name}(…) as …:`"
+        f"{name}(…) has no 'wait_ready' before it is opened; write `async with {name}(…) as …:`"
     )
     assert not hasattr(opened, "__len__")
 

@@ -341,7 +341,7 @@ async def test_link_opens_once_and_may_retry_after_failure() -> None:
     taken.close()
     await taken.wait_closed()
     await near.open(Recorder())
-    with pytest.raises(BusyError, match="is open"):
+    with pytest.raises(BusyError, match="is already open"):
         await near.open(Recorder())
     near.close()
     with pytest.raises(ConnectionClosed, match="was closed"):

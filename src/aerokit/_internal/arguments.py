@@ -28,11 +28,11 @@ from aerokit.errors import InvalidArgument, LinkOpenError
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 ClassT = TypeVar("ClassT")
 
-# A rule is a check with a description of the allowed values.
+# A rule consists of a check and a description of the values that pass it, which completes "it must be …".
 Check = Callable[[Any], bool]
 Rule = tuple[Check, str]
 
-# Rules by the name in the annotation.
+# Rules for annotations with these names.
 _SIMPLE: dict[str, Rule] = {
     "float": (lambda value: isinstance(value, Real), "a number"),
     "int": (lambda value: isinstance(value, Integral), "a whole number"),
@@ -46,7 +46,7 @@ _SIMPLE: dict[str, Rule] = {
         lambda value: callable(value) or hasattr(value, "__aiter__"),
         "a function or an asynchronous iterable",
     ),
-    "PeerFilter": (lambda _: True, "addresses and networks"),  # checked by the links, with a better message
+    "PeerFilter": (lambda _: True, "addresses and networks"),  # Links check it with a better message.
     "PathLike": (lambda value: isinstance(value, os.PathLike), "a path"),
 }
 
@@ -58,10 +58,10 @@ def _is_above_zero(value: Any) -> bool:
         return False
 
 
-# Rules for parameters that denote a time, by the annotation.
+# Rules for parameters that denote a time, with these annotations.
 _SECONDS: dict[str, Rule] = {
-    "float": (_is_above_zero, "seconds above 0"),
-    "float | None": (lambda value: value is None or _is_above_zero(value), "seconds above 0, or None"),
+    "float": (_is_above_zero, "a number of seconds above 0"),
+    "float | None": (lambda value: value is None or _is_above_zero(value), "a number of seconds above 0, or None"),
 }
 
 
@@ -74,7 +74,10 @@ def checks_arguments(cls: type[ClassT]) -> type[ClassT]:
 
 
 def checked(function: FunctionT, *, times_are_above_zero: bool = False) -> FunctionT:
-    """Function decorator: check the arguments. By default a time may be zero, which often means not to wait."""
+    """Function decorator: check the arguments of each call.
+
+    A time may be 0 (often with the meaning "do not wait") unless ``times_are_above_zero`` is True.
+    """
     rules = _Rules(inspect.unwrap(function), times_are_above_zero)
     if inspect.iscoroutinefunction(function):
 
@@ -90,7 +93,7 @@ def checked(function: FunctionT, *, times_are_above_zero: bool = False) -> Funct
         rules.check(args, kwargs)
         try:
             return function(*args, **kwargs)
-        except LinkOpenError as error:  # the traceback inside this library does not help a user
+        except LinkOpenError as error:  # A traceback through the code of this library does not help a user.
             raise error.with_traceback(None) from error.__cause__
 
     return checked_sync  # type: ignore[return-value]  # same signature
@@ -135,7 +138,7 @@ class _Rules:
 
 
 def _is_time(parameter: inspect.Parameter) -> bool:
-    """Return True if the name denotes seconds, rather than metres or degrees per second."""
+    """Return True if the parameter is a time in seconds, and not a speed, whose name ends in ``_s``, too."""
     name, is_speed = parameter.name, parameter.name.endswith(("m_s", "deg_s"))
     return str(parameter.annotation) in _SECONDS and name.endswith(("timeout", "_s")) and not is_speed
 
@@ -152,11 +155,11 @@ def _error(rule: Rule, name: str, value: object, vehicle_parameter: object) -> I
         return InvalidArgument(
             f"value = {short_repr(value)} of {vehicle_parameter[:40]} is not allowed: it must be {allowed}{hint}"
         )
-    return InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}{hint}")
+    return InvalidArgument(f"{name} = {short_repr(value)} is not allowed: it must be {allowed}{hint}")
 
 
 def _hint(check: Check, value: object) -> str:
-    """Return the hint to pass the value of a state cell instead of the cell; else an empty string."""
+    """Return a hint if the program passed a state cell whose value would be allowed; otherwise an empty string."""
     latest = getattr(value, "latest", None)
     return "; pass its .value" if latest is not None and check(latest) else ""
 
@@ -198,6 +201,7 @@ def _named_rule(name: str, names: Mapping[str, Any]) -> Rule:
         return (lambda value: isinstance(value, types)), " or ".join(allowed.__name__ for allowed in types)
     if name in ("Any", "object") or isinstance(annotated, TypeVar):
         return (lambda _: True), "anything"
+    # The module imports this class only for type checking, so that just its name is known.
     return partial(_has_class_name, name), with_article(name)
 
 
@@ -228,7 +232,7 @@ def _class_names(name: str, names: Mapping[str, Any]) -> tuple[str, ...]:
         return ()
     if isinstance(bound, type):
         return (bound.__name__,)
-    return tuple(bound.__forward_arg__.split(" | "))  # a bound given as text: TypeVar(…, bound="Event | Message")
+    return tuple(bound.__forward_arg__.split(" | "))  # The bound is a text: TypeVar(…, bound="Event | Message").
 
 
 def _is_one_of(choices: tuple[object, ...], value: object) -> bool:
@@ -248,16 +252,19 @@ def _is_mapping(is_key: Check, is_value: Check, value: object) -> bool:
 
 
 def _are_items(is_item: Check, value: object) -> bool:
-    # A string is an iterable of characters, which no caller intends. Checking an iterator would exhaust it.
+    # A string is an iterable of characters, but no caller intends that.
     if isinstance(value, (str, bytes, bytearray)) or not isinstance(value, Iterable):
         return False
+    # The items of other iterables are not checked, because that would exhaust an iterator.
     return not isinstance(value, (list, tuple, set, frozenset)) or all(map(is_item, value))
 
 
 def check_kind(name: str, value: object, expected_type: type) -> None:
-    """Raise InvalidArgument unless ``value`` is an instance of this type. Used if the annotation is a type variable."""
+    """Raise InvalidArgument unless ``value`` is an instance of this type. For annotations that are type variables."""
     if not isinstance(value, expected_type):
-        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {with_article(expected_type.__name__)}")
+        raise InvalidArgument(
+            f"{name} = {short_repr(value)} is not allowed: it must be {with_article(expected_type.__name__)}"
+        )
 
 
 def check_range(name: str, value: float, minimum: float, maximum: float, *, above: bool = False) -> None:

@@ -40,7 +40,7 @@ class _Block(AbstractAsyncContextManager[T]):
     async def __aenter__(self) -> T:
         try:
             asyncio.get_running_loop()
-        except RuntimeError:  # there is no asyncio loop, e.g. in trio.run
+        except RuntimeError:  # No asyncio loop is running, for example in trio.run.
             raise InvalidArgument(
                 f"{self._name}(…) requires asyncio, and no asyncio event loop is running here: start the program with"
                 " asyncio.run(…), or, on trio, use aerokit.sync in a thread (trio.to_thread.run_sync)"
@@ -48,7 +48,7 @@ class _Block(AbstractAsyncContextManager[T]):
         try:
             return await self._block.__aenter__()
         except (LinkOpenError, InvalidArgument) as error:
-            # The traceback inside this library does not help a user.
+            # A traceback through the code of this library does not help a user.
             raise error.with_traceback(None) from error.__cause__
 
     async def __aexit__(
@@ -63,11 +63,11 @@ class _Block(AbstractAsyncContextManager[T]):
         raise self._misused("with")
 
     def __exit__(self, *_: object) -> None:
-        """Never called. Python looks it up before it calls ``__enter__``."""
+        """Never called, but needed: Python looks up this method before it calls ``__enter__``."""
 
     def __getattr__(self, name: str) -> None:
         raise AttributeError(
-            f"{self._name}(…) has no {name!r}: it is not open yet; write `async with {self._name}(…) as …:`",
+            f"{self._name}(…) has no {name!r} before it is opened; write `async with {self._name}(…) as …:`",
             name=name,
             obj=self,
         )
@@ -96,24 +96,23 @@ _SETTER_CALLS = {
 class ReadOnly:
     """Base class of public objects whose attributes report the state of the vehicle.
 
-    Assigning to a cell, a property or a part raises AttributeError, which names the method to call: ``set_mode`` for
-    ``vehicle.mode = "GUIDED"``. A program may add attributes.
+    Assigning to a state cell, a property or a sub-object raises AttributeError. Its text names the method to call, for
+    example ``set_mode`` for ``vehicle.mode = "GUIDED"``. A program may add attributes.
     """
 
     def __setattr__(self, name: str, value: object) -> None:
         attribute = inspect.getattr_static(type(self), name, None)
         is_setter = isinstance(attribute, property) and attribute.fset is not None
         is_descriptor = hasattr(type(attribute), "__get__")
-        # Allowed are: replacing a method, e.g. by a mock, and attributes without a descriptor, which the constructor or
-        # the program sets.
+        # A program may replace a method, for example by a mock. Attributes without a descriptor are those that the
+        # constructor sets or the program adds.
         if name.startswith("_") or is_setter or callable(attribute) or not is_descriptor:
             object.__setattr__(self, name, value)
             return
         text = f"{type(self).__name__}.{name} = {short_repr(value)} is not allowed"
         call = _SETTER_CALLS.get(name)
         if call is None or not hasattr(type(self), call.partition("(")[0]):
-            raise AttributeError(f"{text}: it is read-only")
+            raise AttributeError(f"{text}: this attribute is read-only")
         wait = "" if type(self).__module__.startswith("aerokit.sync") else "await "
-        raise AttributeError(
-            f"{text}: it reports the state of the vehicle; write {wait}….{call.format(value=short_repr(value))}"
-        )
+        replacement = f"{wait}….{call.format(value=short_repr(value))}"
+        raise AttributeError(f"{text}: this attribute reports the state of the vehicle; write {replacement}")

@@ -16,27 +16,27 @@ MAX_FILE_SIZE = 16 << 20
 """Size limit in bytes for files of parameters, metadata, plans and definitions; real files have at most 5 MB."""
 
 _XZ_MAGIC = b"\xfd7zXZ\x00"
-_XZ_MEMORY_LIMIT = 128 << 20  # xz -9 needs 65 MB
+_XZ_MEMORY_LIMIT = 128 << 20  # Files compressed by xz -9 need 65 MB.
 
 
 def write_atomically(path: str | os.PathLike[str], text: str) -> None:
     """Write a UTF-8 file with Unix line ends. If writing fails (OSError), the previous content is kept."""
     target = Path(path)
     part_file = target.with_name(target.name + ".part")
-    # Remove the file of an earlier attempt, or a symbolic link that would redirect the writing.
+    # An earlier attempt may have left this file, and a symbolic link of this name would redirect the writing.
     part_file.unlink(missing_ok=True)
     try:
         with part_file.open("x", encoding="utf-8", newline="\n") as file:
             file.write(text)
             file.flush()
-            os.fsync(file.fileno())  # without fsync, a power failure may leave an empty file under the new name
+            os.fsync(file.fileno())  # Without this, a power failure could leave an empty file under the new name.
         part_file.replace(target)
     finally:
         part_file.unlink(missing_ok=True)
 
 
 def read_bounded(path: str | os.PathLike[str]) -> bytes:
-    """Read a file.
+    """Read a file of limited size.
 
     Raises:
         FileFormatError: the file is larger than :data:`MAX_FILE_SIZE`.
@@ -73,7 +73,7 @@ def decompress(data: bytes, name: str) -> bytes:
     if len(content) > MAX_FILE_SIZE:
         raise file_too_large(name)
     if not decompressor.eof:
-        raise FileFormatError(f"{name} is damaged: it is truncated")
+        raise FileFormatError(f"{name} is damaged: the file is truncated")
     return content
 
 
@@ -110,7 +110,9 @@ class PartFile:
 
     @contextmanager
     def writing(self, start: int) -> Iterator[BinaryIO]:
-        """Open the file for writing at offset ``start`` and truncate it there. An error removes an empty file.
+        """Open the file for writing at offset ``start``, and truncate it there.
+
+        If an error ends the `with` block while the file is empty, the file is removed.
 
         Raises:
             OSError: the file cannot be written.

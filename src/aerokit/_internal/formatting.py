@@ -26,7 +26,7 @@ def to_jsonable(value: object) -> Any:
     """
     if value is None or isinstance(value, (bool, str)):
         return value
-    if isinstance(value, Enum):
+    if isinstance(value, Enum):  # Enums come before int, because members of an IntEnum are integers, too.
         return _names(value)
     if isinstance(value, int):
         return int(value)
@@ -51,7 +51,7 @@ def to_jsonable(value: object) -> Any:
 
 
 def _names(member: Enum) -> Any:
-    # A combination of flags is not among the members of its class.
+    # The members of a Flag class are single flags, so that a value that is not among them is a combination.
     if isinstance(member, Flag) and member not in tuple(type(member)):
         return [flag.name for flag in type(member) if flag in member]
     return member.name
@@ -79,15 +79,15 @@ def format_value(value: object) -> str:
     return name if isinstance(name, str) else str(value)
 
 
-# User and password of a URL.
+# Matches the user and the password in a URL.
 _CREDENTIALS = re.compile(r"//([^/@:\s]*):[^\s]*@")
 
 
 def short_repr(value: object) -> str:
-    """Return ``repr(value)``, at most 100 characters, without a URL's password; if it fails, the type's name."""
+    """Return at most 100 characters of ``repr(value)``, without passwords in URLs. If repr fails: the type's name."""
     try:
         text = repr(value)
-    except Exception:  # repr fails for an int of 5000 digits, and may fail for classes of the program
+    except Exception:  # repr fails for an int of 5000 digits, and may fail for a class of the program.
         text = f"<{type(value).__name__}>"
     text = _CREDENTIALS.sub(r"//\1:…@", text)
     return text if len(text) <= _MAX_LENGTH else f"{text[: _MAX_LENGTH - 3]}..."
@@ -99,7 +99,7 @@ def with_article(noun: str) -> str:
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return ``" (did you mean 'GUIDED'?)"`` for the most similar known name, ignoring case, or an empty string."""
+    """Return ``" (did you mean 'GUIDED'?)"`` for the most similar known name; empty if none is similar."""
     if not isinstance(name, str) or len(name) > _MAX_LENGTH:
         return ""
     import difflib  # imported here because it is only needed for errors

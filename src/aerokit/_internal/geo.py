@@ -50,7 +50,7 @@ def check_place(latitude_deg: float, longitude_deg: float) -> None:
 def wrap_360(angle_deg: float) -> float:
     """Normalise an angle to 0 to below 360."""
     wrapped = angle_deg % 360.0
-    return 0.0 if wrapped == 360.0 else wrapped  # rounding turns a tiny negative angle into 360
+    return 0.0 if wrapped == 360.0 else wrapped  # For a tiny negative angle, the remainder is rounded to 360.
 
 
 def wrap_longitude(longitude_deg: float) -> float:
@@ -59,7 +59,7 @@ def wrap_longitude(longitude_deg: float) -> float:
 
 
 def _wgs84() -> Geodesic:
-    # Imported on first use, because it takes longer than the rest of this package together.
+    # Imported on first use, because this import takes longer than all of aerokit's.
     from geographiclib.geodesic import Geodesic
 
     return Geodesic.WGS84

@@ -10,7 +10,7 @@ from importlib import import_module
 # Packages that only the other project called aerokit has: ``aerokit.aero`` and so on.
 _OTHER_PACKAGES = ("aero", "engine", "stability")
 
-# Modules whose names users often expect in the package itself: aerokit.LinkLost instead of aerokit.errors.LinkLost.
+# Users often look in the package for the contents of these modules: aerokit.LinkLost, not aerokit.errors.LinkLost.
 _NAMED_MODULES = ("aerokit.errors", "aerokit.events")
 
 
@@ -31,7 +31,7 @@ def installation_problem(folder: str, *, is_ours: bool = True) -> str | None:
 
 
 def _suggestion(package: str, name: str) -> str:
-    """Return the right place of a name that ``aerokit.errors`` or ``aerokit.events`` has; empty for other names."""
+    """Return a hint if ``aerokit.errors`` or ``aerokit.events`` defines the name; otherwise an empty text."""
     if package != "aerokit" or name.startswith("_"):
         return ""
     places = (module for module in _NAMED_MODULES if name in import_module(module).__all__)
@@ -53,7 +53,7 @@ def lazy_exports(
             raise AttributeError(f"module {package!r} has no attribute {name!r}{_suggestion(package, name)}")
         module = import_module(modules[name])
         value = getattr(module, name, module)
-        setattr(sys.modules[package], name, value)
+        setattr(sys.modules[package], name, value)  # Later accesses find the value there and do not call this function.
         return value
 
     def list_names() -> list[str]:

@@ -23,6 +23,6 @@ def euler_from_quaternion(w: float, x: float, y: float, z: float) -> tuple[float
     """Return roll, pitch and yaw of a unit quaternion in radians."""
     return (
         math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),  # rounding may exceed 1
+        math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),  # Without the limits, rounding may exceed 1.
         math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
     )

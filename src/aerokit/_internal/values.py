@@ -22,19 +22,20 @@ else:  # typing_extensions takes longer to import than this package
 
 @dataclass_transform(frozen_default=True)
 class _SnapshotType(type):
-    """Turns annotated names into slots and generates ``__init__``. The module must postpone annotations."""
+    """Turns annotated names into slots and generates ``__init__``. Needs ``from __future__ import annotations``."""
 
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> _SnapshotType:
         annotations: dict[str, str] = namespace.get("__annotations__", {})
         own_fields = tuple(field for field, annotation in annotations.items() if not annotation.startswith("ClassVar"))
         defaults = {field: value for base in bases for field, value in getattr(base, "_defaults", {}).items()}
+        # A default is removed from the class, because a slot and a class attribute cannot have the same name.
         defaults.update({field: namespace.pop(field) for field in own_fields if field in namespace})
         fields = (*(field for base in bases for field in getattr(base, "__match_args__", ())), *own_fields)
         cls = super().__new__(mcs, name, bases, {**namespace, "__slots__": own_fields, "__match_args__": fields})
         if own_fields:
             type.__setattr__(cls, "__init__", _lazy_init(cls))
         type.__setattr__(cls, "_defaults", defaults)
-        # attrgetter needs a name. Values without fields are all equal, as their class is.
+        # attrgetter needs at least one name. In a class without fields, all values are equal, like their __class__.
         type.__setattr__(cls, "_values", attrgetter(*(fields or ("__class__",))))
         return cls
 
@@ -49,11 +50,11 @@ class _SnapshotType(type):
         defining_class = getattr(init, "defining_class", None)
         if defining_class is not None:
             init = _generate_init(defining_class)
-        return signature(init.__get__(object()))  # bound to any object, because a signature has no self
+        return signature(init.__get__(object()))  # Binding the method, to any object, removes self from its signature.
 
 
 def _lazy_init(cls: Any) -> Callable[..., None]:
-    # A program creates values of few classes, so __init__ is generated at the first call.
+    # __init__ is generated when it is first called, because a program creates values of only a few of these classes.
     def generate_and_call(self: object, *args: Any, **kwargs: Any) -> None:
         init = _generate_init(cls)
         type.__setattr__(cls, "__init__", init)
@@ -93,7 +94,7 @@ class Snapshot(metaclass=_SnapshotType):
         return type(self)(**{**self.to_dict(), **changes})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary, in order."""
+        """Return the fields as a dictionary, in the order of their declaration."""
         return {field: getattr(self, field) for field in self.__match_args__}
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -119,5 +120,5 @@ class Snapshot(metaclass=_SnapshotType):
 
 
 def _short(value: object) -> str:
-    # Seven decimal places of a degree are a centimetre on earth.
+    # Seven decimal places suffice: 1e-7 degrees are about a centimetre on earth.
     return repr(round(value, 7) if isinstance(value, float) else value)

@@ -11,7 +11,7 @@ from importlib import import_module
 from types import MemberDescriptorType
 from typing import TYPE_CHECKING, Any
 
-_VERSION = 1  # the same as in _wire.c, so that a stale build in a clone is not used
+_VERSION = 1  # Must equal VERSION in _wire.c, so that an outdated build of the extension is not used.
 
 
 def _load() -> Any:
@@ -31,7 +31,7 @@ wire_implementation: str = "python" if wire is None else "c"
 """``"c"`` if frames and messages are processed by the compiled extension, ``"python"`` if by Python code."""
 
 
-# Without the compiled extension, frames, their sources and counters have these slots.
+# Without the compiled extension, these classes define the slots of frames, of their sources and of counters.
 class _FrameFields:
     __slots__ = ("_raw", "body", "checksum", "component_id", "message_id", "received_at", "system_id")
 
@@ -50,6 +50,7 @@ class Copyable:
     __slots__ = ()
 
     def __getstate__(self) -> tuple[None, dict[str, Any]]:
+        # Python's own method finds only fields that are declared as __slots__, and compiled fields are not.
         names = (
             name
             for cls in type(self).__mro__

@@ -33,19 +33,19 @@ __all__ = ["Bus", "Detach", "EndSignal", "Overflow", "Sink", "Subscription", "co
 logger: logging.Logger = logging.getLogger("aerokit")
 
 Detach = Callable[[], None]
-"""Ends an attachment. Calling it a second time does nothing."""
+"""Function that ends an attachment of a sink. A second call does nothing."""
 
 Sink = Callable[[Any], None]
 """Callback for one message, frame or event. The callback must return quickly and cannot await."""
 
 EventT = TypeVar("EventT", bound=Event)
 
-# (kind, sink); the kind is MESSAGE, FRAME or BOTH, i.e. the arguments that the sink takes.
+# (kind, sink). The kind says which arguments the sink takes: MESSAGE, FRAME, or BOTH.
 _Entry = tuple[int, Callable[..., None]]
 
 MESSAGE, FRAME, BOTH = range(3)
 
-# (what the sinks take: FRAME, MESSAGE, or BOTH if they differ; all sinks).
+# (kind, all sinks). The kind is FRAME or MESSAGE if that is the only argument of every sink, otherwise BOTH.
 _DeliveryPlan = tuple[int, tuple[Callable[..., None], ...]]
 
 EVERY_SYSTEM = 0
@@ -62,10 +62,10 @@ class Bus:
     def __init__(self, dialect: Dialect = STANDARD) -> None:
         self.dialect = dialect
         self.one_at_a_time = False
-        """True to end :meth:`deliver_all` after the current frame."""
+        """If True, :meth:`deliver_all` returns after the current frame, so that the caller can check the others."""
         self.wanted: dict[int, int] = {}  # message id → number of sinks
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}
-        self._plans: dict[int, _DeliveryPlan] = {}  # cache, by system and message id
+        self._plans: dict[int, _DeliveryPlan] = {}  # cache; the key is system id << 24 | message id
         self._event_sinks: dict[type[Event], tuple[Sink, ...]] = {}
 
     def attach(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
@@ -73,7 +73,7 @@ class Bus:
         return self._attach((system_id, message_type.ID), (MESSAGE, sink))
 
     def require_frames(self, *message_types: type[Message]) -> None:
-        """Make the framer build frames of these types even without subscribers, for code that inspects every frame."""
+        """Make the framer return frames of these types even without a sink, for code that inspects every frame."""
         for message_type in message_types:
             self.attach(message_type, _discard)
 
@@ -88,7 +88,7 @@ class Bus:
         *,
         system_id: int = EVERY_SYSTEM,
     ) -> Detach:
-        """Like :meth:`attach_frames`, but also pass the decoded message if another sink needs it."""
+        """Like :meth:`attach_frames`, but also pass the message to ``sink`` if another sink needs it decoded."""
         return self._attach((system_id, message_type.ID), (BOTH, sink))
 
     def create_on_first(
@@ -123,7 +123,7 @@ class Bus:
         return once(lambda: self._detach_event(event_type, sink))
 
     def deliver(self, frame: Frame) -> None:
-        """Deliver a frame, decoded if needed. Exceptions of sinks are logged; the other sinks still get it."""
+        """Deliver a frame, decoded if needed. If a sink raises, the error is logged, and the other sinks are called."""
         self.deliver_all((frame,), _discard)
 
     def deliver_all(
@@ -173,7 +173,7 @@ class Bus:
 
     def publish(self, event: Event) -> None:
         """Deliver an event to the sinks of its class and base classes."""
-        for event_type in type(event).__mro__[:-1]:
+        for event_type in type(event).__mro__[:-1]:  # all classes of the event, without `object`
             for sink in self._event_sinks.get(event_type, ()):
                 try:
                     sink(event)
@@ -188,21 +188,21 @@ class Bus:
         return once(lambda: self._detach(key, entry))
 
     def _plan(self, frame: Frame) -> _DeliveryPlan:
-        """Return the sinks for the frame's system, then the sinks for all systems. Empty if the message is unknown."""
+        """Return the sinks for the frame's system, then those for all systems. An unknown message has no sinks."""
         entries = self._entries(frame)
         if not entries or self.dialect.get(frame.message_id) is None:
             return FRAME, ()
         kinds = {kind for kind, _ in entries}
         kind = MESSAGE if kinds == {MESSAGE} else BOTH
         if MESSAGE not in kinds:
-            kind = FRAME  # BOTH sinks take the frame alone when no other sink needs the decoded message.
+            kind = FRAME  # No sink needs the message, so it is not decoded. Sinks of kind BOTH get only the frame.
         plan = self._plans[frame.system_id << 24 | frame.message_id] = kind, tuple(sink for _, sink in entries)
         return plan
 
     def _entries(self, frame: Frame) -> tuple[_Entry, ...]:
         system_id, message_id = frame.system_id, frame.message_id
         for_all_systems = self._sinks.get((EVERY_SYSTEM, message_id), ())
-        if system_id == EVERY_SYSTEM:  # an invalid sender, whose own key is that of the sinks for all systems
+        if system_id == EVERY_SYSTEM:  # The sender's id is invalid. Only the sinks for all systems get the frame.
             return for_all_systems
         return self._sinks.get((system_id, message_id), ()) + for_all_systems
 
@@ -219,7 +219,7 @@ class Bus:
 
 
 def _remove_sink(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -> None:
-    """Remove one occurrence of the sink. A delivery in progress continues with the old tuple."""
+    """Remove one occurrence of the sink. A delivery that is in progress still uses the tuple with the sink."""
     remaining = list(table[key])
     remaining.remove(sink)
     table[key] = tuple(remaining)
@@ -233,7 +233,7 @@ def once(action: Callable[[], None]) -> Detach:
 
     def detach() -> None:
         if pending:
-            pending.pop()()  # popped first, so that a call from within the action does nothing
+            pending.pop()()  # The action is removed before its call, because it may call detach() itself.
 
     return detach
 
@@ -264,7 +264,7 @@ def copy_exception(error: ErrorT) -> ErrorT:
 
 
 class EndSignal:
-    """One-shot end signal: has the error that ended its owner, and calls the registered callbacks with it."""
+    """Signals once that its owner has ended: stores the error that ended it, and calls callbacks with this error."""
 
     def __init__(self) -> None:
         self.error: Exception | None = None
@@ -272,12 +272,12 @@ class EndSignal:
         self._callbacks: list[EndCallback] = []
 
     def raise_if_ended(self) -> None:
-        """Raise a copy of :attr:`error` if it is set."""
+        """Raise a copy of :attr:`error` if the owner has ended."""
         if self.error is not None:
             raise copy_exception(self.error)
 
     def on_end(self, callback: EndCallback) -> Detach:
-        """Call ``callback(error)`` at the end, or immediately if it has ended already."""
+        """Call ``callback(error)`` when the owner ends, or immediately if the owner has already ended."""
         if self.error is not None:
             callback(self.error)
             return _nothing
@@ -327,12 +327,12 @@ class Subscription(Generic[ItemT]):
             raise InvalidArgument(f"capacity = {capacity} is not allowed: at least 1")
         if overflow not in ("drop_oldest", "drop_newest", "error"):
             raise InvalidArgument(f"overflow = {overflow!r} is not allowed: 'drop_oldest', 'drop_newest' or 'error'")
-        # Returns the reason why no items arrive, for time-out errors. The default, str(), returns "": unknown.
+        # Function that explains in time-out errors why no items arrive. The default, `str`, returns "": no explanation.
         self._explain_timeout: Callable[[], str] = str
         self.missed: int = 0
-        """Number of items dropped because the reader was slow."""
+        """Number of items that were dropped because the reader was too slow."""
         self._attach = attach
-        self._detach: list[Detach] = []
+        self._detachers: list[Detach] = []
         self._capacity, self._overflow = capacity, overflow
         self._queue: deque[ItemT] = deque()
         self._has_reader = False
@@ -341,9 +341,9 @@ class Subscription(Generic[ItemT]):
         self._closed = False
 
     def __enter__(self) -> Self:
-        if self._closed or self._detach:
+        if self._closed or self._detachers:
             raise BusyError("a subscription can be entered only once; create a new one")
-        self._detach = list(self._attach(self._push))
+        self._detachers = list(self._attach(self._push))
         return self
 
     def __exit__(
@@ -389,16 +389,16 @@ class Subscription(Generic[ItemT]):
         return self._queue.popleft() if self._queue else None
 
     def close(self, error: Exception | None = None) -> None:
-        """Stop taking items. A waiting reader raises ``error``; without an error, its iteration ends."""
-        for detach in self._detach:
+        """Stop collecting items. A waiting reader raises ``error``; without an error, its iteration ends."""
+        for detach in self._detachers:
             detach()
-        self._detach = []
+        self._detachers = []
         self._error = self._error or error
         self._closed = True
         self._wake()
 
     def _push(self, item: ItemT) -> None:
-        if self._closed:  # closed by an earlier sink of the same delivery
+        if self._closed:  # An earlier sink of the same delivery has closed this subscription.
             return
         if len(self._queue) < self._capacity:
             self._queue.append(item)
@@ -417,7 +417,7 @@ class Subscription(Generic[ItemT]):
 
     async def _wait(self) -> None:
         if self._has_reader:
-            raise InvalidArgument("a subscription has one reader; open a second subscription for a second reader")
+            raise InvalidArgument("a subscription can have only one reader: open a second one for another reader")
         self._has_reader, self._waiter = True, asyncio.get_running_loop().create_future()
         try:
             await self._waiter

@@ -85,7 +85,7 @@ class StateCell(Generic[T]):
         self._stamp = clock if stamp is None else stamp  # returns the receive time for a value that is set now
         self.waits_for: str = waits_for
         """Names of the messages that carry the value."""
-        # Returns the reason why no values arrive, for time-out errors. The default, str(), returns "": unknown.
+        # Function that explains in time-out errors why no values arrive. The default, `str`, returns "" (unknown).
         self._explain_timeout: Callable[[], str] = str
         self._known = False
         self._latest: T | None = None
@@ -102,7 +102,7 @@ class StateCell(Generic[T]):
 
     @property
     def value(self) -> T:
-        """The latest value, of any age; raises :class:`ValueUnknownError` before the first."""
+        """The latest value, of any age. Raises :class:`ValueUnknownError` before the first value."""
         self._catch_up()
         if not self._known:
             raise ValueUnknownError(f"{self.name} is not known yet: no {self.waits_for} has been received")
@@ -110,7 +110,7 @@ class StateCell(Generic[T]):
 
     @property
     def latest(self) -> T | None:
-        """The latest value, or None before the first."""
+        """The latest value, of any age; None before the first value."""
         for feed in self._feeds:  # inlined `_catch_up`, to save the call
             if feed.pending:
                 feed.catch_up()
@@ -124,19 +124,19 @@ class StateCell(Generic[T]):
 
     @property
     def updated_at(self) -> float:
-        """Time of the latest value, in seconds of the cell's clock; −inf before the first."""
+        """Time of the latest value, in seconds of the cell's clock; −inf before the first value."""
         self._catch_up()
         return self._updated_at
 
     @property
     def age(self) -> float:
-        """Seconds since the latest value was received; inf before the first."""
+        """Seconds since the latest value was received; inf before the first value."""
         self._catch_up()
         return self._clock() - self._updated_at
 
     @property
     def source(self) -> Source | None:
-        """Sender and message of the latest value; None before the first."""
+        """Sender and message of the latest value; None before the first value."""
         self._catch_up()
         return self._source
 
@@ -148,7 +148,8 @@ class StateCell(Generic[T]):
             StaleValueError: the value is older.
             ValueUnknownError: no value has been received.
         """
-        age = self.age  # read before the value, so that another thread never gets an age that is too small
+        # The age is read first: if the loop's thread sets a new value in between, the age is too large, not too small.
+        age = self.age
         value = self.value
         if age > within:
             raise StaleValueError(
@@ -184,14 +185,14 @@ class StateCell(Generic[T]):
         return await waiter.wait(timeout, description)
 
     def changes(self) -> Changes[T]:
-        """Iterate over values that differ from their predecessor, starting with the current value if there is one.
+        """Iterate over the current value, if there is one, and all later values that differ from the value before.
 
         A slow reader gets only the latest value. The loop can be left at any time.
         """
         return Changes(self, every_arrival=False)
 
     def updates(self) -> Changes[T]:
-        """Like :meth:`changes`, but yield each received value, even if it equals its predecessor."""
+        """Like :meth:`changes`, but yield each received value, even if it equals the value before."""
         return Changes(self, every_arrival=True)
 
     @checked
@@ -217,7 +218,7 @@ class StateCell(Generic[T]):
         self._updated_at = self._stamp()
         self._arrivals += 1
         if self._sinks:
-            for sink in tuple(self._sinks):
+            for sink in tuple(self._sinks):  # A copy, because a sink may remove itself.
                 sink.receive(value)
 
     def _add_age(self, seconds: float) -> None:
@@ -227,7 +228,8 @@ class StateCell(Generic[T]):
 
     def forget(self) -> None:
         """Make the value unknown again, e.g. after a reboot. Waiters keep waiting."""
-        self._known = False  # `_latest` is kept, because another thread may just have read `_known` as True
+        # `_latest` is kept, because another thread may have read `_known` as True just before this line.
+        self._known = False
         self._source = None
         self._updated_at = -math.inf
         for sink in tuple(self._sinks):
@@ -287,7 +289,7 @@ class StateCell(Generic[T]):
     def __repr__(self) -> str:
         return f"<StateCell {self._describe()}>"
 
-    if not TYPE_CHECKING:  # type checkers know the attributes of a cell
+    if not TYPE_CHECKING:  # Without these methods, type checkers report the misuse.
 
         def __getattr__(self, name: str) -> NoReturn:
             """Raise an error that suggests ``.value``, e.g. for ``vehicle.position.latitude_deg``."""
@@ -316,16 +318,18 @@ class Changes(AsyncIterator[T]):
         cell._follow()
         self._cell = cell
         self._every_arrival = every_arrival
-        self._read_count = self._total() - (1 if cell.is_known else 0)  # a known value is yielded first
+        # The current value counts as unread, because iteration starts with it.
+        self._read_count = self._total() - (1 if cell.is_known else 0)
         self._missed = 0
 
-    def __del__(self) -> None:  # the only notice of the end, because a loop can be left at any time
+    # A reader may leave its loop at any time. Only garbage collection then shows that the iteration has ended.
+    def __del__(self) -> None:
         if hasattr(self, "_cell"):  # False if __init__ raised
             self._cell._unfollow()
 
     @property
     def missed(self) -> int:
-        """Number of values that were replaced before this reader got them."""
+        """Number of values that this reader did not get, because newer values had already replaced them."""
         return self._missed
 
     def __aiter__(self) -> Changes[T]:
@@ -340,7 +344,7 @@ class Changes(AsyncIterator[T]):
         return self._cell.value
 
     def _total(self) -> int:
-        """Return the number of values that the cell has had so far, of the kind that is iterated over."""
+        """Return how many values there were so far: changed ones for `changes`, received ones for `updates`."""
         return self._cell._arrivals if self._every_arrival else self._cell._changes
 
     async def _next_arrival(self) -> None:
@@ -366,7 +370,7 @@ class _Sink(Generic[T]):
 
 
 class _Waiter(_Sink[T]):
-    """One call of ``wait_until``: a future, and a timer for ``held_for``."""
+    """One call of ``wait_until``: a future for the result, and a timer that measures ``held_for``."""
 
     __slots__ = (
         "_cell",
@@ -397,7 +401,7 @@ class _Waiter(_Sink[T]):
             value = await self._future
         finally:
             self._cell._remove(self)
-            self._stop_hold()
+            self._stop_hold_timer()
             if timer is not None:
                 timer.cancel()
         if self._error is not None:
@@ -414,26 +418,26 @@ class _Waiter(_Sink[T]):
             self.fail(error)
             return
         if not is_met:
-            self._stop_hold()
+            self._stop_hold_timer()
         elif self._held_for <= 0:
             self._future.set_result(value)
         elif self._hold_timer is None:
-            self._hold_timer = self._loop.call_later(self._held_for, self._finish_hold)
+            self._hold_timer = self._loop.call_later(self._held_for, self._on_held_long_enough)
 
     def forget(self) -> None:
-        self._stop_hold()
+        self._stop_hold_timer()
 
     def fail(self, error: BaseException) -> None:
-        # Not set_exception: asyncio logs an exception that a cancelled caller never retrieves.
+        # set_exception() is not used, because asyncio logs an exception that a cancelled caller never retrieves.
         if not self._future.done():
             self._error = error
             self._future.set_result(None)
 
-    def _finish_hold(self) -> None:
+    def _on_held_long_enough(self) -> None:
         if not self._future.done():
             self._future.set_result(self._cell.value)
 
-    def _stop_hold(self) -> None:
+    def _stop_hold_timer(self) -> None:
         if self._hold_timer is not None:
             self._hold_timer.cancel()
             self._hold_timer = None
@@ -449,7 +453,7 @@ class _Waiter(_Sink[T]):
     def _timeout_text(self, timeout: float, description: str) -> str:
         text = f"{description or self._cell.name}: not reached within {timeout:g} s; {self._cell._describe()}"
         if self._held_for > 0:
-            text += f"; it had to hold for {self._held_for:g} s"
+            text += f"; the condition had to be true for {self._held_for:g} s without a break"
         if self._seen_count > 1:
             text += f"; {self._seen_count} values seen, last " + ", ".join(map(repr, self._seen))
         reason = self._cell._explain_timeout()
@@ -472,7 +476,7 @@ class _Observer(_Sink[T]):
         if self._every_arrival or previous is None or previous != value:
             try:
                 self._callback(previous, value)
-            except Exception:  # other observers must get the value although one is faulty
+            except Exception:  # The other observers must get the value although this one is faulty.
                 logger.exception("an observer of %s raised an exception", self._cell.name)
 
     def forget(self) -> None:

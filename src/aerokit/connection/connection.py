@@ -105,8 +105,8 @@ class Connection:
         """System ids that have a vehicle object on this connection."""
         self.components: set[tuple[int, int]] = set()
         """(system id, component id) of the components that this program provides on this connection."""
-        # (system id, component id) → function that converts loop time to the component's milliseconds since boot; it
-        # returns None while they are unknown.
+        # Maps (system id, component id) to a function that converts loop time to the component's milliseconds since
+        # boot. The function returns None while the time since boot is unknown.
         self.boot_clocks: dict[tuple[int, int], Callable[[float], float | None]] = {}
         self.link_state: StateCell[LinkState] = StateCell("link_state", self.now, "frame")
         """State of the link, from frames of any sender; ``vehicle.link_state`` is about one vehicle."""
@@ -179,10 +179,11 @@ class Connection:
             )
         frame = Frame.parse(bytes(data))
         is_known = self.bus.dialect.get(frame.message_id) is not None
+        # The frame is decoded only to find its target. An unknown message (None) goes to every peer.
         self._write(frame.raw, self.bus.dialect.decode(frame) if is_known else None, to=None)
 
     def send_as(self, encoder: FrameEncoder, message: Message, *, to: int | None = None) -> None:
-        """Send a message of another component of this program, which has an encoder of its own. See :meth:`send`."""
+        """Like :meth:`send`, for another component of this program, which has its own encoder."""
         encoder.version, encoder.signing = self._encoder.version, self._encoder.signing
         self._encode_and_write(encoder, message, to)
 
@@ -206,7 +207,7 @@ class Connection:
 
     @property
     def unsent_bytes(self) -> int:
-        """Number of written bytes that have not left this machine, if the link can measure that number.
+        """Number of written bytes that have not left this machine; 0 if the link cannot measure the number.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
         control asserted); see :class:`LinkStalled`. Always 0 for UDP.
@@ -214,7 +215,7 @@ class Connection:
         return self.link.unsent_bytes
 
     def discard_unsent(self) -> None:
-        """Discard data that was sent but has not left this program, e.g. an outdated command.
+        """Discard written data that has not left this program yet, e.g. an outdated command.
 
         The call discards all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
         stays in :attr:`unsent_bytes`.
@@ -263,7 +264,7 @@ class Connection:
         """
         self.check_types(types)
 
-        def attach(sink: Sink) -> list[Detach]:
+        def attach(sink: Sink) -> list[Detach]:  # called when the `with` block of the subscription is entered
             return [self.on_end(subscription.close), *self.attach(types, sink, system_id=system_id)]
 
         subscription: Subscription[ItemT] = Subscription(attach, capacity=capacity, overflow=overflow)
@@ -279,6 +280,7 @@ class Connection:
             ConnectionClosed, LinkLost: the connection ended.
         """
         self.raise_if_ended()
+        # New discoveries are queued while the earlier ones are yielded.
         with self.subscribe(VehicleFound, capacity=MAX_ROUTES) as discoveries:
             earlier_discoveries = [
                 discovery_event(heartbeat, self.now(), *source) for source, heartbeat in self.heartbeats.items()
@@ -311,7 +313,7 @@ class Connection:
         return self._observers.add_sent(callback)
 
     def check_types(self, types: tuple[type[Any], ...]) -> None:
-        """Raise InvalidArgument unless all types can be subscribed to."""
+        """Raise InvalidArgument unless ``types`` are one or more event classes, or message classes of the dialect."""
         if not types:
             raise InvalidArgument("name at least one message or event class to subscribe to")
         for item in types:
@@ -321,7 +323,7 @@ class Connection:
                 raise InvalidArgument(f"{item.NAME} is not in this connection's dialect")
 
     def on_end(self, callback: Callable[[Exception], None]) -> Detach:
-        """Call ``callback(error)`` when the connection ends, or immediately if it has ended already."""
+        """Call ``callback(error)`` when the connection ends, or immediately if the connection has already ended."""
         return self._end_signal.on_end(callback)
 
     # ---------------------------------------------------------------------------------- state
@@ -332,7 +334,7 @@ class Connection:
         return self._end_signal.error is None
 
     def raise_if_ended(self) -> None:
-        """Raise the error that ended the connection (ConnectionClosed, LinkLost), if it has ended."""
+        """Raise the error that ended the connection (ConnectionClosed or LinkLost), unless the connection is open."""
         self._end_signal.raise_if_ended()
 
     def last_heartbeat_at(self, system_id: int, component_id: int) -> float:
@@ -362,7 +364,7 @@ class Connection:
         return self._unix_epoch_s + self._clock()
 
     def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
-        """Explain, for error texts, why signatures block communication with this component (0: any); "" if none do."""
+        """Return why signatures block communication with this component (0: any), for error texts; "" if none do."""
         return self._gate.describe(
             heartbeat
             for (system, component), heartbeat in self.heartbeats.items()
@@ -388,9 +390,9 @@ class Connection:
         self._observers.close()
 
     def fail(self, error: Exception) -> None:
-        """Close the connection because of an internal error of aerokit, which is the cause of the waiters' errors."""
+        """Close the connection because of an internal error of aerokit, which becomes the cause of raised errors."""
         if not self.is_open and isinstance(error, AerokitError):
-            return  # a background task failed because the connection was closed before
+            return  # a background task failed only because the connection was closed before
         logger.error("the connection is closed because of an internal error of aerokit", exc_info=error)
         closed = ConnectionClosed(f"an internal error of aerokit closed the connection: {error!r}")
         closed.__cause__ = error
@@ -455,7 +457,7 @@ class Connection:
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
         """Called when the vehicle side of a zenoh network refused one of our commands."""
         self.bus.publish(OrderRefused(self._clock(), 0, message, reason, lease_holder))
-        for answer in answers:  # A framer would count these answers as received frames.
+        for answer in answers:  # Not passed to a framer, which would count these answers as frames of the link.
             self.bus.deliver(Frame.parse(answer, self._clock()))
 
     def link_lost(self, error: LinkLost) -> None:
@@ -484,7 +486,7 @@ class Connection:
             self._background.start(self._multilink.watch, "aerokit links")
 
     async def _send_heartbeats(self) -> None:
-        """Once a second: send our heartbeat if the program is active, update the link's state, save the recording."""
+        """Once a second, send our heartbeat if it is not paused, update the link's state, and flush the recording."""
         while self.is_open:
             if self._heartbeat is not None and self._heartbeat.should_send():
                 self.send(self._heartbeat.message)
@@ -537,7 +539,7 @@ class Connection:
 
 
 def _filter_by_system(system_id: int, sink: Sink) -> Sink:
-    """Wrap a sink so that it gets only events of this system and of the link as a whole."""
+    """Wrap a sink so that it gets only events of this system, and events of the whole link (system id 0)."""
 
     def filtered(event: Event) -> None:
         if event.system_id in (0, system_id):

@@ -60,11 +60,11 @@ class ExchangeRun(Generic[ResultT]):
     def receive(self, message: Message) -> None:
         try:
             self._exchange.receive(message, self._connection.now())
-        finally:  # the exchange continues after an exception of a program's callback, which the bus logs
+        finally:  # If a callback of the program raises here, the bus logs the exception, and the exchange continues.
             self._after_step()
 
     def link_chosen(self, system_id: int, event: LinkSelected) -> None:
-        """Inform the exchange that the connection now uses another of several links."""
+        """Inform the exchange that the connection has switched to another of its links."""
         if event.system_id == system_id and event.before is not None:
             self._exchange.link_changed(self._connection.now())
             self._after_step()
@@ -77,7 +77,7 @@ class ExchangeRun(Generic[ResultT]):
     def _expire(self) -> None:
         now = self._connection.now()
         if self._deadline is not None:
-            # A timer may fire early by the clock's resolution. Without this line, the exchange would wait again.
+            # A timer may fire early by the clock's resolution. `expire` would then find that nothing is due yet.
             now = max(now, self._deadline)
             self._deadline = None
         try:
@@ -91,7 +91,7 @@ class ExchangeRun(Generic[ResultT]):
         try:
             for message in exchange.take_outbox():
                 self._connection.send(message)
-        except Exception as error:  # passed on to the caller of result()
+        except Exception as error:  # The exchange ends, and result() raises this error.
             exchange.abort(error)
         if exchange.done:
             self._connection.deadlines.cancel(self._expire)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-MAX_WAITING = 1000  # frames
+MAX_WAITING = 1000  # maximum number of sent frames that wait for the first received frame
 
 SETUP_SIGNING = (256).to_bytes(3, "little")  # message id, as in the header of a MAVLink 2 frame
 
@@ -35,8 +35,8 @@ SETUP_SIGNING = (256).to_bytes(3, "little")  # message id, as in the header of a
 class Recording:
     """A ``.tlog`` file of one connection. An existing file is kept under a numbered name, see :func:`keep_existing`.
 
-    It is renamed when the first frame is received, so without a frame it keeps its name. Frames are written unchanged,
-    signatures included; SETUP_SIGNING is left out because it contains the key.
+    The existing file is renamed when the first frame is received; without a frame, it keeps its name. Frames are
+    written unchanged, with their signatures. SETUP_SIGNING is left out, because it contains the key.
 
     ``now`` is the current time on the clock of :meth:`write`. Time stamps are the system time at the start, advanced by
     that clock. The recording therefore has no jump when the system clock is set in flight, e.g. on a companion computer
@@ -51,10 +51,10 @@ class Recording:
         self._unix_epoch_s = time.time() - now
         self._writer: TlogWriter | None = None
         self._file: BinaryIO | None = None
-        # Sent frames that wait until the first frame is received and an existing file is renamed; None: write at once.
+        # Sent frames that wait until a frame is received and the existing file is renamed. None: no frame must wait.
         self._waiting: deque[tuple[bytes, float]] | None = None
         try:
-            if os.path.exists(path) and not os.path.isfile(path):  # a device or a pipe
+            if os.path.exists(path) and not os.path.isfile(path):  # The path is that of a device or a pipe.
                 self._writer = TlogWriter(path)
             elif os.path.exists(path):
                 _check_renamable(path)
@@ -87,7 +87,7 @@ class Recording:
             self._write(raw, at)
 
     def _open_new(self) -> None:
-        """Create the file. A file that has the name, even one created in this moment, is kept."""
+        """Create the file. An existing file of this name is renamed, even if it was created just before."""
         while True:
             try:
                 self._file = open(self._path, "xb")  # noqa: SIM115 - closed by close()

@@ -71,7 +71,7 @@ class PeerTable:
         if framer is None:
             framer = self._add_unverified(peer)
         frames = framer.receive(data, now)
-        if framer.statistics.frames:
+        if framer.statistics.frames:  # The first valid frame makes the sender a peer.
             del self._unverified[peer]
             if not self._make_room(now):
                 framer.close()
@@ -102,7 +102,7 @@ class PeerTable:
         return framer
 
     def _make_room(self, now: float) -> bool:
-        """Evict a peer if the table is full. Return False if there is still no room."""
+        """Evict a peer if the table is full. Return False if no peer may be evicted."""
         if len(self.framers) < MAX_PEERS:
             return True
         evicted = list(self._evictable_peers(self.framers, now))
@@ -117,7 +117,7 @@ _HEARTBEAT_ID = Heartbeat.ID
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# A pause of the loop of at least this length delays a heartbeat.
+# Pauses of the event loop are logged from this length on, because they delay a heartbeat, which is sent at 1 Hz.
 BLOCKED_WARNING_S = 1.0
 
 BLOCKING_CODE_HINT = (
@@ -152,7 +152,7 @@ class FrameReceiver:
         self._is_closed = False
         bus.one_at_a_time = multilink is not None
         gate.on_change = self._update_checks
-        bus.require_frames(Heartbeat)  # routes and diagnosis need heartbeats
+        bus.require_frames(Heartbeat)  # Routes, and the diagnosis of failed connections, need all heartbeats.
 
     def start(self) -> None:
         self._loop_watch.start()
@@ -184,7 +184,9 @@ class FrameReceiver:
             self._check_and_deliver(frames, framer, peer)
             return
         last = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
-        if last is not None:  # a sink of this frame has closed the connection, set a key or added an observer
+        if last is not None:
+            # The delivery stopped after the frame `last`, because one of its sinks closed the connection, set a signing
+            # key or added an observer. The other frames now need checks; `last` was not yet passed to the observers.
             self.observers.notify_received(last, peer)
             self._check_and_deliver(frames[frames.index(last) + 1 :], framer, peer)
 
@@ -200,8 +202,8 @@ class FrameReceiver:
             is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
             if not gate.is_open and not self._is_admitted(frame, is_other_peer):
                 continue
-            # The recording of one link has every frame with a valid signature, also the frames that are refused below.
-            # With several links, frames are recorded after `accepts`, so that each frame is in the file once.
+            # With one link, each frame with a valid signature is recorded here, even if a check below refuses it. With
+            # several links, frames are recorded further below, after `accepts` has removed the copies.
             if observers.recording is not None and multilink is None:
                 observers.recording.write(frame.raw, self._clock())
             if is_other_peer and not self._claims_route(framer, frame, peer):
@@ -237,6 +239,7 @@ class FrameReceiver:
         return sum(source.received for source in sources), sum(source.lost for source in sources)
 
     def _on_blocked(self, seconds: float) -> None:
+        """Publish that the event loop was blocked, and log a warning if heartbeats were late."""
         if seconds >= BLOCKED_WARNING_S:
             logger.warning(
                 "the event loop was blocked for %.1f s: no messages or heartbeats were processed; %s",
@@ -246,11 +249,11 @@ class FrameReceiver:
         self._bus.publish(LoopBlocked(self._clock(), 0, seconds))
 
     def _on_slept(self, seconds: float) -> None:
-        logger.warning("the computer slept for %.0f s: all values of vehicles are now older by this time", seconds)
+        logger.warning("the computer slept for %.0f s: the age of all vehicle values includes this time", seconds)
         self._bus.publish(ComputerSlept(self._clock(), 0, seconds))
 
     def _update_checks(self) -> None:
-        """Determine whether frames need work besides delivery: checks of route or signature, or observers."""
+        """Turn the fast path off if routes, signatures or observers need more than the delivery of frames."""
         self._bus.one_at_a_time = (
             self._is_closed
             or self._multilink is not None
@@ -270,7 +273,8 @@ class FrameReceiver:
         framer.wanted = None if framer.keep_unknown else self._bus.wanted
 
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
-        # Only the first copy of a frame is checked, because a second check would take the next copy for a replay.
+        # Of the copies that arrive over several links, only the first is checked. A check of the next copy would refuse
+        # it as a replay.
         if self._multilink is not None and self._multilink.copies.was_admitted:
             return True
         is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)
@@ -282,7 +286,7 @@ class FrameReceiver:
         return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_verified(frame))
 
     def _is_stale(self, framer: Framer, frame: Frame) -> bool:
-        """Return True if an out-of-order frame is to be dropped: a second sender's frame or an outdated heartbeat."""
+        """Return True if a frame must be dropped: another sender uses its ids, or it is an outdated heartbeat."""
         is_foreign = frame in framer.foreign
         if not is_foreign and frame not in framer.late:
             return False
@@ -295,7 +299,8 @@ class FrameReceiver:
 
     def _record_heartbeat(self, frame: Frame, framer: Framer, peer: Peer) -> None:
         heartbeat = self._bus.dialect.decode(frame)
-        if frame.system_id == 0 or not isinstance(heartbeat, Heartbeat):
+        is_valid_sender = frame.system_id != 0  # 0 is the broadcast address
+        if not is_valid_sender or not isinstance(heartbeat, Heartbeat):
             return
         if self._routes.record_heartbeat(frame, peer, framer.counters_of(frame)):
             source = frame.system_id, frame.component_id
@@ -303,6 +308,6 @@ class FrameReceiver:
             self.heartbeats[source] = heartbeat
             if is_new:
                 self._bus.publish(discovery_event(heartbeat, self._clock(), *source))
-            if len(self.heartbeats) > MAX_ROUTES:  # more than there are routes, so some belong to expired routes
+            if len(self.heartbeats) > MAX_ROUTES:  # There are at most MAX_ROUTES routes, so some have expired.
                 for expired in [source for source in self.heartbeats if not self._routes.has_route(source)]:
                     del self.heartbeats[expired]

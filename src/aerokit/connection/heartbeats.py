@@ -72,7 +72,7 @@ def discovery_event(
 
 
 BLOCKING_MAX_IDLE_S = 60.0
-"""Seconds without a call after which a blocking program's heartbeat pauses. Programs rarely sleep longer in flight."""
+"""The heartbeat of a blocking program pauses after this many seconds without a call. Programs rarely sleep longer."""
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -92,14 +92,14 @@ class OwnHeartbeat(Snapshot):
 
     def _check(self) -> None:
         if not isinstance(self.type, int) or not 0 <= self.type <= 255:
-            raise InvalidArgument(f"type = {short_repr(self.type)} is not allowed: a MAV_TYPE, 0 to 255")
+            raise InvalidArgument(f"type = {short_repr(self.type)} is not allowed: it must be a MAV_TYPE (0 to 255)")
         limit = self.fed_within_s
         if limit is not None and not (isinstance(limit, (int, float)) and limit >= 1):
-            raise InvalidArgument(f"fed_within_s = {short_repr(limit)} is not allowed: at least 1 second, or None")
+            raise InvalidArgument(f"fed_within_s = {short_repr(limit)} is not allowed: it must be at least 1, or None")
 
 
 class ActivityMonitor:
-    """Tracks when the program last showed activity. Thread-safe; ``clock`` returns seconds."""
+    """Tracks when the program last called aerokit. Thread-safe; ``clock`` returns seconds."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock, self._fed_at = clock, clock()
@@ -116,7 +116,7 @@ class ActivityMonitor:
 
 
 class HeartbeatWatchdog:
-    """Decides each second whether our heartbeat is sent, and publishes an event when that changes."""
+    """Decides each second whether our heartbeat is sent, and publishes an event when heartbeats pause or continue."""
 
     def __init__(self, settings: OwnHeartbeat, clock: Callable[[], float], publish: Callable[[Event], None]) -> None:
         self.message: Heartbeat = Heartbeat(
@@ -133,13 +133,13 @@ class HeartbeatWatchdog:
         self._paused_at: float | None = None
 
     def require(self, activity: ActivityMonitor, fed_within_s: float) -> None:
-        """Watch this activity from now on. ``fed_within_s`` is the limit if the settings have none."""
+        """Pause the heartbeat when this activity ends; ``fed_within_s`` is the limit if the settings have none."""
         self.activity = activity
         if self._limit_s is None:
             self._limit_s = fed_within_s
 
     def should_send(self) -> bool:
-        """Return True if the heartbeat is to be sent now."""
+        """Return True if the heartbeat may be sent now. Publish an event when heartbeats pause or continue."""
         idle_s = self.activity.idle_s
         limit_s = math.inf if self._limit_s is None else self._limit_s
         now = self._clock()
@@ -181,7 +181,7 @@ class LinkStateTracker:
             self._set(LinkState.CONNECTED, at)
 
     def update(self, now: float, frames: int) -> None:
-        """Set the state from ``frames``, the number of frames received since the start."""
+        """Record activity if ``frames``, the total number of frames received, has increased; otherwise `check`."""
         if frames != self._frames:
             self._frames = frames
             self.record_activity(now)
@@ -194,7 +194,7 @@ class LinkStateTracker:
             self._set(LinkState.SILENT, now)
 
     def mark_lost(self, now: float, *, publish: bool = True) -> None:
-        """Set LOST. ``publish=False`` publishes no event, because the program closed the link itself."""
+        """Set LOST. ``publish=False`` is for a link that the program closed itself: it needs no event."""
         self._set(LinkState.LOST, now, publish=publish)
 
     def _set(self, state: LinkState, now: float, *, publish: bool = True) -> None:

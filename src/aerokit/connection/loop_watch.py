@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-# Longer than the interval of 10 Hz telemetry, which then postpones the check each time. Both together are 0.2 s.
+# Telemetry at 10 Hz or more arrives within this interval, and each time postpones the check. The check is late after
+# 0.2 s: this interval plus LATE_THRESHOLD_S.
 CHECK_INTERVAL_S = 0.12
 
 LATE_THRESHOLD_S = 0.08
 
 BLOCKED_THRESHOLD_S = 0.25
 
-# After this many loop iterations without a read, all data that waited during the pause has been read. One iteration
-# would not be enough, because some loops run timers before sockets.
+# If nothing was read in this many loop iterations, all data that waited during the pause has been read. One iteration
+# would not prove this, because some loops run timers before they read sockets.
 IDLE_ITERATIONS = 3
 
 # Platform → (clock that includes suspended time, clock of the loop). On Windows, the loop's clock includes that time.
@@ -62,15 +63,15 @@ class LoopWatch:
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._on_blocked, self._on_slept = on_blocked, on_slept
-        # The maximum of three readings, because a single reading may be too small; see `_has_slept`.
+        # The largest of three readings is used, because a single reading may be too small; see `_has_slept`.
         self._suspended, self._suspended_before = suspended, max(suspended() for _ in range(3))
         self.late_after: float = math.inf
-        """Data read up to this loop time has not waited. For data read later, call :meth:`arrival`."""
+        """Data that is read before this loop time has not waited. For data that is read later, call :meth:`arrival`."""
         self._ran_at = self._due = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
         self.oldest_arrival: float = math.inf
         """Earliest possible receive time of data that is read now; infinite while no data can have waited."""
-        self._check_sleep_at = -math.inf  # the next time at which to read the clocks, because reading them is slow
+        self._check_sleep_at = -math.inf  # The clocks are not read again before this time, because reading is slow.
         self._has_read = False
         self._idle_iterations = 0
 
@@ -84,13 +85,14 @@ class LoopWatch:
             self._timer = None
 
     def arrival(self, now: float) -> float:
-        """Return ``now``, or the earliest possible receive time if data that is read now may have waited."""
+        """Return the receive time of data that is read now: ``now``, or earlier if data may have waited."""
         if now < self._check_sleep_at and self.oldest_arrival < math.inf:
+            # The clocks were just checked, and data may still wait since the last pause.
             self._has_read = True
             return self.oldest_arrival
         self._check_sleep_at = now + CHECK_INTERVAL_S / 2
-        # Data that is read in time postpones the timer, because waking a sleeping process costs as much as a few
-        # messages.
+        # Data that is read in time proves that the loop runs, so the timer is postponed. A timer that wakes an idle
+        # process would cost as much as processing a few messages.
         has_slept = self._has_slept()
         if self.oldest_arrival == math.inf and not has_slept and now <= self._due + LATE_THRESHOLD_S:
             if self._timer is not None:
@@ -109,18 +111,18 @@ class LoopWatch:
         if has_slept or late_s > LATE_THRESHOLD_S:
             self._assume_waiting_data()
         self._set_timer(now)
-        if late_s > BLOCKED_THRESHOLD_S:
+        if late_s > BLOCKED_THRESHOLD_S:  # The pause may have begun just after the timer was set.
             self._on_blocked(late_s + CHECK_INTERVAL_S)
 
     def _has_slept(self) -> bool:
-        # The suspended time is too small if the process is preempted between reading the two clocks. It never shrinks,
-        # so the largest reading is the best.
+        # The suspended time is the difference of two clocks. It is too small if the process was preempted between
+        # reading them. The true time never decreases, so the largest result is closest to it.
         before = self._suspended_before
         self._suspended_before = max(before, self._suspended())
         slept_s = self._suspended_before - before
         if slept_s <= LATE_THRESHOLD_S:
             return False
-        self._ran_at -= slept_s  # the loop's clock stood still, so data may have waited for this time, too
+        self._ran_at -= slept_s  # The loop's clock stood still meanwhile, and data may have waited all this time.
         self._on_slept(slept_s)
         return True
 
@@ -131,17 +133,17 @@ class LoopWatch:
         self._timer = self._loop.call_at(self._due, self._tick)
 
     def _assume_waiting_data(self) -> float:
-        """Date data that is read from now on to the time at which the loop last ran. Return that time."""
+        """Set the receive time of data that is read from now on to the time when the loop last ran, and return it."""
         if self.oldest_arrival == math.inf:
             self.oldest_arrival, self.late_after, self._idle_iterations = self._ran_at, -math.inf, 0
             self._loop.call_soon(self._end_assumption_when_idle)
         return self.oldest_arrival
 
     def _end_assumption_when_idle(self) -> None:
-        """After `IDLE_ITERATIONS` iterations without a read, take data as received when it is read again."""
+        """Use the time of reading as receive time again, once nothing was read for `IDLE_ITERATIONS` iterations."""
         self._idle_iterations = 0 if self._has_read else self._idle_iterations + 1
         self._has_read = False
-        if self._timer is None:
+        if self._timer is None:  # The connection is closed.
             return
         if self._idle_iterations < IDLE_ITERATIONS:
             self._loop.call_soon(self._end_assumption_when_idle)
@@ -157,7 +159,9 @@ IPYTHON_HINT = (
 
 
 def is_unintegrated_ipython() -> bool:
-    """Return True in terminal IPython without ``%gui asyncio``, where the loop runs only while a cell runs."""
+    """Return True in IPython in a terminal without ``%gui asyncio``: the loop then runs only while an input runs."""
+    # `%gui asyncio` sets `active_eventloop`. Without it, IPython runs inputs on an event loop of its own, which stands
+    # still between inputs.
     module = sys.modules.get("IPython.terminal.interactiveshell")
     shell: Any = getattr(getattr(module, "TerminalInteractiveShell", None), "_instance", None)
     if shell is None or getattr(shell, "active_eventloop", None) == "asyncio":

@@ -152,13 +152,13 @@ def _create_link(
 def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None) -> Link:
     if not isinstance(addresses, (list, tuple)) or not all(isinstance(address, (str, Link)) for address in addresses):
         raise InvalidArgument(
-            f"address = {short_repr(addresses)} is not allowed: an address, a link, or a list of them"
+            f"address = {short_repr(addresses)} is not allowed: it must be an address, a link, or a list of them"
         )
     if len(addresses) < 2:
         if not addresses:
-            raise InvalidArgument("address = [] is not allowed: at least one address or link")
+            raise InvalidArgument("address = [] is not allowed: the list must have at least one address or link")
         return _create_link(addresses[0], baud, reconnect, peers)
-    from aerokit.transport import MultiLink, parse_address  # imported here because few programs need them
+    from aerokit.transport import MultiLink, parse_address  # imported here because few programs have several links
 
     targets = [address if isinstance(address, Link) else parse_address(address) for address in addresses]
     _check_distinct(addresses, targets)
@@ -175,14 +175,15 @@ def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: boo
             raise InvalidArgument(
                 f"{address} is not allowed among several links: a recording cannot replace a link to a vehicle"
             )
-        # The filter applies to the listening links of the list. Other kinds of links refuse the argument.
+        # Only listening links get the filter, because other kinds of links refuse the argument.
         peer_filter = peers if parsed.kind in ("udpin", "udpbcast", "tcpin") else None
         factories.append(partial(ReconnectingLink, partial(create_link, parsed, baud=baud, peers=peer_filter)))
     return MultiLink(factories, costly=costly, survives_loss=reconnect)
 
 
 def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | LinkAddress]) -> None:
-    # Opening a socket or port a second time fails, which would look like a lost link.
+    # If an address is listed twice, its socket or port cannot be opened a second time. The error would look like a
+    # broken link, so it is reported here.
     seen: set[object] = set()
     for address, target in zip(addresses, targets):  # noqa: B905 - equal lengths
         key = _target_key(target)
@@ -195,7 +196,7 @@ def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | Li
 
 
 def _target_key(target: Link | LinkAddress) -> object:
-    """Return a key of the port or socket that an address opens; None if it opens a new socket each time."""
+    """Return an equal key for addresses that open the same port or socket; None if each opening gets a new one."""
     if isinstance(target, Link):
         return id(target)
     opens_new_socket = (target.kind in ("udpin", "tcpin") and not target.port) or (
@@ -203,7 +204,8 @@ def _target_key(target: Link | LinkAddress) -> object:
     )
     if opens_new_socket:
         return None
-    endpoints = [option for option in target.options if option[0] in ("connect", "listen")]  # options of zenoh
+    # On zenoh networks, the same name with other endpoints is another vehicle.
+    endpoints = [option for option in target.options if option[0] in ("connect", "listen")]
     return target.kind, target.host, target.port, target.device, target.path, tuple(endpoints)
 
 
@@ -211,7 +213,8 @@ def _return_link(link: Link) -> Link:
     return link
 
 
-# In noise of this length, a pattern that looks like a damaged frame occurs with a probability of about 10 %.
+# Noise of this many bytes contains a pattern that looks like a damaged frame with a probability of about 10 %. Damaged
+# frames are therefore only diagnosed if they are more frequent.
 NOISE_BYTES = 500
 
 MAX_LISTED_IDS = 5
@@ -237,6 +240,7 @@ class _Diagnosis:
         self._systems = {system for counters in statistics for system, _ in counters.sources}
 
     def text(self) -> str:
+        """Return the explanation, which depends on how far the received data could be interpreted."""
         if not self._bytes:
             return "no bytes were received: is the vehicle on, and is it sending to this address?"
         if not self._frames:
@@ -246,7 +250,7 @@ class _Diagnosis:
         return self._without_vehicle()
 
     def _without_frames(self) -> str:
-        # Noise contains a few patterns that look like frames, so a few of them justify no diagnosis.
+        # Noise also contains a few patterns that look like frames. They must not lead to a wrong diagnosis.
         received = f"{self._bytes} bytes were received"
         is_mostly_framed = 2 * self._bad_bytes < self._bytes
         if self._unknown_frames and is_mostly_framed:
@@ -268,6 +272,7 @@ class _Diagnosis:
         return f"{received}, but no HEARTBEAT among them"
 
     def _without_vehicle(self) -> str:
+        """Explain why heartbeats were received, but none of the wanted vehicle."""
         autopilots = sorted({system for (system, _), heartbeat in self._heartbeats.items() if is_autopilot(heartbeat)})
         if autopilots:
             names = ", ".join(map(str, autopilots))

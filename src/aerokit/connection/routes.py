@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     ComponentId = tuple[int, int]
     BootClock = Callable[[float], float | None]
 
-# Message id → offset of time_boot_ms in a frame's body: SYSTEM_TIME, ATTITUDE, ATTITUDE_QUATERNION, LOCAL_POSITION_NED,
-# GLOBAL_POSITION_INT.
+# Maps message ids to the offset of time_boot_ms in `Frame.body`. The messages are SYSTEM_TIME, ATTITUDE,
+# ATTITUDE_QUATERNION, LOCAL_POSITION_NED and GLOBAL_POSITION_INT.
 _BOOT_TIME_OFFSETS = {2: 17, 30: 9, 31: 9, 32: 9, 33: 9}
 
 CLAIM_MIN_FRAMES = 3
@@ -45,7 +45,7 @@ class RouteClaim:
     )
 
     def __init__(self) -> None:
-        self._expected: int | None = None  # sequence number expected of the owner when the claim was made
+        self._expected: int | None = None  # next sequence number of the owner when the claim was made
         # True if the peer's sequence numbers and time since boot continue the owner's stream; None: unknown.
         self._sequence_matches: bool | None = None
         self._clock_matches: bool | None = None
@@ -57,14 +57,15 @@ class RouteClaim:
     def add(self, frame: Frame, evidence: tuple[int, bool | None, bool | None]) -> None:
         """Add a frame and its evidence, the result of ``Routes._evidence``."""
         expected, sequence_matches, clock_matches = evidence
-        if expected != self._expected:  # the owner has sent since the last call, so the claim is judged anew
+        if expected != self._expected:  # The owner has sent frames since the last call, so the claim starts again.
             self._expected = expected
             self._frames = 0
             self.is_refusal_reported = False
             self._sequence_matches, self._clock_matches = sequence_matches, None
             self._claimed_at = frame.received_at
         self._frames += 1
-        if clock_matches is not None and self._clock_matches is not False:  # one mismatch is final
+        # Once the clock of a frame did not match, later matches do not count, because the peer could try many times.
+        if clock_matches is not None and self._clock_matches is not False:
             self._clock_matches = clock_matches
 
     @property
@@ -73,7 +74,10 @@ class RouteClaim:
         return self._sequence_matches is not False and self._clock_matches is True
 
     def has_replaced(self, now: float, rate: float) -> bool:
-        """Return True if the claim continues the owner's stream, and the owner missed three frames at this rate."""
+        """Return True if the claim continues the owner's stream, and the owner was silent for the time of three frames.
+
+        ``rate`` is the owner's number of frames per second.
+        """
         return (
             self.continues_owner
             and self._frames >= CLAIM_MIN_FRAMES
@@ -87,7 +91,7 @@ class RouteClaim:
 
 
 def boot_time_ms(frame: Frame) -> int | None:
-    """Return the sender's time since boot in milliseconds, or None if the frame does not contain it."""
+    """Return the sender's time since boot in milliseconds; None if the frame contains no such time."""
     offset = _BOOT_TIME_OFFSETS.get(frame.message_id)
     return None if offset is None else int.from_bytes(frame.body[offset : offset + 4], "little")
 
@@ -95,7 +99,7 @@ def boot_time_ms(frame: Frame) -> int | None:
 logger: logging.Logger = logging.getLogger("aerokit")
 
 ROUTE_TIMEOUT_S = 3.5
-"""Silence of a component after which another peer may claim its route, e.g. because its port has changed."""
+"""Another peer may claim a component's route after this silence of the component, e.g. because its port has changed."""
 
 PEER_TTL_S = 30.0
 """Time without heartbeats after which a peer may be evicted. A peer with a vehicle object is never evicted."""
@@ -117,10 +121,10 @@ class _Route:
     peer: Peer
     heartbeat_at: float
     sequence: int  # sequence number of the last heartbeat
-    expected: int  # value of `counters.expected` at the last heartbeat
+    expected: int  # `counters.expected` at the last heartbeat, from which `rate` is computed
 
     def __init__(self) -> None:
-        self.counters: SourceStatistics | None = None  # live counters of the peer's framer
+        self.counters: SourceStatistics | None = None  # the component's counters, which the peer's framer updates
         self.rate = 0.0  # frames per second
 
 
@@ -168,7 +172,8 @@ class Routes:
                 return False
             route = self._routes[source] = _Route()
         if counters is not None:
-            is_first = route.counters is not counters  # the first heartbeat, or the first that a new framer counted
+            # The rate needs two heartbeats with the same counters. A new framer has new counters.
+            is_first = route.counters is not counters
             if not is_first and frame.received_at > route.heartbeat_at:
                 route.rate = (counters.expected - route.expected) / (frame.received_at - route.heartbeat_at)
             route.counters, route.expected = counters, counters.expected
@@ -186,7 +191,7 @@ class Routes:
         return 0 < (route.sequence - frame.sequence) & 0xFF < 128
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
-        """Return the peers of a component, or of its whole system if the component is 0 or unknown.
+        """Return the peers to which a message for a component goes; if the component is 0 or unknown, for its system.
 
         Peers that send under the ids of another peer are excluded, because they would execute broadcasts.
         """
@@ -206,7 +211,7 @@ class Routes:
         return route is not None and route.peer != peer
 
     def claims_route(self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool) -> bool:
-        """Return True if ``peer`` takes over a route of another peer with this frame; see the class for the rules."""
+        """Return True if ``peer`` takes over the route of this frame's sender; see the class for the rules."""
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
         is_silent = now - route.heartbeat_at > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)
@@ -229,9 +234,9 @@ class Routes:
             self._publish(DuplicateSender(frame.received_at, frame.system_id, frame.component_id))
 
     def evictable_peers(self, peers: Iterable[Peer], now: float) -> list[Peer]:
-        """Return the first peer without a live component (heartbeat in the last 30 s, or vehicle object), if any.
+        """Return a list with the first peer without a live component, if there is one, and forget its claims.
 
-        The claims of that peer are forgotten, so they are reported again if the peer comes back.
+        A component is live if it has a vehicle object, or sent a heartbeat in the last 30 s.
         """
         live = {
             route.peer
@@ -275,16 +280,16 @@ class Routes:
         expected = 0
         if route.counters is not None:
             expected = route.counters.expected
-            # The owner may have sent half more frames than at its measured rate, and a burst of eight.
+            # While silent, the owner may have sent 50 % more frames than at its measured rate, and a burst of eight.
             max_ahead = 8 + 1.5 * route.rate * silent_s
-            if max_ahead < 128:  # A larger share of the 256 sequence numbers would match by chance.
+            if max_ahead < 128:  # Otherwise more than half of the 256 sequence numbers would match by chance.
                 sequence_matches = (frame.sequence - expected) & 0xFF <= max_ahead
         clock = self._boot_clocks.get((frame.system_id, frame.component_id))
         expected_ms = None if clock is None else clock(frame.received_at)
         boot_ms = boot_time_ms(frame)
         clock_matches: bool | None = None
         if expected_ms is None:
-            # The owner's clock is unknown, so sequence numbers alone decide.
+            # The owner's clock is unknown, so the claim is decided by sequence numbers only.
             clock_matches = None if sequence_matches is None else True
         elif boot_ms is not None:
             tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence
@@ -300,7 +305,7 @@ class Routes:
 
     def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
         source = frame.system_id, frame.component_id
-        may_be_owner = is_same_host and claim.may_continue_owner  # e.g. the owner has just changed its port
+        may_be_owner = is_same_host and claim.may_continue_owner  # The owner may just have changed its port.
         if not claim.is_duplicate_reported and not may_be_owner:
             claim.is_duplicate_reported = True
             self._publish(DuplicateSender(frame.received_at, *source))
@@ -315,7 +320,7 @@ class Routes:
             self._publish(RouteChangeRefused(frame.received_at, *source, _peer_name(peer)))
 
     def _sweep(self, now: float) -> bool:
-        """Remove expired routes, at most once a second. Return True if there is room."""
+        """Remove expired routes, at most once a second. Return True if there is room for another route."""
         if now - self._swept_at >= SWEEP_INTERVAL_S:
             self._swept_at = now
             self._routes = {
@@ -326,11 +331,11 @@ class Routes:
         return len(self._routes) < MAX_ROUTES
 
 
-_SAME_PEER = object()  # key for claims of a second sender behind the same peer as the owner
+_SAME_PEER = object()  # stands for the peer in claims of a second sender that sends through the owner's peer
 
 
 def _peer_name(peer: Peer) -> str:
-    peer = getattr(peer, "peer", peer)  # with a MultiLink, use the peer of the member link
+    peer = getattr(peer, "peer", peer)  # A peer of a MultiLink contains the peer of one of its links.
     if isinstance(peer, tuple) and len(peer) >= 2:
         host, port = peer[:2]
         return f"[{host}]:{port}" if ":" in str(host) else f"{host}:{port}"

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# Unsigned frames prove a removed key, because a vehicle with a key sends a signed heartbeat each second.
+# This many unsigned frames, over MIN_UNSIGNED_S, prove that the vehicle has removed its key, because a vehicle with a
+# key sends a signed heartbeat each second.
 MIN_UNSIGNED_FRAMES = 3
 MIN_UNSIGNED_S = 2.0
 
@@ -38,12 +39,12 @@ class SignatureGate:
     ) -> None:
         self._encoder, self._unix_time, self._publish = encoder, unix_time, publish
         self._reported: set[Refusal] = set()
-        self._handover: _Handover | None = None  # None again after the switch
-        self._is_handing_over = False  # True until the block of key_handover() ends
+        self._handover: _Handover | None = None  # None before a handover, and after the switch to the new key
+        self._is_handing_over = False  # True until the `with` block of key_handover() ends
         self._logged_keep_error: OSError | None = None
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
-        self.on_change: Callable[[], object] = bool  # bool() does nothing
+        self.on_change: Callable[[], object] = bool  # The default, `bool`, does nothing.
         """Called when :attr:`is_open` may have changed."""
 
     def use(self, signing: Signing | None) -> None:
@@ -81,7 +82,7 @@ class SignatureGate:
         self.on_change()
 
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
-        """Return True if a frame is admitted.
+        """Return True if a frame may be delivered. A frame that shows the use of the new key completes a handover.
 
         ``may_hand_over=False`` is for frames of another peer, which must not complete a handover.
         """
@@ -96,8 +97,8 @@ class SignatureGate:
             return True
         try:
             if is_of_handover and not _has_key(frame):
-                # The program may be removing this vehicle's key, so its unsigned frames are neither reported nor
-                # counted as refused.
+                # During the handover, the vehicle may remove its key as requested. Its unsigned frames are therefore
+                # neither reported nor counted as refused.
                 return signing.may_be_unsigned(frame)
             refusal = signing.check(frame, self._unix_time())
         except Exception:
@@ -115,7 +116,7 @@ class SignatureGate:
     def _report(self, frame: Frame, signing: Signing, refusal: Refusal) -> None:
         source = frame.system_id, frame.component_id
         logger.warning(
-            "a frame of %d/%d was refused: %s (%r); further ones are counted, but not logged",
+            "a frame of %d/%d was refused: %s (%r); further refused frames are counted, but not logged",
             *source,
             refusal.value,
             signing.key,
@@ -131,7 +132,7 @@ class SignatureGate:
         self._logged_keep_error = error
 
     def describe(self, heartbeats: Iterable[Heartbeat]) -> str:
-        """Explain, for error texts, why signatures block communication with these senders; "" if none do."""
+        """Return why signatures block communication with these senders, for error texts; "" if they do not."""
         signing = self._encoder.signing
         if signing is not None:
             refused = "; ".join(f"{count}: {reason.value}" for reason, count in signing.refused.items() if count)

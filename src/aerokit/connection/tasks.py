@@ -49,7 +49,7 @@ class BackgroundTasks:
     async def aclose(self) -> None:
         """Cancel all tasks and wait for their end, even if the caller is being cancelled."""
         self.cancel()
-        cancelled: asyncio.CancelledError | None = None
+        cancelled: asyncio.CancelledError | None = None  # a cancellation of the caller, to be raised at the end
         with anyio.CancelScope(shield=True):
             while self._tasks:
                 try:
@@ -73,7 +73,7 @@ async def run_shielded(work: Coroutine[Any, Any, None]) -> None:
     bounded in time. A cancellation is raised afterwards, with an exception of the work as its cause.
     """
     task = asyncio.get_running_loop().create_task(work)
-    cancelled: asyncio.CancelledError | None = None
+    cancelled: asyncio.CancelledError | None = None  # a cancellation of the caller, to be raised at the end
     with anyio.CancelScope(shield=True):
         while not task.done():
             try:
@@ -133,10 +133,10 @@ class Deadlines:
         self._loop = asyncio.get_running_loop()
         self._deadlines: dict[Alarm, float] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0  # stored here, because uvloop's TimerHandle does not give a time that has passed
+        self._timer_at = 0.0  # Stored here, because uvloop's TimerHandle does not return a time in the past.
 
     def set(self, alarm: Alarm, at: float) -> None:
-        """Call ``alarm`` at ``at`` (seconds, loop time). This replaces an earlier deadline of the alarm."""
+        """Call ``alarm`` at the loop time ``at``, in seconds. This replaces an earlier deadline of the same alarm."""
         self._deadlines[alarm] = at
         self._schedule(at)
 
@@ -151,10 +151,11 @@ class Deadlines:
             self._timer = None
 
     def _fire(self, timer_at: float) -> None:
-        # Compared with the time of the timer, not with the clock, because a loop may fire a timer slightly early.
         self._timer = None
+        # An alarm is due if the timer was set for its time or later. The clock is not read, because a loop may fire a
+        # timer slightly early.
         for alarm in [alarm for alarm, at in self._deadlines.items() if at <= timer_at]:
-            if self._deadlines.pop(alarm, None) is not None:  # None: an earlier alarm has cancelled this one
+            if self._deadlines.pop(alarm, None) is not None:  # None if another alarm of this list has cancelled it
                 alarm()
         if self._deadlines:
             self._schedule(min(self._deadlines.values()))

@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
     Report = Callable[["Attachment", HubEventKind, str], object]
 
-# Unsent bytes above which frames are queued: a third of a second of a slow radio.
+# Frames are queued while a link has more unsent bytes than this, which a slow radio sends in a third of a second.
 QUEUE_ABOVE_BYTES = {"serial": 2048, "pty": 2048}
 DEFAULT_QUEUE_ABOVE_BYTES = 16 * 1024
 
-# These links send or drop data at once, so that their unsent bytes need not be checked.
+# These links send or drop data at once. They have no unsent bytes that would need a check.
 UNBUFFERED_KINDS = ("udpin", "udpout", "udpbcast")
 
-# First bytes of frames.
+# The possible first bytes of a frame.
 _MAGICS = (bytes((MAGIC_V2,)), bytes((MAGIC_V1,)))
 
 
@@ -60,9 +60,9 @@ class Attachment:
         self.name: str = endpoint.name or self.link.address
         self.keeps_peers = True
         self.is_open: bool = False
-        self._is_on_link = False  # True once the link was opened here, so that it must be closed here
+        self._is_on_link = False  # True once this object has opened the link, and therefore must close it
         self._reports_bursts = False
-        # True if the link has one remote end, e.g. a serial port. Its port is that of peer None.
+        # True if the link has a single remote end, e.g. a serial port. Its `Port` has the key None.
         self._is_single = False
         self._burst: list[bytes] = []
         self._burst_peer: Peer = None
@@ -73,7 +73,7 @@ class Attachment:
         )
         self._is_full_reported = False
         self.counters: EndpointCounters = EndpointCounters(Counter())
-        self._former_totals = [0, 0, 0, 0]  # frames, bytes, lost frames and bad bytes of former peers
+        self._former_totals = [0, 0, 0, 0]  # frames, bytes, lost frames and bad bytes from peers that are forgotten
         self._reported_refusals: set[str] = set()
         self._gateway: SigningGateway | None = None
         if endpoint.signing is not None:
@@ -123,8 +123,8 @@ class Attachment:
     # -------------------------------------------------------------------- called by the link
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        # Hot path. The datagrams of one burst of a peer are processed together. A datagram that does not begin with a
-        # frame is processed alone, because joined data is forwarded unchanged only if it consists of whole frames.
+        # Hot path. Datagrams that a peer sends in one burst are joined and processed together. A datagram that does not
+        # begin with a frame is processed alone, because only data that consists of whole frames is forwarded as it is.
         if self._burst:
             if peer == self._burst_peer and data[:1] in _MAGICS:
                 self._burst.append(data)
@@ -151,7 +151,7 @@ class Attachment:
             now = self._now()
             port_peer = None if self._is_single else peer
             framer = self._peers.framers.get(port_peer)
-            is_whole = False  # True if the data consists of whole valid frames only
+            is_whole = False  # True if the data consists of whole valid frames and nothing else
             if framer is not None:
                 waiting_before, bad_bytes_before = framer.waiting, framer.statistics.bad_bytes
                 frames = framer.receive(data, now)
@@ -163,7 +163,7 @@ class Attachment:
             if frames:
                 port = self._ports.get(port_peer) or self._add_port(port_peer)
                 self._switch.receive(port, framer, frames, data if is_whole else None, now)
-                if port_peer != peer:  # a peer of a udpbcast link, which has answered our broadcast
+                if port_peer != peer:  # A peer of a udpbcast link has answered the broadcast: send to this peer only.
                     self.link.keep_peer(peer)
         except Exception as error:
             self._report(self, "internal_error", f"internal error of aerokit: {error!r}")
@@ -205,7 +205,7 @@ class Attachment:
             self._add_port(None)
 
     def _on_down(self) -> None:
-        if self._burst:  # the link was lost before the burst ended
+        if self._burst:  # The link was lost before it reported the end of the burst.
             self.burst_ended()
         self.is_open = False
         for peer in tuple(self._ports):
@@ -241,6 +241,7 @@ class Attachment:
         self._peers.forget(peer)
 
     def _forget_port(self, peer: Peer) -> None:
+        """Remove the port of a peer. The counters of its framer stay in the endpoint's totals."""
         framer = self._peers.framers.get(peer)
         if framer is not None:
             self._former_totals = [
@@ -272,7 +273,7 @@ class Attachment:
         self._is_full_reported = is_rejected
 
     def _on_drop(self, reason: str, frame: QueuedFrame) -> None:
-        if frame.kind is not MessageKind.ORDER:  # other frames are only counted
+        if frame.kind is not MessageKind.ORDER:  # Only dropped commands are reported; other frames are just counted.
             return
         name = self._dialect[frame.message_id].NAME
         waited_s = self._now() - frame.since
@@ -301,7 +302,7 @@ def _keep_unknown(framer: Framer) -> None:
 
 
 def _totals(framer: Framer) -> tuple[int, int, int, int]:
-    """Return the framer's numbers of frames, bytes, lost frames and bad bytes."""
+    """Return four counters of a framer: frames, bytes, lost frames and bad bytes."""
     counters = framer.statistics
     lost = sum(source.lost for source in counters.sources.values())
     return counters.frames, counters.bytes, lost, counters.bad_bytes

@@ -44,7 +44,7 @@ _INFO_KINDS = ("opened", "removed", "client_joined", "client_left", "drained", "
 
 @checks_arguments
 class Hub:
-    """Forwards MAVLink frames between endpoints by MAVLink's routing rules. It does not originate messages.
+    """Forwards MAVLink frames between endpoints by MAVLink's routing rules. A hub sends no messages of its own.
 
     ```python
     async with aerokit.Hub(["serial:///dev/ttyACM0:115200", "tcpin:0.0.0.0:5760", "udpout:10.0.0.7:14550"]) as hub:
@@ -69,7 +69,7 @@ class Hub:
             InvalidArgument: an address or a message name is wrong, or two endpoints have the same name.
         """
         if isinstance(endpoints, str):
-            raise InvalidArgument(f"endpoints = {endpoints!r} is not allowed: a list of addresses")
+            raise InvalidArgument(f"endpoints = {endpoints!r} is not allowed: it must be a list of addresses")
         self._endpoints = [_as_endpoint(endpoint) for endpoint in endpoints]
         for endpoint in self._endpoints:
             filters_of(endpoint, dialect)
@@ -209,7 +209,7 @@ class Hub:
                 raise
             self._report(attachment, "lost", f"{error}; it is retried until it can be opened")
             self._background.start(lambda: self._retry_opening(attachment), "aerokit hub opening")
-        except BaseException:  # cancelled, or the link object cannot be opened
+        except BaseException:  # The call was cancelled, or the given link object cannot be opened.
             self._attachments.pop(attachment.name, None)
             raise
         return attachment
@@ -218,14 +218,14 @@ class Hub:
         backoff = Backoff()
         while self._attachments.get(attachment.name) is attachment:
             await anyio.sleep(backoff.next_delay())
-            if self._attachments.get(attachment.name) is not attachment:  # removed meanwhile
+            if self._attachments.get(attachment.name) is not attachment:  # The endpoint was removed meanwhile.
                 return
             try:
                 await attachment.open()
             except LinkError as error:
                 logger.debug("the link still cannot be opened: %s", error)
             else:
-                if self._attachments.get(attachment.name) is not attachment:  # removed meanwhile
+                if self._attachments.get(attachment.name) is not attachment:  # The endpoint was removed meanwhile.
                     attachment.close()
                 return
 
@@ -267,7 +267,7 @@ class Hub:
     def _on_change(self, kind: HubEventKind, source: int, port: Port, other_port: Port | None) -> None:
         """Report an event of the router about the sender ``source`` (system id + 256 · component id)."""
         if other_port is not None and other_port.endpoint == port.endpoint and kind == "route_changed":
-            return  # the endpoint's IdentityGuard has reported it
+            return  # The endpoint's IdentityGuard reports a change between two peers of the same endpoint.
         ids = f"{source & 0xFF}/{source >> 8}"
         other = "a removed endpoint" if other_port is None else other_port.endpoint
         text = {
@@ -295,7 +295,7 @@ def _period(port: Port, message_id: int) -> float | None:
 
 
 async def _wait_until_closed(attachments: list[Attachment]) -> None:
-    """Wait until the links of these attachments are closed, for at most `CLOSE_TIMEOUT_S`."""
+    """Wait until the links of these attachments are closed, but at most `CLOSE_TIMEOUT_S` seconds."""
     with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT_S):
         for attachment in attachments:
             await attachment.wait_closed()
@@ -304,7 +304,7 @@ async def _wait_until_closed(attachments: list[Attachment]) -> None:
 @checked
 @async_block
 async def shared(connection: Connection, endpoints: Iterable[str | Endpoint | Link]) -> AsyncIterator[Hub]:
-    """Share an open connection with other programs for an ``async with`` block, which yields the hub.
+    """Share an open connection with other programs during an ``async with`` block; ``as`` gives the hub.
 
     ``aerokit.connect(…, share=[…])`` does the same. See `Hub.share`.
 

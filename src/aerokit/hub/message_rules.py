@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
 
-# Answers and parts of transfers, some of which have no target. A rate limit for "*" does not apply to them.
+# Answers and parts of transfers. Some have no target, so they look like telemetry, but none may be lost. A rate limit
+# for "*" therefore does not apply to them.
 ANSWERS = frozenset(
     (
         "COMMAND_ACK", "PARAM_VALUE", "PARAM_EXT_VALUE", "PARAM_EXT_ACK", "MISSION_ACK", "MISSION_COUNT",
@@ -36,7 +37,7 @@ ORDER_MAX_AGE_S = 1.0
 
 
 class Filters:
-    """Selects the messages that an endpoint sends: those that match ``only`` (all if empty) and not ``block``.
+    """Selects the messages that an endpoint sends: those that match ``only``, if it is not empty, and not ``block``.
 
     Patterns may contain wildcards: ``"GPS_*"``. ``rates`` maps patterns to the maximum rate per sender in Hz; the first
     matching pattern applies. Wildcards do not limit `ANSWERS`.
@@ -66,7 +67,7 @@ class Filters:
         """Return the minimum interval of a message in seconds: None if it is not sent, 0 if there is no limit."""
         if not (self._only or self._block or self._rates):
             return 0.0
-        if message_id not in self._dialect.rows:
+        if message_id not in self._dialect.rows:  # An unknown message matches no pattern.
             return None if self._only else 0.0
         if message_id not in self._periods:
             self._periods[message_id] = self._period(self._dialect[message_id].NAME)
@@ -78,7 +79,7 @@ class Filters:
         if any(fnmatchcase(name, pattern) for pattern in self._block):
             return None
         if name in ANSWERS:
-            rate_hz = self._rates.get(name)
+            rate_hz = self._rates.get(name)  # Only the exact name limits answers, not a wildcard.
         else:
             rate_hz = next((hz for pattern, hz in self._rates.items() if fnmatchcase(name, pattern)), None)
         return 0.0 if rate_hz is None else 1 / rate_hz
@@ -96,15 +97,15 @@ class MessageKind(Enum):
     """How a queued message is treated."""
 
     TELEMETRY = "telemetry"
-    """Replaced by newer telemetry of the same sender with the same message id."""
+    """While it waits, newer telemetry with the same message id from the same sender replaces it."""
     TRANSFER = "transfer"
-    """Kept in order, never replaced: part of a transfer, an answer, a text."""
+    """Sent in order and never replaced, e.g. part of a transfer, an answer or a text."""
     ORDER = "order"
-    """Kept in order, for at most a second: a command never arrives late."""
+    """A command: sent in order, but dropped after a second, so that it never arrives late."""
 
 
-# Periodic messages that are complete in themselves and of which a sender has one instance. Messages with an instance
-# field (batteries, range finders, named values) and all others are never replaced.
+# Periodic messages of which only the newest matters: a sender has a single instance of each. Messages with an instance
+# field (batteries, range finders, named values), and all messages that are not listed, are never replaced.
 _TELEMETRY = frozenset(
     (
         "HEARTBEAT", "SYS_STATUS", "SYSTEM_TIME", "GPS_RAW_INT", "GPS2_RAW", "GPS_STATUS",
@@ -121,7 +122,7 @@ _TELEMETRY = frozenset(
     )
 )  # fmt: skip
 
-# Messages that match a pattern of `_ORDERS`, but only answer, ask or report.
+# Messages that match a pattern of `_ORDERS` although they are only answers, requests or reports.
 _NOT_ORDERS = frozenset(
     (
         "COMMAND_ACK", "MISSION_ACK", "MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_REQUEST_LIST",
@@ -147,8 +148,8 @@ def kind_of(name: str, *, has_target: bool) -> MessageKind:
     return MessageKind.TRANSFER
 
 
-# Payload offsets of the target's system id and (if any) component id → message ids. This is a table because importing
-# all message definitions in flight would block the loop for a third of a second.
+# Maps the payload offsets of the target's system id and component id (None: no such field) to message ids. The offsets
+# are not computed from the message definitions, because importing these would block the loop for a third of a second.
 STANDARD_OFFSETS: dict[tuple[int, int | None], tuple[int, ...]] = {
     (0, None): (5,),
     (0, 1): (21, 43, 45, 47, 121, 122, 123, 156, 161, 176, 183, 186, 216, 218, 258, 321, 323, 12900, 12903, 12905,
@@ -183,13 +184,13 @@ STANDARD_OFFSETS: dict[tuple[int, int | None], tuple[int, ...]] = {
     (79, 80): (126,),
 }  # fmt: skip
 
-# An offset beyond the end of every frame, for a field that does not exist.
+# Offset of a field that does not exist. It is beyond the end of every frame.
 NO_FIELD = 1 << 16
 
 # Offsets in `Frame.body` of the target's system id and component id.
 FieldOffsets = tuple[int, int]
 
-_SYSTEM_FIELDS = {"MANUAL_CONTROL": "target"}  # the only message whose target field has another name
+_SYSTEM_FIELDS = {"MANUAL_CONTROL": "target"}  # In all other messages, the field is called target_system.
 
 
 class TargetFields:
@@ -200,7 +201,8 @@ class TargetFields:
         self.offsets: dict[int, FieldOffsets | None] = {}
         """Maps message ids to offsets; None means no target. Messages of other dialects are added on demand."""
         if dialect is STANDARD:
-            self.offsets.update(dict.fromkeys(dialect.rows))  # None: no target, unless the table has the message
+            # A message that is not in the table has no target (None).
+            self.offsets.update(dict.fromkeys(dialect.rows))
             for (system, component), message_ids in STANDARD_OFFSETS.items():
                 component = NO_FIELD if component is None else HEADER_LENGTH + component
                 self.offsets.update(dict.fromkeys(message_ids, (HEADER_LENGTH + system, component)))
@@ -208,7 +210,7 @@ class TargetFields:
     def look_up(self, message_id: int) -> FieldOffsets | None:
         """Return the offsets of a message; None if it has no target, or is not in the dialect."""
         if message_id not in self._dialect.rows:
-            return None  # not stored, because noise may contain any message id
+            return None  # An unknown id is not stored, because noise may contain millions of ids.
         offsets = self.offsets[message_id] = _field_offsets(self._dialect[message_id])
         return offsets
 
@@ -227,13 +229,14 @@ class TargetFields:
         offsets = self.offsets[message_id] if message_id in self.offsets else self.look_up(message_id)
         if offsets is None:
             return 0, 0
-        # MAVLink 2 truncates trailing zeros, and MAVLink 1 has no extension fields: missing bytes are 0.
+        # A byte beyond the end is 0: MAVLink 2 truncates trailing zeros, and MAVLink 1 has no extension fields.
         body, (system, component) = frame.body, offsets
         size = len(body)
         return body[system] if system < size else 0, body[component] if component < size else 0
 
 
 def _field_offsets(message_type: type[Message]) -> FieldOffsets | None:
+    """Return the offsets of the target's ids in `Frame.body`; None if the message has no target."""
     names = {field.name for field in message_type.FIELDS}
     system = _SYSTEM_FIELDS.get(message_type.NAME, "target_system")
     if system not in names:

@@ -41,17 +41,19 @@ class FrameQueue:
     """
 
     def __init__(self) -> None:
-        # Frames in order. The key is sender and message for telemetry, and a negative number for other frames.
+        # The frames in the order of sending. The key of telemetry identifies its sender and message. All other frames
+        # have unique negative keys.
         self._frames: dict[int, QueuedFrame] = {}
         self._bytes = 0
-        self._last_key = 0  # the last negative key
-        self._orders = self._telemetry = 0  # numbers of queued frames, so that needless searches are skipped
+        self._last_key = 0  # the negative key that was used last
+        # Numbers of queued commands and of queued telemetry frames. If there are none, the queue is not searched.
+        self._order_count = self._telemetry_count = 0
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def put(self, frame: QueuedFrame, key: int) -> list[tuple[str, QueuedFrame]]:
-        """Add a frame; ``key`` identifies its sender and message. Return dropped frames with the reason."""
+        """Add a frame; ``key`` identifies its sender and message. Return the frames dropped for it, with the reason."""
         dropped: list[tuple[str, QueuedFrame]] = []
         if frame.kind is MessageKind.TELEMETRY:
             replaced = self._frames.get(key)
@@ -60,22 +62,22 @@ class FrameQueue:
                 self._frames[key] = frame
                 return [("superseded", replaced)]
         else:
-            self._last_key -= 1  # a key of its own, so that no other frame replaces this one
+            self._last_key -= 1  # The key is unique, so that no other frame replaces this one.
             key = self._last_key
         while self._is_full(len(frame.raw)):
-            if not self._telemetry:
+            if not self._telemetry_count:
                 return [*dropped, ("queue_full", frame)]
             oldest_key = next(at for at, queued in self._frames.items() if queued.kind is MessageKind.TELEMETRY)
             dropped.append(("queue_full", self._remove(oldest_key)))
         self._frames[key] = frame
         self._bytes += len(frame.raw)
-        self._orders += frame.kind is MessageKind.ORDER
-        self._telemetry += frame.kind is MessageKind.TELEMETRY
+        self._order_count += frame.kind is MessageKind.ORDER
+        self._telemetry_count += frame.kind is MessageKind.TELEMETRY
         return dropped
 
     def expire(self, now: float) -> list[tuple[str, QueuedFrame]]:
-        """Drop commands that have waited too long. Return them with the reason."""
-        if not self._orders:
+        """Remove commands that have waited too long, and return them with the reason."""
+        if not self._order_count:
             return []
         late = [
             key
@@ -91,7 +93,7 @@ class FrameQueue:
     def clear(self) -> list[tuple[str, QueuedFrame]]:
         dropped = [("link_lost", frame) for frame in self._frames.values()]
         self._frames.clear()
-        self._bytes = self._orders = self._telemetry = 0
+        self._bytes = self._order_count = self._telemetry_count = 0
         return dropped
 
     def _is_full(self, size: int) -> bool:
@@ -100,15 +102,15 @@ class FrameQueue:
     def _remove(self, key: int) -> QueuedFrame:
         frame = self._frames.pop(key)
         self._bytes -= len(frame.raw)
-        self._orders -= frame.kind is MessageKind.ORDER
-        self._telemetry -= frame.kind is MessageKind.TELEMETRY
+        self._order_count -= frame.kind is MessageKind.ORDER
+        self._telemetry_count -= frame.kind is MessageKind.TELEMETRY
         return frame
 
 
 def _reframed(frame: Frame, crc_extra: bytes, *, flags: int) -> bytes:
-    """Return the frame as MAVLink 2, with these incompatibility flags, without signature, and with a new checksum."""
+    """Return the frame as an unsigned MAVLink 2 frame with these incompatibility flags, and a new checksum."""
     body = frame.body
-    # MAVLink 2 truncates trailing zeros (to one byte at least), MAVLink 1 does not.
+    # MAVLink 2 truncates trailing zeros, but keeps at least one byte. MAVLink 1 does not truncate.
     payload = body[9:].rstrip(b"\0") or body[9:10]
     body = bytes((len(payload), flags)) + body[2:9] + payload
     return bytes((MAGIC_V2,)) + body + x25(body + crc_extra).to_bytes(2, "little")
@@ -129,10 +131,10 @@ class SigningGateway:
         self._extras, self._refused = crc_extras, refused
 
     def admitted(self, frame: Frame, unix_time: float) -> Frame | None:
-        """Verify a received frame. Return it without its signature, or None if it is refused."""
+        """Verify a received frame. Return the frame without its signature; None if the frame is refused."""
         try:
             refusal = self.signing.check(frame, unix_time)
-        except Exception as error:  # allow_unsigned is a function of the program
+        except Exception as error:  # `check` calls the program's function `allow_unsigned`.
             self._refused(frame, f"allow_unsigned raised {error!r}")
             return None
         if refusal is not None:
@@ -147,7 +149,7 @@ class SigningGateway:
         return Frame.parse(_reframed(frame, extra, flags=0), frame.received_at)
 
     def signed(self, raw: bytes, unix_time: float) -> bytes | None:
-        """Return a complete frame with signature; None if the dialect does not have the message."""
+        """Return the frame ``raw`` with a signature; None if the dialect does not have the message."""
         frame = Frame.parse(raw)
         extra = self._extras.get(frame.message_id)
         if extra is None:
@@ -157,7 +159,7 @@ class SigningGateway:
 
 
 MAX_JOINED_BYTES = 1200
-"""Frames sent together are joined up to this size, so that their datagram is not fragmented."""
+"""Frames sent together are joined up to this size, because IP fragments larger datagrams."""
 UNLIMITED = 1 << 62
 MAX_RATE_LIMITS = 4096
 """Maximum number of (sender, message) pairs whose rate is tracked."""
@@ -216,7 +218,7 @@ class Port:
         self.batch: list[bytes] = []
         """Data to write: single frames, or pieces of several."""
         self.joined_frames: int = 0
-        """Number of frames in ``batch``, minus the number of its pieces."""
+        """Difference between the number of frames in ``batch`` and the number of its pieces, for the counters."""
         self.node: RouterPort[Port] | None = None
         self._dialect = dialect
         self._queue_above_bytes, self._may_queue = queue_above_bytes, queue_above_bytes < UNLIMITED
@@ -234,7 +236,7 @@ class Port:
 
     @property
     def joins_frames(self) -> bool:
-        """True if frames are written together, so that they may be collected in one piece."""
+        """True if several frames may be written in one piece."""
         return self.gateway is None and not self.writes_single_frames
 
     def must_queue(self) -> bool:
@@ -242,24 +244,24 @@ class Port:
 
     def enqueue(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
         message_type = self._dialect.get(plan.message_id)
-        kind = MessageKind.TRANSFER
+        kind = MessageKind.TRANSFER  # An unknown message may be part of a transfer, so it is never replaced.
         if message_type is not None:
             kind = kind_of(message_type.NAME, has_target=plan.target[0] != 0)
         self._drop(self._queue.put(QueuedFrame(raw, kind, plan.message_id, plan.target, now), plan.key))
 
     def is_due(self, key: int, period_s: float, now: float) -> bool:
-        """Return True if the rate limit allows a frame of this sender and message now. Else count it as dropped."""
+        """Return True if the rate limit allows a frame with this sender and message now. Otherwise count a drop."""
         due = self._due.get(key)
         if due is not None and now < due:
             self.counters.dropped["rate_limited"] += 1
             return False
         if due is None:
             if len(self._due) >= MAX_RATE_LIMITS:
-                self._due.clear()
+                self._due.clear()  # This bounds the memory. Each message may then be sent once too early.
             self._due[key] = now + period_s
         else:
-            # The next time counts from the last due time, so that irregular messages keep their average rate. It is at
-            # least `now`, so that no burst follows a pause.
+            # The next due time is counted from the last one rather than from now, so that irregular messages reach the
+            # allowed average rate. It is not before now, so that no burst follows a pause.
             self._due[key] = max(due, now - period_s) + period_s
         return True
 
@@ -277,7 +279,7 @@ class Port:
             write(piece, peer)
 
     def drain(self, now: float, unix_time: float) -> None:
-        """Write queued frames while the link accepts them, and drop late commands."""
+        """Drop queued commands that have waited too long, then write queued frames while the link accepts data."""
         self._drop(self._queue.expire(now))
         while self._queue and not self._is_full():
             raw = self._queue.next()
@@ -307,7 +309,7 @@ class Port:
 
 
 def joined(batch: list[bytes]) -> list[bytes]:
-    """Join pieces to larger pieces of at most `MAX_JOINED_BYTES`. Larger pieces are not joined."""
+    """Join small pieces to pieces of at most `MAX_JOINED_BYTES`. A piece that is larger stays as it is."""
     whole = b"".join(batch)
     if len(whole) <= MAX_JOINED_BYTES:
         return [whole] if whole else []

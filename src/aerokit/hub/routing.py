@@ -53,18 +53,16 @@ class ForwardingPlan(Generic[PortT]):
         sender: Sender = _UNKNOWN_SENDER,
     ) -> None:
         self.key: int = key
-        """Key of sender and message, for any target."""
+        """Number that identifies sender and message; the same for all targets."""
         self.message_id: int = message_id
         self.target: tuple[int, int] = target
         """System id and component id; 0 means all."""
         self.outs: tuple[PortT, ...] = outs
-        """Ports that get each frame. Equal tuples in the plans of one port are one object, so comparing them is cheap.
-        """
+        """Ports that get each frame. Plans of one port use the same object for equal tuples, so `is` compares them."""
         self.rate_limited: tuple[tuple[PortT, float], ...] = rate_limited
-        """Ports that get at most one frame per interval, with the interval in seconds."""
+        """(port, interval in seconds) of ports with a rate limit, which get at most one frame per interval."""
         self.reason: str = reason
-        """Reason for dropping the frames, a key of `EndpointStatistics.dropped`; "" if only the destination is missing.
-        """
+        """Reason for dropping the frames, a key of `EndpointStatistics.dropped`; "" if there is none."""
         self.is_plain: bool = not (rate_limited or reason)
         """True if each frame goes to `outs`, and nothing else is to be done."""
         self.sender: Sender = sender
@@ -74,7 +72,7 @@ class ForwardingPlan(Generic[PortT]):
 
 
 class RouterPort(Generic[PortT]):
-    """A port with the router's data about it."""
+    """One port, and what the router stores for it."""
 
     __slots__ = ("destinations", "echoes", "loop_until", "number", "plans", "port", "streams")
 
@@ -127,7 +125,7 @@ class Router(Generic[PortT]):
         self._senders: dict[int, Sender] = {}  # by system id + 256 · component id
         self._recent = RecentFrames()
         self._port_count = 0  # number of ports created so far
-        self._unproven: dict[int, None] = {}  # senders without a HEARTBEAT, which may be noise
+        self._unproven: dict[int, None] = {}  # senders that sent no HEARTBEAT yet, and may be noise
         self._swept_at = -math.inf
         self._duplicate: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="duplicate")
         self._loop: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="loop")
@@ -135,7 +133,10 @@ class Router(Generic[PortT]):
         self.on_vehicle: Callable[[PortT], object] | None = None
         """Called when an autopilot is received at a port for the first time."""
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
-        """Called with the kind of event, the sender, its port, and its former or other port (None: removed)."""
+        """Called with the kind of event, the sender, the port of the frame, and the sender's former or other port.
+
+        The last argument is None if that port was removed.
+        """
 
     def add(self, port: PortT) -> RouterPort[PortT]:
         self._port_count += 1
@@ -168,33 +169,36 @@ class Router(Generic[PortT]):
         if late or node.echoes or now >= recent.ends_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES:
             return [self.route(node, frame, now, frame in late) for frame in frames]
         newer, older, plans = recent.newer, recent.older, []
-        record = number, self._port_count, now  # for `RecentFrames`
+        record = number, self._port_count, now  # value for `RecentFrames.newer`
         for frame in frames:
             body = frame.body
             plan = streams.get(body[4:9])
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
-                # An equal frame from the same port is another frame with the same number and checksum, by chance.
+                # If the earlier frame arrived at this port, too, it is another frame. Its number and checksum are equal
+                # by chance.
                 if is_new or (newer.get(identity) or older[identity])[0] == number:
                     newer[identity] = record
                     plan.sender.received_at = now
                     plans.append(plan)
                     continue
             plans.append(self.route(node, frame, now))
-            if node.echoes:  # a frame came back: `route` must see every further frame, to detect a loop
+            if node.echoes:
+                # A frame came back. From now on, `route` must process every frame, because it counts them to detect a
+                # loop.
                 streams = {}
         return plans
 
     def route(self, node: RouterPort[PortT], frame: Frame, now: float, is_late: bool = False) -> ForwardingPlan[PortT]:
-        """Return the plan for a frame received at ``node``. ``is_late``: its sequence number is out of order."""
+        """Return the plan for a frame received at ``node``. ``is_late`` is True if its number is out of order."""
         # Hot path. Sender and target are numbers: system id + 256 · component id.
         body, message_id = frame.body, frame.message_id
         source = body[4] | body[5] << 8
         sender = self._senders.get(source)
         if sender is None:
             if message_id not in self._offsets and self._targets.is_unknown(message_id):
-                return self._unknown  # the frame may be noise, because its checksum could not be checked
+                return self._unknown  # Its checksum could not be checked, so the frame may be noise.
             sender = self._add_sender(source, node, now)
         number, recent = node.number, self._recent
         if now >= recent.ends_at or len(recent.newer) >= MAX_RECENT_FRAMES:
@@ -238,7 +242,7 @@ class Router(Generic[PortT]):
     # ------------------------------------------------------------------------------------ senders
 
     def _add_sender(self, source: int, node: RouterPort[PortT], now: float) -> Sender:
-        """Return a new sender, which is remembered if there is room."""
+        """Create a sender. It is remembered if there is room."""
         sender = Sender(source, node.number, now)
         if len(self._senders) < MAX_ROUTES or self._make_room(now):
             self._senders[source] = sender
@@ -247,7 +251,7 @@ class Router(Generic[PortT]):
         return sender
 
     def _make_room(self, now: float) -> bool:
-        """Forget a sender without heartbeats, or else all silent senders. Return True if there is room."""
+        """Forget a sender without heartbeats, or if there is none, all silent senders. Return True if there is room."""
         if self._unproven:
             source = next(iter(self._unproven))
             del self._unproven[source], self._senders[source]
@@ -274,27 +278,27 @@ class Router(Generic[PortT]):
         first_port, port_count, received_at = earlier
         if first_port == number:
             return is_late and now - received_at <= REPEAT_WINDOW_S
-        existed_then = number <= port_count  # this port was not created after the earlier frame
+        existed_then = number <= port_count  # The port already existed when the earlier frame arrived.
         return first_port in self._nodes and existed_then and now - received_at <= DUPLICATE_WINDOW_S
 
     def _is_echo(self, earlier: tuple[int, int, float], number: int, now: float) -> bool:
-        """Return True if an equal frame arrived at another port before, be it by chance or because of a loop."""
+        """Return True if an equal frame arrived at another port before, by chance or because of a loop."""
         first_port, port_count, received_at = earlier
         return first_port != number and number <= port_count and now - received_at <= LOOP_WINDOW_S
 
     def _is_loop(self, node: RouterPort[PortT], source: int, first_port: int, now: float) -> bool:
         """Count a returning frame. Return True if a loop is proven, now or during the last `LOOP_WINDOW_S`."""
         count = node.echoes[source] = min(node.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
-        is_known = now < node.loop_until
-        if count < MIN_LOOP_FRAMES and not is_known:
+        was_proven = now < node.loop_until
+        if count < MIN_LOOP_FRAMES and not was_proven:
             return False
-        if not is_known:
+        if not was_proven:
             self._report("loop", source, node, first_port)
         node.loop_until = now + LOOP_WINDOW_S
         return True
 
     def _record_new(self, node: RouterPort[PortT], source: int) -> None:
-        """Record a new frame of a sender, which counts against the sender's returning frames."""
+        """Subtract a new frame of a sender from the count of the sender's returning frames (`RouterPort.echoes`)."""
         count = node.echoes.pop(source, 0) - 1
         if count > 0:
             node.echoes[source] = count
@@ -314,7 +318,7 @@ class Router(Generic[PortT]):
             self.forget_plans()
             if self.on_vehicle is not None:
                 self.on_vehicle(node.port)
-            if sender.number != node.number:
+            if sender.number != node.number:  # The autopilot was received at another port before.
                 self._report("duplicate_sender", sender.source, node, sender.number)
 
     # -------------------------------------------------------------------------------------- plans
@@ -329,14 +333,14 @@ class Router(Generic[PortT]):
         if has_target:
             numbers = self._ports_to(*ids, source, node.number)
             if not numbers:
-                # This plan is not cached, because the number of unknown targets is not limited.
+                # This plan is not cached, because a sender could fill the cache with unknown targets.
                 return ForwardingPlan(plan_key, message_id, ids, reason="no_route")
         else:
             numbers = dict.fromkeys(self._nodes)
             if self._targets.is_order(message_id):
                 numbers = {number: None for number in numbers if not self._is_redundant(number)}
         numbers.pop(node.number, None)
-        if message_id in _RADIOS:  # an autopilot would adapt its rates to a radio that is not its own
+        if message_id in _RADIOS:  # An autopilot would adapt its message rates to a radio that is not its own.
             numbers = {number: None for number in numbers if not self._has_autopilot(number)}
         outs, rate_limited = [], []
         for number in numbers:
@@ -344,17 +348,19 @@ class Router(Generic[PortT]):
             period = self._period(port, message_id)
             if period is None:
                 continue
-            if period == 0 or has_target:
+            if period == 0 or has_target:  # Rate limits do not apply to messages with a target.
                 outs.append(port)
             else:
                 rate_limited.append((port, period))
         if len(node.plans) >= MAX_PLANS:
             node.forget_plans()
-        shared_outs = node.destinations.setdefault(tuple(outs), tuple(outs))  # one object for equal tuples
+        # Equal tuples become the same object, so that plans can be compared by identity.
+        shared_outs = node.destinations.setdefault(tuple(outs), tuple(outs))
         sender = self._senders.get(source, _UNKNOWN_SENDER)
         plan = ForwardingPlan(plan_key, message_id, ids, shared_outs, tuple(rate_limited), sender=sender)
         node.plans[key] = plan
-        # Heartbeats (0) and frames at other ports change what is known about their sender, so `route` must see them.
+        # The fast path of `route_all` is for broadcasts only. Heartbeats (0), and frames at another port than the
+        # sender's, may change the data about the sender, so `route` must process them.
         if message_id and sender.number == node.number and self._offsets.get(message_id) is None:
             node.streams[source.to_bytes(2, "little") + message_id.to_bytes(3, "little")] = plan
         return plan
@@ -372,11 +378,13 @@ class Router(Generic[PortT]):
         autopilots = [member for member in members if member.is_autopilot]
         numbers: dict[int, None] = {}
         for member in sorted(members, key=lambda member: not member.is_autopilot):
+            # A vehicle needs no further port if one of the chosen ports reaches it.
             is_reached = member.is_vehicle and any(member.is_at(number) for number in numbers)
             if is_reached:
                 continue
             for number in (here,) if member is origin else member.destinations:
-                # Through another port at which the autopilot is received, it would get the command twice.
+                # A port at which an autopilot is received is left out for other members. The autopilot would otherwise
+                # get the command twice.
                 if member.is_autopilot or not any(autopilot.is_at(number) for autopilot in autopilots):
                     numbers[number] = None
         return numbers

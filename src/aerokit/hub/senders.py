@@ -19,19 +19,19 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link, Peer
 
 DUPLICATE_WINDOW_S = 2.0
-"""A frame with the same sender, number and checksum from another port within this time is a duplicate."""
+"""Seconds in which an equal frame (same sender, number and checksum) from another port counts as a duplicate."""
 
 REPEAT_WINDOW_S = 0.5
-"""A frame with an out-of-order number that was received at the same port within this time is a duplicate."""
+"""Seconds in which an equal frame from the same port counts as a duplicate, if its number is out of order."""
 
 LOOP_WINDOW_S = 60.0
-"""Time for which a frame that returns over another port is recognised.
+"""A frame that returns through another port is recognised up to this time after it was first received.
 
 It is below 256 s, after which the sequence numbers of a component that sends only heartbeats repeat.
 """
 
 MIN_LOOP_FRAMES = 8
-"""Number of returning frames of one sender that proves a loop. Fewer may be equal by chance, with two radios."""
+"""This many returning frames of one sender prove a loop. With two radios, a few frames may be equal by chance."""
 
 MAX_RECENT_FRAMES = 1 << 15
 
@@ -84,14 +84,14 @@ class Sender:
         return (self.number,) if self.is_vehicle else self.ports
 
     def is_at(self, number: int) -> bool:
-        """Return True if this port received the sender shortly before the sender's last frame."""
+        """Return True if the sender was received at this port within `ROUTE_TIMEOUT_S` before its last frame."""
         return number == self.number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
     def record_at_other_port(self, number: int, now: float) -> bool:
-        """Record a frame at another port than `number`. Return True if this changes routes."""
+        """Record a frame at another port than `number`. Return True if the routes to the sender change."""
         is_new = now - self.ports.get(number, -math.inf) > ROUTE_TIMEOUT_S
         self.ports[number] = now
-        if now - self.received_at > ROUTE_TIMEOUT_S:
+        if now - self.received_at > ROUTE_TIMEOUT_S:  # The sender is silent at `number`: messages go to the new port.
             self.ports[self.number] = self.received_at
             self.number, self.received_at = number, now
             return True
@@ -99,7 +99,7 @@ class Sender:
 
     def record_heartbeat(self, body: bytes) -> bool:
         """Record from a HEARTBEAT whether the sender is a vehicle or an autopilot. Return True if that has changed."""
-        if len(body) <= _AUTOPILOT:
+        if len(body) <= _AUTOPILOT:  # The payload is too short for a HEARTBEAT.
             return False
         before = self.is_vehicle, self.is_autopilot
         self.is_vehicle = body[_TYPE] != _GROUND_STATION
@@ -107,7 +107,7 @@ class Sender:
         return before != (self.is_vehicle, self.is_autopilot)
 
     def remove_port(self, number: int) -> bool:
-        """Forget a removed port. Return True if the sender was received at no other port."""
+        """Forget a port that was removed. Return True if the sender is not known at any other port."""
         self.reported.discard(number)
         self.ports.pop(number, None)
         if self.number == number and self.ports:
@@ -122,8 +122,8 @@ class RecentFrames:
     __slots__ = ("ends_at", "newer", "older")
 
     def __init__(self) -> None:
-        # Maps sender, sequence number and checksum (as one number) to (port number, number of ports created so far,
-        # time).
+        # Maps sender, sequence number and checksum (as one number) to a record of the frame: the number of the port at
+        # which it arrived, the number of ports created until then, and the time.
         self.newer: dict[int, tuple[int, int, float]] = {}
         self.older: dict[int, tuple[int, int, float]] = {}
         self.ends_at: float = float("-inf")
@@ -157,7 +157,7 @@ class IdentityGuard:
         self._current_peer: Peer = None
 
     def admits(self, frame: Frame, framer: Framer, peer: Peer) -> bool:
-        """Return True if this peer may send this frame. Call it for heartbeats, and for all frames if `is_shared`."""
+        """Return True if this peer may send this frame. Call it for heartbeats; if `is_shared`, for every frame."""
         if self._routes.arrived_on_other_peer(frame, peer):
             self._current_peer = peer
             if not self._routes.claims_route(frame, peer, framer.counters_of(frame), is_signed=False):
@@ -179,7 +179,7 @@ class IdentityGuard:
     def _publish(self, event: Event) -> None:
         if isinstance(event, RouteChanged):
             source = event.system_id, event.component_id
-            self._reported_at.pop(source, None)
+            self._reported_at.pop(source, None)  # The peer that owned the ids may now be the duplicate: report it.
             text = f"messages for {source[0]}/{source[1]} are sent here now, no longer to {event.before}"
             self._report("route_changed", self._current_peer, text)
         elif isinstance(event, DuplicateSender):

@@ -60,7 +60,8 @@ class SharedLink(Link):
             frame = Frame.parse(raw)
             if not self._is_duplicate_reported:
                 self._check_ids(frame)
-            if self._targets.target_of(frame)[0] == self._connection.source_system:
+            is_for_this_program = self._targets.target_of(frame)[0] == self._connection.source_system
+            if is_for_this_program:
                 continue
             try:
                 gateway = self._current_gateway()
@@ -69,7 +70,7 @@ class SharedLink(Link):
                     self.dropped_writes += 1
                 else:
                     self._connection.write_raw(signed)
-            except AerokitError:  # the connection has ended
+            except AerokitError:  # The connection has ended, or the frame cannot be signed.
                 self.dropped_writes += 1
 
     @property
@@ -89,13 +90,13 @@ class SharedLink(Link):
         """See `Link.wait_closed`."""
 
     def _check_ids(self, frame: Frame) -> None:
-        """Report another station with our ids, because both stations would process the vehicle's answers to either."""
+        """Report a frame of another station with our ids. Both stations would process each other's answers."""
         ours = self._connection.source_system, self._connection.source_component
         if (frame.system_id, frame.component_id) == ours:
             self._is_duplicate_reported = True
             logger.warning(
-                "another station on the shared link uses this program's ids %d/%d, so that each processes the answers"
-                " to the other; give this program other ids (source_system=, source_component=)",
+                "another station on the shared link uses the same ids %d/%d as this program, so both process each"
+                " other's answers; give this program other ids (source_system=, source_component=)",
                 *ours,
             )
             self._connection.bus.publish(DuplicateSender(self._connection.now(), *ours))
@@ -113,7 +114,8 @@ class SharedLink(Link):
             self._receiver.bytes_received(unsigned, None)
 
     def _on_end(self, error: Exception) -> None:
-        # Report the loss in the next loop iteration, because the connection may have ended inside a write.
+        # The loss is reported in the next loop iteration, because the connection may have ended during a write. A link
+        # must not call its receiver during a write.
         self._loss_report = asyncio.get_running_loop().call_soon(self._report_loss, error)
 
     def _report_loss(self, error: Exception) -> None:
@@ -133,15 +135,15 @@ class SharedLink(Link):
 
 
 def _frames(data: bytes) -> Iterator[bytes]:
-    """Split data of a hub, which consists of whole frames."""
+    """Split data that a hub writes into its frames."""
     begin = 0
     while begin < len(data):
         payload_length = data[begin + 1]
         if data[begin] == MAGIC_V1:
-            end = begin + 8 + payload_length  # 6 bytes of header, 2 of checksum
+            end = begin + 6 + payload_length + 2  # header, payload and checksum
         else:
-            is_signed = data[begin + 2] != 0  # the incompatibility flags, of which only "signed" exists
-            end = begin + 12 + payload_length + (SIGNATURE_LENGTH if is_signed else 0)
+            is_signed = data[begin + 2] != 0  # "signed" is the only incompatibility flag.
+            end = begin + 10 + payload_length + 2 + (SIGNATURE_LENGTH if is_signed else 0)
         yield data[begin:end]
         begin = end
 

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.framer import Framer
 
-# Interval at which full links are polled. The interval is doubled while no link accepts data.
+# Full links are polled at this interval. It is doubled after each poll in which no link accepted data.
 MIN_POLL_INTERVAL_S = 0.01
 MAX_POLL_INTERVAL_S = 0.08
 
-# Frames of a long burst are written each time this many have been collected.
+# If a port receives more frames than this at once, the collected frames are written immediately.
 MAX_BURST_FRAMES = 256
 
 _message_id = attrgetter("message_id")
@@ -80,7 +80,7 @@ class Switch:
         self._queueing_ports.clear()
 
     def receive(self, port: Port, framer: Framer, frames: list[Frame], data: bytes | None, now: float) -> None:
-        """Forward frames received at a port. ``data``: these frames as received, None if there were other bytes."""
+        """Forward frames received at a port. ``data`` has their bytes; None if other bytes were between them."""
         # Hot path: local variables are faster than attributes.
         node, guard, peer = port.node, port.guard, port.peer
         if node is None or port.is_read_only:
@@ -97,7 +97,7 @@ class Switch:
             received_count = len(frames)
             frames, late = self._admitted(port, framer, frames)
             if port.gateway is not None or len(frames) != received_count:
-                data = None
+                data = None  # The bytes as received are no longer those of the frames to forward.
         plans = self.router.route_all(node, frames, now, late)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
             for frame, plan in zip(frames, plans, strict=True):
@@ -105,7 +105,7 @@ class Switch:
         if self._ports_to_flush:
             if len(frames) > MAX_BURST_FRAMES:
                 self.flush()
-            elif not (self._is_scheduled or port.reports_bursts):
+            elif not (self._is_scheduled or port.reports_bursts):  # Otherwise the end of the burst flushes.
                 self._is_scheduled = True
                 self._loop.call_soon(self.flush)
 
@@ -119,7 +119,7 @@ class Switch:
             if port.batch:
                 try:
                     port.flush(unix_time)
-                except Exception as error:  # e.g. the time stamps of a key are exhausted; other ports continue
+                except Exception as error:  # E.g. the time stamps of a key are exhausted. Other ports must continue.
                     self._on_error(port, error)
 
     def _admitted(self, port: Port, framer: Framer, frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
@@ -131,7 +131,7 @@ class Switch:
             frame = received if gateway is None else gateway.admitted(received, self.unix_time())
             if frame is None:
                 continue
-            # The guard records every heartbeat (0). A single peer has no rival, so its other frames need no check.
+            # The guard must see every heartbeat (0). If there is only one peer, its other frames need no check.
             must_check = guard is not None and (guard.is_shared or frame.message_id == 0)
             if guard is not None and must_check and not guard.admits(frame, framer, peer):
                 port.counters.dropped["foreign"] += 1
@@ -142,7 +142,7 @@ class Switch:
         return admitted, late
 
     def _forward_together(self, plans: list[ForwardingPlan[Port]], data: bytes) -> bool:
-        """Forward the frames of ``data`` unchanged if all go to the same ports in one datagram. Else return False."""
+        """Forward ``data`` as it is if its frames go to the same ports, and fit into one write. Else return False."""
         outs = plans[0].outs
         for plan in plans:
             if plan.outs is not outs or not plan.is_plain:
@@ -175,7 +175,7 @@ class Switch:
 
     def _start_batch(self, out: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
         if out.node is None:
-            return  # removed since the frame was routed
+            return  # The port was removed after the frame was routed.
         if out.must_queue():
             out.enqueue(raw, plan, now)
             if out not in self._queueing_ports:

@@ -52,6 +52,7 @@ class Endpoint(Snapshot):
     """True to start the hub even if this endpoint cannot be opened yet (a server that starts later), and to retry."""
 
     def _check(self) -> None:
+        """Raise InvalidArgument if a field is invalid."""
         if not isinstance(self.address, (str, Link)):
             raise _not_allowed("address", self.address, "a connection string or a link")
         if isinstance(self.address, str):
@@ -65,10 +66,10 @@ class Endpoint(Snapshot):
             if isinstance(patterns, str) or not _are_texts(patterns):
                 raise _not_allowed(field, patterns, "a tuple of message names")
         if not isinstance(self.rates, Mapping) or not _are_texts(self.rates):
-            raise _not_allowed("rates", self.rates, "names of messages and Hz: {'ATTITUDE': 5}")
+            raise _not_allowed("rates", self.rates, "a mapping of message names to Hz, such as {'ATTITUDE': 5}")
         for hz in self.rates.values():
             if isinstance(hz, bool) or not isinstance(hz, (int, float)):
-                raise _not_allowed("rates", self.rates, "names of messages and Hz: {'ATTITUDE': 5}")
+                raise _not_allowed("rates", self.rates, "a mapping of message names to Hz, such as {'ATTITUDE': 5}")
         if isinstance(self.baud, bool) or not isinstance(self.baud, int) or self.baud <= 0:
             raise _not_allowed("baud", self.baud, "a whole number above 0")
         if not isinstance(self.name, str):
@@ -80,7 +81,7 @@ def _are_texts(values: object) -> bool:
 
 
 def _not_allowed(field: str, value: object, allowed: str) -> InvalidArgument:
-    return InvalidArgument(f"{field} = {short_repr(value)} is not allowed: {allowed}")
+    return InvalidArgument(f"{field} = {short_repr(value)} is not allowed: it must be {allowed}")
 
 
 class EndpointStatistics(Snapshot):
@@ -100,7 +101,7 @@ class EndpointStatistics(Snapshot):
     bytes_out: int
     """Bytes written; writes that the link dropped are counted in ``dropped["link"]``."""
     lost: int
-    """Number of frames that were lost before this endpoint, by sequence numbers."""
+    """Number of frames that were sent to this endpoint but not received, by their sequence numbers."""
     bad_bytes: int
     """Bytes outside valid frames."""
     waiting: int

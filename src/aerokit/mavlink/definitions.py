@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 _MIN_VALUE, _MAX_VALUE = -(1 << 63), (1 << 64) - 1
 
-# Names used by message classes. A field of a private dialect with such a name gets a trailing underscore.
+# Names of attributes that message classes already have. A field with such a name gets a trailing underscore. Only
+# private dialects have such fields.
 _RESERVED = frozenset(
     (
         "ID", "NAME", "CRC_EXTRA", "FIELDS", "LENGTH", "BASE_LENGTH", "received_frame",
@@ -49,11 +50,11 @@ class FieldDefinition:
     description: str = ""
     extension: bool = False
     default: int | None = None  # only for mavlink_version
-    carries_bytes: bool = False  # True for a char array that holds bytes, see BYTES_IN_CHARS
+    carries_bytes: bool = False  # True for a char array that holds bytes instead of a text; see BYTES_IN_CHARS
 
     @property
     def attribute(self) -> str:
-        """Name in Python: the standard's name, with a trailing underscore if that is a keyword."""
+        """Name in Python: the standard's name. A Python keyword gets a trailing underscore."""
         reserved = keyword.iskeyword(self.name) or self.name in _RESERVED
         return self.name + "_" if reserved else self.name
 
@@ -81,8 +82,8 @@ class MessageDefinition:
     name: str
     fields: tuple[FieldDefinition, ...]
     description: str = ""
-    origin: str = ""  # name of the XML file without suffix
-    remarks: tuple[str, ...] = ()  # e.g. that the message is deprecated, superseded or work in progress
+    origin: str = ""  # name of the XML file without its suffix
+    remarks: tuple[str, ...] = ()  # sentences which say that the message is deprecated, superseded or work in progress
 
     @property
     def class_name(self) -> str:
@@ -108,6 +109,7 @@ class MessageDefinition:
     @property
     def crc_extra(self) -> int:
         """Byte derived from the definition; the checksum of a frame fails if the sender has another definition."""
+        # https://mavlink.io/en/guide/serialization.html#crc_extra
         text = self.name + " "
         for field in self.wire_fields:
             if not field.extension:
@@ -129,7 +131,7 @@ class EntryDefinition:
 
 @dataclass(frozen=True)
 class EnumDefinition:
-    """One enum. It has the entries of one file or, after `merged_enums`, of all files."""
+    """One enum, with the entries of one file. The enums that `merged_enums` returns have the entries of all files."""
 
     name: str
     entries: tuple[EntryDefinition, ...]
@@ -137,7 +139,7 @@ class EnumDefinition:
     description: str = ""
     origin: str = ""
     remarks: tuple[str, ...] = ()
-    own_prefix: str = ""  # value of `prefix`; empty: derive the prefix from the entries
+    own_prefix: str = ""  # the value of `prefix`; if empty, the prefix is derived from the entries
 
     @property
     def class_name(self) -> str:
@@ -180,7 +182,8 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
         InvalidArgument: a file is missing, is larger than 16 MB, or is not MAVLink XML.
     """
     dialects: dict[str, DialectDefinition] = {}
-    pending: set[str] = set()  # files whose includes are being read, because files may include each other
+    # Files that are being read. They are not read again, because files may include each other.
+    pending: set[str] = set()
 
     def visit(file: Path) -> None:
         if file.name in dialects or file.name in pending:
@@ -197,7 +200,8 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
 
 def read_xml(path: Path) -> DialectDefinition:
     """Read one file without its includes. Raises InvalidArgument if the file is not MAVLink XML."""
-    from xml.etree.ElementTree import ParseError  # not needed for definitions from pymavlink
+    # The XML parsers are imported here, because definitions from pymavlink do not need them.
+    from xml.etree.ElementTree import ParseError
 
     from defusedxml import ElementTree as DefusedXml
 
@@ -210,7 +214,7 @@ def read_xml(path: Path) -> DialectDefinition:
             includes=tuple((node.text or "").strip() for node in root.findall("include")),
         )
     except FileNotFoundError:
-        raise InvalidArgument(f"no dialect file {path}") from None
+        raise InvalidArgument(f"there is no dialect file {path}") from None
     except (InvalidArgument, FileFormatError):
         raise
     except (ParseError, LookupError, ValueError) as error:
@@ -226,6 +230,7 @@ def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
             if first is None:
                 merged[enum.name] = enum
                 continue
+            # An entry in a later file replaces an entry with the same name.
             entries = {entry.name: entry for entry in (*first.entries, *enum.entries)}
             ordered = sorted(entries.values(), key=lambda entry: entry.value)
             merged[enum.name] = replace(first, entries=tuple(ordered))
@@ -238,13 +243,14 @@ def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
 def _find_include(include: str, file: Path, search: Sequence[Path]) -> Path:
     folders = [file.parent, *search]
     for folder in folders:
-        if os.path.isfile(folder / include):  # unlike Path.is_file, os.path.isfile does not raise for long names
+        if os.path.isfile(folder / include):  # For a name that is too long, Path.is_file would raise.
             return folder / include
     searched = ", ".join(str(folder) for folder in folders)
-    raise InvalidArgument(f"{file.name} includes {include}, which is in none of: {searched}")
+    raise InvalidArgument(f"{file.name} includes {include}, which is in none of these folders: {searched}")
 
 
 def _message(node: Element, origin: str) -> MessageDefinition:
+    """Parse a ``<message>``. Fields after ``<extensions/>`` are extension fields."""
     fields: list[FieldDefinition] = []
     extension = False
     for child in node:
@@ -272,7 +278,7 @@ def _message(node: Element, origin: str) -> MessageDefinition:
 
 
 def _field(node: Element, extension: bool, message: str) -> FieldDefinition:
-    # The field mavlink_version of HEARTBEAT has a type of its own, and is always 3.
+    # The field mavlink_version of HEARTBEAT has its own type "uint8_t_mavlink_version", and its value is always 3.
     match = _FIELD_TYPE.match(node.attrib["type"])
     if match is None or match[1] not in SIZES or match[2] == "0":
         raise ValueError(f"unknown field type {node.attrib['type']!r}")
@@ -292,7 +298,7 @@ def _field(node: Element, extension: bool, message: str) -> FieldDefinition:
 
 
 def carries_bytes(message: str, field_name: str, kind: str) -> bool:
-    """Return True for fields in BYTES_IN_CHARS, in any dialect."""
+    """Return True if this field is in BYTES_IN_CHARS, and is an array of ``char`` in its dialect."""
     return kind == "char" and (message, field_name) in BYTES_IN_CHARS
 
 
@@ -300,7 +306,7 @@ def _enum(node: Element, origin: str) -> EnumDefinition:
     entries: list[EntryDefinition] = []
     highest = 0
     for child in node.findall("entry"):
-        # Without a value, the entry follows the highest one, as in pymavlink's mavparse.py.
+        # An entry without a value gets the highest value so far plus 1, as in pymavlink's mavparse.py.
         value = _integer(child.attrib["value"]) if "value" in child.attrib else highest + 1
         highest = max(highest, value)
         entries.append(
@@ -331,7 +337,7 @@ def _integer(text: str) -> int:
     for operator in ("<<", "**"):
         if operator in text:
             left, right = (int(part.strip(), 0) for part in text.split(operator))
-            if not (0 <= left <= _MAX_VALUE and 0 <= right <= 64):
+            if not (0 <= left <= _MAX_VALUE and 0 <= right <= 64):  # A hostile file must not create a huge number.
                 raise ValueError(f"{text!r} is not a valid enum value")
             return _in_range(left << right if operator == "<<" else int(left**right))
     return _in_range(int(text.strip(), 0))
@@ -345,7 +351,7 @@ def _in_range(value: int) -> int:
 
 def _identifier(name: str) -> str:
     if not _IDENTIFIER.match(name):
-        raise ValueError(f"{name!r} is not a name")
+        raise ValueError(f"{name!r} is not a name of letters, digits and '_'")
     return name
 
 
@@ -354,6 +360,7 @@ def _text(node: Element | None) -> str:
 
 
 def _remarks(node: Element) -> tuple[str, ...]:
+    """Return one sentence for each ``<deprecated>``, ``<superseded>`` and ``<wip>`` of a message or entry."""
     remarks: list[str] = []
     for child in node:
         if child.tag in ("deprecated", "superseded"):
@@ -370,13 +377,14 @@ def _remarks(node: Element) -> tuple[str, ...]:
 
 
 def _common_prefix(enum: str, names: list[str]) -> str:
-    """Return the enum's name if most entries begin with it, else the words with which all entries begin."""
+    """Return the prefix of the entries: the enum's name if most begin with it, else the words with which all begin."""
     if not names:
         return ""
     enum_prefix = enum + "_"
     if sum(name.startswith(enum_prefix) for name in names) * 2 > len(names):
         return enum_prefix
-    # The last word of an entry is never part of the prefix. A single entry is compared with the enum's name.
+    # The last word of an entry is never part of the prefix. If there is only one entry, it is compared with the enum's
+    # name instead of with other entries.
     split_names = [name.split("_")[:-1] for name in names]
     if len(names) == 1:
         split_names.append(enum.split("_"))
@@ -389,11 +397,12 @@ def _common_prefix(enum: str, names: list[str]) -> str:
 
 
 def _member_name(enum: str, prefix: str, name: str) -> str:
-    if not name.startswith(prefix):  # the entry lacks the first words of the enum's name
+    if not name.startswith(prefix):  # Some entries begin with the last words of the enum's name only.
         words = enum.split("_")
         shorter_prefixes = ("_".join(words[i:]) + "_" for i in range(1, len(words)))
         prefix = next((shorter for shorter in shorter_prefixes if name.startswith(shorter)), "")
     member = name[len(prefix) :]
-    if member[:1].isdigit():  # a Python name cannot begin with a digit: keep the last word of the prefix
+    # A Python name cannot begin with a digit, so the last word of the prefix is kept.
+    if member[:1].isdigit():
         member = prefix.rstrip("_").rpartition("_")[2] + "_" + member
     return member + "_" if keyword.iskeyword(member) or member == "mro" else member

@@ -48,7 +48,7 @@ class Dialect:
         self._decoders: dict[int, Callable[[bytes, Frame | None], Message]] = {
             message_id: partial(self._decode_first, message_id) for message_id in rows
         }
-        if wire is not None:
+        if wire is not None:  # Compiled code is available, and decodes faster.
             self.table: Any = wire.table(
                 rows, lambda message_id: layout_of(self[message_id]), partial(Dialect.decode, self)
             )
@@ -85,14 +85,14 @@ class Dialect:
         return self[message_id] if message_id in self.rows else None
 
     def by_name(self, name: str) -> type[Message]:
-        """Return the class of a message by name, ``"GLOBAL_POSITION_INT"``. InvalidArgument if there is none."""
+        """Return the class of the message with a name, such as ``"GLOBAL_POSITION_INT"``; InvalidArgument if none."""
         for message_class in self:
             if name == message_class.NAME:
                 return message_class
         raise InvalidArgument(f"dialect {self.name!r} has no message {name!r}")
 
     def enum(self, name: str) -> type[Any]:
-        """Return an enum by name, ``"MAV_CMD"``. InvalidArgument if there is none."""
+        """Return the enum with a name, such as ``"MAV_CMD"``. InvalidArgument if there is none."""
         if name in self._enums:
             return self._enums[name]
         raise InvalidArgument(f"dialect {self.name!r} has no enum {name!r}")
@@ -114,8 +114,8 @@ class Dialect:
         return self._decoders[frame.message_id](frame.body, frame)
 
     def _decode_first(self, message_id: int, body: bytes, frame: Frame | None) -> Message:
-        # This function replaces itself by the decoder of the class, so that `decode` need not check if the class is
-        # loaded.
+        # The class is loaded at the first decoding. This function then replaces itself by the decoder of the class, so
+        # that `decode` need not check each time whether the class is loaded.
         decoder = self._decoders[message_id] = decoder_of(self[message_id])
         return decoder(body, frame)
 
@@ -169,8 +169,11 @@ class _Extended(Dialect):
             except InvalidArgument:
                 continue
         if not enum_types:
-            return super().enum(name)
-        if len(enum_types) == 1 or enum_types[1].__members__.keys() <= enum_types[0].__members__.keys():
+            return super().enum(name)  # This raises InvalidArgument.
+        is_first_complete = len(enum_types) == 1 or (
+            enum_types[1].__members__.keys() <= enum_types[0].__members__.keys()
+        )
+        if is_first_complete:
             return enum_types[0]
         if name not in self._enums:
             self._enums[name] = _merge_enums(*enum_types)
@@ -178,7 +181,7 @@ class _Extended(Dialect):
 
 
 def _merge_enums(first: type[Any], second: type[Any]) -> type[Any]:
-    # Private dialects add entries to enums of the standard.
+    # A private dialect may add entries to an enum of the standard. If both define an entry, the first one is used.
     members = {**second.__members__, **first.__members__}
     bitmask = issubclass(first, IntFlag)
     return make_enum(first.__module__, first.__name__, bitmask, first.__doc__ or "", members.items())

@@ -71,12 +71,12 @@ class FrameEncoder:
             if compiled is not None:
                 self.sequence = (self.sequence + 1) & 0xFF
                 return compiled if signing is None else compiled + signing.sign(compiled, now)
-            # None: there is no layout yet. Make it for the next message of this type.
+            # The result is None until this type has a layout. The layout is made now, for the next message.
             layout_of(type(message))
         payload = message.encode()
         message_id = message.ID
         if self._version == 2:
-            payload = payload.rstrip(b"\0") or payload[:1]  # the standard keeps the first byte
+            payload = payload.rstrip(b"\0") or payload[:1]  # MAVLink 2 never truncates the first byte.
             flags = 0 if signing is None else SIGNED
             source = self.system_id, self.component_id
             body = _HEADER_V2(len(payload), flags, 0, self.sequence, *source, message_id & 0xFFFF, message_id >> 16)

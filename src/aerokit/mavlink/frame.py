@@ -27,7 +27,7 @@ SIGNATURE_LENGTH = 13
 class Frame(FrameFields):
     """One frame with a valid checksum. Treat it as immutable, because all receivers share it."""
 
-    # There is no constructor, for speed: the framer sets the attributes, and properties compute further values.
+    # For speed, there is no constructor: the framer sets the attributes directly. Properties compute all other values.
     if not TYPE_CHECKING:  # type checkers see the attributes of the base class
         __slots__ = ()
 
@@ -41,7 +41,7 @@ class Frame(FrameFields):
     """System id of the sender, 0..255 (0 is invalid)."""
     component_id: int
     """Component id of the sender, 0..255."""
-    _raw: bytes  # set only if `raw` cannot be reconstructed: for MAVLink 1, signed frames and parsed frames
+    _raw: bytes  # set only if `raw` cannot be computed from the rest: for MAVLink 1, signed frames and parsed frames
     received_at: float
     """Time in seconds that was passed to the framer with the data."""
 
@@ -54,7 +54,7 @@ class Frame(FrameFields):
         payload_end = raw[1] + (6 if raw[0] == MAGIC_V1 else 10)
         frame.checksum = int.from_bytes(raw[payload_end : payload_end + 2], "little")
         if raw[0] == MAGIC_V1:
-            # The MAVLink 1 header in the layout of MAVLink 2.
+            # `body` always has the header layout of MAVLink 2, so the MAVLink 1 header is converted.
             frame.body = bytes((raw[1], 0, 0, *raw[2:6], 0, 0)) + raw[6:payload_end]
         else:
             frame.body = raw[1:payload_end]
@@ -108,7 +108,7 @@ if wire is not None:
 
 
 def is_whole_frame(data: bytes) -> bool:
-    """Return True if the bytes have the length and header of exactly one frame. The checksum is not verified."""
+    """Return True if the bytes are one frame by their header and length. The checksum is not verified."""
     if len(data) < 8 or data[0] not in (MAGIC_V1, MAGIC_V2):
         return False
     if data[0] == MAGIC_V1:
@@ -121,7 +121,7 @@ def x25_in_python() -> Callable[[bytes], int]:
     table: list[int] = []
     for byte in range(256):
         for _ in range(8):
-            byte = (byte >> 1) ^ 0x8408 if byte & 1 else byte >> 1  # the reversed polynomial of CRC-16/MCRF4XX
+            byte = (byte >> 1) ^ 0x8408 if byte & 1 else byte >> 1  # 0x8408: reversed polynomial of CRC-16/MCRF4XX
         table.append(byte)
 
     def x25(data: bytes) -> int:
@@ -134,6 +134,7 @@ def x25_in_python() -> Callable[[bytes], int]:
 
 
 def _fastest_x25() -> Callable[[bytes], int]:
+    """Return the checksum function of the compiled module, else that of ``fastcrc``, else the one in Python."""
     if wire is not None:
         compiled: Callable[[bytes], int] = wire.x25
         return compiled

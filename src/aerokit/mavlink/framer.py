@@ -27,30 +27,31 @@ from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, So
 MAX_SOURCES = 1024
 """Number of senders with separate counters, for a framer without a shared `SourceLimit`."""
 
-# The last item is the id in its lower three bytes; the upper byte belongs to the payload.
+# Struct has no number of three bytes. The message id is therefore the lower three bytes of the last item, whose upper
+# byte belongs to the payload.
 _HEADER_V2 = Struct("<BBBxBHI").unpack_from  # magic, length, flags, sequence, source, id
 _HEADER_V1 = Struct("<xBBHB").unpack_from  # length, sequence, source, id
 _CHECKSUM = Struct("<H").unpack_from
 _MIN_LENGTH_V2 = 12
 _MIN_LENGTH_V1 = 8
 _MAGICS = (MAGIC_V1, MAGIC_V2)
-# Possible starts of frames. MAVLink 2 frames must have known flags, unless the data ends before the flags.
+# Finds possible starts of frames. A MAVLink 2 frame must have known flags, unless the data ends before the flags.
 _magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).finditer
 
 # Verdicts about a position in the data.
 _GOOD = 0  # a whole frame with a valid checksum
 _WAIT = 1  # the beginning of a plausible frame
-_IMPLAUSIBLE = 2  # the beginning of an implausible frame: wait for the rest, but also examine the bytes that follow
+_IMPLAUSIBLE = 2  # the beginning of an unlikely frame: wait for the rest, but also examine the bytes that follow
 _UNKNOWN = 3  # looks like a whole frame of an unknown message
 _BAD_CRC = 4
 _NOISE = 5
 
-# Position of a valid frame, and parts of its header: begin, end, message id, sequence number, source.
+# Position of a valid frame, and parts of its header: (begin, end, message id, sequence number, source).
 _ValidFrame = tuple[int, int, int, int, int]
 
-# State of the data that is kept: how far it was examined, candidates (begin, verdict, size at which to examine again),
-# and positions of bad checksums. This state avoids examining the same bytes again while further bytes arrive one by
-# one.
+# What is known about the data that is kept: (position up to which it was examined, candidates for frames, positions of
+# bad checksums). A candidate is (begin, verdict, data size at which to examine it again). Without this state, all kept
+# bytes would be examined again with each further byte.
 _ScanState = tuple[int, list[tuple[int, int, int]], list[int]]
 _NEW_SCAN: _ScanState = (0, [], [])
 
@@ -201,7 +202,7 @@ class PythonFramer:
         return len(self._rest)
 
     def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
-        # Unwanted frames are not in the list, so the list may have a different frame at that position.
+        # Frames of unwanted messages are not in `frames`, so there may be a different frame at that position.
         for position, verdict, identity in out_of_order:
             if position < len(frames):
                 frame = frames[position]
@@ -268,7 +269,7 @@ class PythonFramer:
         return frames
 
     def _skip_unknown(self, data: bytes, begin: int, end: int) -> None:
-        # The frame was received, although it is unknown, so its sequence number does not count as lost.
+        # An unknown frame was received, so its sequence number must not count as lost.
         if self.keep_unknown:
             self._unknown.append(data[begin:end])
         if data[begin] == MAGIC_V2:
@@ -281,7 +282,7 @@ class PythonFramer:
             source.skip(1)
 
     def _count_skipped(self, begin: int, end: int, bad_crcs: list[int]) -> None:
-        # Count bytes outside frames. Bytes that are kept are examined, and counted, later.
+        # Bytes outside frames are counted. Bytes that are kept are not counted yet, because they may become a frame.
         self.statistics.bad_bytes += end - begin
         if bad_crcs:
             self.statistics.bad_crcs += sum(place < end for place in bad_crcs)
@@ -311,7 +312,7 @@ class PythonFramer:
             return (_UNKNOWN if end <= size else _IMPLAUSIBLE), end, None
         extra, base_length, full_length = row
         if body - begin == 6 and not base_length <= length <= full_length:
-            return _NOISE, size, None  # MAVLink 1 neither truncates payloads nor allows unknown extensions
+            return _NOISE, size, None  # A MAVLink 1 payload is neither truncated nor longer than its definition.
         if end > size:
             return (_WAIT if length <= full_length else _IMPLAUSIBLE), end, None
         payload_end = body + length
@@ -322,7 +323,7 @@ class PythonFramer:
 
 def _earliest(keep_from: int, unknown: int, here: int) -> int:
     """Return the start of the data to keep: the earliest candidate for a frame, at ``here`` or before (-1: none)."""
-    if unknown >= 0:  # `unknown` is set only while `keep_from` is not, so it is earlier
+    if unknown >= 0:  # `unknown` is only set while `keep_from` is not set, so it is the earlier position.
         return unknown
     return here if keep_from < 0 else keep_from
 
@@ -340,8 +341,8 @@ else:
             self._out_of_order: list[tuple[int, int, int]] = []
 
         def _find(self, data: bytes, begin: int, kept: int, now: float, frames: list[Frame]) -> int | None:
-            # `kept` is 2 if `_scan` describes the kept data, 1 if that data is the beginning of one plausible frame,
-            # and 0 if no data was kept.
+            # `kept` comes from compiled code. It is 0 if no data was kept from earlier calls, 1 if the kept data is the
+            # beginning of one plausible frame, and 2 if `_scan` describes the kept data.
             scan = _NEW_SCAN
             if kept == 2:
                 scan = self._scan

@@ -39,7 +39,7 @@ from aerokit.mavlink.rendering import render_enum_row, render_enum_stub, render_
 
 UNION_FOLDER = Path(__file__).parent / "additions"
 
-# The standard's files. Each includes the previous file. A definition in several files belongs to the first of them.
+# The standard's files. Each includes the previous one. A definition belongs to the first file that has it.
 STANDARD_FILES = ("minimal", "standard", "common")
 
 DefinedT = TypeVar("DefinedT", EnumDefinition, MessageDefinition)
@@ -104,12 +104,12 @@ def _entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[EntryDefi
     merged = {entry.name: _entry(by_name.get(entry.name, entry), entry) for entry in added.entries}
     for name, entry in by_name.items():
         merged.setdefault(name, entry)
-    # Sorting is stable, so of several names for one value the added (standard) name comes first.
+    # The additions come first in `merged` and, because sorting is stable, also among several names for one value.
     return tuple(sorted(merged.values(), key=lambda entry: entry.value))
 
 
 def _entry(existing: EntryDefinition, added: EntryDefinition) -> EntryDefinition:
-    params = {param[0]: param for param in (*existing.params, *added.params)}  # by number
+    params = {param[0]: param for param in (*existing.params, *added.params)}  # Added params replace existing ones.
     return replace(
         existing,
         value=added.value,
@@ -127,8 +127,8 @@ MODULES: dict[str, tuple[str, ...]] = {
     "development": ("development",),
 }
 
-# Messages of ``common.xml`` that every flight uses; they are in ``common.py``. The other two hundred are in
-# ``common_more.py``, because importing them takes several times as long.
+# Messages of ``common.xml`` that every flight uses. They are in ``common.py``. The other two hundred messages are in
+# ``common_more.py``, so that a program imports them only if it needs one: that takes several times as long.
 EVERYDAY = """
     Attitude AttitudeQuaternion AvailableModes BatteryStatus CommandAck CommandInt CommandLong CurrentMode
     DistanceSensor EstimatorStatus ExtendedSysState FileTransferProtocol Gps2Raw GpsGlobalOrigin GpsRawInt
@@ -371,7 +371,7 @@ def _other_files(stems: Sequence[str]) -> str:
 def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
     text = "\n\n".join(render_message(message) for message in messages)
     helpers = "".join(f", {name}" for name in ("pack_bytes", "pack_items", "pack_text") if f"{name}(" in text)
-    stems = MODULES.get(module, MODULES["common"])
+    stems = MODULES.get(module, MODULES["common"])  # COMMON_MORE has messages of the same files as common.
     head = _MESSAGES_HEAD.format(name=stems[0], more=_other_files(stems), helpers=helpers)
     if "Sequence[" not in text:
         head = head.replace("    from collections.abc import Sequence\n\n", "")

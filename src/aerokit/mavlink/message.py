@@ -16,22 +16,22 @@ if TYPE_CHECKING:
     from typing_extensions import Self, dataclass_transform
 
     from aerokit.mavlink.frame import Frame
-else:  # typing_extensions takes longer to import than this package
+else:  # At run time it is not imported, because importing typing_extensions takes longer than importing aerokit.
 
     def dataclass_transform(**_: object) -> Any:
         return lambda cls: cls
 
 
-# Errors of packing a wrong value. Generated classes convert them to InvalidArgument.
+# Errors that packing a wrong value may raise. Generated classes convert them to InvalidArgument.
 PACK_ERRORS = (struct.error, OverflowError, TypeError, ValueError, AttributeError)
 
 MessageT = TypeVar("MessageT", bound="Message")
 
 _ANY_HEADER = bytes(HEADER_LENGTH)
-# Message and field of ``char`` arrays that carry bytes, a number or a text, depending on another field. Decoding such
-# an array as a string, which ends at the first NUL, would truncate a number.
+# (message, field) of ``char`` arrays that carry a number or a text, depending on another field. They are decoded as
+# bytes, because a string ends at the first NUL, so that a number would be truncated.
 BYTES_IN_CHARS = frozenset((name, "param_value") for name in ("PARAM_EXT_VALUE", "PARAM_EXT_SET", "PARAM_EXT_ACK"))
-# Fields whose values never appear in texts.
+# Fields whose values are secret, and therefore never appear in texts.
 SECRET_FIELDS = frozenset(("secret_key", "passkey", "password"))
 # Size in bytes of each type of the standard.
 SIZES = {
@@ -101,11 +101,11 @@ class Field:
         carries_bytes: bool = False,
     ) -> None:
         self.name = name
-        """Name of the attribute: the name in the standard, with a trailing underscore if that is a Python keyword."""
+        """Name of the attribute: the name in the standard. A Python keyword gets a trailing underscore."""
         self.type = type
         """Type without brackets: ``"uint16_t"``, ``"float"``, ``"char"`` …"""
         self.array_length = array_length
-        """Number of elements; 0 if it is not an array."""
+        """Number of elements; 0 if the field is not an array."""
         self.units = units
         """Unit, for example ``"cm/s"``, or empty."""
         self.enum = enum
@@ -166,14 +166,14 @@ def offset_of(message_type: type[Message], field: str) -> int:
 
 def _wire_rows(message_type: type[Message]) -> list[tuple[Any, ...]]:
     """Return the rows of ``_FIELDS`` in the order of the fields on the wire."""
-    # A row has the arguments of `Field`: row[1] is the type, row[7] is True for extensions.
+    # A row has the arguments of `Field`. row[1] is the type; row[7] is True if the field is an extension.
     base = sorted((row for row in message_type._FIELDS if not row[7]), key=lambda row: -SIZES[row[1]])
     return [*base, *(row for row in message_type._FIELDS if row[7])]
 
 
 def layout_of(message_type: type[Message]) -> Any:
     """Return the layout that compiled code uses for a generated class, created on first use; None for other classes."""
-    own_attributes = message_type.__dict__  # without those of base classes
+    own_attributes = message_type.__dict__  # without the attributes of base classes, whose layout would be wrong
     if "_LAYOUT" not in own_attributes:
         is_generated = {"_FIELDS", "decode_body", "encode"} <= own_attributes.keys()
         message_type._LAYOUT = _new_layout(message_type) if wire is not None and is_generated else None
@@ -281,7 +281,7 @@ class Message:
 
 
 def _format_field(name: str, value: object) -> str:
-    # Keys do not belong into logs and error messages.
+    # Secret keys must not appear in logs and error messages.
     return "<not shown>" if name in SECRET_FIELDS else repr(value)
 
 
@@ -289,7 +289,7 @@ def _format_field(name: str, value: object) -> str:
 
 
 def pack_text(value: str, size: int) -> bytes:
-    """Encode a text as UTF-8. ValueError if it exceeds ``size``; struct appends zeros."""
+    """Encode a text as UTF-8. Raises ValueError above ``size`` bytes. The struct format appends missing zeros."""
     data = value.encode()
     if len(data) > size:
         raise ValueError(value)
@@ -297,14 +297,14 @@ def pack_text(value: str, size: int) -> bytes:
 
 
 def pack_bytes(value: bytes, size: int) -> bytes:
-    """Return the bytes. ValueError if they exceed ``size``; struct appends zeros."""
+    """Return the value as bytes. Raises ValueError above ``size`` bytes. The struct format appends missing zeros."""
     if len(value) > size:
         raise ValueError(value)
     return value
 
 
 def pack_items(value: Sequence[float], size: int) -> Sequence[float]:
-    """Return the numbers, with zeros appended up to ``size``. If there are more numbers, struct raises."""
+    """Return the numbers, with zeros appended up to ``size``. If there are more numbers, packing them raises."""
     missing = size - len(value)
     return (*value, *(0,) * missing) if missing else value
 
@@ -325,7 +325,7 @@ def _number_problem(value: Any, kind: str) -> str | None:
     """Explain why a value does not fit into this type, or return None. The module struct decides what is a number."""
     if kind in INTEGER_RANGES:
         low, high = INTEGER_RANGES[kind]
-        try:
+        try:  # With the largest type, this fails only for a huge number, or for a value that is no integer.
             struct.pack("<q" if low < 0 else "<Q", value)
         except (struct.error, OverflowError, TypeError):
             if not hasattr(value, "__index__"):
@@ -341,6 +341,7 @@ def _number_problem(value: Any, kind: str) -> str | None:
 
 
 def _text_problem(value: Any, size: int) -> str | None:
+    """Explain why a value does not fit into a text field of this size in bytes, or return None."""
     if not isinstance(value, str):
         return f"must be a str of at most {size} bytes"
     try:
@@ -352,13 +353,13 @@ def _text_problem(value: Any, size: int) -> str | None:
 
 # ------------------------------------------------------------------------------------------ enums
 
-# Since Python 3.11, the standard library uses this decorator for its long enums. It makes the same enum in half the
-# time.
+# The standard library uses this decorator for its own long enums since Python 3.11. It creates the same enum in half
+# the time. It is private, so it may be missing.
 _simple_enum: Any = getattr(enum, "_simple_enum", None)
 
 
 class _Flags(enum.IntFlag):
-    # Python caches every combination of flags. Received values would fill that cache without limit.
+    # Python caches every combination of flags that occurs. Received values must not fill that cache without limit.
     @classmethod
     def _missing_(cls, value: object) -> Any:
         combination = super()._missing_(value)
@@ -382,7 +383,7 @@ def make_enum(
     """
     base: Any = _Flags if bitmask else enum.IntEnum
     enum_type: type[Any]
-    if _simple_enum is not None and not is_external:
+    if _simple_enum is not None and not is_external:  # `_simple_enum` does not check names.
         body = {"__module__": module, "__qualname__": name, "__doc__": doc, **dict(members)}
         enum_type = _simple_enum(base)(type(name, (), body))
     else:

@@ -58,12 +58,12 @@ class MessageFactory(_MAVLink):
             dialect: Any = mavutil.mavlink
             function = getattr(dialect.MAVLink, name, None)
             if function is not None:
-                return function.__get__(self)  # as a method of this object, although it is one of another class
+                return function.__get__(self)  # The function of pymavlink's class is bound to this object.
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
 
 def _accept_text(encode: Callable[..., Any]) -> Callable[..., Any]:
-    # pymavlink accepts only bytes in text fields.
+    # pymavlink accepts only bytes for text fields, so `str` is converted.
 
     @wraps(encode)
     def encode_text(self: MessageFactory, *args: Any, **kwargs: Any) -> Any:
@@ -72,7 +72,7 @@ def _accept_text(encode: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return encode(self, *converted_args, **converted_kwargs)
         except AttributeError:
-            raise InvalidArgument(f"{encode.__name__}: a text must be str or bytes") from None
+            raise InvalidArgument(f"{encode.__name__}: the value of a text field must be str or bytes") from None
 
     return encode_text
 

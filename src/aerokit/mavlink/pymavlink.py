@@ -59,6 +59,7 @@ def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
 
 def _class_of(message: Any) -> type[Message]:
     message_type: Any = type(message)
+    # Classes of pymavlink have these attributes. For any other object, the message's name must be in the standard.
     if hasattr(message_type, "ordered_fieldnames") and hasattr(message_type, "crc_extra"):
         return _counterpart(int(message_type.id), int(message_type.crc_extra), message_type)
     try:
@@ -98,8 +99,8 @@ def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
 
 def _has(message: Any, name: str) -> bool:
     """Return True if the message has a value for an extension field."""
-    # hasattr is not enough for pymavlink's messages: each of their classes has an attribute ``id``, and a message may
-    # have an extension field of this name.
+    # hasattr() is not enough for pymavlink's messages. All their classes have an attribute ``id`` (the message id), but
+    # ``id`` may also be the name of an extension field.
     if name in getattr(message, "__dict__", ()):
         return True
     return hasattr(message, name) and not hasattr(type(message), "ordered_fieldnames")
@@ -109,7 +110,7 @@ def _converted(message_class: type[Message], field: Field, value: Any) -> Any:
     """Convert a value of pymavlink to the type of aerokit's field."""
     if field.is_text:
         return _text(value)
-    if field.type == "char" and isinstance(value, str):
+    if field.type == "char" and isinstance(value, str):  # an array of `char` that carries bytes
         return value.encode()
     is_real = field.type in REAL_TYPES
     if not field.array_length:
@@ -135,7 +136,7 @@ def _is_byte(value: Any) -> bool:
 
 
 def _integer(value: Any) -> Any:
-    # `Message.encode` rejects values that are not numbers.
+    # A value that is not a number is returned unchanged, because `Message.encode` rejects it.
     try:
         return operator.index(value)
     except TypeError:
@@ -144,7 +145,8 @@ def _integer(value: Any) -> Any:
 
 
 def _real(value: Any) -> Any:
-    # This includes numbers of numpy and decimal. `Message.encode` rejects values that are not numbers.
+    # Numbers of numpy and decimal have __float__, too. Other values are returned unchanged, because `Message.encode`
+    # rejects them.
     if isinstance(value, (int, float)) or not hasattr(value, "__float__"):
         return value
     try:
@@ -159,7 +161,7 @@ def _error(message_class: type[Message], field: Field, value: Any, problem: str)
 
 # ------------------------------------------------------------------------------------------ texts
 def _original_text(message: Any, name: str) -> Any:
-    # pymavlink keeps the original bytes in addition to a text without non-ASCII characters.
+    # In the text of a received message, pymavlink replaces non-ASCII characters. It also stores the original bytes.
     text, raw = getattr(message, name), getattr(message, f"_{name}_raw", None)
     if isinstance(raw, bytes) and text == raw.partition(b"\0")[0].decode("ascii", "replace"):
         return raw
@@ -193,7 +195,8 @@ class _RawText(str):
         return self._data
 
 
-# Dialects to search for pymavlink's class of a message if the program's dialect has none. They cover all of STANDARD.
+# pymavlink dialects in which a message class is searched if the program's dialect has none. Together they have all
+# messages of STANDARD.
 DIALECTS = ("ardupilotmega", "development")
 
 CHECKSUM_LENGTH = 2
@@ -219,7 +222,7 @@ def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: 
 
 @cache
 def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
-    """Return the decoder of the first pymavlink dialect that has the message with the definition of the standard."""
+    """Return the decoder of the first pymavlink dialect that has the message, with the standard's definition if any."""
     row = STANDARD.rows.get(message_id)
     for module in _dialects(preferred):
         message_class = module.mavlink_map.get(message_id)
@@ -260,7 +263,7 @@ def _decoder_for(message_class: Any) -> Decoder:
         fields.update(zip(names, values))  # noqa: B905 - same length
         for name, raw_name in texts:
             raw = fields[raw_name] = fields[raw_name].rstrip(b"\0")
-            text_bytes = raw.partition(b"\0")[0] if b"\0" in raw else raw
+            text_bytes = raw.partition(b"\0")[0] if b"\0" in raw else raw  # A text ends at the first NUL.
             fields[name] = text_bytes.decode("ascii", "replace")
         return message
 
@@ -268,13 +271,15 @@ def _decoder_for(message_class: Any) -> Decoder:
 
 
 class _Layout:
-    """Positions of pymavlink's attributes among the unpacked values."""
+    """Describes which of the unpacked values belong to which attributes of a pymavlink message."""
 
     def __init__(self, message_class: Any) -> None:
         zeros = message_class.unpacker.unpack(bytes(message_class.unpacker.size))
-        self.names: list[str] = []  # in wire order; a text field has the name of its raw bytes
-        self.arrays: list[tuple[int, int]] = []  # position and width of each field; empty if no field is an array
-        self.texts: list[tuple[str, str]] = []  # name of each text field, and the name of its raw bytes
+        # Attribute names in wire order. For a text field, it is the name of the attribute with the raw bytes.
+        self.names: list[str] = []
+        # For each field, the position of its first value and the number of its values; empty if there are no arrays.
+        self.arrays: list[tuple[int, int]] = []
+        self.texts: list[tuple[str, str]] = []  # for each text field, its name and the name of its raw bytes
         position = 0
         for name, width in zip(message_class.ordered_fieldnames, message_class.lengths):  # noqa: B905
             is_text = isinstance(zeros[position], bytes)
@@ -294,14 +299,14 @@ class _Received:
     _frame: Frame
     _header_class: Any
     _decoded_class: Any
-    _signed = False  # signatures are not verified here
+    _signed = False  # Signatures are not verified here.
     _link_id = None
     _instances = None
 
     def __getattr__(self, name: str) -> Any:
         if name not in LAZY_ATTRIBUTES:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        value = self.__dict__[name] = getattr(self, f"create{name}")()  # `_header` is made by `create_header`
+        value = self.__dict__[name] = getattr(self, f"create{name}")()  # E.g. `create_header` creates `_header`.
         return value
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -320,7 +325,7 @@ class _Received:
         return bytearray(self._frame.raw)
 
     def create_payload(self) -> bytearray:
-        # pymavlink's payload begins at offset 6 even for MAVLink 2, where the header has ten bytes.
+        # In pymavlink, `_payload` begins at offset 6 of the frame, even in MAVLink 2, where the header has ten bytes.
         return bytearray(self._frame.raw)[6 : -_length_after_payload(self._frame)]
 
     def create_crc(self) -> int:
@@ -332,7 +337,7 @@ def _length_after_payload(frame: Frame) -> int:
 
 
 def _received_class(message_class: Any) -> Any:
-    """Create a subclass that has the same name and attributes as the class."""
+    """Create a subclass of a pymavlink class with the same name and attributes, for received messages."""
     return type(
         message_class.__name__,
         (_Received, message_class),
@@ -357,7 +362,8 @@ def _restored(message_class: Any, state: dict[str, Any]) -> Any:
 
 # -------------------------------------------------------------------------------- unknown messages
 def _checked(message_class: Any, decode: Decoder) -> Decoder:
-    # The framer could not verify a message that the standard does not have, but the program's dialect can.
+    # The framer cannot verify the checksum of a message that the standard does not have. The program's dialect has the
+    # message, so the checksum is verified here.
 
     def decode_if_valid(frame: Frame, timestamp: float) -> Any:
         raw = frame.raw

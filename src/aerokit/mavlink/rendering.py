@@ -15,7 +15,7 @@ from aerokit.mavlink.frame import HEADER_LENGTH
 from aerokit.mavlink.message import STRUCT_CODES
 
 _WIDTH = 110
-# Arrays up to this length are unpacked into separate names; longer arrays are sliced.
+# Generated code unpacks arrays up to this length into separate variables. It slices longer arrays.
 _MAX_UNPACKED_LENGTH = 4
 
 
@@ -116,7 +116,7 @@ def _sentence(text: str) -> str:
 
 def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
     texts = [text.replace("\\", "\\\\").replace('"""', "'''") for text in paragraphs if text]
-    if texts and texts[-1].endswith('"'):  # this quotation mark would belong to the closing quotes
+    if texts and texts[-1].endswith('"'):  # Without a space, this quotation mark would join the closing quotes.
         texts[-1] += " "
     wrapped: list[str] = []
     for number, text in enumerate(texts):
@@ -140,7 +140,7 @@ def _tuple(name: str, items: list[str]) -> list[str]:
 
 
 def _filled(head: str, items: list[str], tail: str, indent: str) -> list[str]:
-    """Format items in brackets: on one line if they fit, else filling lines."""
+    """Format items in brackets on one line. If they do not fit, break them into lines that are as full as possible."""
     single = f"{head}{', '.join(items)}{',' if len(items) == 1 else ''}{tail}"
     if len(single) <= _WIDTH:
         return [single]
@@ -188,7 +188,7 @@ def _annotation(field: FieldDefinition, *, argument: bool = False) -> str:
 
 
 def _default(field: FieldDefinition) -> str:
-    """Return `` = value`` for a field that a program may omit, i.e. an extension field; else an empty text."""
+    """Return the default, as `` = value``, for a field that a program may omit; an empty text for other fields."""
     if field.default is not None:
         return f" = {field.default}"
     if not field.extension:
@@ -201,7 +201,7 @@ def _default(field: FieldDefinition) -> str:
 
 
 def _init(message: MessageDefinition) -> list[str]:
-    # In Python, a parameter without a default cannot follow one with a default unless it is keyword-only.
+    # A parameter without a default that follows one with a default must be keyword-only in Python, i.e. follow a "*".
     arguments: list[str] = []
     optional = False
     for field in message.fields:

@@ -28,7 +28,7 @@ from aerokit.mavlink.generator import xml_folder
 from aerokit.mavlink.message import Message, make_enum
 from aerokit.mavlink.rendering import render_message
 
-# Name of the dialect, message classes, and enums by their MAVLink names (``MAV_CMD``).
+# (name of the dialect, message classes, enums). The enums are keyed by their MAVLink names (``MAV_CMD``).
 LoadedDialect = tuple[str, list[type[Message]], dict[str, type[Any]]]
 
 
@@ -55,6 +55,7 @@ def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> Load
     classes: dict[int, Any] | None = getattr(module, "mavlink_map", None)
     if classes is None:
         raise InvalidArgument(f"{module.__name__} is not a pymavlink dialect: it has no mavlink_map")
+    # Negative ids are those of pseudo messages such as BAD_DATA.
     definitions = [_message(cls) for _, cls in sorted(classes.items()) if cls.id >= 0]
     enums = [_enum(name, entries) for name, entries in getattr(module, "enums", {}).items()]
     name = module.__name__.rpartition(".")[2]
@@ -93,6 +94,7 @@ def compile_message(definition: MessageDefinition) -> type[Message]:
 def _load(
     name: str, definitions: Iterable[MessageDefinition], enums: Iterable[EnumDefinition], standard: Standard
 ) -> LoadedDialect:
+    # Several files of a dialect may contain the same definition, but not different ones with the same id.
     by_id: dict[int, MessageDefinition] = {}
     for definition in definitions:
         earlier = by_id.setdefault(definition.id, definition)
@@ -116,7 +118,7 @@ def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
             members,
             is_external=True,
         )
-    except (TypeError, ValueError) as error:  # a duplicate or reserved name
+    except (TypeError, ValueError) as error:  # The name of an entry occurs twice, or is reserved.
         raise InvalidArgument(f"enum {enum.name} of {enum.origin or dialect}: {error}") from error
 
 
@@ -138,9 +140,11 @@ def _import(name: str) -> ModuleType:
         try:
             return import_module(candidate)
         except ModuleNotFoundError as error:
-            if error.name is None or not candidate.startswith(error.name):  # the candidate imports a missing module
+            # The error may be about another module, which the candidate itself imports.
+            is_candidate_missing = error.name is not None and candidate.startswith(error.name)
+            if not is_candidate_missing:
                 raise
-    raise InvalidArgument(f"no pymavlink dialect {name!r}: tried {', '.join(candidates)}")
+    raise InvalidArgument(f"there is no pymavlink dialect {name!r}: tried {', '.join(candidates)}")
 
 
 def _message(cls: Any) -> MessageDefinition:
@@ -151,7 +155,7 @@ def _message(cls: Any) -> MessageDefinition:
         array_length = int(cls.array_lengths[order.index(name)])
         units = getattr(cls, "fieldunits_by_name", {}).get(name, "")
         enum = getattr(cls, "fieldenums_by_name", {}).get(name, "")
-        default = 3 if name == "mavlink_version" else None  # the field of HEARTBEAT, which is always 3
+        default = 3 if name == "mavlink_version" else None  # This field of HEARTBEAT is always 3.
         is_bytes = carries_bytes(message_name, name, kind)
         fields.append(FieldDefinition(name, kind, array_length, units, enum, default=default, carries_bytes=is_bytes))
     description = " ".join((cls.__doc__ or "").split())
@@ -162,7 +166,8 @@ def _message(cls: Any) -> MessageDefinition:
 
 
 def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra: int) -> MessageDefinition:
-    # pymavlink's classes do not mark extensions, but CRC_EXTRA and the wire order determine them.
+    # pymavlink's classes do not tell which fields are extensions. Each possible number of base fields is tried, until
+    # CRC_EXTRA and the wire order match.
     fields = definition.fields
     for base_count in range(len(fields), -1, -1):
         guess = MessageDefinition(
@@ -174,11 +179,11 @@ def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra:
         )
         if guess.crc_extra == crc_extra and [field.name for field in guess.wire_fields] == order:
             return guess
-    raise InvalidArgument(f"{definition.name}: CRC_EXTRA {crc_extra} matches none of its field orders")
+    raise InvalidArgument(f"{definition.name}: the fields do not match CRC_EXTRA {crc_extra}")
 
 
 def _enum(name: str, entries: dict[int, Any]) -> EnumDefinition:
-    end_marker = f"{name}_ENUM_END"
+    end_marker = f"{name}_ENUM_END"  # pymavlink adds this entry to each enum.
     definitions = [
         EntryDefinition(entry.name, value, entry.description)
         for value, entry in entries.items()

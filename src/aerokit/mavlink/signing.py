@@ -24,16 +24,17 @@ KEY_LENGTH = 32
 
 TICKS_PER_S = 100_000  # one tick of a timestamp is 10 µs
 
-EPOCH_S = 1_420_070_400  # timestamps count from 2015-01-01
+EPOCH_S = 1_420_070_400  # 2015-01-01 in seconds since 1970; timestamps count from then
 
 LAST_TIMESTAMP = (1 << 48) - 1
 
 ONE_MINUTE = 60 * TICKS_PER_S
 
-# Limit of stored streams, each a (system id, component id, link id). Only senders with the key can create one.
+# Maximum number of stored streams. A stream is a (system id, component id, link id); only senders with the key can
+# create one.
 MAX_STREAMS = 1024
 
-# RADIO_STATUS and RADIO are inserted by telemetry radios, which have no key.
+# Telemetry radios insert RADIO_STATUS (109) and RADIO (166), and have no key.
 ALWAYS_UNSIGNED = frozenset((109, 166))
 
 _HASH_LENGTH = 6
@@ -77,7 +78,7 @@ class SigningKey:
             InvalidArgument: the passphrase is empty.
         """
         if not passphrase:
-            raise InvalidArgument("the passphrase of a signing key is empty")
+            raise InvalidArgument("the passphrase of a signing key must not be empty")
         return cls(sha256(passphrase.encode()).digest())
 
     @classmethod
@@ -174,7 +175,8 @@ class Signing:
         if keep is not None:
             self._timestamp_file = TimestampFile(keep, LAST_TIMESTAMP)
             self.timestamp = max(self.timestamp, self._timestamp_file.timestamp)
-        self._keyed = sha256(key.secret)  # copied for each signature, because a signature hashes the key first
+        # A signature is a hash that begins with the key. The key is hashed once; each signature copies this state.
+        self._keyed = sha256(key.secret)
         self.streams: dict[tuple[int, int, int], int] = {}
         """Last timestamp of each (system id, component id, link id), shared by all links with the same key."""
 
@@ -199,7 +201,7 @@ class Signing:
         stamp = self.timestamp_now(now)
         if stamp > LAST_TIMESTAMP:
             raise InvalidArgument(f"the timestamps of {self.key!r} are exhausted: use another key")
-        self._advance(stamp + 1)
+        self._advance(stamp + 1)  # The next frame must have a later timestamp.
         link_and_timestamp = bytes((self.link_id,)) + stamp.to_bytes(6, "little")
         return link_and_timestamp + self._hash(frame + link_and_timestamp)
 
@@ -217,7 +219,7 @@ class Signing:
 
     @property
     def keep_error(self) -> OSError | None:
-        """Error of the last write of the ``keep`` file; None if it succeeded. The next write retries."""
+        """Error of the last write of the ``keep`` file; None if the write succeeded. The next write tries again."""
         return None if self._timestamp_file is None else self._timestamp_file.error
 
     @property
@@ -245,7 +247,7 @@ class Signing:
         return refusal
 
     def _refusal(self, frame: Frame, now: float) -> Refusal | None:
-        """Return why a frame has no valid signature, or None. Has no side effects."""
+        """Return the reason why a frame has no valid signature; None if it has one. Has no side effects."""
         if not frame.incompat_flags & SIGNED:
             return Refusal.UNSIGNED
         if not self.has_signed(frame):
@@ -262,7 +264,7 @@ class Signing:
         return None
 
     def _store_stream(self, stream: tuple[int, int, int], stamp: int) -> None:
-        # A sender that is removed here counts as new at its next frame, whose timestamp is then compared with ours.
+        # A stream that is removed here counts as new at its next frame, whose timestamp is then compared with ours.
         if stream not in self.streams and len(self.streams) >= MAX_STREAMS:
             del self.streams[min(self.streams, key=self.streams.__getitem__)]
         self.streams[stream] = stamp
@@ -272,7 +274,9 @@ class Signing:
         # Store the timestamp before using it, so that the next program starts with a later timestamp even after a
         # crash.
         if self._timestamp_file is not None:
-            self._timestamp_file.reserve(timestamp, ONE_MINUTE // 2)  # a sender may be a minute behind
+            # After a restart, timestamps are up to half a minute ahead. This is harmless, because receivers accept
+            # other senders that are up to a minute behind.
+            self._timestamp_file.reserve(timestamp, ONE_MINUTE // 2)
         self.timestamp = timestamp
 
     def may_be_unsigned(self, frame: Frame) -> bool:
@@ -294,7 +298,7 @@ _MAX_LENGTH = 64
 
 
 class TimestampFile:
-    """A file with a timestamp that is later than all timestamps used.
+    """A file with a timestamp that is later than all timestamps used so far.
 
     The constructor raises OSError, or FileFormatError if the file contains anything else. A later error must not end a
     flight, so it is stored in ``error`` until writing succeeds.
@@ -305,8 +309,8 @@ class TimestampFile:
         self.timestamp: int = self._read()
         """Timestamp in the file; 0 if there is no file."""
         self.error: OSError | None = None
-        """Error of the last write; None if it succeeded."""
-        self._write(self.timestamp)  # raises now if the file cannot be written later
+        """Error of the last write; None if the write succeeded."""
+        self._write(self.timestamp)  # Fails at once if the file is not writable, rather than in flight.
 
     def reserve(self, timestamp: int, ahead: int) -> None:
         """Ensure that the stored timestamp is later than ``timestamp``: if needed, write ``timestamp + ahead``."""
@@ -323,6 +327,7 @@ class TimestampFile:
         write_atomically(self._path, f"{timestamp}\n")
 
     def _read(self) -> int:
+        """Return the stored timestamp; 0 if there is no file."""
         try:
             with self._path.open("rb") as file:
                 text = file.read(_MAX_LENGTH).decode("ascii", "replace")

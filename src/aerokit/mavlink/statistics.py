@@ -9,14 +9,14 @@ from aerokit._internal.wire import CounterFields, SourceFields, wire
 _SILENCE_S = 10.0
 
 _MAX_UNKNOWN_IDS = 64
-_HALF = 128  # sequence numbers wrap at 256, so a number up to 127 further on is ahead, any other is behind
+_HALF = 128  # Sequence numbers wrap at 256: a number is ahead if it is less than 128 further on, otherwise behind.
 _WINDOW = (1 << _HALF) - 1  # mask of the bits in `_missing`
-_MAX_STEP = 4  # sequence numbers of consecutive frames of one stream rarely differ by more
-_MAX_GAP = 16  # a frame after a larger gap may belong to another stream
-_MIN_ALTERNATIONS = 10  # two streams that alternate this often have different senders
-_EXPIRY_S = 5.0  # after this time, a second stream and its alternations are forgotten
-_STREAM_TIMEOUT_S = 1.5  # no autopilot is silent for this long
-_MIN_RETURNS = 3  # this many frames that continue the previous stream show that it has not ended
+_MAX_STEP = 4  # Sequence numbers of consecutive frames of one stream rarely differ by more.
+_MAX_GAP = 16  # A frame after a larger gap may belong to another stream.
+_MIN_ALTERNATIONS = 10  # Two streams that alternate this often have different senders.
+_EXPIRY_S = 5.0  # A second stream and its alternations are forgotten after this time.
+_STREAM_TIMEOUT_S = 1.5  # A stream has ended after this silence, because no autopilot is silent for so long.
+_MIN_RETURNS = 3  # This many frames that continue the previous stream show that it has not ended.
 
 # Results of :meth:`SourceStatistics.out_of_order`.
 IN_ORDER, LATE, OTHERS = range(3)
@@ -53,7 +53,7 @@ class SourceStatistics(SourceFields):
         "system_id",
     )
 
-    _late_run: int  # number of consecutive repeated frames
+    _late_run: int  # number of repeated frames so far whose numbers follow each other
     # The following are set when a second stream with the same ids begins.
     _other_count: int  # number of frames of the second stream
     _other_at: float
@@ -64,19 +64,19 @@ class SourceStatistics(SourceFields):
         self.system_id: int = system_id
         self.component_id: int = component_id
         self.lost: int = 0
-        """Number of lost frames. A frame that arrives late is subtracted again."""
+        """Number of lost frames. A frame that arrives late no longer counts as lost."""
         self.expected = sequence
         """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
-        # How far `expected` has advanced without a received frame. `received` is derived from both numbers, so that
-        # counting a frame needs a single addition.
+        # The number of steps by which `expected` has advanced without a received frame. `received` is the difference of
+        # both, so that a received frame costs a single addition.
         self._unreceived = sequence
         self._missing = 0  # bit n is set if the frame n + 1 before `_missing_at` is missing
         self._missing_at = sequence
-        self._late_sequence = self._late_at = -1  # number of the last repeated frame, and `received` at that time
-        self._other_expected = -1  # next sequence number of another stream with the same ids; -1 if there is none
+        self._late_sequence = self._late_at = -1  # sequence number of the last repeated frame, and `received` then
+        self._other_expected = -1  # next sequence number of a second stream with the same ids; -1 if there is none
         self._stream_start = 0  # value of `received` at the beginning of the current stream
         self._alternations, self._alternated_at = 0, 0.0
-        # `expected` at the last call of `out_of_order`, and the time at which a call found it advanced.
+        # `expected` as the last call of `out_of_order` found it, and the time of the last call that found a new value.
         self._last_expected, self._advanced_at = sequence, 0.0
 
     @property
@@ -104,13 +104,13 @@ class SourceStatistics(SourceFields):
             self._last_expected, self._advanced_at = self.expected, now
         ahead = (sequence - self.expected) & 0xFF
         if self._other_expected >= 0 and (sequence - self._other_expected) & 0xFF < _MAX_STEP:
-            if now - self._other_at < _EXPIRY_S:
+            if now - self._other_at < _EXPIRY_S:  # The frame continues the other stream.
                 return self._continue_other(sequence, now)
             self._other_expected = -1
         if ahead < _HALF:
             self._on_gap(ahead, sequence, now)
             return IN_ORDER
-        if self._was_missing(256 - ahead):
+        if self._was_missing(256 - ahead):  # A frame that counted as lost has arrived late.
             self._unreceived -= 1
             self.lost -= 1
             return LATE
@@ -124,7 +124,7 @@ class SourceStatistics(SourceFields):
     def _on_gap(self, ahead: int, sequence: int, now: float) -> None:
         """Process a frame after ``ahead`` missing frames, which count as lost until they arrive late."""
         self.lost += ahead
-        if ahead > _MAX_GAP:
+        if ahead > _MAX_GAP:  # The frame may belong to another stream.
             self._begin_stream(now)
             self._skipped_over = ahead
         missing_bits = ((1 << ahead) - 1) << 1  # bit 0 is this frame
@@ -134,13 +134,13 @@ class SourceStatistics(SourceFields):
         self._missing_at = self.expected
 
     def _begin_stream(self, now: float) -> None:
-        # Keep the position of the previous stream for a while, in case that stream continues.
+        # The position of the previous stream is kept for a while, because that stream may continue.
         self._other_expected, self._other_count = self.expected & 0xFF, self.received - self._stream_start
         self._other_at = now
         self._stream_start, self._returns, self._skipped_over = self.received, 0, 0
 
     def _shifted(self, further: int) -> int:
-        """Return the bits of `_missing`, relative to ``further`` numbers after `expected`."""
+        """Return `_missing` with its bits shifted, so that they are relative to the number `expected` + ``further``."""
         distance = self.expected - self._missing_at + further
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
@@ -153,30 +153,31 @@ class SourceStatistics(SourceFields):
         return was_missing
 
     def _on_repeated(self, sequence: int, now: float) -> int:
-        # A single frame like this is a repetition. Several in direct succession mean that the sender rebooted.
+        # A single frame with an old number is a repetition. Several in direct succession show that the sender rebooted.
         follows = sequence == (self._late_sequence + 1) & 0xFF
         is_direct_succession = follows and self._late_at == self.received
         self._late_run = self._late_run + 1 if is_direct_succession else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
-        min_run = 3 if is_near else 1  # a link may repeat a few recent frames, but not old ones
+        min_run = 3 if is_near else 1  # A link may repeat a few recent frames, but hardly old ones.
         if self._late_run >= min_run:
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
-        # Repeated frames in sequence may be those of a second sender. Otherwise the count starts again from 0.
+        # Repeated frames whose numbers follow each other may come from a second sender, so they count as alternations.
+        # Any other repeated frame resets the count to 0.
         self._count_alternations(now, 1 if follows else -self._alternations)
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._late_sequence, self._late_at = sequence, self.received
         return OTHERS if self.has_duplicates(now) else LATE
 
     def _continue_at(self, sequence: int) -> None:
-        """Make a frame with this number the newest one, without counting the numbers before it as lost."""
+        """Make this sequence number the newest, without counting the numbers before it as lost."""
         self.skip((sequence - self.expected) & 0xFF)
         self.expected += 1
         self._missing, self._missing_at, self._skipped_over = 0, self.expected, 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
-        # The other stream counts as the sender if it has more frames, or if the current stream has timed out.
+        # The stream with more frames counts as the sender's. If the current stream has timed out, it is the other one.
         count = self.received - self._stream_start
         is_other_longer = self._other_count > count
         is_over = now - self._advanced_at > _STREAM_TIMEOUT_S
@@ -187,24 +188,26 @@ class SourceStatistics(SourceFields):
             self._swap(sequence, now, count, self._other_count if is_other_longer else 0)
             return IN_ORDER
         if is_other_longer and self._was_missing((self.expected - sequence) & 0xFF or 256):
+            # The frame is in the gap before the current stream, which was counted as lost.
             self.lost -= 1
             self._skipped_over -= 1
         self._other_expected, self._other_count = (sequence + 1) & 0xFF, self._other_count + 1
         self._other_at = now
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
-        self._stream_start += 1  # the frame does not count for the current stream
+        self._stream_start += 1  # The frame does not count as one of the current stream.
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, count: int, other_count: int) -> None:
-        """Make the other stream the sender's stream, and the current stream the other one."""
-        # The gap before the current stream was no loss. The difference is below 0 if frames of the gap arrived late.
+        """Swap the two streams: the other stream becomes the sender's stream, the current stream the other one."""
+        # The gap before the current stream was no loss, so it is subtracted. Frames of the gap may have arrived late,
+        # so the result could be negative without max().
         self.lost = max(0, self.lost - self._skipped_over)
         self._other_expected, self._other_count, self._other_at = self.expected & 0xFF, count, now
         self._stream_start, self._returns = self.received - other_count, 0
         self._continue_at(sequence)
 
     def _count_alternations(self, now: float, count: int) -> None:
-        """Add to the number of times that two streams have alternated, within the last `_EXPIRY_S`."""
+        """Add to the count of alternations between two streams. It starts again from 0 if the last was too long ago."""
         if now - self._alternated_at > _EXPIRY_S:
             self._alternations = 0
         self._alternations = max(0, self._alternations + count)
@@ -231,7 +234,7 @@ class SourceLimit:
         self._swept_at = -math.inf
 
     def join(self, statistics: FramerStatistics) -> None:
-        """Count the senders of these statistics, too."""
+        """Include the senders of these statistics in the limit."""
         self._statistics.add(statistics)
 
     def leave(self, statistics: FramerStatistics) -> None:

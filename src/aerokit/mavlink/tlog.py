@@ -19,12 +19,12 @@ _TIME = Struct(">Q")
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
 _MAX_RECORD = 8 + 280
-# The search for the next record after garbage ignores times before the year 2000, because zeros in the header of a
-# frame look like such a time. Where a record is expected, these times are accepted, because the clock may not have been
-# set.
+# After garbage, the search for the next record ignores times before the year 2000, because zeros in the header of a
+# frame look like such a time. Where a record is expected, such a time is accepted, because the computer's clock may
+# have been wrong.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100; a larger number is not a timestamp
-# A time whose first two bytes are these or smaller is before _LAST_TIME.
+# If the first two bytes of a time are not larger than these, the time is before _LAST_TIME.
 _MAX_TIME_PREFIX = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]
 
 
@@ -49,7 +49,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
     data, begin, is_at_end, min_time = b"", 0, False, 0
     end: int | None
     while True:
-        # A record, and the header of the next record, must be in `data`.
+        # `data` must contain a whole record and the header of the next one, so that the record can be verified.
         if not is_at_end and len(data) - begin < 2 * _MAX_RECORD:
             block = file.read(_BLOCK)
             is_at_end = not block
@@ -60,7 +60,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
             if records:
                 yield from records
                 continue
-        # Fast path for unsigned MAVLink 2, which takes half the time of `_record_end`.
+        # A fast path for unsigned MAVLink 2 frames. It takes half the time of `_record_end`.
         try:
             end = begin + 20 + data[begin + 9]
             if (
@@ -73,12 +73,12 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
                 or data[end : end + 2] > _MAX_TIME_PREFIX
             ):
                 end = _record_end(data, begin, min_time)
-        except IndexError:  # the last record, or garbage
+        except IndexError:  # This is the last record, or garbage.
             end = _record_end(data, begin, min_time)
         if end is None:
             if len(data) - begin <= 8:
                 return
-            begin, min_time = begin + 1, _FIRST_TIME  # search for the next record
+            begin, min_time = begin + 1, _FIRST_TIME  # No record begins here: search from the next byte on.
             continue
         yield _TIME.unpack_from(data, begin)[0] / 1e6, data[begin + 8 : end]
         begin, min_time = end, 0
@@ -89,13 +89,13 @@ def _record_end(data: bytes, begin: int, min_time: int) -> int | None:
     end = _frame_end(data, begin)
     if end is None or end > len(data) or _TIME.unpack_from(data, begin)[0] < min_time:
         return None
-    if len(data) - end <= 8 or _frame_end(data, end) is not None:
+    if len(data) - end <= 8 or _frame_end(data, end) is not None:  # The log ends here, or another record follows.
         return end
     return None if _looks_shifted(data, begin, end) else end
 
 
 def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
-    """Return True if this record contains the start of the real record, which another record follows directly."""
+    """Return True if this record is an error: inside it, a record begins that another one follows directly."""
     for inside in range(begin + 1, end):
         true_end = _frame_end(data, inside)
         if true_end is not None and true_end > end and _frame_end(data, true_end) is not None:
@@ -105,7 +105,7 @@ def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
 
 def _frame_end(data: bytes, begin: int) -> int | None:
     """Return the end of a frame according to its header, which may be beyond the data. None if there is no header."""
-    start = begin + 8  # the frame follows the time, which has 8 bytes
+    start = begin + 8  # The frame follows the time, which has 8 bytes.
     if len(data) - start < 3 or data[start] not in _MAGICS or _TIME.unpack_from(data, begin)[0] > _LAST_TIME:
         return None
     magic, payload_length, flags = data[start : start + 3]
@@ -117,7 +117,7 @@ def _frame_end(data: bytes, begin: int) -> int | None:
 
 
 class TlogWriter:
-    """Writes a log. Can be used as a context manager. Each record is written in one piece."""
+    """Writes a log; also a context manager. Each record is written in one piece."""
 
     def __init__(self, target: str | PathLike[str] | BinaryIO) -> None:
         """Create a new file at a path, or append to a binary file, which the caller closes."""

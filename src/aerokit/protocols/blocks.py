@@ -8,24 +8,25 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
 
-# A request counts as lost when this many later requests were answered, because answers arrive in order.
+# Answers arrive in the order of the requests. A request therefore counts as lost once the answer to a request that was
+# sent this many places later has arrived.
 OVERTAKEN = 3
 
 # ArduPilot queues at most five requests, processes one every 2 ms, and drops further requests.
 BURST_SIZE = 4
 
-# Pause between requests that follow the first ``BURST_SIZE``.
+# Pause between further requests, after the first ``BURST_SIZE`` were sent at once.
 SPACING_S = 0.002
 
-# An answer that arrives within this fraction of the fastest round trip belongs to an earlier transmission.
+# An answer that arrives sooner than this fraction of the fastest round trip belongs to an earlier transmission.
 MIN_ROUND_TRIP_FRACTION = 0.5
 
-# Number of consecutive timeouts after which requests back off. Fewer do not count, because radios lose single frames.
+# Requests back off after this many consecutive timeouts. Fewer mean nothing, because radios lose single frames.
 TIMEOUTS_BEFORE_BACKOFF = 3
 
 
 class AdaptiveWindow:
-    """Number of requests in flight: as many as the link carries without delaying their answers.
+    """Limits the number of requests in flight to what the link carries without delaying the answers.
 
     The window grows while answers arrive as fast as the fastest answers so far. It shrinks when answers take much
     longer, because they then wait in a queue. Loss does not shrink the window unless most requests are lost, because
@@ -36,7 +37,7 @@ class AdaptiveWindow:
         self._size = float(start)
         self._min_size, self._max_size = min_size, max_size
         self._fastest_s: float | None = None
-        self._loss = 0.0  # share of lost requests, averaged over about the last 16
+        self._loss = 0.0  # fraction of lost requests, averaged over about the last 16 requests
 
     @property
     def size(self) -> int:
@@ -44,7 +45,7 @@ class AdaptiveWindow:
         return int(self._size)
 
     def widen(self, size: float) -> None:
-        """Raise the size to the number of answers that are known to fit into one round trip."""
+        """Raise the size to ``size``, because this many answers are known to fit into one round trip."""
         self._size = max(self._size, min(size, self._max_size / 2))
 
     def on_answer(self, seconds: float | None) -> None:
@@ -57,6 +58,7 @@ class AdaptiveWindow:
             return
         if self._fastest_s is None or seconds < self._fastest_s:
             self._fastest_s = seconds
+        # An answer that takes much longer than the fastest one has waited in a queue.
         if seconds <= 1.25 * self._fastest_s + 0.01:
             self._size = min(self._max_size, self._size + 0.5)
         elif seconds > 2.0 * self._fastest_s + 0.05:
@@ -67,7 +69,7 @@ class AdaptiveWindow:
         self._loss += (1.0 - self._loss) / 16
         if self._loss > 0.75:
             self._size = max(self._min_size, self._size / 2)
-            self._loss = 0.5  # so that only further losses halve the size again
+            self._loss = 0.5  # The average starts again below the limit, so only further losses halve the size again.
 
 
 class _Block:
@@ -94,15 +96,15 @@ class BlockRequests:
         self._sent_count = 0
         self._timeouts = 0
         self._busy_until = float("-inf")
-        self._next_send_at = float("-inf")  # earliest time for a request beyond the first `burst_size`
-        self._must_wait_to_send = False  # True if waiting requests fit into the window, but it is too early
+        self._next_send_at = float("-inf")  # earliest time for the next request beyond the first `burst_size`
+        self._must_wait_to_send = False  # True if a request fits into the window, but must wait until `_next_send_at`
 
     def __len__(self) -> int:
         return len(self._waiting) + len(self._in_flight)
 
     @property
     def deadline(self) -> float | None:
-        """Time at which an answer is overdue or another request may be sent; None while no request is in flight."""
+        """Time for the next `take_due`: an answer is overdue, or a request may be sent. None: nothing is in flight."""
         overdue_at = min((self._due_at(block) for block in self._in_flight.values()), default=None)
         if self._must_wait_to_send and overdue_at is not None:
             return min(overdue_at, self._next_send_at)
@@ -125,7 +127,7 @@ class BlockRequests:
             self.discard(offset)
 
     def set_busy(self, until: float) -> None:
-        """Suspend timeouts and round-trip measurements, because the server is sending a burst."""
+        """Suspend timeouts and round-trip measurements until this time, because the server is sending a burst."""
         self._busy_until = until
 
     def on_answer(self, offset: int, now: float, *, sent_at: float | None = None) -> None:
@@ -137,6 +139,7 @@ class BlockRequests:
         if sent_at is None:
             sent_at = self._sent_at_of_answer(block, now)
         self._timeouts = 0
+        # The time of an answer is not measured if its transmission is unknown, or if the server was busy with a burst.
         if sent_at is None or sent_at <= self._busy_until:
             self.window.on_answer(None)
             return
@@ -154,7 +157,7 @@ class BlockRequests:
         return block.previous_sent_at if is_too_early else None
 
     def take_due(self, now: float, *, limit: int | None = None) -> list[int]:
-        """Return the offsets to request now, retries first, and count them as sent. ``limit`` restricts the window."""
+        """Return the offsets to request now, retries first, and count them as sent. The window is at most ``limit``."""
         overdue = [offset for offset, block in self._in_flight.items() if self._due_at(block) <= now]
         self._requeue(overdue)
         if overdue:
@@ -218,15 +221,15 @@ class Reassembly:
         self.start: int = start
         self.block_size: int = block_size
         self.position = start
-        """Offset up to which everything was written."""
+        """Everything before this offset was written."""
         self.tail: int = start
-        """End of the last block received."""
+        """End of the received block with the largest offset."""
         self.end: int | None = None
         """Size of the file; None while unknown."""
         self.gaps: dict[int, None] = {}
         """Offsets of the missing blocks before ``tail``, in order."""
         self._write = write
-        self._ahead: dict[int, bytes] = {}  # blocks after a gap, which are not written yet
+        self._ahead: dict[int, bytes] = {}  # blocks that cannot be written yet, because an earlier block is missing
         self._bytes_ahead = 0
 
     @property
@@ -242,7 +245,7 @@ class Reassembly:
         """Add a block, and return True if it was missing. A block shorter than ``block_size`` ends the file."""
         if not data or (offset - self.start) % self.block_size or not self._is_missing(offset):
             return False
-        if offset >= self.tail:
+        if offset >= self.tail:  # All blocks between the tail and this block are missing.
             self.gaps.update(dict.fromkeys(range(self.tail, offset, self.block_size)))
             self.tail = offset + len(data)
         else:
@@ -267,7 +270,7 @@ class Reassembly:
             self._bytes_ahead -= len(self._ahead.pop(offset))
         if self.tail < end:
             self.gaps.update(dict.fromkeys(range(self.tail, end, self.block_size)))
-        self.tail = max(end, self.position)
+        self.tail = max(end, self.position)  # Data beyond the end may already have been written.
 
     def missing(self, size: int | None = None) -> tuple[tuple[int, int], ...]:
         """Return the missing ranges as (offset, size); ``size`` is the expected size of the file, if known.

@@ -33,8 +33,8 @@ MAX_ATTEMPTS = 4
 
 _ARM, _RELATIVE, _STEP = (0, 1.0), (3, 1.0), (0, 0.0)
 
-# Maps MAV_CMD to the effect that a repetition has. The second value is the parameter (index, value) for which the
-# repetition has this effect, or None if it always has. docs/reliability.md has the same table.
+# Commands of which a repetition has a further effect. Maps MAV_CMD to (effect, condition). The condition is a parameter
+# (index, value) with which the repetition has this effect; None: it always has. docs/reliability.md has the same table.
 UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _ARM),
     MavCmd.CONDITION_YAW: ("turns by the same angle again", _RELATIVE),
@@ -70,7 +70,7 @@ UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
 
 
 def max_attempts(command: int, params: Sequence[float]) -> int:
-    """Return how often a command may be sent: only once if a repetition would have a further effect."""
+    """Return how often a command may be sent: `MAX_ATTEMPTS`, or once if a repetition would have a further effect."""
     if command not in UNREPEATABLE_COMMANDS:
         return MAX_ATTEMPTS
     _, condition = UNREPEATABLE_COMMANDS[command]
@@ -86,16 +86,16 @@ FLOAT32_MAX = 3.4028234663852886e38
 
 ATTEMPT_TIMEOUT_S = 1.0
 
-# An order that waits to be sent again checks for a new HEARTBEAT at this interval.
+# While an order waits for a new HEARTBEAT to be sent again, it checks for one at this interval.
 POLL_INTERVAL_S = 0.05
 
-# Time before the earliest repetition, as a fraction of ``attempt_timeout``. It is below 1, because HEARTBEATs arrive at
-# 1 Hz with some jitter.
+# An order is repeated at the earliest after this fraction of ``attempt_timeout``. It is below 1, because a repetition
+# follows a HEARTBEAT, and HEARTBEATs arrive at 1 Hz with some jitter.
 MIN_RESEND_FRACTION = 0.75
 
 
 class OrderStatus(Protocol):
-    """State of an order that was sent, which decides whether the order is sent again."""
+    """State of an order. It determines whether the order may be sent again."""
 
     @property
     def end(self) -> str:
@@ -212,8 +212,9 @@ class CommandExchange(Exchange[CommandAck]):
             attempts = MAX_ATTEMPTS if order_status is None else max_attempts(message.command, _params_of(message))
             is_unrepeatable = attempts == 1
         if attempt_timeout is None:
+            # A command that is sent only once waits as long as all attempts of another command together.
             attempt_timeout = ATTEMPT_TIMEOUT_S * (MAX_ATTEMPTS if is_unrepeatable else 1)
-        if attempt_timeout > 0:  # otherwise it is refused below
+        if attempt_timeout > 0:  # Other values are refused below, with the value that the caller gave.
             attempt_timeout = max(attempt_timeout, min_timeout_s)
         if attempts < 1:
             raise InvalidArgument(f"attempts = {attempts} is not allowed: at least 1")
@@ -241,8 +242,8 @@ class CommandExchange(Exchange[CommandAck]):
         """Process a COMMAND_ACK. Other messages are ignored."""
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
-        # A command that may be sent only once does not ignore acknowledgements, because if it ignored its own, there
-        # would be no second one.
+        # An acknowledgement may belong to an earlier command. A command that is sent only once must not ignore one: if
+        # it was its own, no other would follow.
         may_ignore = self._sent_count == 1 and self._attempts > 1
         is_to_earlier_command = may_ignore and self._answer_count < self._earlier_answers
         if message.result != MavResult.IN_PROGRESS:
@@ -258,8 +259,8 @@ class CommandExchange(Exchange[CommandAck]):
 
     @property
     def pending_answers(self) -> int:
-        """Number of acknowledgements that may still arrive. The next command with the same MAV_CMD must ignore them."""
-        # As in receive(), every acknowledgement belongs to this command once it was repeated.
+        """Number of acknowledgements that may still arrive, which the next command with this MAV_CMD must ignore."""
+        # Once the command was repeated, every acknowledgement counts for this command; see `receive`.
         ignored_answers = self._earlier_answers if self._sent_count == 1 else 0
         own_answers = max(0, self._answer_count - ignored_answers)
         return max(0, self._sent_count * self._acks_per_sending - own_answers)
@@ -287,7 +288,7 @@ class CommandExchange(Exchange[CommandAck]):
         if order_status.end:
             self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {order_status.end}"))
             return
-        # A HEARTBEAT since this time shows that the vehicle still receives, or that its link is back.
+        # If the last HEARTBEAT is not older than this, the link to the vehicle works, so the order may be repeated.
         min_heartbeat_at = self._sent_at + MIN_RESEND_FRACTION * self._attempt_timeout
         if self._sent_count < self._attempts and order_status.heartbeat_at >= min_heartbeat_at:
             self._send(now)
@@ -310,12 +311,12 @@ class CommandExchange(Exchange[CommandAck]):
         self._sent_count += 1
         self._sent_at = now
         wait_s = self._attempt_timeout
-        if self._order_status is not None:  # `_expire_order` then checks for a HEARTBEAT, or that the order has ended
+        if self._order_status is not None:  # An order checks earlier for a HEARTBEAT, and whether it has ended.
             wait_s = min(MIN_RESEND_FRACTION * wait_s, ATTEMPT_TIMEOUT_S)
         self.deadline = now + wait_s
 
     def _with_confirmation(self, confirmation: int) -> Message:
-        # Only COMMAND_LONG has the field `confirmation`.
+        # COMMAND_LONG counts repetitions in the field `confirmation`. COMMAND_INT has no such field.
         message = self._message
         if confirmation == 0 or not isinstance(message, CommandLong):
             return message
@@ -323,7 +324,7 @@ class CommandExchange(Exchange[CommandAck]):
         return CommandLong(**fields)
 
     def _is_ours(self, ack: CommandAck) -> bool:
-        # Acknowledgements in MAVLink 1, and of old firmware, have no targets.
+        # In MAVLink 1, and from old firmware, an acknowledgement has no target fields, which then count as 0 (all).
         own_system, own_component = self._own_ids
         frame, component = ack.received_frame, self._message.target_component
         return (
@@ -352,7 +353,7 @@ def _params_of(message: CommandLong | CommandInt) -> tuple[float, ...]:
 
 
 def rejection(command: int, result: int) -> CommandRejected:
-    """Create the error for a result."""
+    """Create the error for a MAV_RESULT other than ACCEPTED and IN_PROGRESS."""
     text = f"{command_name(command)} was refused: {result_name(result)}{_HINTS.get(result, '')}"
     return CommandRejected(text, command=command, result=result)
 
@@ -396,7 +397,7 @@ def _checked_params(command: int, params: tuple[float, ...], count: int) -> list
     numbers = [0.0] * count
     for index, value in enumerate(params):
         if isinstance(value, (int, float)) and -FLOAT32_MAX <= value <= FLOAT32_MAX:
-            numbers[index] = float(value)  # Fast path for ordinary numbers.
+            numbers[index] = float(value)  # the fast path for ordinary numbers
         else:
             numbers[index] = _checked_number(command, f"param{index + 1}", value)
     return numbers
@@ -407,6 +408,6 @@ def _checked_number(command: int, field: str, value: float) -> float:
         number = float(value)
     except (TypeError, ValueError):
         raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} is not a number") from None
-    if math.isinf(number) or abs(number) > FLOAT32_MAX:
+    if math.isinf(number) or abs(number) > FLOAT32_MAX:  # NaN is allowed: many commands use it for "unchanged".
         raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} does not fit into 32 bits")
     return number

@@ -56,7 +56,7 @@ class Exchange(ABC, Generic[ResultT]):
 
     @abstractmethod
     def expire(self, now: float) -> None:
-        """Retry or fail, because the deadline has passed. Not called after ``done`` has become True."""
+        """Send again, or fail, because the deadline has passed. Not called any more once ``done`` is True."""
 
     def link_changed(self, now: float) -> None:
         """Handle a switch to another link, which leads to another port of the vehicle.
@@ -76,7 +76,7 @@ class Exchange(ABC, Generic[ResultT]):
         return outbox
 
     def result(self) -> ResultT:
-        """Return the result, or raise the error with which the exchange ended. Only valid once ``done``."""
+        """Return the result, or raise the error with which the exchange ended. Call it only when ``done`` is True."""
         if self._error is not None:
             raise self._error
         if not self.done:
@@ -98,11 +98,11 @@ class Exchange(ABC, Generic[ResultT]):
 GAIN, DEVIATION_GAIN = 1 / 8, 1 / 4
 DEVIATIONS = 4.0
 
-# Jitter that even regular answers have, from the vehicle's main loop and the resolution of the clock.
+# Minimum jitter of answers, which is due to the vehicle's main loop and the resolution of the clock.
 JITTER_S = 0.03
 
-BACKOFF = 1.5  # each further attempt waits longer by this factor
-MAX_BACKOFFS = 30  # limits the exponent, so that the power does not overflow
+BACKOFF = 1.5  # From the third attempt on, each attempt waits longer than the previous one by this factor.
+MAX_BACKOFFS = 30  # Maximum exponent of BACKOFF, because a higher power could overflow.
 
 
 class RoundTrip:
@@ -146,12 +146,13 @@ class RoundTrip:
         return min(backed_off_s, max(self._max_s, first_s))
 
 
-# If this many messages in a row are missing, the vehicle has stopped sending: radios hardly ever lose so many.
+# If no message arrives in the time of this many messages, the vehicle has stopped sending, because radios hardly ever
+# lose so many in a row.
 SILENT_MESSAGES = 10
 
 
 class MessageStream:
-    """Tracks the messages that follow one request, and when they must have ended.
+    """Tracks the stream of messages that follows one request, and determines when the stream has ended.
 
     The stream has ended when nothing arrives for much longer than the interval between two messages.
     """
@@ -159,7 +160,7 @@ class MessageStream:
     def __init__(self, round_trip: RoundTrip) -> None:
         self._round_trip = round_trip
         self._interval = RoundTrip(min_s=0.001)
-        self._received_at: float | None = None  # time of the last message since the request; None: none yet
+        self._received_at: float | None = None  # time of the last message after the request; None if there was none
         self._last_at = 0.0  # time of the request or of the last message after it
         self.failures: int = 0
         """Number of consecutive requests that no message followed. The owner of this object counts them."""
@@ -171,7 +172,10 @@ class MessageStream:
 
     @property
     def due_at(self) -> float:
-        """Time at which the stream counts as ended, or as not started, unless a message arrives earlier."""
+        """Deadline for the next message.
+
+        If it passes, the stream counts as ended; before the first message, it counts as not started.
+        """
         silence_s = self._round_trip.timeout_s(max(1, self.failures - 1))
         if self._received_at is not None and self._interval.smoothed_s is not None:
             silence_s += max(SILENT_MESSAGES * self._interval.smoothed_s, self._interval.timeout_s())
@@ -182,7 +186,7 @@ class MessageStream:
         self._last_at, self._received_at = now, None
 
     def on_message(self, now: float, messages: int) -> None:
-        """Record a message that is ``messages`` places after the previous message in the stream."""
+        """Record a message of the stream. It comes ``messages`` places after the previous one, so 1 means no loss."""
         if self._received_at is not None and messages > 0:
             self._interval.add_sample((now - self._received_at) / messages)
         elif self._received_at is None and self.failures == 0:
@@ -291,11 +295,11 @@ class Transfer(Exchange[ResultT]):
         return frame is None or (frame.system_id == self.target_system and frame.component_id == self.target_component)
 
 
-# No answer arrives in less than this fraction of the fastest round trip so far.
+# An answer that arrives sooner than this fraction of the fastest round trip so far belongs to an earlier request.
 MIN_ROUND_TRIP_FRACTION = 0.5
 
-# After this many early answers, further ones are accepted, because the vehicle has become faster. Without this limit, a
-# vehicle that was slow at first would get requests until the idle timeout.
+# After this many early answers for one name, further ones are accepted, because the vehicle has become faster. Without
+# this limit, all answers of a vehicle that was slow at first would be refused until the idle timeout.
 MAX_EARLY_ANSWERS = 2
 
 
@@ -312,7 +316,8 @@ class StaleAnswerFilter:
         if elapsed_s >= MIN_ROUND_TRIP_FRACTION * (self._round_trip.fastest_s or 0.0):
             return False
         if attempts == 1:
-            self._round_trip.add_sample(elapsed_s)  # the vehicle may be this fast: accept the next answer
+            # The vehicle may really be this fast. The shorter round trip then makes the next answer acceptable.
+            self._round_trip.add_sample(elapsed_s)
         early_requests = self._early.setdefault(name, set())
         early_requests.add(sent_at)
         return len(early_requests) <= MAX_EARLY_ANSWERS

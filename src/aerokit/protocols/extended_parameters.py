@@ -40,7 +40,7 @@ SettingAnswer = Setting | ParameterRejected | ParameterTimeout
 """Answer to one request: the setting as the component reports it, or the error."""
 
 UNKNOWN_INDEX = 0xFFFF
-MAX_QUIET_S = 1.1  # silence after which the stream of the list has stopped in any case
+MAX_QUIET_S = 1.1  # The stream of a list has stopped after this silence, even if its pauses were long before.
 READ_WINDOW = 10
 # Seconds to wait after PARAM_ACK_IN_PROGRESS before the value is requested.
 PROGRESS_TIMEOUT_S = 5.0
@@ -51,7 +51,7 @@ REFUSALS = {
 
 
 def setting_of(message: ParamExtValue | ParamExtAck) -> Setting:
-    """Convert a message. PARAM_EXT_ACK has no index."""
+    """Convert a PARAM_EXT_VALUE or PARAM_EXT_ACK to a setting. PARAM_EXT_ACK has no index."""
     index = message.param_index if isinstance(message, ParamExtValue) else UNKNOWN_INDEX
     value = setting_value(message.param_value, message.param_type)
     return Setting(message.param_id, value, message.param_type, None if index == UNKNOWN_INDEX else index)
@@ -100,11 +100,11 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             self._end_stream()
 
     def _on_value(self, setting: Setting, index: int, count: int, now: float) -> None:
-        """Store a value of the stream, or the answer to a request. Request the indices that the stream has left out."""
+        """Store a value: of the stream, or the answer to a request. Request indices that the stream has left out."""
         if self._is_streaming and index >= self._next:
             for missing in range(self._next, index):
                 self._window.request(missing)
-            if self._next:
+            if self._next:  # The time before the first value is not a pause of the stream.
                 self._pause_s = max(self._pause_s, now - self._last_at)
             self._next, self._last_at = index + 1, now
             quiet_s = max(self.round_trip.timeout_s(), PAUSES * self._pause_s, MIN_START_TIMEOUT_S)
@@ -131,7 +131,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             if not stale:
                 settings = (self._received[index][0] for index in range(self._count))
                 self._finish({setting.name: setting for setting in settings})
-        elif not len(self._window):  # the count has increased
+        elif not len(self._window):  # Nothing is requested, but values are missing: the count has increased.
             self._end_stream()
 
 
@@ -176,7 +176,8 @@ class SettingReads(NamedReads[Setting]):
         if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
             self._count_probe()
             self._window.on_answer(PROBE, now)
-            unanswered = [asked for asked in self._names if asked not in self._answers and asked != name]
+            # The component answers requests, so other names without an answer may be unknown to it.
+            unanswered = [other for other in self._names if other not in self._answers and other != name]
             self._reject_unknown(unanswered, now)
         if name and name in self._window:
             self._window.on_answer(name, now)
@@ -235,7 +236,7 @@ class SettingWrite(Transfer[Setting]):
         elif settings_equal(reported.value, self._value):
             self._measure(now)
             self._finish(reported)
-        elif not self._is_writing and not self._is_stale(now):
+        elif not self._is_writing and not self._is_stale(now):  # While it writes, a component reports the old value.
             self._measure(now)
             self._on_unexpected_value(reported, now)
 
@@ -253,19 +254,20 @@ class SettingWrite(Transfer[Setting]):
             self._measure(now)
             self._finish(reported)
         elif self._is_stale(now):
-            return  # the answer came too early for our request, so it is for another station
+            return  # The answer arrived too soon for our request, so it answers another station.
         elif result == ParamAck.IN_PROGRESS:
             self._progress_at = now
             self._is_writing = True
             self.deadline = now + min(PROGRESS_TIMEOUT_S, self._idle_timeout_s)
         elif result == ParamAck.ACCEPTED:
-            self._read(now)  # the component has another value: it adjusted the value, or another station has set it
+            # The accepted value differs from ours: the component adjusted it, or another station set it meanwhile.
+            self._read(now)
         else:
             reason = REFUSALS.get(result, f"PARAM_ACK {result}")  # type: ignore[call-overload]
             self._fail(ParameterRejected(f"{self._name} was refused: {reason}", name=self._name, code=result))
 
     def _on_unexpected_value(self, reported: Setting, now: float) -> None:
-        """Handle another value than the requested one: write or read again until it is conclusive."""
+        """Process a value that differs from the requested one. Write or read again until the value is conclusive."""
         self._unexpected.add(reported)
         is_unchanged = self._before is not None and settings_equal(reported.value, self._before)
         if not self._unexpected.are_conclusive(is_unchanged=is_unchanged):

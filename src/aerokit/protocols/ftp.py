@@ -56,7 +56,7 @@ CODES: dict[int, str] = {
     MavFtpErr.FILENOTFOUND: "no such file or directory",
 }
 
-# Error numbers on which Linux, NuttX and newlib agree.
+# Names and texts of the error numbers that are the same on Linux, NuttX and newlib.
 ERRNOS = {
     1: ("EPERM", "operation not permitted"),
     2: ("ENOENT", "no such file or directory"),
@@ -132,7 +132,7 @@ class FtpMessage(Snapshot):
         return cls(sequence, opcode, session, size, request_opcode, burst_complete != 0, offset, data)
 
     def encode(self) -> bytes:
-        """Encode the 251 bytes of the payload."""
+        """Return the payload of the FILE_TRANSFER_PROTOCOL message: 251 bytes."""
         head = HEADER.pack(
             self.sequence,
             self.session,
@@ -150,7 +150,7 @@ class FtpMessage(Snapshot):
 
     @property
     def error_code(self) -> int:
-        """The MAV_FTP_ERR of a NAK; FAIL if the NAK contains none."""
+        """The MAV_FTP_ERR in a NAK; FAIL if the NAK has no error code."""
         return self.data[0] if self.data else MavFtpErr.FAIL
 
     @property
@@ -175,13 +175,13 @@ def path_bytes(path: str) -> bytes:
         raise InvalidArgument(f"path = {path!r} is not allowed: it must be a non-empty string without NUL")
     if len(encoded) > PATH_SIZE:
         raise InvalidArgument(
-            f"path = {path!r} is not allowed: {len(encoded)} bytes, at most {PATH_SIZE} fit into a message"
+            f"path = {path!r} is not allowed: it has {len(encoded)} bytes, but at most {PATH_SIZE} fit into a message"
         )
     return encoded
 
 
 def file_error(request_opcode: int, path: str, code: int, errno: int | None) -> FileError:
-    """Create the error for a NAK."""
+    """Create the error for a NAK with this MAV_FTP_ERR (``code``) and, for FAILERRNO, this error number."""
     operation = OPERATIONS.get(request_opcode, f"operation {request_opcode}")
     text = CODES.get(code, "unknown error code")
     name = MavFtpErr(code).name if code in CODES else f"code {code}"
@@ -197,25 +197,25 @@ SEQUENCE_COUNT = 0x10000
 
 MAX_SESSION = 255
 
-# The vehicle reads or saves the whole file before it answers these requests.
+# The vehicle reads or saves a whole file before it answers these requests, so they do not measure the round trip.
 SLOW_REQUESTS = (MavFtpOpcode.CALCFILECRC, MavFtpOpcode.TERMINATESESSION)
 SLOW_ANSWER_S = 0.25
 
 # Maximum number of times that a request gets a new sequence number.
 MAX_RENUMBERED = 3
 
-# Number of attempts after which retries back off. Fewer do not count, because radios lose single frames.
+# Retries back off after this many attempts. Fewer mean nothing, because radios lose single frames.
 ATTEMPTS_BEFORE_BACKOFF = 3
 
 SESSION_OPCODES = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)
 
-# Answers to these requests while no file is open: INVALIDSESSION from PX4, FILENOTFOUND from ArduPilot. After PX4 has
-# answered FILEEXISTS once, it gives this answer for any refusal, until an operation fails with an errno.
+# Errors that mean "no file is open": PX4 answers INVALIDSESSION, ArduPilot FILENOTFOUND. After PX4 has answered
+# FILEEXISTS once, it answers every refused request so, until an operation fails with an errno.
 NO_SESSION_ERRORS = (MavFtpErr.INVALIDSESSION, MavFtpErr.FILENOTFOUND, MavFtpErr.FILEEXISTS)
 
 
 class FtpSessionLost(FileError):
-    """The vehicle closed the file: because of another program, its own timeout, or a reboot."""
+    """The vehicle has closed the file, e.g. because of another program, its own time-out, or a reboot."""
 
 
 class FtpClient:
@@ -372,7 +372,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
     def _receive_reply(self, reply: FtpMessage, now: float) -> None:
         if reply.sequence != (self._request.sequence + 1) % SEQUENCE_COUNT:
             self._receive_other(reply, now)
-        elif reply.request_opcode != self._request.opcode:  # a repeated reply to an earlier request
+        elif reply.request_opcode != self._request.opcode:  # The server has repeated its reply to an earlier request.
             self._renumber(now)
         else:
             if self.attempts == 1 and self._request.opcode not in SLOW_REQUESTS:
@@ -380,7 +380,8 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._end(reply)
 
     def _renumber(self, now: float) -> None:
-        # The server repeated its reply to an earlier request, because that had the same sequence number as this one.
+        # The earlier request had the same sequence number, so the server took this request for its repetition. With a
+        # new number, the server executes this request.
         if self._renumbered < MAX_RENUMBERED:
             self._renumbered += 1
             self._request = self._request.replace(sequence=self._client.next_sequence())
@@ -389,7 +390,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._wait(now)
 
     def _receive_other(self, reply: FtpMessage, now: float) -> None:
-        # ArduPilot finishes a burst before it processes the next request, so a block of the burst shows that it works.
+        # ArduPilot answers TERMINATESESSION only after the current burst. The burst's blocks count as progress.
         if self._request.opcode == MavFtpOpcode.TERMINATESESSION and reply.session == self._request.session:
             self._progress_at = now
             self._wait(now)
@@ -403,10 +404,11 @@ class FtpRequest(FtpExchange[FtpMessage]):
     def _was_done_before(self, reply: FtpMessage) -> bool:
         opcode, code = self._request.opcode, reply.error_code
         if opcode == MavFtpOpcode.TERMINATESESSION:
-            return True  # The session no longer exists, so it is closed.
+            return True  # If the session does not exist, it is already closed.
         if self.attempts == 1:
             return False
-        # An earlier transmission may have removed the file, and only the answer was lost.
+        # Perhaps an earlier transmission was executed, and only the answer was lost. The file is then already removed,
+        # or the directory already created.
         if opcode in (MavFtpOpcode.REMOVEFILE, MavFtpOpcode.REMOVEDIRECTORY):
             return code == MavFtpErr.FILENOTFOUND
         return opcode == MavFtpOpcode.CREATEDIRECTORY and code == MavFtpErr.FILEEXISTS

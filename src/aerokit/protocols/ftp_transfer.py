@@ -31,36 +31,36 @@ if TYPE_CHECKING:
 
 __all__ = ["FtpDownload", "FtpUpload", "is_virtual"]
 
-# Errors of servers that do not support bursts.
+# Errors by which servers answer a burst request if they do not support bursts.
 NO_BURST = (MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND)
 WINDOW_DURING_BURST = 4
-# If more blocks than this are missing, they are requested before the next burst, because all blocks after the first
-# missing one are held in memory.
+# If more blocks than this are missing, they are requested before the next burst. All blocks after the first missing one
+# stay in memory, so there must not be too many of them.
 MAX_GAPS = 512
 # Number of blocks that ArduPilot sends in one burst.
 BURST_BLOCKS = 500
-# After a block of a burst, the server counts as busy for this many intervals between blocks.
+# Each block of a burst shows that the server is busy. It counts as busy for this many intervals between two blocks.
 BUSY_BLOCKS = 3
-# Seconds to wait for the first block; even a slow radio carries a few blocks in this time.
+# Minimum seconds to wait for the first block of a long file. Even a slow radio carries a few blocks in this time.
 FIRST_BLOCK_TIMEOUT_S = 0.5
-SHORT_FILE = 20 * DATA_SIZE  # bytes
+SHORT_FILE = 20 * DATA_SIZE  # Up to this size in bytes, repeating a burst costs little.
 MAX_REPEATED_BURSTS = 3
-# Maximum number of bursts whose blocks may still arrive.
+# Maximum number of remembered bursts. Blocks of earlier bursts may still arrive.
 MAX_BURSTS = 32
-# The sequence number of a block that is farther away than this is ambiguous.
+# Sequence numbers wrap around, so they do not show the distance of two blocks that are farther apart than this.
 MAX_BLOCK_DISTANCE = SEQUENCE_COUNT // 2 * DATA_SIZE
-# If more blocks than this are missing in a row, the burst has not started (first number) or has ended (second number),
-# because radios hardly ever lose so many.
+# If no block arrives in the time of this many blocks, the burst has not started (first number), or has ended (second
+# number), because radios hardly ever lose so many blocks in a row.
 MAX_LOST_FIRST_BLOCKS, MAX_LOST_BLOCKS = 4, 10
 
 
 def is_virtual(path: str) -> bool:
-    """Return True if the vehicle generates the file when it is read: its size and checksum are estimates."""
+    """Return True if the vehicle generates the file while it is read. Size and checksum are then estimates."""
     return path.startswith("@")
 
 
 class _SentRequest(NamedTuple):
-    """One transmission. Each has its own sequence number, so that every answer measures the round trip."""
+    """One transmission of a request. Each has its own sequence number, so every answer measures the round trip."""
 
     offset: int
     at: float
@@ -76,19 +76,20 @@ class _Burst(NamedTuple):
         return (reply.sequence - self.sequence - 1) % SEQUENCE_COUNT
 
     def contains(self, reply: FtpMessage) -> bool:
-        """Return True if sequence number and offset of this block both fit the burst."""
+        """Return True if this block may belong to the burst: its sequence number and its offset match."""
         blocks, remainder = divmod(reply.offset - self.offset, DATA_SIZE)
         return remainder == 0 and blocks >= 0 and blocks % SEQUENCE_COUNT == self.blocks_before(reply)
 
     def end(self, reply: FtpMessage) -> int | None:
-        """Return the end of the file according to this NAK, or None if it does not belong to the burst."""
+        """Return the end of the file according to this NAK; None if the NAK does not belong to this burst."""
         blocks = self.blocks_before(reply)
         if blocks == 0:
             return self.offset
         last_offset = self.offset + (blocks - 1) * DATA_SIZE
         if not last_offset <= reply.offset <= last_offset + DATA_SIZE:
             return None
-        # The NAK has the offset of the end of the file. After a full block, ArduPilot sends the block's start instead.
+        # PX4's NAK has the offset of the end of the file. If the last block was full, ArduPilot's NAK has the offset of
+        # this block instead.
         return reply.offset if reply.offset > last_offset else last_offset + DATA_SIZE
 
 
@@ -115,18 +116,19 @@ class FtpDownload(FtpExchange[int]):
         super().__init__(client, path, **options)
         self._into, self._session = into, session
         self._size = None if is_virtual(path) or size == 0 else size
-        self._scanned = into.position  # the gaps before this offset were requested
+        self._scanned = into.position  # Missing blocks before this offset were already requested.
         self._requests = BlockRequests(self.round_trip)
         self._reads: dict[int, _SentRequest] = {}  # requests by sequence number
         self._bursts: list[_Burst] = []
         self._is_bursting = False
         self._failed_bursts = 0
-        self._repeated_bursts = 0  # bursts requested since the last new block
-        self._blocks_sent: dict[int, int] = {}  # sequence number of each burst → its highest block number
+        self._repeated_bursts = 0  # number of bursts requested since the last block that was new
+        self._blocks_sent: dict[int, int] = {}  # sequence number of a burst → highest number of its blocks received
         self._supports_bursts = True
         self._burst_at = 0.0
-        self._last_block: tuple[_Burst | None, float, int] = (None, 0.0, -1)  # burst, time, number in the burst
-        self._interval = RoundTrip(min_s=0.001)  # between two blocks of a burst
+        # The last block of a burst that was received: its burst, the time, and its number in the burst.
+        self._last_block: tuple[_Burst | None, float, int] = (None, 0.0, -1)
+        self._interval = RoundTrip(min_s=0.001)  # smoothed time between two blocks of a burst
 
     def start(self, now: float) -> None:
         """Request the first burst, and the blocks that are already known to be missing."""
@@ -156,7 +158,7 @@ class FtpDownload(FtpExchange[int]):
             self._proceed(now)
 
     def _receive_burst(self, reply: FtpMessage, now: float) -> None:
-        """Process a block of a burst, or its end. Replies to earlier bursts may still arrive."""
+        """Process a block of a burst, or the NAK that ends a burst. Replies to earlier bursts may still arrive."""
         for burst in reversed(self._bursts):
             if reply.is_ack and burst.contains(reply):
                 self._on_block(burst, reply, now)
@@ -178,7 +180,8 @@ class FtpDownload(FtpExchange[int]):
         self._add(reply.offset, reply.data, now)
 
     def _measure(self, burst: _Burst, number: int, now: float) -> None:
-        # Known blocks of a repeated burst count as progress too, but only for a limited number of bursts.
+        # In a repeated burst, known blocks also count as progress, because the server works. The number of such bursts
+        # is limited, so that the download cannot go on forever.
         if number > self._blocks_sent.get(burst.sequence, -1) and self._repeated_bursts <= MAX_REPEATED_BURSTS:
             self._blocks_sent[burst.sequence], self._progress_at = number, now
         last_burst, last_at, last_number = self._last_block
@@ -194,7 +197,7 @@ class FtpDownload(FtpExchange[int]):
 
     def _stop_bursting(self) -> None:
         self._is_bursting = False
-        # The interval between blocks shows how many blocks fit into a round trip.
+        # The server sends one block per interval, so this many answers fit into a round trip without queueing.
         if self._interval.smoothed_s and self.round_trip.smoothed_s:
             self._requests.window.widen(self.round_trip.smoothed_s / self._interval.smoothed_s)
 
@@ -206,6 +209,7 @@ class FtpDownload(FtpExchange[int]):
             self._stop_bursting()
         if reply.error_code == MavFtpErr.EOF:
             self._end_at(end)
+        # After the first block, such an error is a failure, because the server does support bursts.
         elif is_latest and reply.error_code in NO_BURST and self._into.done == self._into.start:
             self._supports_bursts = False
         elif is_latest:
@@ -217,7 +221,7 @@ class FtpDownload(FtpExchange[int]):
         is_end = reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset)
         if reply.is_ack and reply.data:
             self._add(offset, reply.data, now)
-        elif is_end:  # an ACK without data, or EOF
+        elif is_end:  # The offset is at or after the end: an ACK without data, EOF, or any error after the known size.
             self._end_at(offset)
         else:
             self._fail(self._refused(reply))
@@ -227,19 +231,20 @@ class FtpDownload(FtpExchange[int]):
         self._requests.discard_from(end)
 
     def _is_plausible(self, offset: int) -> bool:
-        # A block far behind all others would create millions of gaps.
+        # A block far beyond all others would add millions of missing blocks.
         return not self._is_past_size(offset) and offset - self._into.tail < MAX_BLOCK_DISTANCE
 
     def _is_past_size(self, offset: int) -> bool:
-        # After PX4 has answered another request with FILEEXISTS, it also sends FILEEXISTS instead of EOF.
+        # At the end of the file, PX4 may answer FILEEXISTS instead of EOF, namely if it answered FILEEXISTS before. So
+        # any error after the known size counts as the end.
         return self._size is not None and offset >= self._size
 
     def _add(self, offset: int, data: bytes, now: float) -> None:
         if self._size is not None:
-            data = data[: self._size - offset]  # The file may have grown; later blocks are ignored before.
+            data = data[: self._size - offset]  # The file may have grown since it was opened.
         try:
             is_new = self._into.add(offset, data)
-        except Exception as error:  # the disk is full, for example
+        except Exception as error:  # Writing failed, e.g. because the disk is full.
             self._fail(error)
             return
         if is_new:
@@ -295,8 +300,8 @@ class FtpDownload(FtpExchange[int]):
         """Request a burst of everything after the last block received."""
         offset = self._into.tail
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
-        # The sequence numbers of the replies are reserved. Otherwise a server might mistake a later request for this
-        # one, and repeat its last reply.
+        # The replies to a burst have increasing sequence numbers. These are reserved, because a later request with such
+        # a number would look like a repetition of this one, and the server would only repeat its last reply.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
         self._bursts = [*self._bursts[1 - MAX_BURSTS :], _Burst(sequence, offset, now)]
         self._is_bursting, self._burst_at = True, now
@@ -305,10 +310,11 @@ class FtpDownload(FtpExchange[int]):
 
     @property
     def _burst_due_at(self) -> float:
-        """Time at which the burst counts as ended, or as not started, unless a block arrives earlier."""
+        """Deadline for the next block. If it passes, the burst counts as ended; before any block, as not started."""
         silence_s = self.round_trip.timeout_s(1 + self._failed_bursts)
         if self._interval.smoothed_s is None:
-            if self._size is not None and self._size > SHORT_FILE:  # Repeating the burst of a long file is expensive.
+            # Repeating the burst of a long file is expensive, so a burst gets more time to start.
+            if self._size is not None and self._size > SHORT_FILE:
                 silence_s = max(silence_s, FIRST_BLOCK_TIMEOUT_S)
         else:
             has_started = self._last_block[0] is self._bursts[-1]
@@ -332,7 +338,7 @@ class FtpDownload(FtpExchange[int]):
         return self._size if self._into.end is None else self._into.end
 
     def _end(self) -> None:
-        """Finish at the end of the file, which must be at the size that the server reported (unless estimated)."""
+        """Finish at the end of the file. Fail if the server reported another size, unless that was an estimate."""
         end = self._into.position
         if self._size is None:
             self._finish(end)

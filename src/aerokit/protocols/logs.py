@@ -33,16 +33,16 @@ __all__ = ["LOG_BLOCK", "LogDownload", "LogList", "LogStop"]
 LOG_BLOCK = 90
 """Number of log bytes in one message."""
 
-# Pause between requests for single blocks, because PX4 reads only the latest request, every 2 to 10 ms.
+# Pause between requests for single blocks. PX4 reads requests every 2 to 10 ms, and then only the latest one.
 SPACING_S = 0.005
 
-# Sizes of ranges, in blocks.
+# Initial, minimum and maximum number of blocks that are requested as one range.
 FIRST_RANGE, MIN_RANGE, MAX_RANGE = 512, 64, 40_000
 
 # Gaps of at least this many blocks are requested as ranges.
 LONG_GAP = 8
 
-# Ranges grow until they last this many round trips, so that the pause after a range is negligible.
+# Ranges grow until one takes this many round trips, so that the pause between two ranges is negligible.
 MIN_RANGE_ROUND_TRIPS = 60
 
 MAX_EARLY_ENDS = 3
@@ -74,8 +74,8 @@ class LogDownload(Transfer[int]):
         self._stream = MessageStream(self.round_trip)
         self._is_streaming = False
         self._range_end = into.position
-        self._latest = self._range_end  # the largest offset received in the current range
-        # Maximum size of a range, and the sizes of the current range as requested and as received, in blocks.
+        self._latest = self._range_end  # largest offset received in the current range
+        # Numbers of blocks: maximum for a range, requested in the current range, and received of the current range.
         self._range, self._requested, self._received = FIRST_RANGE, 0, 0
         self._early_ends = 0
         self._has_checked_gaps = True
@@ -110,13 +110,13 @@ class LogDownload(Transfer[int]):
             )
             self._send_end()
             return
-        if self._is_streaming and now >= self._stream.due_at:
+        if self._is_streaming and now >= self._stream.due_at:  # The current range has ended early, or never started.
             self._is_streaming = False
             self._stream.failures += 1
         self._proceed(now)
 
     def _is_plausible(self, offset: int) -> bool:
-        # A block far beyond the data received so far would create millions of gaps.
+        # A block far beyond the data received so far would add millions of missing blocks.
         return offset < self._size and offset - self._into.tail < MAX_RANGE * LOG_BLOCK
 
     def _on_block(self, message: LogData, now: float) -> None:
@@ -126,14 +126,15 @@ class LogDownload(Transfer[int]):
             self._latest = offset
             self._received += 1
             self._is_streaming = offset + LOG_BLOCK < self._range_end
-        # If the log has grown since it was listed, PX4 sends a whole block even at the listed end.
+        # If the log has grown since it was listed, PX4 sends a full block at the listed end. The rest is cut off.
         length = min(message.count, self._size - offset)
         if into.add(offset, bytes(message.data[:length])):
             self._report_progress(now, into.done, self._size)
         self._requests.on_answer(offset, now)
 
     def _end_early(self, end: int) -> None:
-        # The vehicle could not read its own log, perhaps temporarily.
+        # The vehicle has sent a short block before the end of the log, because it could not read its own log. This may
+        # be temporary, so the data is requested again a few times.
         self._is_streaming = False
         self._early_ends += 1
         if self._early_ends >= MAX_EARLY_ENDS:
@@ -142,7 +143,7 @@ class LogDownload(Transfer[int]):
             self._send_end()
 
     def _proceed(self, now: float) -> None:
-        """Finish, or request the gaps of the last range, or the next range."""
+        """Finish if all data is there. Else request the gaps of the last range; without gaps, the next range."""
         into = self._into
         if into.position >= self._size:
             self._finish(into.position)
@@ -155,7 +156,7 @@ class LogDownload(Transfer[int]):
         self._set_deadline()
 
     def _request_gaps(self, now: float) -> None:
-        """After a range has ended, request its long gaps one by one, then all other missing blocks."""
+        """After the end of a range, request its long gaps one after the other, then all other missing blocks."""
         if not self._has_checked_gaps:
             gap = self._first_long_gap()
             if gap is not None:
@@ -180,7 +181,7 @@ class LogDownload(Transfer[int]):
         return (start, end) if end - start >= LONG_GAP * LOG_BLOCK else None
 
     def _stream_range(self, start: int, end: int, now: float) -> None:
-        """Request a range, or the first part of a range that is too long."""
+        """Request a range, or its beginning if the range is longer than a request may be."""
         self._adapt_range()
         self._range_end = min(start + self._range * LOG_BLOCK, end, self._size)
         self._requested = math.ceil((self._range_end - start) / LOG_BLOCK)
@@ -190,7 +191,8 @@ class LogDownload(Transfer[int]):
         self._request(start, self._range_end - start)
 
     def _adapt_range(self) -> None:
-        # Radios lose up to a third of the messages. A loss of more than half means that a queue overflows.
+        # Radios lose up to a third of the messages. If more than half are lost, a queue overflows, so ranges must be
+        # shorter.
         if self._stream.failures or not self._requested:
             return
         if self._received < self._requested / 2:
@@ -289,7 +291,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         self._end = end
         self._max_unanswered = max_unanswered
         self._entries: dict[int, LogEntry] = {}
-        self._missing: dict[int, None] | None = None  # None while the number of logs is unknown
+        self._missing: dict[int, None] | None = None  # ids of the missing entries; None before the first entry
         self._stream = MessageStream(self.round_trip)
         self._last_id = 0
 
@@ -312,12 +314,14 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         if not self._missing:
             self._finish(tuple(self._entries[number] for number in sorted(self._entries)))
             self._outbox.append(LogRequestEnd(self.target_system, self.target_component))
-        elif message.id > next(reversed(self._missing)):  # entries arrive in order, so this was the last entry
+        # Entries arrive in order, so none of the missing entries will follow one with a larger id.
+        elif message.id > next(reversed(self._missing)):
             self._request_missing(now)
         self._set_deadline()
 
     def expire(self, now: float) -> None:
         self._stream.failures += 1
+        # Before the first entry, `_missing` is None.
         is_unanswered = self._missing is None and self._stream.failures == self._max_unanswered
         if is_unanswered or self._is_idle(now):
             self._fail(self._timed_out())

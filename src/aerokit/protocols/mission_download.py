@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["DownloadResult", "MissionDownload"]
 
 MAX_RESTARTS = 8
-# An answer that arrives within this fraction of a round trip answers an earlier message.
+# An answer that arrives sooner than this fraction of a round trip answers an earlier message.
 MIN_ROUND_TRIP_FRACTION = 0.8
 
 
@@ -81,7 +81,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._items: dict[int, Item] = {}
         self._count: int | None = None
         self._opaque_id = 0
-        self._next = 0  # position in `_indices` of the item to request next
+        self._next = 0  # position (in `_indices`) of the item to request next
         self._requested_at: dict[int, float] = {}
         self._request_counts: dict[int, int] = {}
         self._busy_until: float | None = None
@@ -110,7 +110,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         elif self._count is None:
             self._attempt += 1
             self._request_list(now)
-        elif now - self._received_at >= TRANSFER_EXPIRY_S:  # the vehicle may have dropped the transfer
+        elif now - self._received_at >= TRANSFER_EXPIRY_S:  # The vehicle may have dropped the transfer.
             self._restart_after_error(now)
         else:
             for seq in [seq for seq in self._requested_at if self._due_at(seq) <= now]:
@@ -127,14 +127,14 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def _on_count(self, message: MissionCount, now: float) -> None:
         opaque_id = message.opaque_id
         if self._count is None:
-            # With PX4 (window 1), this may be a repeated MISSION_COUNT, which does not measure the round trip.
+            # PX4 (window 1) repeats MISSION_COUNT by itself, so there it does not measure the round trip.
             if self._attempt == 1 and not self._restarts and self._window > 1:
                 self.round_trip.add_sample(now - self._list_requested_at)
             if not opaque_id or opaque_id != self._opaque_id:
                 self._items.clear()
         elif message.count == self._count and opaque_id == self._opaque_id:
             return  # PX4 repeats MISSION_COUNT until the first item is requested
-        else:  # the mission has changed since the download started
+        else:  # The plan has changed since the download began.
             self._items.clear()
             self._discard_requests()
         self._count, self._opaque_id, self._busy_until = message.count, opaque_id, None
@@ -157,19 +157,20 @@ class MissionDownload(MissionExchange[DownloadResult]):
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
-            # An ERROR that arrives earlier answers a message before the request for the list, for example a repeated
-            # item of an upload.
+            # An ERROR that arrives too soon after the request for the list answers an earlier message, e.g. a repeated
+            # item of an upload. It is ignored.
             if now - self._list_requested_at >= MIN_ROUND_TRIP_FRACTION * (self.round_trip.smoothed_s or 0.0):
                 self._restart_after_error(now)
         elif result not in (
             MavMissionResult.ACCEPTED,
-            MavMissionResult.INVALID_SEQUENCE,  # followed by a MISSION_COUNT with the new number
-            MavMissionResult.OPERATION_CANCELLED,  # ends an earlier upload
+            MavMissionResult.INVALID_SEQUENCE,  # A MISSION_COUNT with the new number of items follows.
+            MavMissionResult.OPERATION_CANCELLED,  # This ends an earlier upload, not this download.
         ):
             self._reject(result)
 
     def _wait_while_busy(self, result: int, now: float) -> None:
-        # ArduPilot refuses downloads during an upload, and drops an upload after 8 s without messages.
+        # ArduPilot refuses a download while it waits for items of an upload. It drops an upload that has become silent
+        # after 8 s, so the download is retried for a little longer.
         if self._busy_until is None:
             self._busy_until = now + BUSY_TIMEOUT_S
         if now + BUSY_RETRY_INTERVAL_S > self._busy_until:
@@ -177,11 +178,12 @@ class MissionDownload(MissionExchange[DownloadResult]):
             return
         self._discard_requests()
         self._count = None
-        self._progress_at = now  # the vehicle answers, so the transfer is not idle
+        self._progress_at = now  # The vehicle answers, so the transfer must not time out as idle.
         self.deadline = now + BUSY_RETRY_INTERVAL_S
 
     def _restart_after_error(self, now: float) -> None:
-        # PX4 has dropped the transfer. Received items are kept, but all items must be requested in sequence again.
+        # PX4 has dropped the transfer. The received items stay valid, but PX4 requires a request for each item in
+        # sequence again.
         if self._restarts >= MAX_RESTARTS:
             self._reject(MavMissionResult.ERROR)
             return
@@ -206,7 +208,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
             return
         while self._next < len(self._indices) and len(self._requested_at) < self._window:
             seq = self._indices[self._next]
-            needs_sequence = self._window == 1  # PX4 does not allow leaving out items that we already have
+            needs_sequence = self._window == 1  # PX4 requires a request for each item, even if we already have it.
             if needs_sequence or seq not in self._items:
                 self._request(seq, now)
             self._next += 1
@@ -233,13 +235,14 @@ class MissionDownload(MissionExchange[DownloadResult]):
     # ------------------------------------------------------------------------------------ end
 
     def _end(self) -> None:
-        # PX4 accepts no upload until it has received an acknowledgement or 5 s have passed. It gets two, because one
-        # may be lost.
+        # Until PX4 receives the acknowledgement, it accepts no upload for 5 s. The acknowledgement is therefore sent
+        # twice, because one may be lost.
         self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * (2 if self._window == 1 else 1)
         items = tuple(self._items[seq] for seq in self._indices)
         self._finish(DownloadResult(items, self._count or 0, self._opaque_id))
 
     def _time_out(self, now: float) -> None:
+        """Cancel the download and fail, because the vehicle has stopped answering."""
         self._outbox += self.cancellation()
         missing = [seq for seq in self._indices if seq not in self._items]
         details = "no MISSION_COUNT was received" if self._count is None else f"missing: {format_ranges(missing)}"

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 __all__ = ["MissionUpload", "UploadResult"]
 
 MAX_RESTARTS = 3
-# An item sent less than this fraction of a round trip ago is not repeated, because its answer cannot have arrived yet.
+# An item is not repeated before this fraction of a round trip has passed, because its answer cannot have arrived yet.
 IN_FLIGHT_ROUND_TRIPS = 0.8
 
 
@@ -88,7 +88,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._end = self._first + len(items)
         self._window, self._accepts_int = window, takes_int
         self.is_refusal_ambiguous: bool = False
-        """True if a refusal may be about any of several items in flight. To find out, send items one at a time."""
+        """True if it is unknown which of several items in flight was refused. To find out, send items one at a time."""
         self.was_started: bool = False
         """True once the vehicle has requested an item. From then on it may have overwritten items."""
         self._restarts = 0
@@ -102,7 +102,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._sent_at: dict[int, float] = {}
         self._send_counts: dict[int, int] = {}
         self._requested: set[int] = set()  # items that the vehicle has requested at least once
-        self._error_at: float | None = None  # time of a first ERROR, after which an item is repeated
+        self._error_at: float | None = None  # time of the first ERROR, which is answered by repeating an item
         self._was_tail_repeated = False
         self._attempt = 1
 
@@ -115,7 +115,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def was_sent_completely(self) -> bool:
-        """True if all items were sent, so that the vehicle may have them regardless of its answers."""
+        """True if all items were sent, so that the vehicle may have the whole plan even without a confirmation."""
         return self.was_started and self._sent_end == self._end
 
     # --------------------------------------------------------------------------------- events
@@ -130,6 +130,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             return
         silence_s, self._received_at = now - self._received_at, now
         if isinstance(message, MissionAck):
+            # After a long silence, ERROR means that the vehicle's transfer has expired. The upload then starts again.
             has_expired = self._is_accepted and silence_s >= TRANSFER_EXPIRY_S
             if message.type == MavMissionResult.ERROR and has_expired:
                 self._restart(now)
@@ -147,8 +148,10 @@ class MissionUpload(MissionExchange[UploadResult]):
         if not self._is_accepted:
             self._announce(now)
         elif self._sent_end < self._end:
-            self._send_window(now, ahead=1 if self._window > 1 else 0)  # with a window of 1, each item is requested
-        elif self._attempt % 2 == 0:  # a vehicle that has all items confirms again on the last item
+            # With a window of 1, no item is sent before the vehicle requests it.
+            self._send_window(now, ahead=1 if self._window > 1 else 0)
+        elif self._attempt % 2 == 0:
+            # The last item alone is enough if only the confirmation was lost: the vehicle then confirms again.
             self._send(self._end - 1, now)
         else:
             self._send_window(now)
@@ -163,7 +166,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     # ------------------------------------------------------------------------------- requests
 
     def _on_request(self, seq: int, now: float) -> None:
-        # A request for an item beyond the next one is left over from another transfer.
+        # The vehicle never skips an item, so a request beyond the next item belongs to another transfer.
         if seq > self._sent_end:
             return
         if not self._is_accepted:
@@ -174,9 +177,10 @@ class MissionUpload(MissionExchange[UploadResult]):
         if seq > self._confirmed_end:
             self._advance(seq, now)
         elif seq < self._confirmed_end:
-            self._send(seq, now, again=True)  # This is an old request, or the vehicle has restarted the transfer.
+            # The vehicle has restarted the transfer, or this is a delayed request.
+            self._send(seq, now, again=True)
         elif seq in self._requested:
-            self._send_window(now)  # the item was lost, and the vehicle ignored the items after it
+            self._send_window(now)  # The item was lost, and the vehicle has ignored the items after it.
         self._requested.add(seq)
         while self._sent_end < min(self._end, self._confirmed_end + self._window):
             self._send(self._sent_end, now)
@@ -192,7 +196,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._report_progress(now, seq - self._first, len(self._items))
 
     def _measure(self, seconds: float) -> None:
-        # A late request does not measure the round trip, because vehicles repeat their requests.
+        # A late request may be a repetition by the vehicle, so it does not measure the round trip.
         if self.round_trip.smoothed_s is None or seconds <= self.round_trip.timeout_s():
             self.round_trip.add_sample(seconds)
 
@@ -201,10 +205,12 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _on_ack(self, ack: MissionAck, now: float) -> None:
         result = ack.type
         if result == MavMissionResult.ACCEPTED:
-            if self._is_accepted and self._sent_end == self._end:  # otherwise it is the answer to an earlier upload
+            # Before all items were sent, an ACCEPTED can only answer an earlier upload.
+            if self._is_accepted and self._sent_end == self._end:
                 self._succeed(not self._was_tail_repeated, ack.opaque_id, now)
         elif result == MavMissionResult.INVALID_SEQUENCE:
             if self._is_accepted:
+                # The vehicle already has the item that was sent, or an item before it was lost.
                 self._send_window(now, ahead=1)
                 if self._outbox:
                     self._wait(now)
@@ -233,6 +239,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._wait(now)
         elif now - self._error_at >= IN_FLIGHT_ROUND_TRIPS * (self.round_trip.smoothed_s or 0.0):
             if self._sent_end == self._end:
+                # All items were sent, so the upload may be complete. The caller must read the plan back.
                 self._succeed(False, 0, now)
             else:
                 self._refuse(MavMissionResult.ERROR)
@@ -243,11 +250,11 @@ class MissionUpload(MissionExchange[UploadResult]):
         if now + BUSY_RETRY_INTERVAL_S > self._busy_until:
             self._refuse(MavMissionResult.ERROR)
         else:
-            self._progress_at = now  # the vehicle answers, so the transfer is not idle
+            self._progress_at = now  # The vehicle answers, so the transfer must not time out as idle.
             self._wait(now, BUSY_RETRY_INTERVAL_S)
 
     def _restart(self, now: float) -> None:
-        # The vehicle's transfer has expired. If it has requested no item yet, an older transfer has expired.
+        # The transfer has expired on the vehicle. Before the vehicle has requested an item, this was an older transfer.
         if not self._is_accepted:
             return
         if self._is_partial or self._restarts >= MAX_RESTARTS:
@@ -266,6 +273,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._finish(UploadResult(is_confirmed, opaque_id, max(0, self._confirmed_end - self.offset)))
 
     def _time_out(self, now: float) -> None:
+        """Cancel the upload and fail, because the vehicle has stopped answering."""
         self._outbox += self.cancellation()
         missing = range(max(self._confirmed_end, self.offset), self._end)
         details = f"items {format_ranges(missing)} were not confirmed" if self._is_accepted else "no item was requested"
@@ -281,7 +289,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _announce(self, now: float) -> None:
         target = (self.target_system, self.target_component)
-        if self._busy_until is not None:  # The vehicle may still wait for our acknowledgement of an earlier download.
+        if self._busy_until is not None:  # The vehicle may be busy because our MISSION_ACK to a download was lost.
             self._outbox += self.cancellation()
         if self._is_partial:
             partial = MissionWritePartialList(*target, self._first, self._end - 1, self.mission_type)
@@ -293,13 +301,14 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
         """Repeat all unconfirmed items and send ``ahead`` more items, because requests may have been lost."""
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
-            # PX4 takes any repeated item for the last item of the mission.
+            # PX4 takes any repeated item for the mission's last item. Its confirmation is then no proof.
             self._was_tail_repeated = True
         new_end = min(self._sent_end + ahead, self._confirmed_end + self._window + 1, self._end)
         for seq in range(self._confirmed_end, max(self._sent_end, new_end)):
             self._send(seq, now, again=True)
 
     def _send(self, seq: int, now: float, *, again: bool = False) -> None:
+        """Send one item. With ``again``, it is not sent if an earlier transmission may still be answered."""
         if again and self._is_in_flight(seq, now):
             return
         make_message = to_wire_float if self._as_float else to_wire
@@ -317,8 +326,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._sent_end = max(self._sent_end, seq + 1)
 
     def _is_in_flight(self, seq: int, now: float) -> bool:
-        # An item in flight is not repeated: the vehicle answers a duplicate item with another request, and each such
-        # request would cause a whole window of items to be sent again.
+        # An item in flight is not repeated. The vehicle would answer the duplicate by another request, and each such
+        # request would make us send a whole window of items again.
         sent_at, round_trip_s = self._sent_at.get(seq), self.round_trip.smoothed_s
         if round_trip_s is None:
             round_trip_s = self.round_trip.timeout_s()

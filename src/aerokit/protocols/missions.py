@@ -36,15 +36,17 @@ __all__ = [
 
 ResultT = TypeVar("ResultT")
 
-# Maximum seconds for which a vehicle is busy with a transfer that its ground station has dropped: ArduPilot 8, PX4 5.
+# A vehicle is busy for at most this many seconds with a transfer that another station has abandoned. ArduPilot drops
+# such a transfer after 8 s, PX4 after 5 s.
 BUSY_TIMEOUT_S = 9.0
 
 BUSY_RETRY_INTERVAL_S = 1.0
 
-# The time-out grows up to attempt 5, stays the same for 7 attempts, and then grows again.
+# The time-out grows during the first GROWING_ATTEMPTS attempts, stays the same during the next CONSTANT_ATTEMPTS
+# attempts, and then grows again.
 GROWING_ATTEMPTS, CONSTANT_ATTEMPTS = 5, 7
 
-# After this many seconds without messages, the vehicle may have dropped the transfer: PX4 does after 5 s, ArduPilot
+# After this many seconds without messages, the vehicle may have dropped the transfer. PX4 drops it after 5 s, ArduPilot
 # after 8 s.
 TRANSFER_EXPIRY_S = 4.5
 
@@ -121,7 +123,8 @@ class MissionExchange(Transfer[ResultT]):
         self.deadline: float | None = now + (self._timeout_s(self._attempt) if seconds is None else seconds)
 
     def _timeout_s(self, attempt: int) -> float:
-        # A few losses do not lengthen the time-out further, because small messages do not congest a link.
+        # After a few attempts, the time-out stays the same for a while: longer waits are for a congested link, and the
+        # small messages of a mission do not congest a link.
         backoff_attempt = min(attempt, max(GROWING_ATTEMPTS, attempt - CONSTANT_ATTEMPTS))
         return self.round_trip.timeout_s(backoff_attempt)
 
@@ -145,7 +148,7 @@ class MissionClear(MissionExchange[None]):
         self._send(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Process the MISSION_ACK. A result that only an expired upload can have is ignored."""
+        """Process the MISSION_ACK. A result that can only belong to an expired upload is ignored."""
         if not isinstance(message, MissionAck) or not self._is_ours(message):
             return
         if message.type == MavMissionResult.ACCEPTED:
@@ -176,7 +179,7 @@ class MissionClear(MissionExchange[None]):
 
 POLL_INTERVAL_S = 0.1
 
-# MISSION_CURRENT is streamed at this interval, and also sent when the current item changes.
+# Vehicles stream MISSION_CURRENT at this interval, and also send it when the current item changes.
 MISSION_CURRENT_INTERVAL_S = 1.0
 
 
@@ -235,17 +238,17 @@ class SetCurrentItem(Transfer[None]):
                 )
             )
         elif self._order_status is not None and self._order_status.heartbeat_at < self._sent_at:
-            self.deadline = now + POLL_INTERVAL_S  # the vehicle is silent: wait for its HEARTBEAT
+            self.deadline = now + POLL_INTERVAL_S  # No HEARTBEAT since the last transmission: wait for one.
         else:
             self._send(now)
 
     def _has_passed(self, seq: int) -> bool:
-        """Return True if the vehicle has passed our item, and has not just continued from the reported item."""
+        """Return True if the vehicle can only be at item ``seq`` because it has set and then passed our item."""
         last = self._reported
         if last is None:
             return False
         has_moved_on = last <= self._seq < seq
-        has_jumped_back = self._seq < seq < last  # it jumped back to our item or before, and has passed it since
+        has_jumped_back = self._seq < seq < last  # The vehicle went back to our item, and has passed it since.
         return has_moved_on or has_jumped_back
 
     def _send(self, now: float) -> None:

@@ -23,20 +23,20 @@ if TYPE_CHECKING:
 ValueT = TypeVar("ValueT")
 ResultT = TypeVar("ResultT")
 
-# The stream of a list has stopped when nothing arrives for this many times its longest pause so far.
+# The stream of a list has stopped if nothing arrives for its longest pause so far, multiplied by this number.
 PAUSES = 4
-# Seconds in which a list may start. It is not requested again earlier, because that would restart it.
+# A list gets at least this many seconds to start. It is not requested again earlier, because that would restart it.
 MIN_START_TIMEOUT_S = 0.3
-# Maximum number of times that values are requested again because the number of parameters has changed since.
+# Maximum number of times that old values are requested again because the number of parameters has changed.
 MAX_REFRESHES = 3
-# The index that is sent in requests by name.
+# Index in a request that selects the parameter by its name.
 BY_NAME = -1
-# The request for index 0, which every component that has parameters answers.
+# Name and index of the probe: a request for index 0, which every component with parameters answers.
 PROBE, PROBE_INDEX = "", 0
-# A name counts as unknown once the probability that only the answers were lost is below this.
+# A name without an answer counts as unknown once the probability that all its answers were lost is below this value.
 MAX_LOSS_PROBABILITY = 1e-4
-# Number of answers with the same unexpected value after which a write counts as done with this value. The second number
-# applies to the previous value, which may also be in messages that were sent before the write arrived.
+# A write ends with an unexpected value after this many answers with the same value. The second number is for the value
+# from before the write, because the vehicle may have sent such answers before the write arrived.
 ANSWERS_TO_SETTLE, ANSWERS_TO_SETTLE_UNCHANGED = 2, 8
 
 
@@ -50,11 +50,12 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
     def __init__(self, target_system: int, target_component: int, **options: Unpack[TransferOptions]) -> None:
         super().__init__(target_system, target_component, **options)
         self._window: RequestWindow[int] = RequestWindow(self.round_trip, size=self.window_size)
-        self._received: dict[int, tuple[ValueT, int]] = {}  # index → value, and the count in the same message
+        # Maps an index to the value, and to the number of parameters that the same message reports.
+        self._received: dict[int, tuple[ValueT, int]] = {}
         self._count: int | None = None
-        self._next = 0  # the index that the stream should send next
+        self._next = 0  # next index that is expected in the stream
         self._is_streaming = False
-        self._quiet_at: float | None = None  # time at which the stream has stopped if no message arrives before
+        self._quiet_at: float | None = None  # deadline for the next message of the stream, which has then stopped
         self._last_at = self._pause_s = 0.0  # time of the stream's last message, and its longest pause
         self._attempts = self._refreshes = 0
 
@@ -64,7 +65,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         if self._is_idle(now):
             self._fail(ParameterTimeout(self._timeout_text(), missing=self._missing()))
             return
-        if self._quiet_at is not None and now >= self._quiet_at:
+        if self._quiet_at is not None and now >= self._quiet_at:  # The stream has stopped.
             self._on_quiet(now)
         self._step(now)
 
@@ -98,6 +99,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
             self._report_progress(now, min(len(self._received), count), count)
 
     def _step(self, now: float) -> None:
+        """Finish, or send the requests that are due. Called after each message and at each deadline."""
         self._conclude()
         if self.done:
             return
@@ -107,7 +109,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         self.deadline: float | None = min(at for at in times if at is not None)
 
     def _drop_stale(self, count: int) -> tuple[int, ...]:
-        """Drop values that were received with another count, and return their indices. Does so only a few times."""
+        """Drop values received with another count, and return their indices. Does so at most `MAX_REFRESHES` times."""
         stale = tuple(index for index in range(count) if self._received[index][1] != count)
         if not stale or self._refreshes >= MAX_REFRESHES:
             return ()
@@ -195,6 +197,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
         self._report_progress(now, len(self._answers), len(self._names))
 
     def _step(self, now: float) -> None:
+        """Finish, or send the requests that are due. Called after each message and at each deadline."""
         if len(self._answers) < len(self._names):
             self._before_sending(now)
         if len(self._answers) == len(self._names):
@@ -239,7 +242,7 @@ class NamedReads(NamedRequests[ValueT]):
         self._is_probe_wanted = False
 
     def _count_probe(self) -> None:
-        # Duplicate answers do not count.
+        # There cannot be more answers than requests, so further answers are duplicates.
         self._probes_answered = min(self._probes_answered + 1, self._probes_sent)
 
     def _reject_unknown(self, names: Iterable[str], now: float) -> None:
@@ -251,7 +254,7 @@ class NamedReads(NamedRequests[ValueT]):
     def _loss_probability(self, attempts: int) -> float:
         """Estimate the probability that the answers to ``attempts`` requests were all lost.
 
-        The losses of probes give the probability of each loss, by Laplace's rule of succession.
+        It is derived from the numbers of sent and answered probes, by Laplace's rule of succession.
         """
         if not self._probes_answered:
             return 1.0
@@ -260,7 +263,7 @@ class NamedReads(NamedRequests[ValueT]):
 
 
 class UnexpectedAnswers(Generic[ValueT]):
-    """Consecutive answers to one write that have the same value, which is not the requested value."""
+    """The last answers to one write, if they all have the same value, and this is not the requested value."""
 
     def __init__(self, is_same: Callable[[ValueT, ValueT], bool]) -> None:
         self._is_same = is_same
@@ -273,12 +276,12 @@ class UnexpectedAnswers(Generic[ValueT]):
         return bool(self._answers) and self._is_same(self._answers[-1], answer)
 
     def add(self, answer: ValueT) -> None:
-        """Add an answer. If its value differs from that of the previous answers, those are dropped."""
+        """Add an answer. If its value differs from the value of the previous answers, these are dropped."""
         if not self.ends_with(answer):
             self._answers.clear()
         self._answers.append(answer)
 
     def are_conclusive(self, *, is_unchanged: bool) -> bool:
-        """Return True if the last answer is final. ``is_unchanged``: its value is the one from before the write."""
+        """Return True if the answers suffice to end the write. ``is_unchanged``: they have the value from before it."""
         needed = ANSWERS_TO_SETTLE_UNCHANGED if is_unchanged else ANSWERS_TO_SETTLE
         return len(self._answers) >= needed

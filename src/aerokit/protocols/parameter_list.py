@@ -33,7 +33,7 @@ def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Param
         if type_ is ParameterType.REAL32 and value == value // 1:
             value, type_ = int(value), known.type
         if same_value(float(known.value), float(value)):
-            value = known.value
+            value = known.value  # The reported value is equal, except for bits that a float cannot hold.
     index = known.index if reported.index is None else reported.index
     return Parameter(known.name, value, type_, known.default, index)
 
@@ -41,14 +41,14 @@ def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Param
 # Maximum seconds between two parts of a list. ArduPilot sends parts ten times a second, or once a second (MAV1_PARAMS).
 MAX_TICK_S = 1.1
 
-# When this few values are left, a gap is requested without waiting for the next part of the list, because that costs
-# little.
+# Once at most this many values are missing, they are requested at once rather than after the rest of the list, because
+# a few repeated values cost little.
 NEAR_END = 20
 
-# After this many values of the stream, it counts as started, and the list is not requested again.
+# The list's stream counts as started once it has sent this many values. The list is then not requested again.
 MIN_STREAMED = 2
 
-# Number of PARAM_ERROR messages after which an index counts as nonexistent.
+# An index counts as nonexistent after this many PARAM_ERROR messages.
 MAX_REFUSALS = 2
 
 
@@ -73,11 +73,11 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._bytewise = bytewise
-        self._names: dict[str, Parameter] = {}  # latest value of each name
+        self._names: dict[str, Parameter] = {}  # name → parameter with the latest value
         self._refusals: dict[int, int] = {}  # index → number of PARAM_ERROR messages
-        self._streamed_count: int | None = None  # number of parameters according to the stream
-        self._needs_check = False  # True to look for missing indices
-        self._streamed = 0  # number of values of the stream
+        self._streamed_count: int | None = None  # number of parameters that the stream's last message reported
+        self._needs_check = False  # True if missing indices must be searched and requested
+        self._streamed = 0  # number of values received from the stream
 
     # ---------------------------------------------------------------------------- as an exchange
 
@@ -119,13 +119,13 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._quiet_at = now + self._quiet_s()
         parameter = parameter_of(message, self._bytewise)
         if parameter.name not in self._names and len(self._names) >= MAX_PARAMETERS:
-            return  # a limit for the memory that a faulty vehicle can fill
+            return  # A faulty vehicle must not fill the memory.
         self._names[parameter.name] = parameter
         self._store(index, parameter, message.param_count, now)
 
     def _on_uncounted_value(self, message: ParamValue, now: float) -> None:
-        # This is not part of the list: another client has set the parameter, or it is the hash, after which the list
-        # starts.
+        # The value is not part of the list. Either another client has set the parameter, or the value is PX4's hash of
+        # all parameters, after which the list starts.
         self._record_count(message.param_count, False)
         if message.param_id == HASH_NAME:
             self._last_at = now
@@ -135,8 +135,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._names[reported.name] = merge_update(self._names[reported.name], reported, self._bytewise)
 
     def _on_refusal(self, message: ParamError) -> None:
-        # The list has become shorter. Only the index of this message is reliable, because PX4 does not fill in the
-        # name.
+        # The error means that the list has become shorter. Only the index in the message is used, because PX4 does not
+        # fill in the name.
         index = message.param_index
         if message.error != MavParamError.DOES_NOT_EXIST or index not in self._window or index in self._received:
             return
@@ -147,8 +147,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._count = min(self._count, index)
 
     def _record_count(self, count: int, is_streamed: bool) -> None:
-        # ArduPilot's stream keeps the count from its start, although the number may change meanwhile. A streamed count
-        # is therefore compared only with the previous one of the stream.
+        # All messages of ArduPilot's stream report the count from the start of the stream, although the number of
+        # parameters may change meanwhile. A streamed count is therefore only compared with an earlier streamed count.
         if is_streamed:
             is_unchanged = count == self._streamed_count
             self._streamed_count = count
@@ -162,7 +162,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         for missing in range(self._next, min(index, self._count or 0)):
             self._window.request(missing)
         if self._streamed:
-            self._pause_s = max(now - self._last_at, 0.98 * self._pause_s)  # a long pause is slowly forgotten
+            # The longest pause is slowly forgotten, because it may have been an exception.
+            self._pause_s = max(now - self._last_at, 0.98 * self._pause_s)
         self._next = index + 1
         self._streamed += 1
         self._last_at = now
@@ -196,7 +197,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         Answers to requests also count as messages, because they delay the stream.
         """
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
-        if self._streamed < MIN_STREAMED:  # the only value may be the answer to the request by index
+        if self._streamed < MIN_STREAMED:  # A single value may be the answer to our request by index.
             return max(seconds, MIN_START_TIMEOUT_S)
         return seconds if self._is_near_end else max(seconds, MAX_TICK_S)
 
@@ -223,7 +224,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         if len(parameters) != count:
             return
         names = {parameter.name for parameter in parameters}
-        is_consistent = len(names) == count == len(self._names)  # each name has exactly one index
+        is_consistent = len(names) == count == len(self._names)  # Each name has exactly one index, and vice versa.
         if not is_consistent and self._drop_stale(count):
             self._needs_check = True
         else:
@@ -232,7 +233,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     def _in_order(self, parameters: list[Parameter], names: set[str]) -> list[Parameter]:
         """Sort parameters by index, each name once with its latest value. Names without an index come last."""
         ordered = dict.fromkeys(parameter.name for parameter in parameters)
-        if self._refreshes == 0:  # otherwise the list has changed, and other names may no longer exist
+        if self._refreshes == 0:  # After a change of the list, names without an index may no longer exist.
             ordered.update(dict.fromkeys(name for name in self._names if name not in names))
         table = []
         for index, name in enumerate(ordered):

@@ -82,7 +82,7 @@ class ParameterRequests(NamedRequests[Parameter]):
         """Process a value."""
 
     def _on_error(self, message: ParamError, now: float) -> None:
-        name = message.param_id  # only the name is reliable: PX4 does not initialise the other fields
+        name = message.param_id  # PX4 does not initialise the other fields, so only the name is used.
         if name in self._names and name in self._window:
             self._window.on_answer(name, now)
             self._settle(name, rejection(name, message.error), now)
@@ -160,7 +160,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             reported = parameter_of(message, self._bytewise)
             old_value = self._possibly_stale.pop(name, None)
             if old_value is not None and same_value(old_value, reported.value):
-                self._window.request(name)  # it may be a delayed message: read once more
+                self._window.request(name)  # A delayed message may have had the old value, so it is read once more.
             else:
                 self._settle(name, reported, now)
                 self._reject_alternatives(name, now)
@@ -172,7 +172,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
                 self._settle(alternative, ParameterRejected(text, name=alternative), now)
 
     def _on_error(self, message: ParamError, now: float) -> None:
-        # PX4 also answers DOES_NOT_EXIST if it has no room to send the value, so the request is repeated once.
+        # PX4 also answers DOES_NOT_EXIST if it has no room to send the value. The request is therefore repeated once.
         name = message.param_id
         is_first = name in self._names and name in self._window and name not in self._refused
         if is_first and message.error == MavParamError.DOES_NOT_EXIST:
@@ -237,25 +237,27 @@ class ParameterWrites(ParameterRequests):
             self.target_system, self.target_component, name, requested.value, requested.type, self._bytewise
         )
         if unexpected:
-            # The vehicle has answered an earlier write with another value. The read gets an answer even if the vehicle
-            # ignores this write.
+            # The vehicle has answered an earlier write with another value, so it may ignore this write. The read is
+            # answered in any case.
             return [write, read]
         return [write]
 
     def _on_value(self, message: ParamValue, now: float) -> None:
         name = message.param_id
         if not self._window.attempts(name):
-            return  # An answer to another station: the write of this name was not sent yet.
+            return  # This answers another station, because our write of this name was not sent yet.
         requested = self._requested[name]
         reported = self._with_integer_type(parameter_of(message, self._bytewise), requested.type)
         unexpected = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))
         is_as_requested = same_value(reported.value, requested.value)
         if is_as_requested and name in self._recent:
-            self._recent.remove(name)  # this may be the answer to the write a moment ago: read once more
+            # This may be the late answer to the write from a moment ago, so the value is read once more.
+            self._recent.remove(name)
             unexpected.add(reported)
             self._window.on_answer(name, now)
             self._window.request(name)
             return
+        # The requested value with another type must be reported twice.
         if is_as_requested and (reported.type == requested.type or unexpected.ends_with(reported)):
             self._window.on_answer(name, now)
             self._settle(name, reported, now)
@@ -267,14 +269,14 @@ class ParameterWrites(ParameterRequests):
         self._window.on_answer(name, now)
         is_unchanged = same_value(reported.value, self._before.get(name, reported.value))
         if is_unchanged and not is_as_requested:
-            self._to_set.add(name)
+            self._to_set.add(name)  # The value is still the old one, so PARAM_SET is sent again.
         if unexpected.are_conclusive(is_unchanged=is_unchanged):
             self._settle(name, reported, now)
         else:
             self._window.request(name)
 
     def _with_integer_type(self, reported: Parameter, type_: ParameterType) -> Parameter:
-        # In answers to PARAM_SET, ArduPilot reports an integer as a float if the value is the default.
+        # If the value is the default, ArduPilot's answer to PARAM_SET reports an integer parameter as a float.
         is_whole = reported.type is ParameterType.REAL32 and reported.value == reported.value // 1
         if self._bytewise or not type_.is_integer or not is_whole:
             return reported

@@ -15,16 +15,18 @@ KeyT = TypeVar("KeyT", bound=Hashable)
 DEFAULT_SIZE = 20
 # The window grows to at most this many times its initial size.
 MAX_GROWTH = 5
-# An answer that takes longer than QUEUED_FACTOR times the fastest one plus QUEUED_MARGIN_S has waited in a queue.
+# An answer has waited in a queue if it takes longer than QUEUED_FACTOR times the fastest answer plus QUEUED_MARGIN_S.
 QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02
-# When only this many requests are left, a request is sent twice from its third attempt on. Otherwise a transfer over a
-# bad radio would wait long for a few requests.
+# Once at most FEW_LEFT requests are left, each is sent twice, from attempt DUPLICATE_FROM_ATTEMPT on. Otherwise a
+# transfer over a bad radio would wait long for its last few requests.
 FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
-# Each of the last few requests is repeated after at most this time or two round trips, because that costs little.
+# The last few requests are repeated after at most two round trips, or this time if it is longer, because few repeated
+# requests cost little.
 FEW_LEFT_TIMEOUT_S = 0.5
-# Maximum seconds to wait for an answer. A queue that delayed answers may be empty after this time.
+# Maximum seconds to wait for an answer. A queue that delayed the answers may be empty by then.
 MAX_TIMEOUT_S = 2.0
-# A request counts as lost when this many later requests were answered, because answers arrive in order.
+# Answers arrive in the order of the requests. A request therefore counts as lost once the answer to a request that was
+# sent this many places later has arrived.
 OVERTAKEN = 3
 
 
@@ -50,11 +52,12 @@ class RequestWindow(Generic[KeyT]):
         self._fastest_s = math.inf
         self._duplicate_last = duplicate_last
         self._answered_at = self._silent_until = -math.inf
-        self._silences = 0  # time-outs of the whole link since the last answer
+        self._silences = 0  # number of times since the last answer that the whole link was found silent
         self._waiting: dict[KeyT, None] = {}
         self._in_flight: dict[KeyT, _Request] = {}  # in the order in which they were sent
-        self._requests: dict[KeyT, _Request] = {}  # sent at least once, not answered
-        # Answered after a repetition: seconds from the first transmission to the answer, which may answer either.
+        self._requests: dict[KeyT, _Request] = {}  # sent at least once, but not yet answered
+        # For requests that were answered after a repetition: seconds from the first transmission to the answer. It is
+        # ambiguous which transmission was answered, until a second answer arrives.
         self._ambiguous: dict[KeyT, float] = {}
         self._sent_count = 0
 
@@ -113,15 +116,16 @@ class RequestWindow(Generic[KeyT]):
         lost = []
         for key_in_flight, request_in_flight in self._in_flight.items():
             if request_in_flight.number > request.first_number - overtaken:
-                break
+                break  # All further requests were sent later.
             lost.append(key_in_flight)
         self._requeue(lost)
         return lost
 
     def take_due(self, now: float) -> list[KeyT]:
-        """Return the keys to request now, some of them twice, and count these requests as sent."""
+        """Return the keys to request now, and count them as sent. A key that is listed twice is requested twice."""
         overdue = self.overdue(now)
-        is_silent = any(self._in_flight[key].sent_at >= self._answered_at for key in overdue)  # no answer since then
+        # If nothing was answered since an overdue request was sent, the whole link is silent.
+        is_silent = any(self._in_flight[key].sent_at >= self._answered_at for key in overdue)
         if is_silent:
             self._on_silence(now)
         self._requeue(overdue)
@@ -139,7 +143,7 @@ class RequestWindow(Generic[KeyT]):
         return due
 
     def _on_silence(self, now: float) -> None:
-        # Nothing arrives, so the link may be down. Fewer requests are sent at a time, and less often.
+        # The link may be down, so fewer requests are sent at a time, and less often.
         self._limit = self._size
         if now >= self._silent_until:
             self._silences += 1
@@ -153,7 +157,7 @@ class RequestWindow(Generic[KeyT]):
         return min(seconds, MAX_TIMEOUT_S)
 
     def _measure(self, seconds: float) -> None:
-        # The window widens while answers stay fast. Slower answers show that a queue builds up.
+        # The window grows while answers stay fast. It shrinks when slower answers show that a queue builds up.
         self._round_trip.add_sample(seconds)
         self._fastest_s = min(self._fastest_s, seconds)
         if seconds <= QUEUED_FACTOR * self._fastest_s + QUEUED_MARGIN_S:
@@ -162,6 +166,7 @@ class RequestWindow(Generic[KeyT]):
             self._limit = max(self._limit - 1, self._size)
 
     def _send(self, key: KeyT, now: float) -> None:
+        """Record a transmission of the request, and the time at which its answer is overdue."""
         self._sent_count += 1
         request = self._requests.get(key)
         if request is None:
@@ -178,7 +183,8 @@ class RequestWindow(Generic[KeyT]):
             self._waiting = {**dict.fromkeys(keys), **self._waiting}
 
     def _on_second_answer(self, key: KeyT) -> None:
-        # The first answer was to the first transmission, which was considered lost too early.
+        # A second answer shows that the first one answered the first transmission, which was repeated too early. The
+        # round trip is now known, and makes the time-out longer.
         seconds = self._ambiguous.pop(key, None)
         if seconds is not None:
             self._round_trip.add_sample(seconds)

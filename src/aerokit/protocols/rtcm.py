@@ -24,7 +24,7 @@ def _crc_table() -> tuple[int, ...]:
     for byte in range(256):
         crc = byte << 16
         for _ in range(8):
-            crc = crc << 1 ^ (0x1864CFB if crc & 0x800000 else 0)
+            crc = crc << 1 ^ (0x1864CFB if crc & 0x800000 else 0)  # 0x1864CFB: polynomial of CRC-24Q
         table.append(crc)
     return tuple(table)
 
@@ -47,7 +47,7 @@ def message_number(frame: bytes) -> int | None:
 
 def _frame_size(data: bytes, begin: int) -> int | None:
     """Return the size of the frame that begins at ``begin``; None if no frame begins there. Needs three bytes."""
-    # The six bits before the length are reserved and zero.
+    # After the preamble, six reserved bits must be zero. The length follows in ten bits.
     if data[begin] != PREAMBLE or data[begin + 1] & 0xFC:
         return None
     return HEADER_SIZE + (data[begin + 1] << 8 | data[begin + 2]) + CRC_SIZE
@@ -61,11 +61,11 @@ def rtcm_messages(data: bytes) -> list[bytes]:
     """
     messages: list[bytes] = []
     begin = 0
-    while begin < len(data) or not messages:  # empty data is refused, too
+    while begin < len(data) or not messages:  # The second condition also refuses empty data, in the first iteration.
         size = _frame_size(data, begin) if len(data) - begin > HEADER_SIZE else None
         subject = f"rtcm (byte {begin} of {len(data)})"
         if size is None:
-            raise InvalidArgument(f"{subject} is not allowed: not the start of an RTCM 3 message, which is 0xD3")
+            raise InvalidArgument(f"{subject} is not allowed: no RTCM 3 message begins there (its first byte is 0xD3)")
         frame = data[begin : begin + size]
         if len(frame) < size:
             raise InvalidArgument(
@@ -75,7 +75,8 @@ def rtcm_messages(data: bytes) -> list[bytes]:
             raise InvalidArgument(f"{subject} is not allowed: the CRC-24Q of the message is wrong")
         if size > MAX_MESSAGE_SIZE:
             raise InvalidArgument(
-                f"{subject} is not allowed: the message has {size} bytes, but GPS_RTCM_DATA carries {MAX_MESSAGE_SIZE}"
+                f"{subject} is not allowed: the message has {size} bytes, but GPS_RTCM_DATA carries at most"
+                f" {MAX_MESSAGE_SIZE}"
             )
         messages.append(frame)
         begin += size
@@ -104,8 +105,9 @@ class RtcmReader:
             if len(buffer) - begin < HEADER_SIZE:
                 break
             size = _frame_size(buffer, begin)
-            if size is not None and len(buffer) - begin < size:
+            if size is not None and len(buffer) - begin < size:  # The rest of the message has not arrived yet.
                 break
+            # If no valid message begins here, the search continues at the next byte.
             if size is None or crc24q(buffer[begin : begin + size]):
                 begin += 1
                 self.skipped_bytes += 1

@@ -75,7 +75,7 @@ class BlockingContext:
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         self.close()
 
-    if not TYPE_CHECKING:  # type checkers report the misuse themselves
+    if not TYPE_CHECKING:  # Without these methods, type checkers report the misuse.
 
         def __await__(self) -> NoReturn:
             self._misused("await")
@@ -84,7 +84,7 @@ class BlockingContext:
             self._misused("async with")
 
         async def __aexit__(self, *_: object) -> None:
-            """Unused; Python looks it up before ``__aenter__``."""
+            """Not called. It must exist, because Python looks it up before it calls ``__aenter__``."""
 
     def _misused(self, word: str) -> NoReturn:
         self.close()
@@ -131,7 +131,7 @@ class TwinOf(ReadOnly, Generic[AsyncT]):
         try:
             yield entered
         finally:
-            with contextlib.suppress(ConnectionClosed):
+            with contextlib.suppress(ConnectionClosed):  # If the loop has ended, there is nothing left to exit.
                 self._loop.call(block.__exit__, None, None, None)
 
     @contextmanager
@@ -149,17 +149,17 @@ class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
         return repr(self.aio)
 
     def __bool__(self) -> bool:
-        return bool(self.aio)  # raises TypeError with a hint
+        return bool(self.aio)  # The cell raises a TypeError with a hint.
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            if name.startswith("_"):  # copy looks these up before __init__
+            if name.startswith("_"):  # The module copy reads such names before `self.aio` exists.
                 raise AttributeError(name)
-            return getattr(self.aio, name)  # raises AttributeError with a suggestion
+            return getattr(self.aio, name)  # The cell raises an AttributeError with a suggestion.
 
         def __getitem__(self, key: object) -> Any:
-            return self.aio[key]  # raises TypeError with a suggestion
+            return self.aio[key]  # The cell raises a TypeError with a suggestion.
 
 
 class IteratorTwin(TwinOf[IteratorT], Generic[IteratorT, ItemT]):
@@ -171,7 +171,8 @@ class IteratorTwin(TwinOf[IteratorT], Generic[IteratorT, ItemT]):
     def __next__(self) -> ItemT:
         items = self.aio
 
-        async def read() -> tuple[ItemT, ...]:  # empty at the end: a coroutine cannot raise StopAsyncIteration
+        # The coroutine returns an empty tuple at the end, because a coroutine cannot raise StopAsyncIteration.
+        async def read() -> tuple[ItemT, ...]:
             try:
                 return (await items.__anext__(),)
             except StopAsyncIteration:
@@ -195,7 +196,7 @@ class SubscriptionTwin(IteratorTwin["Subscription[T]", T], Generic[T]):
         return self
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
-        with contextlib.suppress(ConnectionClosed):  # it is closed already
+        with contextlib.suppress(ConnectionClosed):  # With the connection, the subscription is closed already.
             self._loop.call(self.aio.close)
 
 
@@ -207,7 +208,7 @@ class BlockTwin(TwinOf[BlockT]):
         return self
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
-        exit_block: Any = self.aio.__aexit__  # Any, because its parameters have other names in each class
+        exit_block: Any = self.aio.__aexit__  # The type is Any, because each class names its parameters differently.
         self._loop.run(exit_block, exc_type, exc, traceback)
 
 
@@ -222,7 +223,7 @@ class MeasurementTwin(BlockTwin["MeasurementStream[T]"], Generic[T]):
 class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
     """Gimbals by device id; ``T`` is the twin of a gimbal."""
 
-    if TYPE_CHECKING:  # the generated twin defines these
+    if TYPE_CHECKING:  # The generated twin defines these members.
 
         @property
         def ids(self) -> tuple[int, ...]:
@@ -246,29 +247,29 @@ class CalibrationTwin(IteratorTwin["Calibration", "CalibrationStep"]):
 
 
 class PhotoIntervalTwin(BlockTwin["PhotoInterval"], IteratorTwin["PhotoInterval", "Capture"]):
-    """Takes pictures while its ``with`` block runs; an iterator over them."""
+    """Takes pictures while its ``with`` block runs. Iterating over it yields the pictures."""
 
 
 class LogStreamTwin(BlockTwin["LogStream"], IteratorTwin["LogStream", bytes]):
-    """A flight log while PX4 writes it; an iterator over its bytes."""
+    """A flight log while PX4 writes it. Iterating over it yields its bytes."""
 
 
 class ShieldedBlockTwin(TwinOf[ShieldedT]):
-    """Twin of a block whose exit Ctrl-C does not interrupt."""
+    """Twin of a block whose exit cannot be interrupted by Ctrl-C."""
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         self._loop.run_shielded(self.aio.__aexit__, exc_type, exc, traceback)
 
 
 class TemporarilyTwin(ShieldedBlockTwin["TemporaryParameters"]):
-    """Block that sets parameters and yields the results of the writes; its exit restores the previous values."""
+    """Block that sets parameters; ``as`` gives the results. Its exit restores the previous values."""
 
     def __enter__(self) -> dict[str, ParameterWrite]:
         return self._loop.enter(self.aio)
 
 
 class TransactionTwin(ShieldedBlockTwin["Transaction"]):
-    """Block of parameter changes that are undone if it raises."""
+    """Block of parameter changes, which are undone if the block raises."""
 
     def __enter__(self) -> Self:
         self._loop.enter(self.aio)
@@ -285,14 +286,14 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
         self._context = context
 
     def vehicles(self) -> Iterator[VehicleFound]:
-        """Yield each autopilot once: those found so far, then new ones, until the connection ends.
+        """Yield each autopilot once, until the connection ends: first those already known, then new ones.
 
         Raises:
             ConnectionClosed, LinkLost: the connection ended.
         """
         discoveries = self.aio.vehicles()
         try:
-            while True:  # until the connection's end raises its error
+            while True:  # The loop ends by an exception, when the connection ends.
                 yield self._loop.run(discoveries.__anext__)
         finally:
             with contextlib.suppress(ConnectionClosed):
@@ -311,7 +312,7 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
 
 
 class OpenedTwin(TwinOf[T], BlockingContext):
-    """Twin of an object whose context is open on the loop thread, which ends with it if it was started for it."""
+    """Twin of an object whose context is open on a loop thread. Closing it ends the thread, unless that is shared."""
 
     def __init__(self, loop: LoopThread, context: OpenContext[T], *, owns_loop: bool) -> None:
         super().__init__(loop, context.value)
@@ -333,7 +334,9 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
 
     def _part(self, name: str, twin: Callable[[LoopThread, Any], T]) -> T:
         """Return a part of the vehicle, created on the loop thread on first access."""
-        key = f"_part_{name}"  # no lock, because code on the loop thread reads parts, too
+        # No lock is used, because code on the loop's thread reads parts, too, and must not wait. If two threads create
+        # a part at the same time, setdefault() keeps one of them.
+        key = f"_part_{name}"
         if key not in vars(self):
 
             def read() -> Any:
@@ -342,7 +345,7 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
             try:
                 original = read() if self._loop.is_current else self._loop.call(read)
             except ConnectionClosed:
-                original = read()  # the loop has ended
+                original = read()  # The loop has ended, so no other thread uses the vehicle any more.
             vars(self).setdefault(key, twin(self._loop, original))
         part: T = vars(self)[key]
         return part
@@ -357,7 +360,7 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         is_hold_pending = self.aio.is_hold_pending
         self.close()
-        # The asynchronous context would warn about the exception, but did not get it.
+        # The asynchronous context would warn about an exception, but `close` does not pass it on, so it is done here.
         if exc is not None and not is_hold_pending:
             warn_if_left_flying(self.aio)
 
@@ -371,7 +374,7 @@ def opened(
     address: Any,
     **options: Any,
 ) -> TwinT:
-    """Open a context on a new loop thread, or on that of the connection passed as address."""
+    """Open a context on a new loop thread; if ``address`` is a connection, on the connection's loop thread."""
     is_connection = isinstance(address, ConnectionTwin)
     loop = address._loop if is_connection else LoopThread()
     try:
@@ -379,7 +382,7 @@ def opened(
     except BaseException as error:
         if not is_connection:
             loop.close()
-        if isinstance(error, KeyboardInterrupt):  # without the traceback of this library, which does not help a user
+        if isinstance(error, KeyboardInterrupt):  # The traceback inside this library would not help the user.
             raise error.with_traceback(None) from error.__cause__
         raise
     if not is_connection:

@@ -71,7 +71,7 @@ def opened_component(
     connection: Any,
     **options: Any,
 ) -> ComponentT:
-    """Open a component on a new loop thread, or on that of a connection."""
+    """Open a component on a new loop thread; if ``connection`` is given, on the connection's loop thread."""
     is_shared = isinstance(connection, ConnectionTwin)
     loop = connection._loop if is_shared else LoopThread()
     try:

@@ -25,7 +25,7 @@ FleetT = TypeVar("FleetT", bound="FleetTwin")
 
 
 class _Borrowed(Generic[T]):
-    """Stands in for an OpenContext: the fleet, not its vehicle twins, closes the vehicles."""
+    """Replaces the OpenContext of a fleet's vehicle twins, because the fleet closes the vehicles, not the twins."""
 
     def __init__(self, value: T) -> None:
         self.value = value
@@ -75,7 +75,8 @@ class FleetTwin(OpenedTwin["AsyncFleet"]):
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         without_hold = [vehicle for vehicle in self.aio.vehicles.values() if not vehicle.is_hold_pending]
         self.close()
-        if exc is not None:  # the asynchronous context would warn about it, but did not get it
+        # The asynchronous context would warn about an exception, but `close` does not pass it on, so it is done here.
+        if exc is not None:
             for vehicle in without_hold:
                 warn_if_left_flying(vehicle)
 
@@ -86,14 +87,15 @@ def opened_fleet(
     sources: tuple[Any, ...],
     **options: Any,
 ) -> FleetT:
-    """Open a fleet on a new loop thread, or on that of the connections and vehicles passed as sources."""
+    """Open a fleet on a new loop thread; if a source is a connection or vehicle, on its loop thread."""
     entries: list[Any] = []
     for source in sources:
         entries += source.values() if isinstance(source, Mapping) else (source,)
     loops = {entry._loop for entry in entries if isinstance(entry, (ConnectionTwin, VehicleTwin))}
     if len(loops) > 1:
         raise InvalidArgument(
-            "sources: these connections run on different loops; pass addresses, or open all vehicles on one connection"
+            "sources: the connections run on different event loops; pass addresses, or open all vehicles on one"
+            " connection"
         )
     loop = next(iter(loops), None) or LoopThread()
     try:
@@ -108,7 +110,7 @@ def opened_fleet(
 
 
 def _original(source: Any) -> Any:
-    """Return the asynchronous object of a twin, or the source itself; also inside a mapping."""
+    """Return the asynchronous object of a source that is a twin; other sources unchanged. Also convert mappings."""
     if isinstance(source, Mapping):
         return {name: _original(entry) for name, entry in source.items()}
     return source.aio if isinstance(source, TwinOf) else source

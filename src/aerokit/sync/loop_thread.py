@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 T = TypeVar("T")
 
-SIGNAL_CHECK_INTERVAL_S = 0.2  # Windows raises KeyboardInterrupt only between waits
+SIGNAL_CHECK_INTERVAL_S = 0.2  # Maximum length of a wait, because Windows raises KeyboardInterrupt only between waits.
 INTERRUPTED_CALL_TIMEOUT_S = 2.0
 CLOSE_TIMEOUT_S = 5.0
 CLOSED_DURING_CALL = "the connection was closed while this call waited"
@@ -45,10 +45,11 @@ class LoopThread:
 
     def __init__(self) -> None:
         self.activity: ActivityMonitor = ActivityMonitor(time.monotonic)
-        """Record of the program's calls, which shows that it is running."""
+        """Monitor of the program's calls, which show that the program does not hang."""
         self._calls = _Calls()
         started: ThreadFuture[asyncio.AbstractEventLoop] = ThreadFuture()
-        # An empty context: sniffio stores the running async library there, and the caller may use another one.
+        # The thread starts with an empty context, because the caller's context may name another async library, which
+        # sniffio would then report.
         self._thread = threading.Thread(
             target=contextvars.Context().run,
             args=(_run, self._calls, started),
@@ -57,7 +58,7 @@ class LoopThread:
         )
         self._is_closed = False
         self._finalizer: weakref.finalize[Any, Any] | None = None
-        self._lock = threading.Lock()  # also acquired by the loop's thread: never wait while holding it
+        self._lock = threading.Lock()  # The loop's thread also acquires it, so it must not be held during a wait.
         try:
             self._thread.start()
             while not started.wait(SIGNAL_CHECK_INTERVAL_S):
@@ -66,7 +67,7 @@ class LoopThread:
             atexit.register(self._calls.finish, self._thread)
         except (OSError, RuntimeError) as error:
             self._abort()
-            # Thread.start waits with a Condition, in which Ctrl-C becomes a RuntimeError; see ThreadFuture.
+            # Ctrl-C during Thread.start() becomes a RuntimeError, because it waits with a Condition; see ThreadFuture.
             if isinstance(error.__context__, KeyboardInterrupt):
                 raise error.__context__ from None
             raise _not_started(error) from error
@@ -97,11 +98,11 @@ class LoopThread:
         self,
         interrupt_timeout_s: float | None,
         function: Callable[P, Awaitable[T]],
-        /,  # the function may have arguments of these names
+        /,  # Positional only, because the function itself may have arguments with these names.
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
-        """Run a function; after Ctrl-C wait ``interrupt_timeout_s`` for its end, or without limit if None."""
+        """Run a function. After Ctrl-C, wait ``interrupt_timeout_s`` for its end; None means without limit."""
         call: _Call[T] | None = None
         try:
             call = _Call(functools.partial(function, *args, **kwargs))
@@ -111,7 +112,7 @@ class LoopThread:
         except BaseException as error:
             is_shielded = interrupt_timeout_s is None
             if is_shielded and isinstance(error, KeyboardInterrupt):
-                # Ctrl-C may have come before the function was started. Starting a call twice has no effect.
+                # Clean-up must run even if Ctrl-C came before the call was started. Starting it twice has no effect.
                 call = call or _Call(functools.partial(function, *args, **kwargs))
                 with contextlib.suppress(AerokitError):
                     self._start(call)
@@ -121,6 +122,7 @@ class LoopThread:
                 while call.is_scheduled and not call.wait(wait_s):
                     if not is_shielded or not self._thread.is_alive():
                         break
+                # An error of the clean-up function must not be lost, so it becomes the cause of the raised exception.
                 failure = call.pop_exception() if is_shielded else None
                 if failure is not None:
                     raise error from failure
@@ -132,7 +134,7 @@ class LoopThread:
         return call.result()
 
     def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a synchronous function on the loop's thread; otherwise like :meth:`run`."""
+        """Like :meth:`run`, but for a synchronous function, which is called on the loop's thread."""
 
         async def call() -> T:
             return function(*args, **kwargs)
@@ -140,9 +142,9 @@ class LoopThread:
         return self.run(call)
 
     def enter(self, context: AbstractAsyncContextManager[T]) -> T:
-        """Enter a context manager on the loop. The caller exits it with :meth:`run_shielded`.
+        """Enter a context manager on the loop. The caller must exit the context manager with :meth:`run_shielded`.
 
-        If Ctrl-C arrives after it was entered, but before this method returns, it is exited.
+        If Ctrl-C arrives after the context manager was entered, but before this method returns, this method exits it.
         """
         is_entered = False
 
@@ -180,7 +182,7 @@ class LoopThread:
             self._schedule(functools.partial(function, *args, **kwargs))
 
     def open_context(self, context: AbstractAsyncContextManager[T]) -> OpenContext[T]:
-        """Enter an asynchronous context manager on the loop. Closing it exits it in the same task."""
+        """Enter an asynchronous context manager on the loop. `OpenContext.close` exits it in the same task."""
         return OpenContext(self, context)
 
     def close(self) -> None:
@@ -189,7 +191,7 @@ class LoopThread:
             if self._is_closed:
                 return
             self._calls.end_soon()
-            self._is_closed = True  # set last, so that close() can be repeated after Ctrl-C
+            self._is_closed = True  # Set last: if Ctrl-C interrupts the line above, close() can be called again.
         if self._finalizer is not None:
             self._finalizer.detach()
         atexit.unregister(self._calls.finish)
@@ -197,7 +199,7 @@ class LoopThread:
             self._thread.join(CLOSE_TIMEOUT_S)
 
     def when_dropped(self, function: Callable[[], object]) -> None:
-        """Call ``function`` on the loop and end the loop when this object is garbage collected.
+        """When this object is garbage-collected, call ``function`` on the loop, and end the loop.
 
         The function must not refer to this object, directly or indirectly. It is not called after :meth:`close` or at
         interpreter exit.
@@ -211,12 +213,13 @@ class LoopThread:
         return threading.current_thread() is self._thread
 
     def wait_for(self, future: ThreadFuture[Any]) -> None:
-        """Wait for a future; Ctrl-C interrupts on every system. Raises ConnectionClosed if the loop ends first."""
+        """Wait for a future; Ctrl-C interrupts the wait on every system. ConnectionClosed if the loop ends first."""
         while not future.wait(SIGNAL_CHECK_INTERVAL_S):
             if not self._thread.is_alive() and not future.is_done:
                 raise ConnectionClosed(CLOSED_DURING_CALL)
 
     def _start(self, call: _Call[Any]) -> None:
+        """Schedule the start of a call on the loop."""
         if self.is_current:
             raise BusyError(
                 "a blocking call on the event loop's own thread would be a deadlock; predicates and callbacks run"
@@ -229,7 +232,7 @@ class LoopThread:
 
     def _cancel(self, call: _Call[Any]) -> None:
         if call.is_scheduled:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
+            with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 self._schedule(call.cancel)
 
     def _abort(self) -> None:
@@ -258,7 +261,7 @@ class OpenContext(Generic[T]):
             loop.wait_for(opened)
             if not opened.has_result:
                 loop.wait_for(self._call)
-                self._call.result()  # raises what __aenter__ raised
+                self._call.result()  # This raises the exception of __aenter__.
         except BaseException:
             loop._cancel(self._call)
             raise
@@ -266,7 +269,7 @@ class OpenContext(Generic[T]):
 
     def close(self) -> None:
         """Exit the context manager and wait for it. Idempotent."""
-        if self._loop.is_current:
+        if self._loop.is_current:  # The loop's own thread must not wait for the loop.
             self._task.close.set()
         elif not self._call.is_done:
             with contextlib.suppress(ConnectionClosed):
@@ -292,7 +295,7 @@ class _ContextTask(Generic[T]):
 
 
 class _AsyncContext(AbstractAsyncContextManager[T]):
-    """A synchronous context manager as an asynchronous one."""
+    """Wraps a synchronous context manager, so that it can be used as an asynchronous one."""
 
     def __init__(self, context: AbstractContextManager[T]) -> None:
         self._context = context
@@ -327,13 +330,13 @@ class _Calls:
         call.has_started = True
         task = asyncio.get_running_loop().create_task(call.run())
         self._tasks[task] = call
-        # This finishes a call that was cancelled before its first step. Other calls have finished already.
+        # The callback finishes a call whose task was cancelled before its first step. Other calls finish by themselves.
         task.add_done_callback(lambda task: self._tasks.pop(task).finish())
 
     def end_soon(self, function: Callable[[], object] | None = None) -> None:
-        """Call a function on the loop, then end the loop. From any thread; does not block; idempotent."""
+        """Call a function on the loop, then end the loop. May be called from any thread; never blocks; idempotent."""
         if self._loop is not None and self.is_of_this_process:
-            with contextlib.suppress(RuntimeError):  # the loop has ended
+            with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 self._loop.call_soon_threadsafe(self._end_after, function, context=self.context)
 
     def finish(self, thread: threading.Thread) -> None:
@@ -368,7 +371,7 @@ class _Call(ThreadFuture[T]):
         super().__init__()
         self._function = function
         self._cancellation = Cancellation()
-        self.is_scheduled = False  # True once the loop was told to start it
+        self.is_scheduled = False  # True once its start was scheduled on the loop
         self.has_started = False
 
     def cancel(self) -> None:
@@ -385,12 +388,12 @@ class _Call(ThreadFuture[T]):
                 self.set_result(await self._function())
             except asyncio.CancelledError:
                 raise
-            except BaseException as error:  # including SystemExit, which is meant for the caller's thread
+            except BaseException as error:  # SystemExit, too, must be raised in the caller's thread, not in the loop's.
                 self.set_exception(error)
 
 
 def _run(calls: _Calls, started: ThreadFuture[asyncio.AbstractEventLoop]) -> None:
-    """Run the loop; the thread's target function. An error before the start goes to ``started``."""
+    """Run the loop. This is the thread's main function. An error before the loop starts is stored in ``started``."""
     try:
         anyio.run(calls.run, started)
     except BaseException as error:

@@ -58,7 +58,7 @@ def _names(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-# All twins, each after those that its members return.
+# All twins. A twin comes after the twins that its members return.
 TWINS = (
     Twin(
         "aerokit.connection.cells.StateCell",
@@ -154,7 +154,7 @@ def tree(module: str) -> ast.Module:
 
 @cache
 def imports_of(module: str) -> dict[str, tuple[str, str]]:
-    """Return the imports of a module: each local name, with the module and the name there."""
+    """Return the imports of a module: maps each imported name to the module and its name in that module."""
     imports: dict[str, tuple[str, str]] = {}
     for node in ast.walk(tree(module)):
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -183,11 +183,11 @@ class ClassMember:
     node: ast.FunctionDef | ast.AsyncFunctionDef | None
     returns: ast.expr | None
     text: str | None
-    is_cell: bool = False  # True for a declared state
+    is_cell: bool = False  # True if the member is declared as a state, which becomes a StateCell
 
 
 def members_of(twin: Twin) -> list[ClassMember]:
-    """Return the members to generate, inherited ones included, in the order of their first definition."""
+    """Return the members of a twin to generate, including inherited ones, in the order of their first definition."""
     cls = _class_of(twin)
     classes_of_base_twin = next((_class_of(base).__mro__ for base in TWINS if base.name == twin.inherits), ())
     members: dict[str, ClassMember] = {}
@@ -242,7 +242,10 @@ def _own_members(cls: type) -> Iterator[ClassMember]:
 
 
 def _attributes(init: ast.FunctionDef, module: tuple[str, ...]) -> Iterator[ClassMember]:
-    """Yield public attributes with the docstring below. The type is the annotation, or the class that is called."""
+    """Yield the public attributes that ``__init__`` sets, with the docstrings below them.
+
+    The type is the annotation; without one, it is the class whose call is assigned.
+    """
     for index, node in enumerate(init.body):
         target: ast.expr | None = node.target if isinstance(node, ast.AnnAssign) else None
         if isinstance(node, ast.Assign) and len(node.targets) == 1:

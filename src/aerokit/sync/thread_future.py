@@ -47,20 +47,20 @@ class ThreadFuture(Generic[T]):
     def wait(self, timeout: float) -> bool:
         """Wait at most ``timeout`` seconds and return True if done."""
         if not self.is_done and self._gate.acquire(timeout=timeout):
-            self._gate.release()  # for other threads that wait
+            self._gate.release()  # Another thread may wait, too.
         return self.is_done
 
     def result(self) -> T:
-        """Return the result, or raise the error (once), or LookupError if there is neither."""
+        """Return the result, or raise the error. An error is raised only once. LookupError if there is neither."""
         error = self.pop_exception()
         if error is not None:
             raise error
         if not self._values:
-            raise LookupError("finished without a result")
+            raise LookupError("the future was finished without a result")
         return self._values[0]
 
     def pop_exception(self) -> BaseException | None:
-        """Return the error and forget it: its traceback refers to this object, which would be a reference cycle."""
+        """Return the error and forget it, because its traceback refers to this object: a reference cycle."""
         error, self._error = self._error, None
         return error
 

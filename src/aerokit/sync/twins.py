@@ -247,12 +247,12 @@ class StateCell(CellTwin[T]):
 
     @property
     def value(self) -> T:
-        """The latest value, of any age; raises :class:`ValueUnknownError` before the first."""
+        """The latest value, of any age. Raises :class:`ValueUnknownError` before the first value."""
         return self.aio.value
 
     @property
     def latest(self) -> T | None:
-        """The latest value, or None before the first."""
+        """The latest value, of any age; None before the first value."""
         return self.aio.latest
 
     @property
@@ -262,17 +262,17 @@ class StateCell(CellTwin[T]):
 
     @property
     def updated_at(self) -> float:
-        """Time of the latest value, in seconds of the cell's clock; −inf before the first."""
+        """Time of the latest value, in seconds of the cell's clock; −inf before the first value."""
         return self.aio.updated_at
 
     @property
     def age(self) -> float:
-        """Seconds since the latest value was received; inf before the first."""
+        """Seconds since the latest value was received; inf before the first value."""
         return self.aio.age
 
     @property
     def source(self) -> Source | None:
-        """Sender and message of the latest value; None before the first."""
+        """Sender and message of the latest value; None before the first value."""
         return self.aio.source
 
     def fresh(self, within: float) -> T:
@@ -310,14 +310,14 @@ class StateCell(CellTwin[T]):
         )
 
     def changes(self) -> Changes[T]:
-        """Iterate over values that differ from their predecessor, starting with the current value if there is one.
+        """Iterate over the current value, if there is one, and all later values that differ from the value before.
 
         A slow reader gets only the latest value. The loop can be left at any time.
         """
         return Changes(self._loop, self._loop.call(self.aio.changes))
 
     def updates(self) -> Changes[T]:
-        """Like :meth:`changes`, but yield each received value, even if it equals its predecessor."""
+        """Like :meth:`changes`, but yield each received value, even if it equals the value before."""
         return Changes(self._loop, self._loop.call(self.aio.updates))
 
 
@@ -330,7 +330,7 @@ class Changes(ChangesTwin[T]):
 
     @property
     def missed(self) -> int:
-        """Number of values that were replaced before this reader got them."""
+        """Number of values that this reader did not get, because newer values had already replaced them."""
         return self.aio.missed
 
 
@@ -343,7 +343,7 @@ class Subscription(SubscriptionTwin[ItemT]):
 
     @property
     def missed(self) -> int:
-        """Number of items dropped because the reader was slow."""
+        """Number of items that were dropped because the reader was too slow."""
         return self.aio.missed
 
     def get(self, timeout: float | None = None) -> ItemT:
@@ -361,7 +361,7 @@ class Subscription(SubscriptionTwin[ItemT]):
         return self._loop.call(self.aio.get_nowait)
 
     def close(self, error: Exception | None = None) -> None:
-        """Stop taking items. A waiting reader raises ``error``; without an error, its iteration ends."""
+        """Stop collecting items. A waiting reader raises ``error``; without an error, its iteration ends."""
         self._loop.call(self.aio.close, error)
 
 
@@ -407,7 +407,7 @@ class Connection(ConnectionTwin):
 
     @property
     def unsent_bytes(self) -> int:
-        """Number of written bytes that have not left this machine, if the link can measure that number.
+        """Number of written bytes that have not left this machine; 0 if the link cannot measure the number.
 
         A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
         control asserted); see :class:`LinkStalled`. Always 0 for UDP.
@@ -415,7 +415,7 @@ class Connection(ConnectionTwin):
         return self._loop.call(lambda: self.aio.unsent_bytes)
 
     def discard_unsent(self) -> None:
-        """Discard data that was sent but has not left this program, e.g. an outdated command.
+        """Discard written data that has not left this program yet, e.g. an outdated command.
 
         The call discards all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and
         stays in :attr:`unsent_bytes`.
@@ -476,7 +476,7 @@ class SetpointStream(StreamTwin[SetpointT]):
 
         Raises:
             InvalidArgument: a value is out of range; the previous set-point remains in force until it expires.
-            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+            SetpointStreamStopped: the stream has ended by itself, or its `async with` block was left.
         """
         self._loop.call(self.aio.set, setpoint)
 
@@ -740,7 +740,7 @@ class StickStream(BlockTwin["AsyncStickStream"]):
 
         Raises:
             InvalidArgument: a position is out of range; the previous positions stay in force until they expire.
-            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+            SetpointStreamStopped: the stream has ended by itself, or its `async with` block was left.
         """
         self._loop.call(self.aio.set, sticks)
 
@@ -756,7 +756,7 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
     behaves as if its sensor had failed. Of several measurements within one period, only the newest is sent. A
     measurement is dropped if it is older than ``valid_for_s`` when it is due to be sent, for example after the event
     loop was blocked. While the vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count
-    measurements. The stream ends only with the block.
+    measurements. The stream ends only with its `async with` block.
 
     Entering raises:
         NotSupported: this firmware does not read such measurements. Nothing was sent.
@@ -777,7 +777,7 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
 
     @property
     def is_open(self) -> bool:
-        """True inside the block."""
+        """True inside the stream's `async with` block."""
         return self.aio.is_open
 
     @property
@@ -785,7 +785,7 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
         """Use of these measurements by the vehicle's estimator: ``"used"``, ``"not used"`` or ``"unknown"``.
 
         No message reports this, so aerokit derives it from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the
-        parameters at the beginning of the block. ``"used"``: the estimator has a position, and its parameters allow no
+        parameters when the stream was entered. ``"used"``: the estimator has a position, and its parameters allow no
         other source of it. ``"not used"``: the estimator has no position. ``"unknown"``: all other cases, for example
         if the vehicle also has a GPS, for sensors that supply no position, or without a recent report.
         """
@@ -796,7 +796,7 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
 
         Raises:
             InvalidArgument: a value is out of range; nothing was sent.
-            SetpointStreamStopped: the block was left or not entered.
+            SetpointStreamStopped: the `async with` block of this stream was left, or not entered.
             ValueUnknownError: PX4's attitude or local position is unknown, which a landing target requires.
             ConnectionClosed: the connection has ended.
         """
@@ -812,14 +812,14 @@ class External(TwinOf["AsyncExternal"]):
     """
 
     def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
-        """Supply pose and velocity (ODOMETRY). ArduPilot needs VISO_TYPE, PX4 EKF2_EV_CTRL."""
+        """Supply pose and velocity (ODOMETRY). Set VISO_TYPE on ArduPilot, EKF2_EV_CTRL on PX4."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.odometry, rate_hz=rate_hz, valid_for_s=valid_for_s),
         )
 
     def vision_position(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
-        """Supply a pose (VISION_POSITION_ESTIMATE). ArduPilot needs VISO_TYPE, PX4 EKF2_EV_CTRL."""
+        """Supply a pose (VISION_POSITION_ESTIMATE). Set VISO_TYPE on ArduPilot, EKF2_EV_CTRL on PX4."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.vision_position, rate_hz=rate_hz, valid_for_s=valid_for_s),
@@ -840,13 +840,13 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def gps(self, *, rate_hz: float = 5.0, valid_for_s: float = 0.5) -> MeasurementStream[GpsMeasurement]:
-        """Supply a satellite position (GPS_INPUT). ArduPilot needs GPS1_TYPE 14; PX4 does not read it."""
+        """Supply a satellite position (GPS_INPUT). Set GPS1_TYPE to 14 on ArduPilot; PX4 does not read GPS_INPUT."""
         return MeasurementStream(self._loop, self._loop.call(self.aio.gps, rate_hz=rate_hz, valid_for_s=valid_for_s))
 
     def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:
         """Supply distances around the vehicle (OBSTACLE_DISTANCE).
 
-        ArduPilot needs PRX1_TYPE 2, PX4 needs CP_DIST above 0.
+        Set PRX1_TYPE to 2 on ArduPilot, CP_DIST above 0 on PX4.
         """
         return MeasurementStream(
             self._loop,
@@ -854,14 +854,14 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def obstacle_points(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstaclePoints]:
-        """Supply positions of obstacles (OBSTACLE_DISTANCE_3D). ArduPilot needs PRX1_TYPE 2; PX4 does not read them."""
+        """Supply positions of obstacles (OBSTACLE_DISTANCE_3D). Only ArduPilot reads them: set PRX1_TYPE to 2."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.obstacle_points, rate_hz=rate_hz, valid_for_s=valid_for_s),
         )
 
     def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
-        """Supply a distance (DISTANCE_SENSOR). ArduPilot needs RNGFND1_TYPE 10 and RNGFND1_ORIENT."""
+        """Supply a distance (DISTANCE_SENSOR). On ArduPilot, set RNGFND1_TYPE to 10, and RNGFND1_ORIENT."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.range_finder, rate_hz=rate_hz, valid_for_s=valid_for_s),
@@ -873,7 +873,7 @@ class External(TwinOf["AsyncExternal"]):
         rate_hz: float = 20.0,
         valid_for_s: float = 0.3,
     ) -> MeasurementStream[TargetMeasurement]:
-        """Supply the position of a landing target (LANDING_TARGET). ArduPilot needs PLND_ENABLED and PLND_TYPE 1.
+        """Supply the position of a landing target (LANDING_TARGET). On ArduPilot, set PLND_ENABLED and PLND_TYPE to 1.
 
         ``vehicle.land_on`` opens this stream itself and lands the vehicle.
         """
@@ -885,7 +885,7 @@ class External(TwinOf["AsyncExternal"]):
     def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
         """Supply optical flow (OPTICAL_FLOW; for PX4 OPTICAL_FLOW_RAD).
 
-        ArduPilot needs FLOW_TYPE 5, PX4 EKF2_OF_CTRL.
+        Set FLOW_TYPE to 5 on ArduPilot, EKF2_OF_CTRL on PX4.
         """
         return MeasurementStream(
             self._loop,
@@ -900,9 +900,10 @@ class External(TwinOf["AsyncExternal"]):
         speed_accuracy_m_s: float = 1.0,
         direction_accuracy_deg: float = 15.0,
     ) -> None:
-        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE); returns at the acknowledgement.
+        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE). Returns when the vehicle acknowledges it.
 
-        No message reports the effect. ArduPilot uses the estimate in its simpler estimator (DCM), PX4 in EKF2.
+        No message reports whether the vehicle uses it. ArduPilot uses the wind in its simpler estimator (DCM), PX4 in
+        EKF2.
 
         Args:
             speed_m_s: horizontal speed, 0 to 100.
@@ -932,7 +933,7 @@ class External(TwinOf["AsyncExternal"]):
 
         Args:
             origin: latitude, longitude and altitude above mean sea level.
-            timeout: seconds until the vehicle reports it.
+            timeout: seconds to wait until the vehicle reports the origin.
 
         Raises:
             InvalidArgument: the origin has no altitude above mean sea level. Nothing was sent.
@@ -1328,7 +1329,8 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
 
         Raises:
-            InvalidArgument: a parameter is not a number or does not fit, or the block was left. Nothing was sent.
+            InvalidArgument: a parameter is not a number or does not fit, or the `with` block was left. Nothing was
+                sent.
             OperationRejected: the order has ended: it was superseded or taken over.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
@@ -1364,7 +1366,8 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             component_id: as for :meth:`command`.
 
         Raises:
-            InvalidArgument: the mode is not one of the modes of the order, or the block was left. Nothing was sent.
+            InvalidArgument: the mode is not one of the modes of the order, or the `with` block was left. Nothing was
+                sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             OperationTimeout: the vehicle accepted the mode but stayed in another mode.
@@ -2938,7 +2941,7 @@ class Rtk(TwinOf["AsyncRtk"]):
 
         Raises:
             InvalidArgument: ``rtcm`` is empty, or a message is incomplete, damaged or too long. Nothing was sent.
-            ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
+            ConnectionClosed, LinkLost: the connection has ended, or this vehicle's `async with` block was left.
         """
         self._loop.call(self.aio.send, rtcm)
 
@@ -3742,7 +3745,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def vtol_state(self) -> StateCell[int]:
-        """MAV_VTOL_STATE: 1 to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
+        """MAV_VTOL_STATE: 1 going to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
         return StateCell(self._loop, self.aio.vtol_state)
 
     @cached_property
@@ -3802,7 +3805,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def batteries(self) -> StateCell[tuple[Battery, ...]]:
-        """All batteries (BATTERY_STATUS, else SYS_STATUS)."""
+        """All batteries (BATTERY_STATUS, or SYS_STATUS if that is missing)."""
         return StateCell(self._loop, self.aio.batteries)
 
     @cached_property
@@ -4139,7 +4142,7 @@ class Vehicle(VehicleTwin):
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
-            ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
+            ConnectionClosed, LinkLost: the connection has ended, or this vehicle's `async with` block was left.
         """
         self._loop.call(self.aio.send, message)
 
@@ -4155,8 +4158,8 @@ class Vehicle(VehicleTwin):
     ) -> AbstractContextManager[PostedOrder]:
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
-        Within the block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged or
-        their effect is reported. The retries also end when a newer order about the same subject is given, when the
+        In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
+        or their effect is reported. The retries also end when a newer order about the same subject is given, when the
         vehicle changes to a mode that neither this order nor another order of the last ten seconds explains, and, if
         the order is about motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
         vehicle hold nor monitors late arming; use the actions for that.
@@ -4189,7 +4192,7 @@ class Vehicle(VehicleTwin):
         ``vehicle.component(100).subscribe(...)``.
 
         Raises:
-            InvalidArgument: no type, a rate out of range, or a message that the dialect does not contain.
+            InvalidArgument: no type was given, the rate is out of range, or the dialect does not contain a message.
         """
         return Subscription(
             self._loop,
@@ -4232,9 +4235,7 @@ class Vehicle(VehicleTwin):
 
     @property
     def is_armed(self) -> bool:
-        """True if the last heartbeat reports armed; False before the first one, and after a reboot until the next
-        one.
-        """
+        """True if the last heartbeat reports armed; False while the state is unknown."""
         return self.aio.is_armed
 
     @property
@@ -4267,8 +4268,9 @@ class Vehicle(VehicleTwin):
         return self._loop.call(self.aio.describe_link)
 
     def describe_now(self) -> str:
-        """Return a clause about the reported state: ``holding in BRAKE, still armed, 9 m above home, last heartbeat
-        0.3 s ago``.
+        """Return a clause about the reported state.
+
+        For example: ``holding in BRAKE, still armed, 9 m above home, last heartbeat 0.3 s ago``.
         """
         return self.aio.describe_now()
 
@@ -4359,7 +4361,7 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
     def hold(self) -> None:
-        """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's hold mode.
+        """Stop and stay (a fixed wing circles). Returns when HEARTBEAT reports the autopilot's hold mode.
 
         The mode is BRAKE on Copter, LOITER on Plane and boats, HOLD on Rover, POSHOLD on Sub and LOITER on PX4.
 
@@ -4406,10 +4408,9 @@ class Vehicle(VehicleTwin):
         return self._loop.call(self.aio.missing_for_flight)
 
     def why_not_armable(self) -> list[str]:
-        """Return the reasons why arming would be refused now, in the present mode; an empty list means that none is
-        known.
+        """Return the reasons why arming in the present mode would be refused now; an empty list if none is known.
 
-        What only a flight needs is not listed, see :meth:`missing_for_flight`.
+        :meth:`missing_for_flight` also lists what is needed only for a flight.
 
         Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) if it supports that, and collects its status
         texts. Also reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
@@ -4425,7 +4426,7 @@ class Vehicle(VehicleTwin):
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
-                texts. If the pre-arm checks fail, the vehicle is asked for its reasons three seconds before the end.
+                texts. Three seconds before this error, a vehicle whose pre-arm checks fail is asked for its reasons.
         """
         self._loop.run(self.aio.wait_ready, timeout=timeout)
 
@@ -4457,7 +4458,7 @@ class Vehicle(VehicleTwin):
                 sent to the vehicle as a STATUSTEXT right before the command, and ArduPilot writes this text into its
                 flight log. PX4 logs only texts that have the vehicle's own system id.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
-            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no such limit.
 
         Raises:
             InvalidArgument: there is no such mode, it does not allow arming, or the reason is too long. Nothing was
@@ -4492,7 +4493,7 @@ class Vehicle(VehicleTwin):
         Args:
             force: also disarm in flight: **the vehicle falls**.
             timeout: seconds for HEARTBEAT to report disarmed after the command was accepted.
-            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no such limit.
 
         Raises:
             CommandRejected: the vehicle refused, usually because it is flying.
@@ -4557,9 +4558,9 @@ class Vehicle(VehicleTwin):
         timeout: float | None = None,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Fly circles around a place; returns when the vehicle's reported positions have gone around it ``turns``
-        times.
+        """Fly circles around a place.
 
+        Returns when the vehicle's reported positions have gone around the place ``turns`` times.
         Afterwards a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit
         orders the vehicle to hold.
 
@@ -4579,7 +4580,7 @@ class Vehicle(VehicleTwin):
                 autopilot. A fixed wing ignores it.
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             NotSupported: this type of vehicle cannot circle a place. Nothing was sent.
@@ -4631,7 +4632,7 @@ class Vehicle(VehicleTwin):
             clockwise: direction in the first lobe, as seen from above.
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
         """
         self._loop.run(
             self.aio.figure_eight,
@@ -4678,7 +4679,7 @@ class Vehicle(VehicleTwin):
             max_distance_m: a place farther away than this many metres is refused.
             timeout: seconds in total. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle
                 moves.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             InvalidArgument: a value is out of range, or ``turns`` was given without ``radius_m``. Nothing was sent.
@@ -4813,7 +4814,7 @@ class Vehicle(VehicleTwin):
         order was given meanwhile or another party changed the mode. After a silence, aerokit waits for the next
         heartbeat, and orders a hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
-        vehicle that does not support it.
+        vehicle that does not support this command.
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level. The vehicle keeps its
@@ -4823,7 +4824,7 @@ class Vehicle(VehicleTwin):
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
             max_distance_m: a place farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             InvalidArgument: the target is not on earth or too far away, or another argument is out of range. Nothing
@@ -4880,7 +4881,7 @@ class Vehicle(VehicleTwin):
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until the vehicle has the heading.
-            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no such limit.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
@@ -4900,15 +4901,14 @@ class Vehicle(VehicleTwin):
         )
 
     def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
-        """Move the home position, to a place or to the vehicle's present position, and wait until HOME_POSITION
-        reports it.
+        """Move the home position, and wait until HOME_POSITION reports the new place.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
         firmware that does not support this gets a COMMAND_LONG, which has a resolution of about a metre.
 
         Args:
-            place: latitude, longitude and an altitude above mean sea level; None: the present position.
-            timeout: seconds until HOME_POSITION reports it.
+            place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.
+            timeout: seconds until HOME_POSITION reports the new place.
 
         Raises:
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
@@ -4932,7 +4932,7 @@ class Vehicle(VehicleTwin):
         timeout: float = 60.0,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Take off and climb to ``altitude_m`` above home; returns at that altitude.
+        """Take off and climb to ``altitude_m`` above home. Returns when the vehicle is at that altitude.
 
         The vehicle must be armed. If the autopilot requires another mode for a take-off, aerokit changes the mode.
         After a cancellation or a time-out, aerokit orders the vehicle to hold where it is.
@@ -4940,7 +4940,7 @@ class Vehicle(VehicleTwin):
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
             timeout: seconds until the vehicle is at that altitude.
-            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no such limit.
 
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
@@ -4956,14 +4956,14 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, max_silence_s=max_silence_s)
 
     def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Land at the present position; returns when the vehicle is on the ground.
+        """Land at the present position. Returns when the vehicle is on the ground.
 
         The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation the
         vehicle continues to land.
 
         Args:
-            timeout: seconds until it is on the ground; None: no limit.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            timeout: seconds until the vehicle is on the ground; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             NotSupported: this type of vehicle has no landing mode. Nothing was sent.
@@ -4976,7 +4976,7 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.land, timeout=timeout, max_silence_s=max_silence_s)
 
     def return_to_launch(self, *, timeout: float | None = 600.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Return to launch; the call ends on the ground, or above it if the autopilot does not land by itself.
+        """Return to launch. Returns on the ground, or above home if the autopilot does not land by itself.
 
         Raises the same errors as :meth:`land`.
         """
@@ -5004,13 +5004,13 @@ class Vehicle(VehicleTwin):
     def camera(self) -> Camera:
         """The first camera found. Cameras attached to the autopilot come after cameras with their own component id.
 
-        A call to this object waits briefly until a camera is found. ``camera_at`` returns any other camera.
+        The calls of this object wait briefly until a camera is found. ``camera_at`` returns any other camera.
         """
         return self._part("camera", Camera)
 
     @property
     def cameras(self) -> StateCell[tuple[int, ...]]:
-        """The numbers of the cameras found so far, for ``camera_at``.
+        """The numbers of the cameras found so far. Pass a number to ``camera_at`` to get the camera.
 
         A number is a component id (100 to 105), or 1 to 6 for a camera attached to the autopilot that has reported a
         picture.
@@ -5047,11 +5047,11 @@ class Vehicle(VehicleTwin):
 
         Args:
             initial: stick positions that are sent while the mode is entered; None centres all sticks.
-            mode: the piloted mode. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane), MANUAL (ArduPilot
-                Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
+            mode: the flight mode for the sticks. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane),
+                MANUAL (ArduPilot Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
             rate_hz: transmission rate of the latest positions, 2 to 400.
             valid_for_s: seconds for which the latest positions are repeated; the stream stops after that.
-            max_lag_s: maximum delay of the event loop in seconds; the stream stops above it.
+            max_lag_s: the stream stops if the event loop is blocked for more than this many seconds.
 
         Raises:
             InvalidArgument: a rate or a time is out of range, or the autopilot has no such mode.
@@ -5082,7 +5082,7 @@ class Vehicle(VehicleTwin):
         timeout: float | None = 300.0,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> LandingReport:
-        """Land on a target that your program sees; returns on the ground, disarmed, with a report of the landing.
+        """Land on a target that your program sees. Returns a report when the vehicle is on the ground and disarmed.
 
         aerokit streams LANDING_TARGET, and the autopilot's own mode lands: LAND with PLND_ENABLED on ArduCopter,
         PRECLAND on PX4. If the target is lost, the autopilot decides. ArduCopter retries, or lands where it is
@@ -5094,9 +5094,9 @@ class Vehicle(VehicleTwin):
             target: a function or coroutine function that returns a :class:`aerokit.TargetMeasurement`, or None while
                 the target is not visible; or an asynchronous iterable of such results.
             rate_hz: rate at which the function is called, and the highest rate of LANDING_TARGET.
-            acquire_timeout: seconds to wait until the target is visible. The landing is ordered only then.
-            timeout: seconds until the vehicle is on the ground and disarmed; None: no limit.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            acquire_timeout: seconds to wait until the target is visible. Once it is visible, the landing is ordered.
+            timeout: seconds until the vehicle must be on the ground and disarmed; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             InvalidArgument: a rate or a time is out of range, or the target is of another type.
@@ -5184,19 +5184,19 @@ class Vehicle(VehicleTwin):
         return self._loop.run(self.aio.return_altitude)
 
     def set_return_altitude(self, altitude_m: float) -> None:
-        """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
+        """Set the altitude at which the vehicle returns to launch. Returns when the vehicle has confirmed the value.
 
         Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
         higher than this when the return starts keeps its height.
 
         Args:
-            altitude_m: metres above home, above 0, at most 3,000. Q_RTL_ALT holds whole metres only.
+            altitude_m: metres above home, above 0, at most 3,000. The parameter Q_RTL_ALT can hold only whole metres.
 
         Raises:
             InvalidArgument: the altitude is out of range, or has a fraction that the parameter cannot hold.
             NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
             ParameterRejected: the vehicle has no such parameter, or kept the previous value.
-            ParameterTimeout: not confirmed, but it may have been set.
+            ParameterTimeout: the vehicle did not confirm the new value, but may have stored it.
         """
         self._loop.run(self.aio.set_return_altitude, altitude_m)
 

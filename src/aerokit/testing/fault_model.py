@@ -55,7 +55,9 @@ class FaultModel(Snapshot):
                 raise InvalidArgument(f"{name} = {getattr(self, name)!r} is not allowed: it must be above 0")
         for begin, end in self.outages:
             if not begin <= end:
-                raise InvalidArgument(f"the outage ({begin!r}, {end!r}) is not allowed: it must begin before its end")
+                raise InvalidArgument(
+                    f"outages: ({begin!r}, {end!r}) is not allowed: an outage must begin before its end"
+                )
 
 
 class Air:

@@ -25,7 +25,7 @@ ACCEPTED_FORMS = """\
   zenoh://fleet/alpha  zenoh://fleet/alpha?connect=tcp/10.0.0.5:7447      a vehicle on a zenoh network, by name
   zenohin://fleet/alpha?listen=tcp/0.0.0.0:7447                           serve that name, for clients of zenoh:
   IPv6 addresses need brackets: udpin:[::1]:14550"""
-"""Forms of a connection string, for error messages and help texts."""
+"""Accepted forms of a connection string, for error messages and help texts."""
 
 
 class LinkAddress(Snapshot):
@@ -60,7 +60,8 @@ class LinkAddress(Snapshot):
             baud = "" if self.baud is None else f":{self.baud}"
             return f"serial://{_quote_device(self.device)}{baud}"
         if self.kind == "replay":
-            # In replay://…, the slashes belong to the scheme. A path that begins with two slashes gets two more.
+            # In replay://…, the first two slashes do not belong to the path. A path that begins with two slashes
+            # therefore gets two more.
             slashes = "//" if self.path.startswith("//") else ""
             return f"replay:{slashes}{_quote(self.path)}"
         if self.kind == "pty":
@@ -124,7 +125,8 @@ _PYMAVLINK_ONLY = ("uds", "unix", "mcast", "ws", "wss", "wsserver", "csv")
 
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^/].*", re.IGNORECASE | re.DOTALL)
 
-_SCHEME = re.compile(r"([a-z][a-z0-9_+.-]+):(.*)", re.IGNORECASE | re.DOTALL)  # a single letter is a Windows drive
+# A scheme has at least two characters, because a single letter is a Windows drive.
+_SCHEME = re.compile(r"([a-z][a-z0-9_+.-]+):(.*)", re.IGNORECASE | re.DOTALL)
 
 _URL = re.compile(r"([a-z][a-z0-9_+.-]*)://(.*)", re.IGNORECASE | re.DOTALL)
 
@@ -165,7 +167,7 @@ class _Parser:
             self.fail("it is empty")
         if "\0" in text:
             self.fail("it contains a NUL character")
-        if text.lower() == "pty" or text.lower().startswith("pty:"):
+        if text.lower() == "pty" or text.lower().startswith("pty:"):  # The rest is a path, without any options.
             return LinkAddress("pty", path=text[len("pty:") :])
         scheme, after_scheme = self.split_scheme(text)
         if scheme in _SCHEMES:
@@ -179,6 +181,7 @@ class _Parser:
         if match := _URL.fullmatch(text):
             return match[1].lower(), match[2]
         match = _SCHEME.fullmatch(text)
+        # Without "//", only a known word is a scheme. Any other word may be a host.
         if match and match[1].lower() in (*_SCHEMES, *_PYMAVLINK_ONLY, "http", "https", "ftp"):
             return match[1].lower(), match[2]
         return "", text
@@ -215,19 +218,19 @@ class _Parser:
         return self.network("udpin", text, {})
 
     def network(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
-        """Parse ``host:port``."""
+        """Parse the part of a network address after its scheme: ``host:port``."""
         if text.startswith("["):
             host, bracket, tail = text[1:].partition("]")
             if not bracket or not _is_ipv6(host):
                 self.fail(f"{text!r} does not start with an IPv6 address in brackets")
         else:
             host, colon, port = text.rpartition(":")
-            if not colon:  # rpartition() then has the whole text in its last part
+            if not colon:  # Without a colon, rpartition() returns the whole text as the last part.
                 host, port = text, ""
             tail = colon + port
             if _is_ipv6(host):
                 self.fail("an IPv6 address needs brackets, as in [::1]:14550")
-            if host.isdigit() and not tail:  # only a port, e.g. "udpin:14550"
+            if host.isdigit() and not tail:  # The text is only a port, e.g. in "udpin:14550".
                 self.fail(f"the host is missing, as in {kind}:127.0.0.1:{host}")
         if not host and kind in _LISTENING:
             host = "0.0.0.0"
@@ -240,7 +243,7 @@ class _Parser:
         return LinkAddress(kind, host=host, port=self.port(kind, tail), options=tuple(sorted(options.items())))
 
     def zenoh(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
-        """Parse ``fleet/name``."""
+        """Parse the part of a zenoh address after its scheme: ``fleet/name``."""
         from aerokit.transport.zenoh.keys import check_name  # imported here because few addresses need it
 
         for key in ("connect", "listen"):
@@ -271,7 +274,8 @@ class _Parser:
 
     def serial(self, text: str, options: dict[str, str], *, decode: bool) -> LinkAddress:
         """Parse a serial port and its baud rate. ``decode`` is True for an address with a scheme."""
-        # Without a scheme, a colon before the baud rate is accepted only after a COM port.
+        # In an address without a scheme, only the name of a COM port may be followed by a colon and the baud rate.
+        # Other names may contain colons themselves.
         colon_baud = _COLON_BAUD if decode else _COM_COLON_BAUD
         baud_text: str | None
         if "," in text:
@@ -312,12 +316,12 @@ class _Parser:
                     self.fail(f"{key}= is empty")
             else:
                 options[key] = self.option_value(key, value.strip().lower())
-        # An option with its default value is left out, so that addresses of the same link are equal.
+        # An option with its default value is left out, so that equal links have equal addresses.
         defaults = (("rtscts", "0"), ("costly", "0"), ("speed", "1"))
         return {key: value for key, value in options.items() if (key, value) not in defaults}
 
     def option_value(self, key: str, value: str) -> str:
-        """Check a value, and return its canonical form."""
+        """Check the value of an option, and return its canonical form."""
         if key == "baud":
             return value
         if key in _CHOICES:
@@ -385,5 +389,5 @@ def _unquote(text: str) -> str:
 
 
 def _quote_device(device: str) -> str:
-    """Percent-encode also commas, and a colon before digits at the end, because a baud rate follows them."""
+    """Like `_quote`, but also encode what separates a baud rate: commas, and a colon before digits at the end."""
     return re.sub(r":(?=[0-9]+$)", "%3A", _quote(device).replace(",", "%2C"))

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: PeerFilter | None = None) -> Link:
-    """Make the link that a connection string describes, without opening it.
+    """Create the link that a connection string describes. The link is not opened.
 
     Args:
         address: a connection string, or the result of :func:`parse_address`.
@@ -30,7 +30,8 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: PeerFil
             f"peers = … is not allowed with {parsed}: only udpin, udpbcast and tcpin links filter senders"
         )
     if parsed.kind == "serial":
-        from aerokit.transport.serial import SerialLink  # imported here because a program uses few kinds of links
+        # Each kind of link is imported where it is used, because a program uses few kinds.
+        from aerokit.transport.serial import SerialLink
 
         return SerialLink(parsed.device, parsed.baud or baud, rtscts=parsed.option("rtscts") == "1")
     if parsed.kind == "replay":

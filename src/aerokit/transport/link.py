@@ -37,7 +37,7 @@ class DrainListener(Receiver, Protocol):
     """A receiver that is notified when written data does not leave this machine."""
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """Called when no waiting data has left for a second. Commands in the data may arrive late or never."""
+        """Called when no waiting data has left for a second. Commands in this data may arrive late or never."""
 
     def link_drained(self, stalled_s: float) -> None:
         """Called when data leaves again, after ``stalled_s`` seconds."""
@@ -71,7 +71,7 @@ class BurstListener(Receiver, Protocol):
     """A receiver that processes the data of one read burst together. Used by links with `Link.reports_bursts`."""
 
     def burst_ended(self) -> None:
-        """Called after the ``bytes_received`` calls of one burst, before those of a later loop iteration."""
+        """Called at the end of a burst, after its last ``bytes_received`` and before that of any later data."""
 
 
 @runtime_checkable
@@ -79,14 +79,14 @@ class PeerListener(Receiver, Protocol):
     """A receiver that is notified of connecting and disconnecting peers, i.e. the clients of a TCP server."""
 
     def peer_joined(self, peer: Peer) -> None:
-        """Called when a peer has connected. It may never send anything."""
+        """Called when a peer has connected, even if the peer never sends anything."""
 
     def peer_left(self, peer: Peer) -> None:
         """Called when a peer has disconnected."""
 
 
 def keeps_peers(receiver: Receiver) -> bool:
-    """Return True if the receiver decides which peers a link remembers."""
+    """Return True if the receiver is a `PeerKeeper` that decides which peers a link remembers."""
     return isinstance(receiver, PeerKeeper) and receiver.keeps_peers
 
 
@@ -139,11 +139,11 @@ class Link(ABC):
         return 0
 
     def unsent_bytes_to(self, peer: Peer) -> int:
-        """Return `unsent_bytes` of one peer, or of all peers if the link does not count them separately."""
+        """Return the unsent bytes of one peer; if the link does not count per peer, those of all peers."""
         return self.unsent_bytes
 
     def discard_unsent(self) -> None:
-        """Discard data that has not left, and count it in `dropped_writes`.
+        """Discard written data that has not left this machine, and count it in `dropped_writes`.
 
         Data in the kernel's TCP buffer cannot be discarded; it stays in `unsent_bytes`.
         """
@@ -190,13 +190,13 @@ class _State(enum.Enum):
 
 
 class BaseLink(Link):
-    """State machine of a link. Subclasses implement `_connect`, `_release` and `write`."""
+    """Base class of links, with their state machine. Subclasses implement `_connect`, `_release` and `write`."""
 
     def __init__(self, address: str) -> None:
         self.address = address
         self.dropped_writes: int = 0
         self._state = _State.NEW
-        self._receiver: Receiver | None = None  # None: no callbacks
+        self._receiver: Receiver | None = None  # None before the opening and after the end: nothing is called
         self._keeps_peers = False
         self._stalled_at: float | None = None
         self._released = asyncio.Event()
@@ -216,7 +216,7 @@ class BaseLink(Link):
         if self._is_closed:
             self._release()
             raise ConnectionClosed(f"{self.address} was closed while it was being opened")
-        if self._state is _State.OPENING:  # otherwise the link was lost already
+        if self._state is _State.OPENING:  # In any other state, the link was lost while it was being opened.
             self._state = _State.OPEN
 
     def close(self) -> None:
@@ -247,7 +247,7 @@ class BaseLink(Link):
         self.dropped_writes += writes
 
     def _report_stalled(self, is_stalled: bool) -> None:
-        """Notify the receiver when the first transport of this link stalls, and when all have recovered."""
+        """Notify the receiver when one of the link's transports stalls, and when none is stalled any more."""
         now, stalled_at = asyncio.get_running_loop().time(), self._stalled_at
         was_stalled = stalled_at is not None
         if is_stalled == was_stalled:
@@ -317,7 +317,7 @@ _HINTS = {
 
 
 def import_optional(address: str, module: str, package: str, extra: str) -> Any:
-    """Import a module; raise LinkOpenError with the package to install if it is missing."""
+    """Import an optional module. If it is missing, raise a LinkOpenError that names the package to install."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
@@ -347,11 +347,11 @@ class MemoryLink(BaseLink):
         self._latency_s = latency_s
         self._far: MemoryLink | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._inbox: deque[tuple[float, bytes | None]] = deque()  # (due, data or None: the far end has closed)
+        self._inbox: deque[tuple[float, bytes | None]] = deque()  # (due time, data); data is None if the far end closed
         self._wake_up: asyncio.Handle | None = None
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; the far end receives it in a later loop iteration."""
+        """See `Link.write`. The far end receives the data in a later loop iteration."""
         if self._receiver is not None and self._far is not None:
             self._far._post(bytes(data), self)
 
@@ -365,10 +365,10 @@ class MemoryLink(BaseLink):
         self._inbox.clear()
         was_open, self._loop = self._loop is not None, None
         if was_open and self._far is not None:
-            self._far._post(None, self)
+            self._far._post(None, self)  # The far end reports its loss after the data that was written before.
 
     def _post(self, data: bytes | None, sender: MemoryLink) -> None:
-        """Schedule the arrival of ``sender``'s data; None: ``sender`` was closed."""
+        """Schedule the arrival of data from ``sender``; None means that ``sender`` was closed."""
         if self._loop is None or self._receiver is None:
             if data is not None:
                 sender.dropped_writes += 1
@@ -386,11 +386,12 @@ class MemoryLink(BaseLink):
         self._wake_up = None
         if self._loop is None or not self._inbox:
             return
-        now = max(self._loop.time(), self._inbox[0][0])  # a timer may fire early by the clock's resolution
-        # Counted before the delivery, so that data written by the receiver arrives in a later loop iteration.
+        now = max(self._loop.time(), self._inbox[0][0])  # A timer may fire early by the clock's resolution.
+        # Due items are counted before the delivery, because the receiver may write data that is due at once. This data
+        # must arrive in a later loop iteration.
         due_count = 1 if len(self._inbox) == 1 else sum(due <= now for due, _ in self._inbox)
         for _ in range(due_count):
-            if not self._inbox:  # closed by the receiver
+            if not self._inbox:  # The receiver has closed the link in its callback.
                 return
             _, data = self._inbox.popleft()
             if data is None:

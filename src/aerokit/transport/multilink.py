@@ -20,7 +20,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class LinkPeer(NamedTuple):
-    """A peer behind one of several links."""
+    """A peer of a `MultiLink`: one of the links, and a peer of this link."""
 
     link: int
     """Index of the link."""
@@ -48,8 +48,8 @@ class MultiLink(Link):
     Args:
         factories: functions that create the links, called for the first and every later attempt to open them.
         costly: indices of links that are used only when the others fail.
-        survives_loss: if all links are lost, True keeps this link open, reports an interruption and reopens the links
-            as soon as possible; False reports this link as lost for good.
+        survives_loss: what happens when all links are lost. True keeps this link open, reports an interruption and
+            reopens the links as soon as possible. False reports this link as lost for good.
     """
 
     is_multilink = True
@@ -62,10 +62,10 @@ class MultiLink(Link):
         survives_loss: bool = False,
     ) -> None:
         if not factories:
-            raise InvalidArgument("factories = [] is not allowed: at least one link")
+            raise InvalidArgument("factories = [] is not allowed: at least one link is needed")
         unknown_links = [index for index in costly if not 0 <= index < len(factories)]
         if unknown_links:
-            raise InvalidArgument(f"costly = {unknown_links} is not allowed: there are links 0 to {len(factories) - 1}")
+            raise InvalidArgument(f"costly = {unknown_links} is not allowed: the indices are 0 to {len(factories) - 1}")
         self.costly: frozenset[int] = frozenset(costly)
         """Indices of links that are used only when the others fail."""
         self._factories = tuple(factories)
@@ -74,9 +74,10 @@ class MultiLink(Link):
         self._receiver: Receiver | None = None
         self._was_opened = self._is_closed = False
         self._is_available = [False] * len(self._links)
-        self._kept: list[set[Peer]] = [set() for _ in self._links]  # peers to keep again at a reopened link
+        # For each link, the peers that the receiver keeps. After a reopening, `keep_peer` is called again for them.
+        self._kept: list[set[Peer]] = [set() for _ in self._links]
         self._openings: set[asyncio.Task[None]] = set()
-        self._foreign: set[int] = set()  # links that another owner opened and closes
+        self._foreign: set[int] = set()  # link objects that are open elsewhere, so that they must not be closed here
         self._is_opening = False
         self._last_loss: LinkLost | None = None
         self._lost_at: float | None = None
@@ -84,7 +85,7 @@ class MultiLink(Link):
 
     @property
     def address(self) -> str:  # type: ignore[override]
-        """``udpin:0.0.0.0:14550 + serial:///dev/ttyUSB0:57600``."""
+        """The addresses of all links: ``udpin:0.0.0.0:14550 + serial:///dev/ttyUSB0:57600``."""
         return " + ".join(self.names)
 
     @property
@@ -110,7 +111,7 @@ class MultiLink(Link):
         self._links[link].discard_unsent()
 
     def is_available(self, link: int) -> bool:
-        """Return True if a link is open and not interrupted."""
+        """Return True if the link with this index is open."""
         return self._is_available[link]
 
     async def open(self, receiver: Receiver) -> None:
@@ -136,7 +137,7 @@ class MultiLink(Link):
             if failure is not None and not self._is_closed:
                 logger.warning("one of several links cannot be opened and is retried: %s", failure)
                 self._start_opening(index)
-        self._check_all_lost()
+        self._check_all_lost()  # A link may have been lost while others were still being opened.
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`; None writes to every peer of every link."""
@@ -168,7 +169,7 @@ class MultiLink(Link):
         if not self._is_closed:
             self._is_closed, self._receiver = True, None
             for task in self._openings:
-                with contextlib.suppress(RuntimeError):  # the loop is closed
+                with contextlib.suppress(RuntimeError):  # The loop may be closed.
                     task.cancel()
             for link in self._own_links:
                 link.close()
@@ -192,7 +193,7 @@ class MultiLink(Link):
             await self._links[index].open(receiver)
         except LinkOpenError as error:
             return error
-        except BusyError:  # a link object that another connection uses
+        except BusyError:  # The given link object is already used by another connection.
             self._foreign.add(index)
             raise
         if not receiver.is_lost:
@@ -206,7 +207,7 @@ class MultiLink(Link):
         await asyncio.wait(openings)
         for link in self._own_links:
             link.close()
-        # Make new links for another call of open(), because a closed link cannot be opened again.
+        # open() may be called again, and then needs new links, because a closed link cannot be opened again.
         for index, make_link in enumerate(self._factories):
             if index not in self._foreign:
                 self._links[index] = make_link()
@@ -226,7 +227,8 @@ class MultiLink(Link):
             if error is None:
                 return
             logger.debug("the link still cannot be opened: %s", error)
-            # The first failure is not reported, because no subscriber of the connection's events is attached yet.
+            # open() does not report a failure to the receiver, because the connection has no subscribers then. The
+            # first failed retry is reported instead.
             if not is_reported and isinstance(self._receiver, MemberLinkListener):
                 is_reported = True
                 self._receiver.member_link_open_failed(index, error)
@@ -244,7 +246,7 @@ class MultiLink(Link):
         self._check_all_lost()
 
     def _check_all_lost(self) -> None:
-        """Report a loss or an interruption if no link is available. Does nothing during the first opening."""
+        """If no link is available, report an interruption or a loss. Does nothing while `open` is running."""
         receiver, error = self._receiver, self._last_loss
         if error is None or receiver is None or self._is_opening:
             return
@@ -261,6 +263,7 @@ class MultiLink(Link):
         receiver.link_lost(lost)
 
     def _on_restored(self, index: int) -> None:
+        """Continue with a link that was opened or reopened. It may end an interruption of all links."""
         self._is_available[index] = True
         for peer in self._kept[index]:
             self._links[index].keep_peer(peer)

@@ -12,22 +12,22 @@ WRITE_TIMEOUT_S = 1.0
 """Seconds after which waiting data is dropped, because a late command is worse than none."""
 
 STALLED_AFTER_S = 1.0
-"""Time without progress after which a link counts as stalled."""
+"""A link counts as stalled if data waits, and none has left this machine for this many seconds."""
 
 _POLL_INTERVAL_S = 0.25
-_MAX_JOINED_BYTES = 1024  # small frames that waited are joined up to this size
+_MAX_JOINED_BYTES = 1024  # Small frames that have waited are joined to writes of up to this size.
 
 
 class Outbox:
-    """Write buffer of one transport: forwards writes while the transport accepts them, and keeps them otherwise.
+    """Write buffer of one transport: forwards writes while the transport accepts them, and buffers them otherwise.
 
-    At most ``limit`` bytes (or one larger write) are kept, for at most `WRITE_TIMEOUT_S`. While the transport is
+    At most ``limit`` bytes (or one larger write) are buffered, for at most `WRITE_TIMEOUT_S`. While the transport is
     stalled, nothing is forwarded, because data in the transport cannot be discarded.
 
     Args:
         send: writes bytes to the transport.
         pending: returns the number of unsent bytes in the transport and the kernel.
-        limit: maximum number of bytes kept.
+        limit: maximum number of buffered bytes.
         dropped: called with the number of dropped writes.
         stalled: called with True when no waiting data has left for `STALLED_AFTER_S`, with False when it leaves again.
     """
@@ -46,9 +46,9 @@ class Outbox:
         self._dropped, self._on_stalled = dropped, stalled
         self._waiting: deque[tuple[float, bytes]] = deque()  # (deadline, frame)
         self._waiting_bytes = 0
-        self._forwarded_bytes = 0  # bytes written to the transport
-        self._sent_bytes = 0  # bytes that had left this machine at the last poll
-        self._progress_at = 0.0  # time of the last progress, or of the start of waiting
+        self._forwarded_bytes = 0  # number of bytes written to the transport
+        self._sent_bytes = 0  # number of bytes that had left this machine at the last poll
+        self._progress_at = 0.0  # time at which data last left this machine, or at which polling began
         self._is_full = False  # True between pause() and resume()
         self._is_stalled = self._is_closed = False
         self._timer: asyncio.TimerHandle | None = None
@@ -62,7 +62,7 @@ class Outbox:
         return self._waiting_bytes + self._pending()
 
     def write(self, data: bytes) -> None:
-        """Forward, keep or drop data. Never blocks."""
+        """Forward data to the transport, buffer it, or drop it if there is no room. Never blocks."""
         if self._is_closed:
             self._dropped(1)
             return
@@ -75,11 +75,11 @@ class Outbox:
             self._schedule_poll()
 
     def pause(self) -> None:
-        """Keep data from now on, because the transport accepts no more."""
+        """Buffer writes from now on, because the transport's own write buffer is full."""
         self._is_full = True
 
     def resume(self) -> None:
-        """Forward the kept data, because the transport accepts data again."""
+        """Forward the buffered data, because the transport accepts data again."""
         self._is_full = False
         if self._is_closed:
             return
@@ -88,17 +88,17 @@ class Outbox:
         self._flush()
 
     def discard(self) -> None:
-        """Drop the data in this buffer. Data in the transport is kept."""
+        """Drop the data in this buffer, but not data that was already forwarded to the transport."""
         self._dropped(len(self._waiting))
         self._waiting.clear()
         self._waiting_bytes = 0
 
     def reclaimed(self, count: int) -> None:
-        """Record that bytes were removed from the transport or kernel without being sent."""
+        """Record that this many bytes were removed from the transport or the kernel without being sent."""
         self._forwarded_bytes -= count
 
     def close(self) -> None:
-        """Forward waiting data, or drop it if the transport is stalled. Only ``dropped`` is called afterwards."""
+        """Forward waiting data; if the transport is stalled, drop it. Afterwards, only ``dropped`` is called."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -126,7 +126,7 @@ class Outbox:
             self._forward(self._joined())
 
     def _joined(self) -> bytes:
-        """Return the next write, joined with following writes up to `_MAX_JOINED_BYTES`."""
+        """Remove the next write and return it, joined with following writes up to `_MAX_JOINED_BYTES`."""
         data = self._pop_oldest()
         while self._waiting and len(data) + len(self._waiting[0][1]) <= _MAX_JOINED_BYTES:
             data += self._pop_oldest()
@@ -160,7 +160,7 @@ class Outbox:
         self._timer = None
         self._drop_outdated()
         pending, now = self._pending(), self._loop.time()
-        sent_bytes = self._forwarded_bytes - pending
+        sent_bytes = self._forwarded_bytes - pending  # Forwarded bytes that are no longer pending have left.
         is_idle = not (pending or self._waiting or self._is_full)
         if sent_bytes != self._sent_bytes or is_idle:
             self._sent_bytes, self._progress_at = sent_bytes, now
@@ -180,12 +180,12 @@ class Outbox:
 
 
 def kernel_unsent_bytes(fd: int) -> int:
-    """Return the bytes in the kernel that are unsent or unacknowledged; 0 on systems other than Linux."""
+    """Return the number of bytes in the kernel that are unsent or unacknowledged; 0 on systems other than Linux."""
     if sys.platform != "linux":
         return 0
     import fcntl
     import termios
 
-    with contextlib.suppress(OSError, ValueError):  # the descriptor was closed meanwhile
+    with contextlib.suppress(OSError, ValueError):  # The descriptor may have been closed.
         return int.from_bytes(fcntl.ioctl(fd, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
     return 0

@@ -33,7 +33,7 @@ MAX_RETRY_DELAY_S = 5.0
 
 
 class Backoff:
-    """Delays between attempts, doubled each time: 0.2 s, 0.4 s, … 5 s."""
+    """Delays between attempts, doubled each time: by default 0.2 s, 0.4 s, … 5 s."""
 
     def __init__(self, min_s: float = MIN_RETRY_DELAY_S, max_s: float = MAX_RETRY_DELAY_S) -> None:
         self._min_s, self._max_s = min_s, max_s
@@ -84,10 +84,10 @@ class ReconnectingLink(Link):
         self._make_link = make_link
         self._link = make_link()
         self._backoff = Backoff(min_delay_s, max_delay_s)
-        self._receiver: Receiver | None = None  # None: no callbacks
-        self._current: _CurrentReceiver | None = None  # callbacks of earlier links are ignored
+        self._receiver: Receiver | None = None  # None before the opening and after the end: nothing is called
+        self._current: _CurrentReceiver | None = None  # receiver of the current link; callbacks of others are ignored
         self._was_opened = self._is_closed = self._is_up = False
-        self._lost_at: float | None = None  # None while the link is not reported as lost
+        self._lost_at: float | None = None  # time of the reported loss; None while no loss is reported
         self._reopening: asyncio.Task[None] | None = None
         self._stable_timer: asyncio.TimerHandle | None = None
         self._dropped = 0
@@ -132,7 +132,7 @@ class ReconnectingLink(Link):
         try:
             await self._link.open(current)
         except BaseException:
-            self._cancel_reopening()  # the link may have been lost while it was being opened
+            self._cancel_reopening()  # running if the link was lost while it was being opened
             self._receiver = self._current = self._lost_at = None
             self._was_opened = False
             raise
@@ -180,7 +180,8 @@ class ReconnectingLink(Link):
         if current is self._current and self._lost_at is not None:
             self._is_up = True
             self._on_restored()
-        if current is self._current and self._receiver is not None:  # the callback above has not closed the link
+        # The callback above may have closed this link.
+        if current is self._current and self._receiver is not None:
             self._receiver.bytes_received(data, peer)
 
     def _drain_listener(self, current: _CurrentReceiver) -> DrainListener | None:
@@ -201,7 +202,8 @@ class ReconnectingLink(Link):
             logger.warning("%s; reopening it", error)
             if isinstance(self._receiver, InterruptionListener):
                 self._receiver.link_interrupted(error)
-        if self._reopening is None and self._receiver is not None:  # the callback above has not closed the link
+        # The callback above may have closed this link.
+        if self._reopening is None and self._receiver is not None:
             self._reopening = asyncio.get_running_loop().create_task(self._reopen(), name="aerokit reopening")
 
     # ----------------------------------------------------------------------- reopening
@@ -210,7 +212,7 @@ class ReconnectingLink(Link):
         try:
             while not await self._try_to_open():
                 pass
-        except Exception as error:  # make_link failed, so further attempts are useless
+        except Exception as error:  # The program's make_link() raised, so further attempts are useless.
             lost = LinkLost(f"{self.address} cannot be reopened: {error}")
             lost.__cause__ = error
             self._end(lost)
@@ -218,7 +220,7 @@ class ReconnectingLink(Link):
             self._reopening = None
 
     async def _try_to_open(self) -> bool:
-        """Wait, and try once to open a new link. Return True if no further attempt is needed."""
+        """Wait, then try once to open a new link. Return True if it is open, or if this link has ended."""
         await self._link.wait_closed()
         await asyncio.sleep(self._backoff.next_delay())
         link = self._make_link()
@@ -230,7 +232,8 @@ class ReconnectingLink(Link):
         except OSError as error:
             logger.debug("the link still cannot be opened: %s", error)
             return False
-        if current.is_lost:  # during the opening; further attempts follow, unless that was the end of a recording
+        if current.is_lost:  # The new link was lost while it was being opened.
+            # Without a receiver, this link has ended, too (the end of a recording). Otherwise another attempt follows.
             return self._receiver is None
         self._is_up = True
         if self._lost_at is not None:
@@ -238,6 +241,7 @@ class ReconnectingLink(Link):
         return True
 
     def _on_restored(self) -> None:
+        """Report that the link is back, because the reopened link has been stable or has delivered bytes."""
         self._cancel_stable_timer()
         if self._lost_at is None:
             return
@@ -255,7 +259,7 @@ class ReconnectingLink(Link):
     def _cancel_reopening(self) -> None:
         self._cancel_stable_timer()
         if self._reopening is not None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
+            with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 self._reopening.cancel()
 
     def _cancel_stable_timer(self) -> None:

@@ -71,13 +71,13 @@ class Replay(BaseLink):
             stamp, frame = self._next
             self._deliver(frame)
             self._advance(stamp)
-        if self._next is None:  # `_lose` does nothing if the receiver has closed the link
+        if self._next is None:  # If the receiver has closed the link, `_lose` does nothing.
             self._lose(f"end of recording after {self.frames} frames", kind=RecordingEnded)
         else:
             self._wake_up = self._loop.call_at(max(now, self._due), self._play)
 
     def _advance(self, stamp: float) -> None:
-        if self._receiver is None:  # closed by the receiver
+        if self._receiver is None:  # The receiver has closed the link in its callback.
             return
         try:
             self._next = next(self._records, None)

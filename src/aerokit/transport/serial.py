@@ -38,11 +38,11 @@ _READ_SIZE = 4096
 
 _LINGER_STEP_S = 0.005
 
-_MAX_BUFFER_S = 2.0  # data that waits for longer would be outdated when it arrives
+_MAX_BUFFER_S = 2.0  # The write buffer holds data for this time. Older data would be outdated when it arrives.
 
 
 class AddressError(SerialException, InvalidArgument):  # type: ignore[misc]  # pyserial has no types
-    """An invalid connection string. Also a SerialException, because pymavlink raises that."""
+    """An invalid connection string. It is also a SerialException, which pymavlink raises for such a string."""
 
 
 class SerialLink(BaseLink):
@@ -73,7 +73,7 @@ class SerialLink(BaseLink):
             self._outbox.write(data)
 
     def discard_unsent(self) -> None:
-        """See `Link.discard_unsent`. Also clears the driver's buffer, which may truncate a frame."""
+        """See `Link.discard_unsent`. Also clears the driver's buffer, which may cut off a frame that is being sent."""
         if self._outbox is None or not self._loop or self._loop.is_closed():
             return
         self._outbox.discard()
@@ -83,7 +83,7 @@ class SerialLink(BaseLink):
             self._port.reset_output_buffer()
         discarded_bytes = bytes_before - self._waiting_to_be_sent(self._transport)
         self._outbox.reclaimed(discarded_bytes)
-        if discarded_bytes > 0:
+        if discarded_bytes > 0:  # The number of writes in these bytes is unknown: count one.
             self._drop(1)
 
     async def _connect(self) -> None:
@@ -96,7 +96,9 @@ class SerialLink(BaseLink):
         )
         _replace_calls(port, self._device_failed)
         limit = max(4096, int(self._baud / 10 * _MAX_BUFFER_S))
-        self._transport.set_write_buffer_limits(high=0)  # data that the driver does not accept waits in the outbox
+        # The transport must buffer nothing itself: data that the driver does not accept waits in the outbox, where it
+        # can be discarded.
+        self._transport.set_write_buffer_limits(high=0)
         self._outbox = Outbox(
             self._transport.write,
             partial(self._waiting_to_be_sent, self._transport),
@@ -118,7 +120,7 @@ class SerialLink(BaseLink):
                 self._device, self._baud, rtscts=self._rtscts, exclusive=True, timeout=0, write_timeout=0
             )
         except _TermiosError as error:
-            # pyserial does not convert this error, which occurs when the device vanishes during opening.
+            # This error occurs if the device vanishes while it is being opened. pyserial does not convert it.
             raise serial.SerialException(*error.args) from error
 
     def _device_failed(self, error: OSError) -> None:
@@ -133,11 +135,11 @@ class SerialLink(BaseLink):
         if transport is None or self._loop is None:
             return
         if outbox is not None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
+            with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 outbox.close()
         transport.pause_reading()
         if self._loop.is_running():
-            linger_s = LINGER_S if self._is_closed else 0.0  # nothing can be sent to a lost device
+            linger_s = LINGER_S if self._is_closed else 0.0  # If the device was lost, nothing can be sent any more.
             self._loop.call_soon(self._close_when_sent, transport, self._loop.time() + linger_s)
         else:
             self._close_port(transport)
@@ -156,12 +158,13 @@ class SerialLink(BaseLink):
 
     def _close_port(self, transport: Any) -> None:
         unsent = self._waiting_to_be_sent(transport)
-        with contextlib.suppress(RuntimeError):  # the loop is closed
-            transport.pause_reading()  # again, because the first call has no effect before the first loop iteration
+        with contextlib.suppress(RuntimeError):  # The loop may be closed.
+            # `_release` has already called this, but a call before the transport's first loop iteration has no effect.
+            transport.pause_reading()
             transport.flush()
         if unsent:
             with contextlib.suppress(Exception):
-                self._port.reset_output_buffer()  # with data in the buffer, close() would wait for up to 30 s
+                self._port.reset_output_buffer()  # Otherwise close() would wait up to 30 s for the unsent data.
         self._port.close()
         self._released.set()
 
@@ -178,17 +181,18 @@ class _SerialProtocol(asyncio.Protocol):
             self._link._outbox.pause()
 
     def resume_writing(self) -> None:
-        # Resume in a later loop iteration, because the transport is in the middle of a write.
+        # The outbox resumes in a later loop iteration, because the transport calls this method during a write.
         if self._link._outbox is not None and self._link._loop is not None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
+            with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 self._link._loop.call_soon(self._link._outbox.resume)
 
-    def connection_lost(self, exc: Exception | None) -> None:  # only called for errors outside the replaced methods
+    # The replaced methods report their errors themselves. This is called for all other errors.
+    def connection_lost(self, exc: Exception | None) -> None:
         self._link._lose(f"the device failed: {exc}", exc)
 
 
 def _replace_calls(port: Any, on_failure: _OnFailure) -> None:
-    """Replace the methods of a port by methods that never block and report a lost device to ``on_failure``."""
+    """Replace methods of a port, so that they never block, and report a lost device to ``on_failure``."""
     port.flush = lambda: None
     if os.name == "posix":
         port.read = partial(_read, port.fileno(), on_failure)
@@ -205,7 +209,7 @@ def _read(fd: int, on_failure: _OnFailure, _size: int) -> bytes:
     except OSError as error:
         on_failure(error)
         return b""
-    if not data:  # end of file
+    if not data:  # The end of the file means that the device is gone.
         on_failure(OSError(errno.ENODEV, "unplugged"))
     return data
 
@@ -214,15 +218,16 @@ def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -
     try:
         return write(data)
     except (BlockingIOError, InterruptedError):
-        raise  # the transport retries later
+        raise  # The transport retries such a write by itself.
     except OSError as error:
         on_failure(error)
-        return len(data)  # the transport must not retry, because the link is closed soon
+        return len(data)  # Report the data as written, so that the transport does not retry: the link is closed soon.
 
 
 def _open_error(address: str, error: Exception) -> OSError:
     number = error.errno if isinstance(error, OSError) else None
-    if number is None and str(errno.ENOTTY) in str(error):  # an error of termios has its number only in the text
+    # An error of termios has no `errno`: its number is only in the text.
+    if number is None and str(errno.ENOTTY) in str(error):
         number = errno.ENOTTY
     cause = OSError(number, os.strerror(number)) if number else OSError(str(error))
     is_missing = number in (errno.ENOENT, errno.ENXIO, errno.ENODEV)
@@ -277,7 +282,7 @@ class PtyLink(BaseLink):
         import tty
 
         self._loop = asyncio.get_running_loop()
-        # Keep the other end open too, because our end fails while no process has the other end open.
+        # The other end is kept open here, because reading our end fails while no process has the other end open.
         ours, theirs = self._ends = os.openpty()
         tty.setraw(theirs)
         os.set_blocking(ours, False)
@@ -289,7 +294,8 @@ class PtyLink(BaseLink):
         self._loop.add_reader(ours, self._read)
 
     def _make_symlink(self, target: str) -> None:
-        if os.path.islink(self._path) and not os.path.exists(self._path):  # dangling, e.g. of a killed program
+        # A symbolic link without a target is left over, e.g. from a killed program.
+        if os.path.islink(self._path) and not os.path.exists(self._path):
             os.unlink(self._path)
         os.symlink(target, self._path)
         self._has_symlink = True

@@ -23,7 +23,7 @@ class SocketAddress(NamedTuple):
     """Address family, and an address for ``socket.bind`` or ``connect``."""
 
     family: int
-    address: Any  # a tuple, whose length depends on the family
+    address: Any  # a tuple of two elements for IPv4, of four for IPv6
 
 
 async def resolve(host: str, port: int, kind: socket.SocketKind) -> list[SocketAddress]:
@@ -40,14 +40,14 @@ async def resolve(host: str, port: int, kind: socket.SocketKind) -> list[SocketA
 
 
 async def bound_socket(host: str, port: int, kind: socket.SocketKind) -> socket.socket:
-    """Return a non-blocking socket bound to the first possible address; raise the last OSError if there is none.
+    """Return a non-blocking socket, bound to the first address that can be bound; raise the last OSError if none can.
 
     "::" also receives IPv4. UDP ports are not shared (no SO_REUSEADDR), because a second listener would silently take
     the datagrams of the first.
     """
     addresses = await resolve(host, port, kind)
     for address in addresses[:-1]:
-        with contextlib.suppress(OSError):  # try the next address
+        with contextlib.suppress(OSError):  # If it cannot be bound, the next address is tried.
             return bind_to(address, kind)
     return bind_to(addresses[-1], kind)
 
@@ -66,8 +66,8 @@ def bind_to(address: SocketAddress, kind: socket.SocketKind) -> socket.socket:
         sock.setblocking(False)
         if address.family == socket.AF_INET6:
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
-        # With SO_REUSEADDR, a TCP port that was just closed can be bound again. On Windows the option would share the
-        # port with another program.
+        # With SO_REUSEADDR, a TCP port can be bound again just after it was closed. The option is not set on Windows,
+        # where another program could then bind the same port at the same time.
         if kind is socket.SOCK_STREAM and hasattr(socket, "AF_UNIX"):
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind(address.address)
@@ -84,8 +84,8 @@ def discard_on_close(sock: socket.socket) -> None:
 
 
 def has_more(sock: socket.socket) -> Callable[[], object]:
-    """Return a function whose result is true if data can be read. A call costs a third of a failed read."""
-    if sys.platform == "win32":  # Windows has no poll
+    """Return a function that returns true if data can be read. It takes a third of the time of a failed read."""
+    if sys.platform == "win32":  # Windows has no poll(), so a read is always attempted.
         return partial(bool, True)
     poll = select.poll()
     poll.register(sock, select.POLLIN)
@@ -112,7 +112,7 @@ class AllowedPeers:
     def __init__(self, peers: PeerFilter | None) -> None:
         self._networks = None if peers is None else tuple(map(_parse_network, _as_iterable(peers)))
         if self._networks == ():
-            raise InvalidArgument("peers = [] is not allowed: at least one IP address or network, or None")
+            raise InvalidArgument("peers = [] is not allowed: give at least one IP address or network, or None for all")
 
     def allows(self, host: str) -> bool:
         if self._networks is None:
@@ -132,6 +132,7 @@ def _as_iterable(peers: PeerFilter) -> Iterable[object]:
 
 
 def _parse_network(peer: object) -> Network:
+    """Convert one value of ``peers``. A single IP address becomes a network with one address."""
     reason = "wrong type"
     if isinstance(peer, _PEER_TYPES):
         try:
@@ -153,7 +154,7 @@ def port_bind_error(host: str, port: int, *, udp: bool) -> OSError | None:
     """Return the error of binding an IPv4 port (errno.EADDRINUSE if it is in use), or None if it is free."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM if udp else socket.SOCK_STREAM) as sock:
         if not udp and os.name == "posix":
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just closed is free
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # A port that was just closed counts as free.
         try:
             sock.bind((host, port))
         except OSError as error:

@@ -27,7 +27,8 @@ CONNECT_TIMEOUT_S = 10.0
 """Default time-out of `TcpConnect.open`."""
 
 MAX_PENDING_BYTES = 256 * 1024
-"""Write buffer per connection. Writes beyond this size are dropped, and so is data that has waited for a second."""
+"""Size of each connection's write buffer in bytes. Writes that do not fit are dropped, and so are those older than 1 s.
+"""
 
 SEND_BUFFER = 16 * 1024
 """Kernel send buffer (Linux doubles it). The buffer is small because data in it cannot be discarded."""
@@ -35,8 +36,8 @@ SEND_BUFFER = 16 * 1024
 NOT_SENT_LOW_WATER = 1024
 """Limit of unsent data in the kernel (TCP_NOTSENT_LOWAT, where available)."""
 
-# Loop iterations from accepting a client to `connection_made`. A closed link waits for them, because the connection of
-# a client that was just accepted can only be closed then.
+# Maximum number of loop iterations between accepting a client and `connection_made`. A closed link waits for so many
+# iterations, because the connection of a client can only be closed once `connection_made` was called.
 ACCEPT_ITERATIONS = 5
 
 MAX_CLIENTS = 64
@@ -49,7 +50,7 @@ class _TcpLink(BaseLink):
     def __init__(self, scheme: str, host: str, port: int) -> None:
         super().__init__(f"{scheme}:{host_and_port(host, port)}")
         self._host, self._port = host, port
-        self._streams: set[_Stream] = set()  # including closing streams
+        self._streams: set[_Stream] = set()  # includes streams that are closed, but still send their remaining data
         self._stalled: set[_Stream] = set()
 
     @property
@@ -70,7 +71,7 @@ class _TcpLink(BaseLink):
     def _add_stream(self, stream: _Stream) -> None:
         self._streams.add(stream)
         self._released.clear()
-        if self._receiver is None:  # the link was closed while this connection was being made
+        if self._receiver is None:  # The link was closed while this connection was being made.
             stream.close()
         else:
             self._on_connected(stream)
@@ -115,7 +116,7 @@ class TcpConnect(_TcpLink):
     async def _connect(self) -> None:
         with anyio.move_on_after(self._connect_timeout_s):
             return await self._connect_to_any(await resolve(self._host, self._port, socket.SOCK_STREAM))
-        # Reached only after the time-out.
+        # The block above returns after a success, so this line is reached only after the time-out.
         raise OSError(errno.ETIMEDOUT, f"no answer within {self._connect_timeout_s:g} s")
 
     async def _connect_to_any(self, addresses: list[SocketAddress]) -> None:
@@ -124,7 +125,7 @@ class TcpConnect(_TcpLink):
             try:
                 return await self._connect_to(address)
             except OSError as error:
-                first_error = first_error or error
+                first_error = first_error or error  # The first address is the preferred one, so its error is raised.
         raise first_error or OSError(errno.EADDRNOTAVAIL, "the host has no address")
 
     async def _connect_to(self, address: SocketAddress) -> None:
@@ -140,10 +141,11 @@ class TcpConnect(_TcpLink):
         try:
             await loop.create_connection(lambda: stream, sock=sock)
         except BaseException:
-            self._stream = None  # the link was never open, so this is not a loss
+            self._stream = None  # Without this, closing the stream would count as the loss of an open link.
             stream.close()
-            sock.close()  # uvloop leaves the socket to the garbage collector
-            self._remove_stream(stream, None)  # uvloop does not call connection_lost
+            # On uvloop, the socket would stay open until it is garbage-collected, and `connection_lost` is not called.
+            sock.close()
+            self._remove_stream(stream, None)
             raise
 
     def _on_connected(self, stream: _Stream) -> None:
@@ -216,7 +218,7 @@ class TcpListen(_TcpLink):
             stream.close()
 
     async def wait_closed(self) -> None:
-        for _ in range(ACCEPT_ITERATIONS):  # a client that was just accepted is closed by `_add_stream`
+        for _ in range(ACCEPT_ITERATIONS):  # Meanwhile, `_add_stream` closes clients that were just accepted.
             await asyncio.sleep(0)
         await super().wait_closed()
         if self._server is not None and self._receiver is None:
@@ -229,10 +231,11 @@ class TcpListen(_TcpLink):
         self.address: str = f"tcpin:{host_and_port(self._host, self._local_address[1])}"
         loop = asyncio.get_running_loop()
         self._server = await loop.create_server(lambda: _Stream(self), sock=sock, backlog=16, start_serving=False)
-        self._socket = None  # from now on, closing the server closes the socket
+        self._socket = None  # The server now owns the socket and closes it.
         await self._server.start_serving()
 
     def _on_connected(self, stream: _Stream) -> None:
+        # The host is unknown if the client has already disconnected.
         host = stream.peer[0] if isinstance(stream.peer, tuple) else ""
         if (host and not self._allowed.allows(host)) or not self._make_room():
             stream.close()
@@ -242,7 +245,7 @@ class TcpListen(_TcpLink):
                 self._receiver.peer_joined(stream.peer)
 
     def _make_room(self) -> bool:
-        """Disconnect a client if there are too many. Return False if all of them are kept."""
+        """Disconnect a client if there are too many. Return False if no client may be disconnected."""
         if len(self._clients) < MAX_CLIENTS:
             return True
         unkept = next((peer for peer in self._clients if peer not in self._kept), None)
@@ -263,7 +266,7 @@ class TcpListen(_TcpLink):
     def _release(self) -> None:
         self._clients.clear()
         if self._server is not None:
-            with contextlib.suppress(RuntimeError):  # the loop and its sockets are closed
+            with contextlib.suppress(RuntimeError):  # The loop may be closed, and its sockets with it.
                 self._server.close()
         if self._socket is not None:
             self._socket.close()
@@ -306,7 +309,7 @@ class _Stream(asyncio.Protocol):
         """Send remaining data for up to `LINGER_S`, then close. Close at once if the connection is stalled."""
         if self._transport is None or self._outbox is None or self._transport.is_closing():
             return
-        with contextlib.suppress(RuntimeError):  # the loop is closed
+        with contextlib.suppress(RuntimeError):  # The loop may be closed.
             if self._outbox.is_stalled:
                 self._abort()
                 return
@@ -322,11 +325,14 @@ class _Stream(asyncio.Protocol):
         discard_on_close(sock)
         self._transport.abort()
 
-    def connection_made(self, transport: Any) -> None:  # not every loop's transport inherits from Transport
+    # The type of `transport` is Any, because the transports of some loops do not inherit from asyncio.Transport.
+    def connection_made(self, transport: Any) -> None:
         self._transport = transport
-        # The name is None if the client has disconnected already.
+        # The address is unknown (None) if the client has already disconnected. The peer then gets a unique name.
         self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"
-        transport.set_write_buffer_limits(high=0)  # data that cannot be sent at once waits in the outbox
+        # The transport must buffer nothing itself: data that cannot be sent at once waits in the outbox, where it can
+        # be discarded.
+        transport.set_write_buffer_limits(high=0)
         sock = transport.get_extra_info("socket")
         with contextlib.suppress(OSError):
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -362,7 +368,7 @@ class _Stream(asyncio.Protocol):
         return self._transport.get_write_buffer_size() + kernel_unsent_bytes(self._fd)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._fd = -1  # the system may reuse the number
+        self._fd = -1  # The system may give the same number to another file.
         if self._outbox is not None:
             self._outbox.discard()
             self._outbox.close()

@@ -33,10 +33,10 @@ MAX_PEERS = 256
 """Maximum number of peers if the receiver is not a `PeerKeeper`. A new peer replaces the least recent one."""
 
 REMOTE_TIMEOUT_S = 3.5
-"""Silence of the peer that answered a broadcast, after which its port or address may have changed."""
+"""After this silence of the peer that answered a broadcast, its address may have changed, so broadcasts start again."""
 
 _MAX_DATAGRAM_BYTES = 65535
-_RECEIVE_BUFFER = 1024 * 1024  # room for a burst of a log download while the program is busy
+_RECEIVE_BUFFER = 1024 * 1024  # enough for a burst of a log download that arrives while the program is busy
 _TRANSIENT_ERRORS = (
     errno.ENETDOWN,
     errno.ENETUNREACH,
@@ -55,9 +55,9 @@ class _UdpLink(BaseLink):
         self._host, self._port = host, port
         self._loop: asyncio.AbstractEventLoop | None = None
         self._socket: socket.socket | None = None
-        self._transport: asyncio.DatagramTransport | None = None  # only on loops without add_reader
+        self._transport: asyncio.DatagramTransport | None = None  # used only on loops without add_reader
         self._transport_owns_socket = False
-        # Tells whether another datagram waits. bool() returns False, because no socket is open yet.
+        # Function that returns whether another datagram can be read. The default, `bool`, returns False: no socket yet.
         self._has_more: Callable[[], object] = bool
         self._burst_listener: BurstListener | None = None
 
@@ -81,7 +81,7 @@ class _UdpLink(BaseLink):
         _enlarge_buffer(sock)
         try:
             self._loop.add_reader(sock, self._on_readable)
-        except NotImplementedError:
+        except NotImplementedError:  # The loop has no add_reader, e.g. the Proactor loop on Windows.
             await self._connect_without_reader(sock)
 
     async def _connect_without_reader(self, sock: socket.socket) -> None:
@@ -91,12 +91,12 @@ class _UdpLink(BaseLink):
         try:
             await self._loop.create_datagram_endpoint(lambda: _DatagramProtocol(self), sock=sock)
         except BaseException:
-            self._released.set()  # asyncio has closed the socket
+            self._released.set()  # asyncio has already closed the socket.
             raise
 
     def _transport_opened(self, transport: asyncio.DatagramTransport) -> None:
         self._transport = transport
-        if self._socket is None:  # the link was closed meanwhile
+        if self._socket is None:  # The link was closed while the endpoint was being created.
             self._release()
 
     def _transport_closed(self, error: Exception | None) -> None:
@@ -109,7 +109,7 @@ class _UdpLink(BaseLink):
         transport, self._transport = self._transport, None
         loop = None if self._loop is None or self._loop.is_closed() else self._loop
         if transport is not None and loop is not None:
-            transport.abort()  # _transport_closed runs in the next loop iteration
+            transport.abort()  # asyncio calls `_transport_closed` in the next loop iteration.
         if sock is not None and not self._transport_owns_socket:
             if loop is not None:
                 loop.remove_reader(sock)
@@ -126,7 +126,7 @@ class _UdpLink(BaseLink):
 
     def _read_burst(self) -> None:
         for _ in range(MAX_BURST_DATAGRAMS):
-            if self._socket is None:  # closed by the receiver
+            if self._socket is None:  # The receiver has closed the link in its callback.
                 return
             try:
                 data, source = self._socket.recvfrom(_MAX_DATAGRAM_BYTES)
@@ -140,7 +140,7 @@ class _UdpLink(BaseLink):
                 return
 
     def _receive_failed(self, error: OSError) -> None:
-        # A closed port at the other end, or a missing network, does not end a UDP link.
+        # A UDP link continues after errors that may pass, e.g. a closed port at the other end, or a missing network.
         if not isinstance(error, ConnectionError) and error.errno not in _TRANSIENT_ERRORS:
             self._lose(f"the socket failed: {error.strerror or error}", error)
 
@@ -154,7 +154,7 @@ class _UdpLink(BaseLink):
 
 
 class UdpListen(_UdpLink):
-    """``udpin:`` link: binds a port. Each sender is a peer, and gets what is written to all.
+    """``udpin:`` link: binds a port. Each sender becomes a peer, and gets the data that is written to all peers.
 
     With port 0, the system chooses a port. `address` and `local_address` have this port once the link is open.
     ``peers`` are the IP addresses and networks to accept; None: all.
@@ -163,7 +163,7 @@ class UdpListen(_UdpLink):
     def __init__(self, host: str, port: int, *, peers: PeerFilter | None = None) -> None:
         super().__init__("udpin", host, port)
         self._allowed = AllowedPeers(peers)
-        self._peers: dict[Peer, None] = {}  # most recent last
+        self._peers: dict[Peer, None] = {}  # ordered, the most recent peer last
         self._last_source: Peer = None
 
     @property
@@ -172,7 +172,7 @@ class UdpListen(_UdpLink):
         return tuple(reversed(self._peers))
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`. Data for all peers is not counted as dropped while there is no peer."""
+        """See `Link.write`. Data for all peers does not count as dropped if there is no peer yet."""
         if peer is None:
             for known_peer in self._peers:
                 self._send(data, known_peer)
@@ -196,7 +196,7 @@ class UdpListen(_UdpLink):
         return sock
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
-        if source != self._last_source:  # A sender is checked only when it changes, because most links have one peer.
+        if source != self._last_source:  # Consecutive datagrams of one sender are checked once, to save time.
             if source not in self._peers and not self._allowed.allows(source[0]):
                 return
             self._last_source = source
@@ -242,7 +242,7 @@ class UdpBroadcast(_UdpLink):
     once. Data for one peer is never broadcast. ``peers`` are the IP addresses and networks to accept; None: all.
     """
 
-    _received_at: float  # set with _remote
+    _received_at: float  # time of the last datagram from `_remote`; set together with `_remote`
 
     def __init__(self, host: str, port: int, *, peers: PeerFilter | None = None) -> None:
         super().__init__("udpbcast", host, port)
@@ -278,22 +278,24 @@ class UdpBroadcast(_UdpLink):
             return
         elif not self._keeps_peers:
             self.keep_peer(source)
-        # Without peers to keep, this is a link with a single remote end, whose peer is None.
+        # If the receiver keeps no peers, this link has a single remote end, and its peer is None.
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:
-        # A receiver that keeps peers checks the frames of another port before it accepts the port (`keep_peer`).
+        # Another port of the same host is passed on to a receiver that keeps peers. The receiver checks its frames
+        # before it accepts the port by `keep_peer`.
         is_same_host = self._keeps_peers and self._remote is not None and source[0] == self._remote[0]
         return (is_same_host or self._is_remote_silent()) and self._allowed.allows(source[0])
 
 
 class _DatagramProtocol(asyncio.DatagramProtocol):
-    """Reads the socket on loops without add_reader."""
+    """asyncio protocol that receives datagrams on loops without ``add_reader``."""
 
     def __init__(self, link: _UdpLink) -> None:
         self._link = link
 
-    def connection_made(self, transport: Any) -> None:  # not every loop's transport inherits from DatagramTransport
+    # The type of `transport` is Any, because the transports of some loops do not inherit from DatagramTransport.
+    def connection_made(self, transport: Any) -> None:
         self._link._transport_opened(transport)
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
@@ -309,7 +311,10 @@ class _DatagramProtocol(asyncio.DatagramProtocol):
 
 
 def _source_address(remote: SocketAddress) -> Any:
-    """Return the source address of datagrams from ``remote`` (0.0.0.0: this host); raises OSError without a route."""
+    """Return the address from which ``remote`` sends datagrams; raise OSError if there is no route to it.
+
+    It differs from the given address for 0.0.0.0, which means this host.
+    """
     with socket.socket(remote.family, socket.SOCK_DGRAM) as probe:
         probe.connect(remote.address)
         return probe.getpeername()

@@ -12,7 +12,7 @@ import anyio
 
 from aerokit._internal.arguments import checked
 from aerokit._internal.async_block import async_block
-from aerokit.connection.bus import copy_exception
+from aerokit.connection.bus import EVERY_SYSTEM, copy_exception
 from aerokit.connection.connection import Connection
 from aerokit.connection.heartbeats import OwnHeartbeat, is_autopilot
 from aerokit.connection.opening import explain_no_vehicle, open_connection
@@ -44,7 +44,7 @@ __all__ = ["connect", "vehicles_on", "warn_if_left_flying"]
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# An older heartbeat does not prove that the vehicle is present now, so the search waits for the next one.
+# A heartbeat older than this (seconds) does not prove that the vehicle is present, so the search waits for a new one.
 HEARTBEAT_MAX_AGE_S = 2.0
 
 # A component other than 1 counts as the autopilot after this many heartbeats, if component 1 has sent none.
@@ -118,24 +118,29 @@ async def connect(
     _check_arguments(system_id, timeout, rates, address.bus.dialect if isinstance(address, Connection) else dialect)
     if isinstance(address, Connection):
         if record is not None:
-            raise InvalidArgument("record = … is not allowed here: the connection is open; use its record()")
+            raise InvalidArgument(
+                "record = … is not allowed here: the connection is already open; use connection.record(…)"
+            )
         if signing is not None:
-            raise InvalidArgument("signing = … is not allowed here: the connection is open; set its attribute signing")
+            raise InvalidArgument(
+                "signing = … is not allowed here: the connection is already open; set connection.signing"
+            )
         if reconnect:
             raise InvalidArgument(
-                "reconnect = True is not allowed here: the connection is open; pass it to open_connection"
+                "reconnect = True is not allowed here: the connection is already open;"
+                " pass reconnect to open_connection"
             )
         if heartbeat != OwnHeartbeat():
             raise InvalidArgument(
-                "heartbeat = … is not allowed here: the connection is open; pass it to open_connection"
+                "heartbeat = … is not allowed here: the connection is already open; pass heartbeat to open_connection"
             )
         if peers is not None or may_move:
             raise InvalidArgument(
-                "peers and may_move are not allowed here: the connection is open; pass them to open_connection"
+                "peers and may_move are not allowed here: the connection is already open; pass them to open_connection"
             )
         if share:
             raise InvalidArgument(
-                "share = … is not allowed here: the connection is open; use aerokit.hub.shared(connection, …)"
+                "share = … is not allowed here: the connection is already open; use aerokit.hub.shared(connection, …)"
             )
         async with _attached(address, system_id, timeout, rates) as vehicle:
             yield vehicle
@@ -163,7 +168,7 @@ async def connect(
 
 
 def _create_hub(share: Iterable[str | Endpoint | Link], dialect: Dialect) -> Hub | None:
-    """Create the hub for ``share``, after validating ``share`` and before opening anything; None without ``share``."""
+    """Validate ``share`` and create the hub for it, without opening a link. Return None if ``share`` is empty."""
     endpoints = tuple(share)
     if not endpoints:
         return None
@@ -174,7 +179,7 @@ def _create_hub(share: Iterable[str | Endpoint | Link], dialect: Dialect) -> Hub
 
 @asynccontextmanager
 async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None]:
-    """Share the connection by the hub for the duration of the block; do nothing without a hub."""
+    """Share the connection by the hub for the duration of an `async with` block; do nothing without a hub."""
     if hub is None:
         yield
         return
@@ -187,7 +192,7 @@ def _check_arguments(
     system_id: int | None, timeout: float, rates: Mapping[type[Message], float] | None, dialect: Dialect
 ) -> None:
     if system_id is not None and not 1 <= system_id <= 255:
-        raise InvalidArgument(f"system_id = {system_id} is not allowed: 1 to 255, or None for the first one found")
+        raise InvalidArgument(f"system_id = {system_id} is not allowed: 1 to 255, or None for the first vehicle found")
     if not timeout > 0:
         raise InvalidArgument(f"timeout = {timeout} is not allowed: above 0")
     for message_type, hz in (rates or {}).items():
@@ -203,7 +208,7 @@ async def _attached(
     timeout: float,
     rates: Mapping[type[Message], float] | None,
 ) -> AsyncIterator[Vehicle]:
-    """Find a vehicle on an open connection and keep it for the duration of the block."""
+    """Find a vehicle on an open connection, and close it at the end of the `async with` block."""
     context, vehicle, heartbeat = await _find_vehicle(connection, system_id, timeout)
     was_left_by_exception = False
     try:
@@ -224,21 +229,22 @@ async def _attached(
 
 
 def warn_if_left_flying(vehicle: Vehicle) -> None:
-    """Log a warning if the program leaves the block while the vehicle still executes the program's orders."""
+    """Log a warning if the vehicle may still execute the program's orders when its `async with` block is left."""
     if vehicle._arbiter.may_be_executing and not vehicle.is_confirmed_disarmed:
-        logger.warning("the block of vehicle %d was left: %s", vehicle.system_id, vehicle.describe_now())
+        logger.warning("the async with block of vehicle %d was left: %s", vehicle.system_id, vehicle.describe_now())
 
 
 async def _find_vehicle(connection: Connection, system_id: int | None, timeout: float) -> _Found:
-    """Return the vehicle of the first acceptable heartbeat."""
+    """Create the vehicle at the first acceptable heartbeat; return it with its context and this heartbeat."""
     connection.raise_if_ended()
     search = _Search(connection, system_id)
+    # A recent heartbeat may have arrived before this call.
     for heartbeat in connection.heartbeats.values():
         frame = heartbeat.received_frame
         if frame is not None and connection.now() - frame.received_at <= HEARTBEAT_MAX_AGE_S:
             search.on_heartbeat(heartbeat)
     detachments = [
-        connection.bus.attach(Heartbeat, search.on_heartbeat, system_id=system_id or 0),
+        connection.bus.attach(Heartbeat, search.on_heartbeat, system_id=system_id or EVERY_SYSTEM),
         connection.on_end(search.abort),
     ]
     try:
@@ -249,7 +255,7 @@ async def _find_vehicle(connection: Connection, system_id: int | None, timeout: 
             detach()
         search.close()
     raise ConnectFailed(
-        f"no heartbeat of {search.description} within {timeout:g} s on {connection.link.address}:"
+        f"no heartbeat of {search.description} arrived within {timeout:g} s on {connection.link.address}:"
         f" {explain_no_vehicle(connection, system_id)}"
     )
 
@@ -260,7 +266,8 @@ _Found = tuple[VehicleContext, Vehicle, Heartbeat]
 class _Search:
     """Creates the vehicle while its first heartbeat is being delivered, so that no later message is missed.
 
-    A recording replayed at full speed delivers many frames in one iteration of the loop.
+    Before a waiting task could create it, more messages may be delivered: a recording replayed at full speed delivers
+    many in one iteration of the loop.
     """
 
     def __init__(self, connection: Connection, system_id: int | None) -> None:
@@ -272,7 +279,7 @@ class _Search:
         self.description = "an autopilot" if system_id is None else f"the autopilot of system {system_id}"
 
     def on_heartbeat(self, heartbeat: Heartbeat) -> None:
-        """Create the vehicle if this is the heartbeat of an acceptable autopilot; afterwards, ignore all heartbeats."""
+        """Create the vehicle if this heartbeat is of an acceptable autopilot. Later heartbeats are ignored."""
         frame = heartbeat.received_frame
         if frame is None or self._ended.is_set() or not self._is_wanted(frame, heartbeat):
             return
@@ -331,16 +338,16 @@ async def vehicles_on(
     rates: Mapping[type[Message], float] | None = None,
     on_found: Callable[[Vehicle], object] | None = None,
 ) -> AsyncIterator[Mapping[int, Vehicle]]:
-    """Connect to every vehicle found on a connection, for the duration of the block.
+    """Connect to every vehicle found on a connection, for the duration of the ``async with`` block.
 
     A vehicle that falls silent stays in the mapping; its ``link_state`` and the ages of its cells show the silence.
-    Vehicles that this program is already connected to are left out.
+    Vehicles to which this program is already connected are not in the mapping.
 
     Args:
         connection: the result of :func:`aerokit.open_connection`.
         rates: rates to request from each vehicle, as a mapping of message class to Hz; see :func:`aerokit.connect`.
             ``{}`` requests nothing.
-        on_found: called in the loop with each new vehicle.
+        on_found: called in the event loop with each new vehicle.
 
     Returns:
         Mapping of system id to vehicle, in the order in which they were found; grows while the block lasts.
@@ -357,10 +364,10 @@ async def vehicles_on(
                 vehicles[system_id] = vehicle
                 if on_found is not None:
                     on_found(vehicle)
-                await asyncio.Event().wait()  # until `vehicles_on` ends and cancels this task
+                await asyncio.Event().wait()  # Wait until `vehicles_on` ends and cancels this task.
         except AerokitError as error:
             # The vehicle fell silent again, the program is connected to it already, or the connection has ended.
-            logger.info("system %d was not connected: %s", system_id, error)
+            logger.info("the connection to system %d failed or ended: %s", system_id, error)
 
     async def search() -> None:
         try:

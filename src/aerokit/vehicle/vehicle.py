@@ -47,8 +47,9 @@ GIMBAL_MESSAGE_IDS = tuple(
 )
 
 PICTURE_MESSAGE_IDS = tuple(MESSAGE_IDS[name] for name in ("CameraImageCaptured", "CameraFeedback", "CameraTrigger"))
-"""Ids of the messages that report a picture. Looked up by name, so that programs without cameras do not import the
-classes.
+"""Ids of the messages that report a picture.
+
+They are looked up by name, so that programs without cameras do not import the message classes.
 """
 
 
@@ -115,13 +116,13 @@ class Vehicle(
     def camera(self) -> Camera:
         """The first camera found. Cameras attached to the autopilot come after cameras with their own component id.
 
-        A call to this object waits briefly until a camera is found. ``camera_at`` returns any other camera.
+        The calls of this object wait briefly until a camera is found. ``camera_at`` returns any other camera.
         """
         return self._cameras.first
 
     @property
     def cameras(self) -> StateCell[tuple[int, ...]]:
-        """The numbers of the cameras found so far, for ``camera_at``.
+        """The numbers of the cameras found so far. Pass a number to ``camera_at`` to get the camera.
 
         A number is a component id (100 to 105), or 1 to 6 for a camera attached to the autopilot that has reported a
         picture.
@@ -166,11 +167,11 @@ class Vehicle(
 
         Args:
             initial: stick positions that are sent while the mode is entered; None centres all sticks.
-            mode: the piloted mode. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane), MANUAL (ArduPilot
-                Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
+            mode: the flight mode for the sticks. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane),
+                MANUAL (ArduPilot Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
             rate_hz: transmission rate of the latest positions, 2 to 400.
             valid_for_s: seconds for which the latest positions are repeated; the stream stops after that.
-            max_lag_s: maximum delay of the event loop in seconds; the stream stops above it.
+            max_lag_s: the stream stops if the event loop is blocked for more than this many seconds.
 
         Raises:
             InvalidArgument: a rate or a time is out of range, or the autopilot has no such mode.
@@ -196,7 +197,7 @@ class Vehicle(
         timeout: float | None = 300.0,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> LandingReport:
-        """Land on a target that your program sees; returns on the ground, disarmed, with a report of the landing.
+        """Land on a target that your program sees. Returns a report when the vehicle is on the ground and disarmed.
 
         aerokit streams LANDING_TARGET, and the autopilot's own mode lands: LAND with PLND_ENABLED on ArduCopter,
         PRECLAND on PX4. If the target is lost, the autopilot decides. ArduCopter retries, or lands where it is
@@ -208,9 +209,9 @@ class Vehicle(
             target: a function or coroutine function that returns a :class:`aerokit.TargetMeasurement`, or None while
                 the target is not visible; or an asynchronous iterable of such results.
             rate_hz: rate at which the function is called, and the highest rate of LANDING_TARGET.
-            acquire_timeout: seconds to wait until the target is visible. The landing is ordered only then.
-            timeout: seconds until the vehicle is on the ground and disarmed; None: no limit.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            acquire_timeout: seconds to wait until the target is visible. Once it is visible, the landing is ordered.
+            timeout: seconds until the vehicle must be on the ground and disarmed; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             InvalidArgument: a rate or a time is out of range, or the target is of another type.
@@ -313,19 +314,19 @@ class Vehicle(
         return await read_return_altitude(self.parameters, self._session)
 
     async def set_return_altitude(self, altitude_m: float) -> None:
-        """Set the altitude of returns to launch; returns when the vehicle has confirmed the value.
+        """Set the altitude at which the vehicle returns to launch. Returns when the vehicle has confirmed the value.
 
         Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
         higher than this when the return starts keeps its height.
 
         Args:
-            altitude_m: metres above home, above 0, at most 3,000. Q_RTL_ALT holds whole metres only.
+            altitude_m: metres above home, above 0, at most 3,000. The parameter Q_RTL_ALT can hold only whole metres.
 
         Raises:
             InvalidArgument: the altitude is out of range, or has a fraction that the parameter cannot hold.
             NotSupported: this type of vehicle does not climb for a return. Nothing was sent.
             ParameterRejected: the vehicle has no such parameter, or kept the previous value.
-            ParameterTimeout: not confirmed, but it may have been set.
+            ParameterTimeout: the vehicle did not confirm the new value, but may have stored it.
         """
         from aerokit.vehicle.parameters.return_altitude import write_return_altitude
 

@@ -29,7 +29,7 @@ async def test_block_left_after_cancelled_flight_warns_that_vehicle_holds(
     assert scope.cancelled_caught
     (record,) = [record for record in caplog.records if "was left: " in record.message]
     assert (record.name, record.levelname) == ("aerokit", "WARNING")
-    assert record.message.startswith("the block of vehicle 1 was left: holding in BRAKE, still armed, ")
+    assert record.message.startswith("the async with block of vehicle 1 was left: holding in BRAKE, still armed, ")
 
 
 async def test_block_left_by_exception_in_flight_warns(caplog: pytest.LogCaptureFixture) -> None:
@@ -155,9 +155,9 @@ async def test_block_left_with_stream_in_other_task_holds() -> None:
             await vehicle.arm()
             await vehicle.take_off(10.0)
             stream = await vehicle.guided.velocity().__aenter__()
-        with pytest.raises(SetpointStreamStopped, match="the block of its vehicle was left"):
+        with pytest.raises(SetpointStreamStopped, match="the async with block of its vehicle was left"):
             stream.set(VelocitySetpoint())
-        with pytest.raises(ConnectionClosed, match="the block of this vehicle was left; nothing was sent"):
+        with pytest.raises(ConnectionClosed, match="the async with block of this vehicle was left; nothing was sent"):
             vehicle.send(Heartbeat(6, 8, 0, 0, 4))
         await anyio.sleep(1.0)
         assert copter.mode.number == CopterMode.BRAKE

@@ -129,9 +129,7 @@ async def test_force_skips_the_checks(grounded: Flight) -> None:
 async def test_arm_accepted_not_executed_times_out(grounded: Flight) -> None:
     grounded.copter.arming.arm = lambda **_: True  # type: ignore[method-assign]
     started = now()
-    with pytest.raises(
-        OperationTimeout, match=r"arm\(\): not done within 3 s; the vehicle sent no status text about it"
-    ):
+    with pytest.raises(OperationTimeout, match=r"arm\(\): not done within 3 s; the vehicle sent no status text"):
         await grounded.vehicle.arm(timeout=3.0)
     assert 3.0 <= now() - started < 4.0
 

@@ -386,12 +386,12 @@ async def test_posted_order_errors_say_why(grounded: Flight) -> None:
         grounded.copter.send(m.CommandAck(ARM, MavResult.DENIED, 0, 0, 255, vehicle.connection.source_component))
         with pytest.raises(CommandRejected, match="DENIED"):  # taken back
             await order.wait_confirmed(2)
-    with pytest.raises(InvalidArgument, match="subjects are missing"), vehicle.posted():
+    with pytest.raises(InvalidArgument, match="needs at least one subject"), vehicle.posted():
         pass
     grounded.wire.clear()
     with pytest.raises(InvalidArgument, match="requires armed=True or armed=False"), vehicle.posted("arm"):
         pass
-    with pytest.raises(InvalidArgument, match="the block of this order was left"):
+    with pytest.raises(InvalidArgument, match="the `with` block of this order was left"):
         await order.command(ARM, 1)
     assert not grounded.wire.commands(ARM)
 

@@ -119,8 +119,8 @@ async def test_sticks_dead_program_returns_to_transmitter() -> None:
     ("changed", "reason"),
     [
         ({"MAV_GCS_SYSID": 254.0}, r"only from system 254 .* source_system=254"),
-        ({"RC_OVERRIDE_TIME": -1.0}, "RC_OVERRIDE_TIME = -1 ArduPilot never releases the sticks"),
-        ({"RC_OVERRIDE_TIME": 0.0}, "RC_OVERRIDE_TIME = 0 ArduPilot ignores stick positions"),
+        ({"RC_OVERRIDE_TIME": -1.0}, "RC_OVERRIDE_TIME = -1, ArduPilot never releases the sticks"),
+        ({"RC_OVERRIDE_TIME": 0.0}, "RC_OVERRIDE_TIME = 0, ArduPilot ignores stick positions"),
         ({"RC_OPTIONS": 2.0}, "bit 1 of RC_OPTIONS"),
     ],
 )

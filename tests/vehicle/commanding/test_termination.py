@@ -38,7 +38,7 @@ async def test_terminate_on_px4_returns_in_its_termination_mode() -> None:
 @pytest.mark.parametrize("intent", ["", "Terminate flight", "terminate", "shut down"])
 async def test_terminate_other_intent_sends_nothing(intent: str) -> None:
     async with in_the_air() as flight:
-        with pytest.raises(InvalidArgument, match=r"intent = .* is not allowed: one of terminate flight"):
+        with pytest.raises(InvalidArgument, match=r"intent = .* is not allowed: it must be one of terminate flight"):
             await flight.vehicle.terminate(intent=intent)  # type: ignore[arg-type]
         assert flight.wire.commands(TERMINATE) == []
 

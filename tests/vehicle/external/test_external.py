@@ -313,7 +313,7 @@ async def test_clock_requests_are_answered_only_inside_block() -> None:
 )
 async def test_parameter_that_ignores_measurements_raises(kind: str, parameter: str) -> None:
     async with open_flight(copter(**{parameter: 0.0})) as flight:
-        with pytest.raises(OperationRejected, match=f"{parameter} = 0, so that ArduCopter ignores the measurements"):
+        with pytest.raises(OperationRejected, match=f"{parameter} = 0, so ArduCopter ignores the measurements"):
             async with getattr(flight.vehicle.external, kind)():
                 raise AssertionError("entered")
 
@@ -322,7 +322,7 @@ async def test_px4_without_external_vision_raises() -> None:
     async with open_px4(px4(EKF2_EV_CTRL=3.0)) as flight:
         async with flight.vehicle.external.odometry():
             pass
-        with pytest.raises(OperationRejected, match=r"EKF2_EV_CTRL = 3, so that .* set EKF2_EV_CTRL to 4 or 5"):
+        with pytest.raises(OperationRejected, match=r"EKF2_EV_CTRL = 3, so .* set EKF2_EV_CTRL to 4 or 5"):
             async with flight.vehicle.external.vision_speed():
                 raise AssertionError("entered")
 
@@ -391,7 +391,7 @@ async def test_ignored_origin_times_out() -> None:
         flight.copter.navigation.origin = None
         flight.vehicle.telemetry.origin.forget()
         flight.copter.handlers.pop(m.SetGpsGlobalOrigin.ID)
-        with pytest.raises(OperationTimeout, match="did not report the origin within 3 s; it reports none"):
+        with pytest.raises(OperationTimeout, match="did not report the origin within 3 s; it has reported no origin"):
             await flight.vehicle.external.set_origin(ORIGIN, timeout=3.0)
         assert len(flight.wire.all(m.SetGpsGlobalOrigin)) == 1
 

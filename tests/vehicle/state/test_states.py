@@ -36,7 +36,7 @@ def test_power() -> None:
 def test_state_field_invalid_declaration_raises() -> None:
     with pytest.raises(ValueError, match="needs at least one message"):
         StateField[int]()
-    with pytest.raises(ValueError, match="Heartbeet is not a message class"):
+    with pytest.raises(ValueError, match="Heartbeet is not the name of a message class"):
         MessageSource("Heartbeet", lambda message: 1)
 
 

@@ -48,7 +48,7 @@ def test_nonsense_is_refused_by_name(fields: dict[str, Any], text: str) -> None:
 
 def test_position_offset_wrong_type_is_named() -> None:
     north: Any = "30"
-    with pytest.raises(InvalidArgument, match="north_m = '30' is not allowed: a number"):
+    with pytest.raises(InvalidArgument, match="north_m = '30' is not allowed: it must be a number"):
         Position(47.3977, 8.5456).offset(north_m=north)
 
 

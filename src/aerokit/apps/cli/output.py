@@ -145,7 +145,7 @@ def plain_warnings() -> Iterator[None]:
 
 def _rewrite_for_commands(record: logging.LogRecord) -> bool:
     """Replace warnings about a program's code: about a blocked event loop, and about the block of a vehicle."""
-    if str(record.msg).startswith("the block of vehicle %d was left: "):
+    if str(record.msg).startswith("the async with block of vehicle %d was left: "):
         record.msg = "disconnected from vehicle %d: %s"
     if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):
         record.msg = "this computer was busy for %.1f s: no messages or heartbeats were processed"

@@ -14,15 +14,17 @@ if TYPE_CHECKING:
     from aerokit.connection.multilink.link_choice import Candidate, LinkChoice
     from aerokit.mavlink.frame import Frame
 
-MAX_REMEMBERED = 4096  # frames, i.e. 10 s at 400 frames per second
+MAX_REMEMBERED = 4096  # number of remembered frames, enough for 10 s at 400 frames per second
 
-# A copy within this time is always a duplicate.
+# An equal frame over another link is always a duplicate if it arrives within this time after the first.
 COPY_WINDOW_S = 3.0
 
-# A later copy, within this time, is a duplicate only if the first copy was accepted. Slow links deliver such copies.
+# Over a slow link, a copy may arrive later, up to this time after the first. It is then a duplicate only if the first
+# copy was accepted.
 LATE_COPY_WINDOW_S = 10.0
 
-# Sequence numbers repeat after 256 frames. Equal bytes after at least half as many frames are a different frame.
+# Sequence numbers repeat after 256 frames. If a sender's frame has the bytes of an earlier one, but at least this many
+# of its frames came between them, it is a different frame.
 COPY_WINDOW_FRAMES = 128
 
 
@@ -31,25 +33,26 @@ class _Seen:
 
     def __init__(self, at: float, links: int, count: int) -> None:
         self.at, self.links = at, links  # links: one bit for each link
-        self.count = count  # the sender's frame count when this frame arrived
+        self.count = count  # number of the sender's frames, this one included, when it arrived
         self.is_admitted = self.is_accepted = False
 
 
 class Copies:
     """Remembers which frame arrived over which link, and detects copies.
 
-    An equal frame over the same link is not a copy: the sender has repeated it, or the sequence numbers have wrapped.
+    An equal frame over the same link is not a copy, because the sender sent it again, perhaps by chance with the same
+    sequence number after a wrap-around.
     """
 
     def __init__(self) -> None:
         self._seen: dict[tuple[bytes, int, bytes], _Seen] = {}
-        self._counts: dict[int, int] = {}  # sender → frames that were not copies
+        self._counts: dict[int, int] = {}  # sender → number of its frames that were not copies
         self._current: _Seen | None = None
         self.is_late: bool = False
         """True if the last checked frame equals one that was accepted over another link some seconds ago."""
 
     def is_copy(self, frame: Frame, link: int) -> bool:
-        """Return True if an equal frame arrived within the last seconds, over another link and not over this one."""
+        """Return True if an equal frame arrived a few seconds ago over another link, but not yet over this link."""
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
         count = self._counts.get(sender, 0)
@@ -64,10 +67,11 @@ class Copies:
                 self._current = earlier
                 return True
             self.is_late = is_other_link and earlier.is_accepted and age_s <= LATE_COPY_WINDOW_S
-            del self._seen[key]
+            del self._seen[key]  # The new frame, which is not a copy, takes the place of the earlier one.
         self._counts[sender] = count + 1
         self._current = self._seen[key] = _Seen(frame.received_at, link_bit, count + 1)
         if len(self._seen) > MAX_REMEMBERED:
+            # Many frames are forgotten at once, because building the list takes time.
             for oldest_key in list(self._seen)[: MAX_REMEMBERED // 4]:
                 del self._seen[oldest_key]
         return False
@@ -93,15 +97,15 @@ class Copies:
             self._current.is_accepted = True
 
 
-# For this time after a change of links, answers to earlier requests may still arrive over the former link.
+# After a switch to another link, answers to earlier requests may still arrive over the former link for this time.
 ANSWER_TIMEOUT_S = 3.0
 
-# A component counts as reachable over a link for this time after its last frame there.
+# A component counts as reachable over a link until it has sent nothing over this link for this time.
 COMPONENT_TTL_S = 10.0
 
 MAX_STREAMS = 1024
 
-# Answers to requests. Unlike telemetry, they do not become outdated in transit.
+# Answers to requests. Unlike telemetry, a delayed answer is still valid.
 ANSWERS = frozenset(
     message_type.ID
     for message_type in (
@@ -110,24 +114,24 @@ ANSWERS = frozenset(
     )
 )  # fmt: skip
 
-# PX4 sends an acknowledgement over each port on which it received our frames. The second copy would be taken for the
-# answer to the next command.
+# PX4 sends each acknowledgement over every port on which it received our frames. Without this list, the second one
+# would be taken for the answer to the next command.
 ACKNOWLEDGEMENTS = frozenset(message_type.ID for message_type in (m.CommandAck, m.MissionAck, m.ParamExtAck))
 
 
 class _Stream:
-    """The frames of one component."""
+    """State of the frames that one component sends over all links."""
 
     __slots__ = ("acknowledgements", "newest", "received_at")
 
     def __init__(self, links: int) -> None:
         self.received_at = [-math.inf] * links
         self.newest = -1  # sequence number of the newest accepted frame; -1: none
-        # Payload → count per link, since the last change of links.
+        # Acknowledgement's payload → how often each link delivered it since the last switch to another link.
         self.acknowledgements: dict[bytes, list[int]] = {}
 
     def is_repeated(self, payload: bytes, link: int) -> bool:
-        """Count an acknowledgement. Return True if another link has delivered it at least as often as this one."""
+        """Count an acknowledgement of this link. Return True if another link delivered it at least as often."""
         counts = self.acknowledgements.setdefault(payload, [0] * len(self.received_at))
         counts[link] += 1
         return counts[link] <= max(count for index, count in enumerate(counts) if index != link)
@@ -153,8 +157,8 @@ class MergedStreams:
         if not self.copies.is_copy(frame, link):
             return False
         choice = self._choices.get(frame.system_id)
-        # Only frames with a time stamp prove that both links lead to one vehicle: two vehicles may send equal
-        # heartbeats.
+        # Equal frames prove that both links lead to one vehicle, but only if they contain the time since boot. Two
+        # vehicles may send equal heartbeats.
         if choice is not None and boot_time_ms(frame):
             links = {link} if choice.used is None else {link, choice.used.link}
             for index in links:
@@ -166,25 +170,26 @@ class MergedStreams:
         return True
 
     def accepts(self, frame: Frame, link: int) -> bool:
-        """Return True if a frame that was not accepted yet is to be delivered, and record it as accepted."""
+        """Return True if a frame is to be delivered, and record it as accepted. Call it for first copies only."""
         stream = self._stream(frame)
         stream.received_at[link] = frame.received_at
         choice = self._choices.get(frame.system_id)
         if choice is None or choice.used is None:
             self.copies.accept()
-            return True  # a sender without heartbeats, e.g. a radio
+            return True  # No link was chosen, because the sender sends no heartbeats, e.g. a radio.
         candidate = choice.candidates.get(link)
         if candidate is not None and not choice.may_be_used(candidate):
             return False
         if frame.received_at <= choice.fresh_after and frame.message_id not in ANSWERS:
-            return False  # older than the telemetry that the former link has delivered
+            return False  # This telemetry is older than that already delivered over the former link.
         if self.copies.is_late and not _may_be_different_frame(frame, link, choice):
             return False
         if link != choice.used.link and not _is_accepted_from_unused(frame, candidate, choice, stream):
             return False
         is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
         if is_after_change and frame.message_id in ACKNOWLEDGEMENTS:
-            is_repeated = stream.is_repeated(frame.payload, link)  # also called for the link in use, to count
+            # `is_repeated` also counts the acknowledgement, so it is called for the link in use, too.
+            is_repeated = stream.is_repeated(frame.payload, link)
             if is_repeated and link != choice.used.link:
                 return False
         stream.newest = frame.sequence
@@ -192,7 +197,7 @@ class MergedStreams:
         return True
 
     def _stream(self, frame: Frame) -> _Stream:
-        """Return the stream of the frame's sender; a new stream replaces the oldest if there are too many."""
+        """Return the stream of the frame's sender. If there are too many streams, a new one replaces the oldest."""
         key = frame.component_id << 8 | frame.system_id
         stream = self._streams.get(key)
         if stream is None:
@@ -203,22 +208,23 @@ class MergedStreams:
 
 
 def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: LinkChoice, stream: _Stream) -> bool:
-    """Return True if a frame is accepted although its link is not in use."""
+    """Return True if a frame is accepted although it arrived over another link than the link in use."""
     if candidate is None or choice.used is None:
         return False
     is_answer = frame.message_id in ANSWERS
     if choice.is_shared(candidate, frame.received_at):
-        # The link in use has lost this frame, or its copy arrives later.
-        is_late = stream.newest >= 0 and (frame.sequence - stream.newest) & 0xFF >= 128
-        return is_answer or not is_late
-    # Separate streams. The component may be reached over this link only, or answer what was sent before a change.
+        # Both links carry the same stream. This is the first copy: the link in use lost its copy, or delivers it later.
+        is_overtaken = stream.newest >= 0 and (frame.sequence - stream.newest) & 0xFF >= 128
+        return is_answer or not is_overtaken
+    # The links carry separate streams. The frame is needed if only this link reaches the component, or if it answers a
+    # request that was sent before the switch to the link in use.
     is_on_used_link = frame.received_at - stream.received_at[choice.used.link] <= COMPONENT_TTL_S
     is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
     return not is_on_used_link or (is_answer and candidate is choice.former and is_after_change)
 
 
 def _may_be_different_frame(frame: Frame, link: int, choice: LinkChoice) -> bool:
-    """Return True if frames with equal bytes may be different frames, such as heartbeats of separate streams."""
+    """Return True if two frames with equal bytes may still be different, as heartbeats of separate streams are."""
     used = choice.used
     if used is None or used.link != link or frame.message_id != m.Heartbeat.ID:
         return False

@@ -10,26 +10,27 @@ from aerokit.connection.multilink.vehicle_clock import VehicleClock
 if TYPE_CHECKING:
     from aerokit.connection.multilink.vehicle_clock import HardwareId
 
-# Silence after which a link is not alive. Probes are answered twice a second.
+# A link counts as dead after this silence, because probes are answered twice a second.
 PROBED_TIMEOUT_S = 1.0
 
-# Silence (two missing heartbeats) after which a link without answers to probes, or a costly link, counts as dead.
+# A costly link, or a link whose probes are not answered, counts as dead after this silence: two missing heartbeats.
 UNPROBED_TIMEOUT_S = 2.5
 
 # Consecutive matching clock samples that prove that a second link leads to the same vehicle.
 MIN_CLOCK_MATCHES = 3
 
-# A vehicle that answers this many TIMESYNC probes, but not the request for its hardware id, has none to report.
+# A vehicle that answers this many TIMESYNC probes after the request for its hardware id, but not the request itself,
+# has no hardware id to report.
 MAX_TIMES_WITHOUT_HARDWARE = 3
 
 MAX_HARDWARE_REQUESTS = 20
 
-# This many frames received both over a link and over the link in use prove that both lead to the same vehicle.
+# If this many frames were received both over a link and over the link in use, both links lead to the same vehicle.
 MIN_COPIES = 3
 
 
 class Candidate:
-    """One link to one system."""
+    """One link over which a system was received: its quality, and the evidence that it leads to the vehicle."""
 
     def __init__(self, link: int, *, is_costly: bool, now: float) -> None:
         self.link = link
@@ -43,24 +44,24 @@ class Candidate:
         self.is_available: bool = True
         """True while the link is open."""
         self.is_stalled: bool = False
-        """True while written data does not leave this machine."""
+        """True while written data stays in this machine's buffers."""
         self.loss: float | None = None
-        """Share of frames lost over the last seconds, 0 to 1; None: unknown."""
+        """Fraction of frames lost over the last seconds, 0 to 1; None if unknown."""
         self.round_trip_s: float | None = None
         """Smoothed round-trip time of the probes; None before the first answer."""
         self.is_proven: bool = False
         """True if the link is known to lead to the vehicle."""
         self.was_proven: bool = False
-        """True if :attr:`is_proven` was True before the vehicle rebooted, or before the link was doubted."""
+        """True if the link was proven before the vehicle rebooted, or before :attr:`is_doubted` became True."""
         self.is_doubted: bool = False
-        """True if another vehicle with the same system id seems to be behind the link."""
+        """True if the link seems to lead to another vehicle with the same system id."""
         self.hardware: HardwareId | None = None
         """Hardware id received over the link; None if none was received."""
         self.is_other_hardware: bool = False
-        """True if :attr:`hardware` belongs to another vehicle: neither clock nor copies can then prove the link."""
+        """True if :attr:`hardware` is another vehicle's. The link is then not proven by its clock or by copies."""
         self._hardware_requests = self._answers_since_request = 0
         self._clock_matches = self._clock_mismatches = self._copies = 0
-        self._last_counts = (0, 0)  # frames received and lost
+        self._last_counts = (0, 0)  # numbers of frames received and lost at the last call of `record_counts`
 
     def record_counts(self, received: int, lost: int, now: float) -> None:
         """Update :attr:`loss` from the total numbers of frames that were received and lost over this link."""
@@ -68,11 +69,11 @@ class Candidate:
         self._last_counts = received, lost
         if received > received_before:
             self.received_at = now
-        # Totals shrink when counters are replaced, e.g. those of an evicted peer.
+        # A total is smaller than before if its counters were replaced, e.g. because a peer was evicted.
         new_received, new_lost = max(0, received - received_before), max(0, lost - lost_before)
         if new_received or new_lost:
             new_loss = new_lost / (new_received + new_lost)
-            weight = 1 - 0.85 ** (new_received + new_lost)  # about the last dozen frames dominate
+            weight = 1 - 0.85 ** (new_received + new_lost)  # The last dozen frames determine most of the average.
             self.loss = new_loss if self.loss is None else self.loss + weight * (new_loss - self.loss)
 
     def record_round_trip(self, seconds: float, now: float) -> None:
@@ -109,7 +110,7 @@ class Candidate:
         self._clock_matches = self._clock_mismatches = self._copies = 0
 
     def request_hardware(self) -> bool:
-        """Return True if the hardware id is to be requested now, and count the request."""
+        """Count a request for the hardware id, and return True if it is to be sent now."""
         if (
             self.hardware is not None
             or self.answered_at == -math.inf
@@ -128,7 +129,7 @@ class Candidate:
         """Record whether the hardware id received over the link contradicts that of the vehicle."""
         if is_other:
             self._doubt()
-            self.was_proven = False
+            self.was_proven = False  # The link now leads to another vehicle, so an earlier proof is void.
         elif self.is_other_hardware:
             self.is_doubted = False
         self.is_other_hardware = is_other
@@ -146,7 +147,7 @@ class Candidate:
         self.is_proven, self.is_doubted = False, True
 
     def is_alive(self, now: float) -> bool:
-        """Return True if frames arrive over the link, and written data leaves."""
+        """Return True if frames arrive over the link, and written data leaves this machine."""
         is_answering = now - self.answered_at <= 2 * UNPROBED_TIMEOUT_S
         timeout_s = PROBED_TIMEOUT_S if is_answering and not self.is_costly else UNPROBED_TIMEOUT_S
         return self.is_available and not self.is_stalled and now - self.received_at <= timeout_s
@@ -161,25 +162,25 @@ class Candidate:
 
     @property
     def cost_s(self) -> float:
-        """Expected time for a command and its answer, retries after losses included."""
+        """Expected seconds for a command and its answer, including retries after losses."""
         loss = min(0.9, self.loss or 0.0)
         round_trip_s = 0.1 if self.round_trip_s is None else self.round_trip_s
-        # The constant keeps links with round trips of a few milliseconds about equal. The loss counts twice, because
-        # the command and its answer must both arrive.
+        # Because of the constant, links with round trips of a few milliseconds cost about the same. The exponent is 2,
+        # because both the command and its answer must arrive.
         return (round_trip_s + 0.05) / (1 - loss) ** 2
 
 
-# Two links that carried the same frame within this time carry one stream.
+# Two links count as carrying the same stream for this time after a frame was received over both.
 SHARED_MAX_AGE_S = 5.0
 
-# A working link is replaced only if another link has cost less than this share of the working link's cost for
+# A link that works is replaced only if another link costs less than this fraction of its cost for at least
 # MIN_BETTER_S.
 MAX_COST_RATIO = 0.5
 MIN_BETTER_S = 3.0
 
 JITTER_S = 0.05
 
-# Maximum wait for a moment without a command in transit, because set-points may be sent continuously.
+# A switch waits until no command is in transit, but at most this time, because set-points may be sent continuously.
 MAX_SWITCH_DELAY_S = 10.0
 
 
@@ -196,16 +197,16 @@ class LinkChoice:
         self.candidates: dict[int, Candidate] = {}
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
-        """The vehicle's hardware id, as received over the link that was in use then."""
-        self._hardware_link = -1  # the link over which `hardware` was received; its next id replaces `hardware`
+        """The vehicle's hardware id, which was received over the link in use at that time."""
+        self._hardware_link = -1  # link over which `hardware` was received; the next id over it replaces `hardware`
         self.used: Candidate | None = None
         """The link in use; None before the first choice."""
         self.former: Candidate | None = None
-        """The link used before; it may still deliver answers."""
+        """The link in use before the last switch. Answers may still arrive over it."""
         self.changed_at: float = -math.inf
         self.fresh_after: float = -math.inf
-        """Telemetry received before this time is older than the last telemetry of the former link."""
-        self._better: Candidate | None = None  # a link that has been better than the link in use since `_better_since`
+        """Telemetry that arrives before this time may be older than the last telemetry of the former link."""
+        self._better: Candidate | None = None  # link that is better than the link in use, since `_better_since`
         self._better_since = 0.0
         self._command_at = -math.inf  # time of the last command to the system
 
@@ -217,34 +218,36 @@ class LinkChoice:
         return candidate
 
     def start_with(self, candidate: Candidate) -> None:
-        """Make this link the reference for all other links, because it received the system's first autopilot."""
+        """Make this link the reference for other links, because the system's autopilot was first received over it."""
         self.needs_proof = True
         if candidate is not self.used:
-            self.used = None  # the old link leads to another component, e.g. a camera
+            self.used = None  # The link used so far leads to another component only, e.g. a camera.
             self.candidates = {candidate.link: candidate}
 
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
         """Record the vehicle's time ``vehicle_s``, received over a link; ``at`` is our time at that moment."""
         candidate = self.candidates[link]
-        # Compared before this answer is recorded: the link in use has missed an earlier answer, too.
+        # True if the link in use did not answer since the previous answer over this link. This is determined before the
+        # new answer is recorded.
         is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
         candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:
             if not self.clock.add(at, vehicle_s, round_trip_s):
-                # The vehicle may have rebooted or been replaced by another one, so the next hardware id over this link
-                # is accepted.
+                # The clock jumped, so the vehicle has rebooted or was replaced by another vehicle. The next hardware id
+                # over this link is therefore accepted as the vehicle's id.
                 self._hardware_link = link
                 for affected in self.candidates.values():
                     affected.reset_proof()
             elif not self.clock.is_steady:
+                # The clock was paused for a moment, so earlier mismatches of other links prove nothing.
                 for affected in self.candidates.values():
                     affected.reset_mismatches()
         else:
             candidate.record_time()
             matches = self.clock.matches(at, vehicle_s, round_trip_s)
             if not matches and is_used_silent:
-                # The link in use may be dead, and the vehicle may have paused or rebooted since. Its clock then proves
-                # nothing against this link, so without a matching hardware id the answer is not judged (None).
+                # The link in use is silent, so it is unknown whether the vehicle has rebooted since. A different clock
+                # then proves nothing. Only a matching hardware id counts; otherwise the answer is ignored (None).
                 matches = True if self._is_same_by_hardware(candidate, now) else None
             if matches is not None:
                 candidate.record_clock(matches, may_prove=not self._awaits_hardware(candidate))
@@ -256,7 +259,7 @@ class LinkChoice:
         another link before, the link in use leads to another vehicle.
         """
         candidate = self.candidates[link]
-        if hardware.has_value or candidate.hardware is None:
+        if hardware.has_value or candidate.hardware is None:  # An empty id does not replace a known one.
             candidate.hardware = hardware
         if candidate is self.used:
             self._adopt_hardware(candidate)
@@ -275,7 +278,7 @@ class LinkChoice:
         return now - candidate.shared_at <= SHARED_MAX_AGE_S
 
     def choose(self, now: float) -> str | None:
-        """Select the link to use. Return the reason for a change; None without a change."""
+        """Select the link to use. Return the reason if it changes, otherwise None."""
         alive = sorted(
             (link for link in self.candidates.values() if self.may_be_used(link) and link.is_alive(now)),
             key=lambda candidate: (candidate.is_costly, candidate.cost_s),
@@ -306,10 +309,11 @@ class LinkChoice:
         """
         if candidate is not self.used:
             return not candidate.is_proven and candidate.request_hardware()
-        return len(self.candidates) > 1 and not is_attached and candidate.request_hardware()
+        has_other_links = len(self.candidates) > 1  # Otherwise there is no other id to compare with.
+        return has_other_links and not is_attached and candidate.request_hardware()
 
     def _is_same_by_hardware(self, candidate: Candidate, now: float) -> bool:
-        """Return True if a matching hardware id suffices: the link was proven before, and no other link is alive."""
+        """Return True if the link was proven before, its hardware id matches, and no other link is alive."""
         is_same = (
             self.hardware is not None and candidate.hardware is not None and self.hardware.confirms(candidate.hardware)
         )
@@ -321,7 +325,7 @@ class LinkChoice:
         return candidate.is_hardware_pending and not can_compare_ids
 
     def _adopt_hardware(self, used: Candidate) -> None:
-        """Make the id received over the link in use the vehicle's id, unless another link's id contradicts it."""
+        """Make the hardware id of the link in use the vehicle's id, unless it contradicts an id from another link."""
         hardware = used.hardware
         if hardware is None or not hardware.has_value:
             return
@@ -330,7 +334,7 @@ class LinkChoice:
             self.hardware, self._hardware_link = hardware, used.link
 
     def _must_wait(self, used: Candidate, now: float) -> bool:
-        """Return True while a command in transit could arrive after a later command over the better link."""
+        """Return True while an earlier command may be in transit, which a command over a faster link would overtake."""
         transit_s = (used.round_trip_s or 0.0) + JITTER_S
         waited_s = now - self._better_since - MIN_BETTER_S
         return now - self._command_at <= transit_s and waited_s <= MAX_SWITCH_DELAY_S
@@ -341,7 +345,7 @@ class LinkChoice:
         if former is not None:
             extra_transit_s = ((chosen.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
             self.fresh_after = former.received_at + extra_transit_s + JITTER_S
-            # The former and the new link lead to the same vehicle; otherwise the new link would not be used.
+            # The new link is only used because it leads to the same vehicle, which proves the former link, too.
             former.is_proven = not former.is_other_hardware
         self.former, self.used, self.changed_at, self._better = former, chosen, now, None
         self._adopt_hardware(chosen)

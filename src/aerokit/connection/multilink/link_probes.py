@@ -27,10 +27,11 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 PROBE_INTERVAL_S = 0.5
 IDLE_COSTLY_PROBE_INTERVAL_S = 5.0
-TIMER_TOLERANCE_S = 0.05  # for probe(), which is called only ten times a second
+TIMER_TOLERANCE_S = 0.05  # A probe may be sent this much early, because probe() is called only ten times a second.
 MAX_PENDING = 256
 
-# Probes per second to all systems without a vehicle object, so that forged system ids cannot saturate a slow radio.
+# Maximum number of probes per second to systems without a vehicle object. Without this limit, a sender that forges
+# system ids could saturate a slow radio.
 UNATTACHED_RATE_HZ = 40.0
 
 _AUTOPILOT = int(MavComponent.AUTOPILOT1)
@@ -39,8 +40,8 @@ _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 class LinkProbes:
     """Probes each link to a system twice a second, an idle costly link every five seconds.
 
-    Answers are recorded in ``choices``. A second vehicle under the same system id is reported once, and again after a
-    pause. ``send(message, peer)`` sends a probe.
+    Answers are recorded in ``choices``. A second vehicle under the same system id is reported once, and again if the
+    link led to the known vehicle in between. ``send(message, peer)`` sends a probe.
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class LinkProbes:
         send: Callable[[Message, Peer], object],
     ) -> None:
         self._names, self._choices, self._bus, self._send = names, choices, bus, send
-        self._pending: dict[int, tuple[int, int, float]] = {}  # ts1 → system, link, sent at
+        self._pending: dict[int, tuple[int, int, float]] = {}  # ts1 of a probe → system id, link, send time
         self._probed_at: dict[tuple[int, int], float] = {}
         # Number of probes that may be sent now to systems without a vehicle object, and the time of its last refill.
         self._budget, self._budget_at = UNATTACHED_RATE_HZ, 0.0
@@ -69,6 +70,7 @@ class LinkProbes:
         is_attached: bool,
     ) -> None:
         """Send a probe if one is due. ``is_attached``: the system has a vehicle object."""
+        # An unused costly link is probed rarely, but not before it is known which vehicle the link leads to.
         is_idle = candidate.is_costly and candidate is not choice.used
         is_new = not candidate.is_proven and not candidate.is_doubted
         interval_s = IDLE_COSTLY_PROBE_INTERVAL_S if is_idle and not is_new else PROBE_INTERVAL_S
@@ -78,9 +80,10 @@ class LinkProbes:
         if not is_attached and not self._consume_budget(now):
             return
         self._probed_at[key] = now
-        # ts1 is our time in nanoseconds, with last digits that tell systems and links apart.
+        # ts1 identifies the probe in the answer: our time in nanoseconds, in which the last three digits differ between
+        # systems and links that are probed at the same time.
         ts1 = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
-        if ts1 <= 0 or ts1 in self._pending:
+        if ts1 <= 0 or ts1 in self._pending:  # The number is invalid, or another probe has it: try again later.
             return
         if len(self._pending) >= MAX_PENDING:
             del self._pending[next(iter(self._pending))]
@@ -94,12 +97,14 @@ class LinkProbes:
     def is_answer(self, frame: Frame, link: int) -> bool:
         """Return True if this TIMESYNC answers one of our probes over any link. Record such an answer."""
         message = self._bus.dialect.decode(frame)
-        if not isinstance(message, m.Timesync) or not message.tc1 or message.ts1 not in self._pending:
+        is_request = isinstance(message, m.Timesync) and not message.tc1  # In an answer, tc1 is the vehicle's time.
+        if not isinstance(message, m.Timesync) or is_request or message.ts1 not in self._pending:
             return False
         now = frame.received_at
         round_trip_s = self._round_trip_of(message, frame.system_id, link, now)
         choice = self._choices.get(frame.system_id)
         if round_trip_s is not None and choice is not None and link in choice.candidates:
+            # The vehicle read its clock at about the middle of the round trip.
             choice.record_answer(link, now - round_trip_s / 2, message.tc1 / 1e9, round_trip_s, now)
             self._report_doubt(frame, choice.candidates[link])
         return True
@@ -115,7 +120,7 @@ class LinkProbes:
                 self._report_doubt(frame, candidate)
 
     def _consume_budget(self, now: float) -> bool:
-        """Count a probe to a system without a vehicle object. Return False if there were too many (token bucket)."""
+        """Take a token for a probe to a system without a vehicle object. Return False if no token is left."""
         self._budget = min(UNATTACHED_RATE_HZ, self._budget + UNATTACHED_RATE_HZ * (now - self._budget_at))
         self._budget_at = now
         if self._budget < 1:
@@ -124,7 +129,7 @@ class LinkProbes:
         return True
 
     def _round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
-        """Return the seconds since the probe; None if the probe went to another system or link."""
+        """Return the seconds since the probe; None if the probe was sent to another system, or over another link."""
         probed_system, probed_link, sent_at = self._pending.get(answer.ts1, (0, 0, 0.0))
         if (probed_system, probed_link) != (system_id, link):
             return None
@@ -132,7 +137,7 @@ class LinkProbes:
         return max(0.0, now - sent_at)
 
     def _report_doubt(self, frame: Frame, candidate: Candidate) -> None:
-        """Report once that another vehicle has the same system id, until the link leads to the known vehicle again."""
+        """Report that another vehicle has the same system id: once, until the link leads to the known vehicle again."""
         key = frame.system_id, candidate.link
         if not candidate.is_doubted:
             self._reported.discard(key)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
     from aerokit.transport.multilink import MultiLink
 
-STATUS_INTERVAL_S = 0.95  # a little below one second, because the time is checked ten times a second
+STATUS_INTERVAL_S = 0.95  # A little below 1 s, because the time is only checked ten times a second.
 
 
 class LinkStates:
@@ -76,6 +76,7 @@ class LinkStates:
             for system_id, choice in self._choices.items()
             if link in choice.candidates
         }
+        # The status has the worst loss and round trip of all systems that are received over the link.
         losses = [candidate.loss for candidate in candidates.values() if candidate.loss is not None]
         round_trips = [
             candidate.round_trip_s for candidate in candidates.values() if candidate.round_trip_s is not None
@@ -95,10 +96,10 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 POLL_INTERVAL_S = 0.1
 
-# A link over which a system was silent for this time is neither probed nor counted until the next heartbeat.
+# If a system was silent over a link for this time, the link is no longer probed until the system's next heartbeat.
 CANDIDATE_TIMEOUT_S = 30.0
 
-# Commands that must not arrive after a newer command.
+# Commands that a newer command must not overtake. A switch to a better link waits while such a command is in transit.
 COMMANDS = frozenset(
     message_type.ID
     for message_type in (
@@ -107,12 +108,12 @@ COMMANDS = frozenset(
     )
 )  # fmt: skip
 
-# Broadcasts without effect on a vehicle. These go to every peer on every link.
+# Broadcasts that a vehicle may receive several times, because they have no effect. They go to every peer on every link.
 BROADCASTS = frozenset(message_type.ID for message_type in (m.Heartbeat, m.Timesync, m.Ping))
 
 
 class MultiLinkRoutes:
-    """One :class:`Routes` per link (``make_routes``), and the choice of a link for each system.
+    """Keeps one :class:`Routes` for each link, created by ``make_routes``, and chooses a link for each system.
 
     ``own_source`` is our own (system id, component id). ``attached`` has the system ids with a vehicle object.
     """
@@ -134,7 +135,7 @@ class MultiLinkRoutes:
         self._choices: dict[int, LinkChoice] = {}
         self._merged = MergedStreams(len(link.names), self._choices)
         self.copies: Copies = self._merged.copies
-        # (system, link) → component → counters
+        # Maps (system id, link) to the counters of each component: component id → counters.
         self._counters: dict[tuple[int, int], dict[int, SourceStatistics]] = {}
         self._probes = LinkProbes(link.names, self._choices, bus, send)
         self._states = LinkStates(link, self._choices, now, bus.publish)
@@ -153,7 +154,7 @@ class MultiLinkRoutes:
             choice = self._choices[frame.system_id] = LinkChoice(needs_proof=is_autopilot)
         is_costly = _link(peer) in self._link.costly
         candidate = choice.record_heartbeat(_link(peer), frame.received_at, is_costly=is_costly)
-        if is_autopilot and not choice.needs_proof:
+        if is_autopilot and not choice.needs_proof:  # So far, only other components of this system were received.
             choice.start_with(candidate)
         if counters is not None:
             self._counters.setdefault((frame.system_id, _link(peer)), {})[frame.component_id] = counters
@@ -186,8 +187,8 @@ class MultiLinkRoutes:
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Return the peers that get a message for this component, all of them on the best link.
 
-        A broadcast goes once to each known system, as far as the links allow it, and to all links without a known
-        system; heartbeats and time messages go everywhere.
+        A broadcast reaches each known system once if possible, and is sent over all links without a known system.
+        Heartbeats and time messages go to all peers of all links.
         """
         if system_id != 0:
             choice = self._choices.get(system_id)
@@ -196,7 +197,7 @@ class MultiLinkRoutes:
             now = self._now()
             self._choose(system_id, choice, now)
             if choice.used.is_other_hardware:
-                return ()  # the link in use leads to another vehicle, and no live link leads to this one
+                return ()  # The link in use leads to another vehicle with this id, and no other link works.
             if message is None or message.ID in COMMANDS:
                 choice.record_command(now)
             return self._peers_on(self._link_reaching(choice, (system_id, component_id)), system_id, component_id)
@@ -216,7 +217,7 @@ class MultiLinkRoutes:
         link = _link(peer)
         if not self._merged.was_accepted(frame, link):
             return False
-        # A copy is not delivered, but shows what this link leads to, and that it works.
+        # A copy is not delivered. It still proves that this link works, and which vehicle the link leads to.
         self._probes.record_hardware(frame, link)
         if frame.message_id == m.Heartbeat.ID and not self.arrived_on_other_peer(frame, peer):
             counters = self._counters.get((frame.system_id, link), {}).get(frame.component_id)
@@ -241,7 +242,7 @@ class MultiLinkRoutes:
             if (candidate := choice.candidates.get(link)) is not None:
                 candidate.is_available = is_available
                 if not is_available:
-                    candidate.is_stalled = False  # a lost link has no unsent data
+                    candidate.is_stalled = False  # A lost link has no unsent data.
                 self._choose(system_id, choice, now)
         self._states.set_state(link, LinkState.CONNECTED if is_available else LinkState.LOST, now)
 
@@ -264,7 +265,7 @@ class MultiLinkRoutes:
         """Update the counts of all links, send probes that are due, and choose the link for each system."""
         for system_id, choice in self._choices.items():
             for link, candidate in choice.candidates.items():
-                if now - candidate.received_at > CANDIDATE_TIMEOUT_S:
+                if now - candidate.received_at > CANDIDATE_TIMEOUT_S:  # The system is no longer received here.
                     self._counters.pop((system_id, link), None)
                     continue
                 counters = self._counters.get((system_id, link), {}).values()
@@ -287,15 +288,16 @@ class MultiLinkRoutes:
         return choice.used.link
 
     def _peers_on(self, link: int, system_id: int, component_id: int) -> Collection[Peer]:
-        """Return peers of this link; all of its peers if the route has expired."""
+        """Return the peers on this link that get a message; all peers of the link if the route has expired."""
         peers = self._routes[link].peers_of(system_id, component_id)
         return (LinkPeer(link, None),) if None in peers else peers
 
     def _one_per_system(self, now: float) -> Collection[Peer]:
-        """Return peers that together reach every system. A system behind an already chosen peer adds no second peer."""
+        """Return peers that together reach every system. No peer is added for a system that is already reached."""
         peers: set[Peer] = set()
         links_with_systems: set[int] = set()
-        options_by_system: list[list[Collection[Peer]]] = []  # for each system, the peers on each usable link
+        # For each system, a list of options: the peers that reach the system, for each link that may be used.
+        options_by_system: list[list[Collection[Peer]]] = []
         for system_id, choice in self._choices.items():
             links_with_systems.update(choice.candidates)
             if choice.used is not None:
@@ -307,7 +309,7 @@ class MultiLinkRoutes:
                 options_by_system.append(
                     [self._peers_on(candidate.link, system_id, 0) for candidate in (choice.used, *usable)]
                 )
-        # Systems with one link come first, because their peers may also reach systems that have several links.
+        # Systems with a single option come first, because their peers are needed anyway and may reach other systems.
         for options in sorted(options_by_system, key=len):
             if not any(peers.issuperset(option) for option in options):
                 peers.update(options[0])
@@ -321,7 +323,8 @@ class MultiLinkRoutes:
         if reason is None or used is None:
             return
         if before is not None:
-            self._link.discard_unsent_of(before.link)  # old data must not arrive after commands over the new link
+            # Old data must not arrive after newer commands that are sent over the new link.
+            self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
             name, former = self._link.names[used.link], self._link.names[before.link]
             log = logger.info if reason in ("better", "cheaper") else logger.warning
@@ -350,7 +353,7 @@ class MultiLinkRoutes:
                 self._probes.probe(system_id, choice, candidate, peer, now, is_attached=is_attached)
 
 
-# Reason for a change, which describes the new link → word for the former link, for the log.
+# The reason for a switch describes the new link. This table has the word that describes the former link, for the log.
 _DISADVANTAGE_OF_FORMER = {"better": "worse", "cheaper": "costly"}
 
 

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 MAX_SAMPLES = 20
 TOLERANCE_S = 0.1
-MAX_SPEED_ERROR = 0.02  # simulations do not keep their nominal speed exactly
-MAX_DRIFT_S = 0.5  # without this limit, any clock would match after a long enough silence
-REAL_TIME_TOLERANCE = 0.05  # a measured speed of 1 ± this counts as 1: the error adds up in a long silence
+MAX_SPEED_ERROR = 0.02  # Simulations do not keep their nominal speed exactly.
+MAX_DRIFT_S = 0.5  # Without this limit, any clock would match after a long enough silence.
+REAL_TIME_TOLERANCE = 0.05  # A measured speed of 1 ± this value counts as 1, so that errors do not add up in a silence.
 MIN_SPAN_S = 1.0
 MAX_SPEED = 200.0  # maximum speed of a simulation, relative to real time
-MAX_PAUSE_S = 10.0  # a simulation that was paused for longer counts as rebooted
-SPEED_MAX_AGE_S = 5.0  # after a pause or reboot, the speed measured before remains valid for this time
+MAX_PAUSE_S = 10.0  # A simulation that was paused for longer counts as rebooted.
+SPEED_MAX_AGE_S = 5.0  # The speed measured before a pause or reboot remains valid for this time.
 
 
 class VehicleClock:
@@ -29,8 +29,8 @@ class VehicleClock:
     def __init__(self) -> None:
         self._samples: deque[tuple[float, float]] = deque(maxlen=MAX_SAMPLES)
         self.is_steady: bool = True
-        """True if the last sample was as expected."""
-        self._former_speed: tuple[float, float] | None = None  # speed, time of measurement
+        """True if the last sample was as expected from the speed; False after a pause or reboot."""
+        self._former_speed: tuple[float, float] | None = None  # speed before the last pause or reboot, and its time
 
     def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
         """Add a sample from the link in use. Return False if the clock does not continue, i.e. the vehicle rebooted.
@@ -42,7 +42,7 @@ class VehicleClock:
         if not self.is_steady:
             if (speed := self._measured_speed) is not None:
                 self._former_speed = speed, at
-            self._samples.clear()
+            self._samples.clear()  # The pause would make the speed measured over older samples too small.
         self._samples.append((at, vehicle_s))
         return continues
 
@@ -58,7 +58,7 @@ class VehicleClock:
         return fits
 
     def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
-        """Return True if a sample is where the clock's speed leads to; None if the speed is unknown."""
+        """Return True if a sample is as expected from the last sample and the speed; None if the speed is unknown."""
         speed = self._speed
         if speed is None:
             return None
@@ -67,11 +67,12 @@ class VehicleClock:
         return abs(last_vehicle_s + speed * (at - last_at) - vehicle_s) <= tolerance
 
     def _continues(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
-        """Return True if a sample may follow the last one: the clock is not too fast, and was paused only briefly."""
+        """Return True unless the clock went back, ran too fast, or was paused for too long since the last sample."""
         last_at, last_vehicle_s = self._samples[-1]
         advance_s = vehicle_s - last_vehicle_s
         speed = self._measured_speed
         if speed is None:
+            # The speed is unknown, so any speed of a simulation is possible.
             max_advance_s = MAX_SPEED * (at - last_at + TOLERANCE_S + round_trip_s)
             return -TOLERANCE_S - round_trip_s <= advance_s <= max_advance_s
         tolerance_s = self._tolerance_s(at, round_trip_s, speed)
@@ -85,7 +86,7 @@ class VehicleClock:
 
     @property
     def _speed(self) -> float | None:
-        """The measured speed, or for a few seconds after a pause or reboot the speed measured before it."""
+        """The measured speed. Shortly after a pause or reboot it is the speed from before; None if neither is known."""
         if self._measured_speed is not None:
             return self._measured_speed
         if self._former_speed is None:
@@ -106,11 +107,11 @@ class VehicleClock:
 
 
 class HardwareId(NamedTuple):
-    """Hardware id from AUTOPILOT_VERSION; all zeros mean none.
+    """Hardware id from AUTOPILOT_VERSION. If all fields are zero, the vehicle has no hardware id.
 
     ArduPilot sends the processor's serial number as ``uid2`` (on Linux and in simulation the machine id), and no
-    ``uid``. PX4 sends both; in simulation ``uid2`` is a constant and ``uid`` the system id. So only different ids
-    prove something: that there are two vehicles.
+    ``uid``. PX4 sends both; in simulation ``uid2`` is a constant and ``uid`` the system id. Equal ids therefore prove
+    nothing, while different ids prove that there are two vehicles.
     https://mavlink.io/en/messages/common.html#AUTOPILOT_VERSION
     """
 

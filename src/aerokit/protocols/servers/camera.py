@@ -13,14 +13,14 @@ from aerokit.protocols.servers.camera_device import CameraDevice
 from aerokit.protocols.servers.commands import ReceivedCommand, whole
 from aerokit.protocols.servers.intervals import Builder
 
-# Handlers are coroutines, because a device may need time. The handlers of a simulated device never suspend.
+# Handlers are coroutine functions, because a device may need time. The handlers of simulated devices never suspend.
 AsyncHandler = Callable[[ReceivedCommand], Coroutine[Any, Any, int]]
 
 _TO_THE_END = -1
 
 
 def camera_builders(camera: CameraDevice) -> dict[int, Builder]:
-    """Return builders by message id.
+    """Return a builder for each message id of the camera protocol.
 
     Param 2 of REQUEST_MESSAGE selects a storage, a stream or the first image.
     """
@@ -49,7 +49,7 @@ def camera_settings(camera: CameraDevice) -> m.CameraSettings:
 
 
 def _number(command: ReceivedCommand | None) -> int:
-    """Return param 2 of a request; 0 (all) for a message that is streamed."""
+    """Return param 2 of a request: the number of a storage or stream; 0 (all) for a message that is streamed."""
     return 0 if command is None else whole(command.param2)
 
 
@@ -86,6 +86,7 @@ def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[M
 
 
 def _streams(camera: CameraDevice, number: int) -> list[m.VideoStreamInformation]:
+    """Return VIDEO_STREAM_INFORMATION for one stream, or for all streams if ``number`` is 0."""
     return [
         m.VideoStreamInformation(
             **_stream_fields(camera, stream),
@@ -106,6 +107,7 @@ def _stream_status(camera: CameraDevice, number: int) -> list[m.VideoStreamStatu
 
 
 def _stream_fields(camera: CameraDevice, stream: int) -> dict[str, Any]:
+    """Return the fields that VIDEO_STREAM_INFORMATION and VIDEO_STREAM_STATUS have in common."""
     return {
         "stream_id": stream,
         "flags": _flags(camera, stream),

@@ -21,7 +21,7 @@ _CAN_ALWAYS_RECORD = CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
 
 
 def camera_commands(camera: CameraDevice) -> dict[int, AsyncHandler]:
-    """Return handlers by MAV_CMD."""
+    """Return the handler for each MAV_CMD of the camera protocol."""
     pictures, videos, settings = _Pictures(camera), _Videos(camera), _Settings(camera)
     return {
         MavCmd.IMAGE_START_CAPTURE: pictures.start,
@@ -56,7 +56,7 @@ def legacy_requests(streams: MessageStreams) -> dict[int, CommandHandler]:
     }
 
     def handler(message_id: int) -> CommandHandler:
-        # REQUEST_MESSAGE has the number of a storage or stream in param 2, the older requests have it in param 1.
+        # The number of a storage or stream is in param 1 of the older requests, but in param 2 of REQUEST_MESSAGE.
         return lambda command: streams.answer_with(message_id, replace(command, param2=command.param1))
 
     return {command: handler(message_id) for command, message_id in message_ids.items()}
@@ -72,7 +72,8 @@ class _Pictures:
     async def start(self, command: ReceivedCommand) -> int:
         """Take images, if param 1 selects this camera.
 
-        A command for a single image with the same sequence number (param 4) as the last one takes none.
+        A repeated command for a single image takes no further image: it has the sequence number (param 4) of the last
+        command.
         """
         camera, captures = self._camera, self._camera.captures
         interval_s = command.param2 if math.isfinite(command.param2) else 0.0
@@ -100,7 +101,7 @@ class _Pictures:
         return MavResult.ACCEPTED
 
     async def control(self, command: ReceivedCommand) -> int:
-        """Execute DO_DIGICAM_CONTROL of the older protocol; param 5 is 1 to take an image."""
+        """Execute DO_DIGICAM_CONTROL, a command of the older camera protocol. Param 5 is 1 to take an image."""
         if command.x == 1:
             self._camera.captures.take()
         return MavResult.ACCEPTED
@@ -126,7 +127,7 @@ class _Videos:
         self._camera = camera
 
     async def start(self, command: ReceivedCommand) -> int:
-        """Start to record; param 2 is the rate in Hz of CAMERA_CAPTURE_STATUS during the recording."""
+        """Start recording. Param 2 is the rate in Hz at which CAMERA_CAPTURE_STATUS is sent during the recording."""
         camera, captures = self._camera, self._camera.captures
         if not camera.can(CameraCapFlags.CAPTURE_VIDEO):
             return MavResult.UNSUPPORTED
@@ -171,6 +172,7 @@ class _Settings:
         self._camera = camera
 
     async def set_mode(self, command: ReceivedCommand) -> int:
+        """Set the CAMERA_MODE in param 2, unless the camera is taking images or recording."""
         camera, mode = self._camera, whole(command.param2)
         if not camera.can(CameraCapFlags.HAS_MODES):
             return MavResult.UNSUPPORTED
@@ -226,5 +228,5 @@ def _is_own(device: float) -> bool:
 
 
 def _has_wrong_mode(camera: CameraDevice, wrong_mode: int, works_in_any_mode: int) -> bool:
-    """Return True if the camera is in this mode, and has no capability ``works_in_any_mode`` (CAMERA_CAP_FLAGS)."""
+    """Return True if the camera is in ``wrong_mode``, and lacks the CAMERA_CAP_FLAGS ``works_in_any_mode``."""
     return camera.can(CameraCapFlags.HAS_MODES) and camera.mode == wrong_mode and not camera.can(works_in_any_mode)

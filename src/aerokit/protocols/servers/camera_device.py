@@ -21,9 +21,9 @@ _IDLE, _CAPTURING, _WAITING, _WAITING_AND_CAPTURING = 0, 1, 2, 3
 _UNLIMITED = -1
 
 MIN_STATUS_INTERVAL_S = 0.02
-"""Minimum seconds between two CAMERA_CAPTURE_STATUS, even if a client requests a higher rate."""
+"""Minimum seconds between two CAMERA_CAPTURE_STATUS messages, even if a client requests a higher rate."""
 
-# Creates CAMERA_IMAGE_CAPTURED from the keywords image_index, capture_result and file_url.
+# Function that creates a CAMERA_IMAGE_CAPTURED. Its keyword arguments are image_index, capture_result and file_url.
 Shot = Callable[..., CameraImageCaptured]
 
 UNKNOWN_ATTITUDE = (math.nan, math.nan, math.nan, math.nan)
@@ -51,7 +51,7 @@ class CameraDevice:
     stream_bits_s: int = 4_000_000
     thermal_celsius: tuple[float, float] | None = None
     capabilities: int = 0
-    """CAMERA_CAP_FLAGS."""
+    """Capabilities of the camera (CAMERA_CAP_FLAGS)."""
     max_images: int = 10_000
     """Maximum number of images in the image log."""
     shutter_s: float = 0.0
@@ -87,7 +87,7 @@ class CameraDevice:
 
     @property
     def free_mib(self) -> float:
-        """Free space for images and videos."""
+        """Free space for images and videos, in MiB."""
         return math.inf
 
     @property
@@ -162,19 +162,19 @@ class Captures:
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
         self.images: list[CameraImageCaptured] = []
-        """The last images since the image log was cleared, at most ``max_images``."""
+        """The image log: the latest images since it was cleared, at most ``max_images``."""
         self.dropped_count: int = 0
-        """Number of older images that the log no longer has; the image index of the first one in it."""
+        """Number of older images that the log has dropped. It is also the image index of the log's first image."""
         self.interval_s: float = 0.0
-        """Interval of the series."""
-        self._remaining = 0  # images that the series has not begun yet; -1: no limit
+        """Seconds between two images of the current series."""
+        self._remaining = 0  # number of images of the series that are still to be taken; -1: no limit
         self._is_exposing = False  # True while an image is being taken
         self._is_late = False  # True if the next image is due, but the previous one is not finished
         self._series = 0  # number of the series; callbacks of earlier series are ignored
         self._recording_since = math.nan  # start of the video; NaN: no video
 
     def switch_off(self) -> None:
-        """Abort everything, as by a power failure. The images are kept."""
+        """End the series and the video at once, as a power failure does. The image log is kept."""
         self._remaining, self._is_exposing, self._is_late, self._recording_since = 0, False, False, math.nan
         self._series += 1
 
@@ -198,7 +198,7 @@ class Captures:
         self._begin_image(self._series)
 
     def stop(self) -> None:
-        """End a series; the current image is completed."""
+        """End the series. An image that is being taken is still completed."""
         self._remaining = 0
 
     def clear(self) -> None:
@@ -212,7 +212,7 @@ class Captures:
         return self.dropped_count + len(self.images)
 
     def between(self, first: int, last: int | None) -> list[CameraImageCaptured]:
-        """Return the images with these indices, up to the newest if ``last`` is None."""
+        """Return the logged images with the indices ``first`` to ``last``; None: to the newest image."""
         end = None if last is None else max(0, last + 1 - self.dropped_count)
         return self.images[max(0, first - self.dropped_count) : end]
 
@@ -257,7 +257,7 @@ class Captures:
             self._begin_image(series)
 
     def record(self, status_interval_s: float) -> None:
-        """Register the start of a video, and send CAMERA_CAPTURE_STATUS at this interval (0: never)."""
+        """Register the start of a video. CAMERA_CAPTURE_STATUS is then sent at this interval in seconds (0: never)."""
         self._recording_since = self._camera.host.now
         self._camera.host.send(self.status())
         if 0.0 < status_interval_s < math.inf:
@@ -273,13 +273,14 @@ class Captures:
 
     def _send_status_every(self, recording: float, interval_s: float) -> None:
         def send_status() -> None:
-            if self._recording_since == recording:  # otherwise this video has ended
+            if self._recording_since == recording:  # Another value means that this video has ended.
                 self._camera.host.send(self.status())
                 self._send_status_every(recording, interval_s)
 
         self._camera.host.call_later(interval_s, send_status)
 
     def status(self) -> CameraCaptureStatus:
+        """Return the CAMERA_CAPTURE_STATUS for the current series and video."""
         camera = self._camera
         is_series = self._remaining != 0 and self.interval_s > 0.0
         if is_series:
@@ -315,7 +316,7 @@ class Tracking:
         self.is_lost: bool = False
 
     def lose(self) -> None:
-        """Lose the target."""
+        """Simulate the loss of the target."""
         self.is_lost = True
 
     async def track_point(self, command: ReceivedCommand) -> int:
@@ -346,7 +347,7 @@ class Tracking:
 
     @property
     def flags(self) -> int:
-        """CAMERA_TRACKING_STATUS_FLAGS."""
+        """State of the tracking (CAMERA_TRACKING_STATUS_FLAGS)."""
         if self.mode == CameraTrackingMode.NONE:
             return 0
         return Flags.ERROR if self.is_lost else Flags.ACTIVE

@@ -58,7 +58,7 @@ class ReceivedCommand:
 
 @dataclass(frozen=True)
 class CommandProgress:
-    """Answers to a command that takes time: IN_PROGRESS with each percentage, then ``result``."""
+    """Answers to a command that takes time: an IN_PROGRESS with each of ``percents``, and finally ``result``."""
 
     percents: tuple[int, ...]
     interval_s: float
@@ -67,7 +67,8 @@ class CommandProgress:
     """Called right before the result is sent."""
 
 
-# Returns a MAV_RESULT, a CommandProgress, or None if it sends the acknowledgement itself.
+# Function that executes a command. It returns a MAV_RESULT or a CommandProgress; None if it sends the acknowledgement
+# itself.
 CommandHandler = Callable[[ReceivedCommand], "int | CommandProgress | None"]
 
 
@@ -102,7 +103,7 @@ class CommandDispatcher:
         self.execute(ReceivedCommand(message.command, *params, *position, message.frame, channel, sender_of(message)))
 
     def execute(self, command: ReceivedCommand) -> None:
-        """Refuse a command, or dispatch it."""
+        """Answer a command with the refusal, if there is one; otherwise dispatch the command."""
         refusal = self._refusal(command)
         if refusal is not None:
             self.answer(command, refusal)
@@ -110,7 +111,7 @@ class CommandDispatcher:
         self.dispatch(command)
 
     def dispatch(self, command: ReceivedCommand) -> None:
-        """Call the handler and answer."""
+        """Call the command's handler, and send the acknowledgement."""
         answer = self.handle(command)
         if isinstance(answer, CommandProgress):
             self.report(command, answer, lambda: self.answer(command, answer.result))
@@ -118,7 +119,7 @@ class CommandDispatcher:
             self.answer(command, answer)
 
     def handle(self, command: ReceivedCommand) -> int | CommandProgress | None:
-        """Call the handler."""
+        """Call the command's handler, and return its result."""
         handler = self._handlers.get(command.command)
         return MavResult.UNSUPPORTED if handler is None else handler(command)
 
@@ -153,7 +154,7 @@ UNKNOWN_PROGRESS = 255
 
 
 RESULT_MAX_AGE_S = 5.0
-"""Seconds for which a repeated command is answered with the same result instead of being executed again."""
+"""For this time after its end, a repeated command is answered with the same result instead of being executed again."""
 
 
 class Outcome(NamedTuple):
@@ -170,7 +171,7 @@ class RunningCommand:
     def __init__(self, command: ReceivedCommand, cancel: Callable[[], None]) -> None:
         self.command = command
         self.progress: int = UNKNOWN_PROGRESS
-        """Percent; 255 if unknown."""
+        """Progress in percent; 255 if unknown."""
         self.cancel = cancel
 
 
@@ -188,14 +189,15 @@ class RunningCommands:
         self._host = host
         self._server = server
         self._running: dict[int, RunningCommand] = {}
-        self._ended: dict[int, tuple[ReceivedCommand, Outcome, float]] = {}  # MAV_CMD → command, result, end time
+        # Maps MAV_CMD to the last command that has ended, its result, and the time of its end.
+        self._ended: dict[int, tuple[ReceivedCommand, Outcome, float]] = {}
         host.on(CommandCancel, self._on_cancel)
 
     def __len__(self) -> int:
         return len(self._running)
 
     def start(self, command: ReceivedCommand, cancel: Callable[[], None]) -> RunningCommand | None:
-        """Register a command; if it must not be executed, inform the sender and return None."""
+        """Register a command that is to be executed. If it must not be executed, answer the sender and return None."""
         running = self._running.get(command.command)
         if running is not None and _is_repeated(command, running.command):
             self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
@@ -232,7 +234,7 @@ class RunningCommands:
             self._server.answer(command, *outcome)
 
     def cancel_all(self) -> None:
-        """Cancel everything that runs, at the end of the component."""
+        """Cancel all running commands, because the component ends."""
         for running in tuple(self._running.values()):
             running.cancel()
 
@@ -243,7 +245,7 @@ class RunningCommands:
 
 
 def _is_repeated(command: ReceivedCommand, first: ReceivedCommand) -> bool:
-    """Return True if ``command`` is another transmission of ``first``."""
+    """Return True if ``command`` is a repeated transmission of the command ``first``."""
     return command.confirmation > 0 and (command.sender, command.params) == (first.sender, first.params)
 
 

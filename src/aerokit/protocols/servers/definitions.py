@@ -29,9 +29,9 @@ class DefinedParameterServer(ExtendedParameterServer):
         self.values: dict[str, SettingValue] = {}
         """Current values; assign them at any time."""
         self.slow: dict[str, float] = {}
-        """Maps the name of a slow setting to the seconds that a change takes.
+        """Maps the name of a slow setting to the seconds that a change of it takes.
 
-        During this time, the answer is IN_PROGRESS.
+        While it is being changed, requests to set it are answered with IN_PROGRESS.
         """
         self._pending: set[str] = set()  # names of slow settings that are being changed
         super().__init__(host, self)
@@ -53,11 +53,11 @@ class DefinedParameterServer(ExtendedParameterServer):
         """Called when the value of a setting has changed."""
 
     def limited(self, name: str, value: SettingValue) -> SettingValue:
-        """Return the value to check and store in place of the received value."""
+        """Return the value that is checked and stored instead of the received value, e.g. a clamped value."""
         return value
 
     def restart(self) -> None:
-        """Drop pending changes, as by a reboot."""
+        """Drop changes of slow settings that are not finished, as a reboot does."""
         super().restart()
         self._pending.clear()
 
@@ -81,7 +81,7 @@ class DefinedParameterServer(ExtendedParameterServer):
         return result, setting_bytes(self.values[name], setting.wire_type), setting.wire_type
 
     def _check(self, name: str, value: SettingValue, kind: int) -> tuple[ParamAck, SettingValue]:
-        """Return the answer to a received value, and the value to store."""
+        """Check a received value. Return PARAM_ACK for the answer, and the value to store."""
         self.refresh()
         setting, definition = self.definition.settings[name], self.definition
         if setting.read_only or not self.can_set(name) or definition.excluded_by(name, self.values):

@@ -8,11 +8,11 @@ from typing import Protocol
 
 from typing_extensions import Self
 
-# Linux's error numbers, which the firmwares send on every platform.
+# Error numbers of Linux. Firmware sends the same numbers, whatever platform this program runs on.
 ENOENT, EEXIST, ENOTDIR, EISDIR = 2, 17, 20, 21
 EINVAL, ENFILE, EFBIG, ENOSPC, EROFS, ENOTEMPTY = 22, 23, 27, 28, 30, 39
 
-# Name and size in bytes; None for a folder.
+# (name, size in bytes). The size is None for a folder.
 Entry = tuple[str, int | None]
 
 
@@ -83,7 +83,7 @@ class UploadedFile(FileHandle):
         self.content[offset : offset + len(data)] = data
 
     def announced_size(self, data: bytes) -> int:
-        """Return the file size that the first block announces; 0 if it announces no size."""
+        """Return the size of the whole file according to its first block; 0 if the block does not contain the size."""
         return 0
 
 
@@ -111,7 +111,7 @@ class Mount(ABC):
 
 
 class TextMount(Mount):
-    """Read-only text files, such as ArduPilot's ``@SYS``. Opening a file reports a size of 100,000 bytes."""
+    """Read-only text files, such as ArduPilot's ``@SYS``. Each is reported with a size of 100,000 bytes when opened."""
 
     is_listed = True
     _PLACEHOLDER = 100_000
@@ -136,7 +136,7 @@ class TextMount(Mount):
 
 
 class _File:
-    """File content, or a function that creates it on first access."""
+    """A file in memory. Its content may be given by a function, which is called on first access."""
 
     def __init__(self, content: bytes | Callable[[], bytes] = b"", size: int | None = None) -> None:
         self._make = content if callable(content) else None
@@ -151,7 +151,7 @@ class _File:
 
     @property
     def size(self) -> int:
-        """Size in bytes. The content is not created for this if the size was given."""
+        """Size in bytes. If the size was given, the content is not created only to determine the size."""
         if self._make is not None and self._size is not None:
             return self._size
         return len(self.content)
@@ -173,7 +173,7 @@ class _Opened(FileHandle):
             raise FileFault(EROFS)
         content = self._file.content
         self._tree.reserve(max(0, offset + len(data) - len(content)))
-        if offset > len(content):
+        if offset > len(content):  # The gap before the new data is filled with zeros.
             content.extend(bytes(offset - len(content)))
         content[offset : offset + len(data)] = data
 
@@ -251,7 +251,7 @@ class FileTree:
         if isinstance(node, dict):
             raise FileFault(EISDIR)
         if node is None:
-            self.reserve(0)
+            self.reserve(0)  # A new name also needs free space.
             folder[name] = _File()
         else:
             self.reserve(-node.size)
@@ -278,16 +278,16 @@ class FileTree:
             raise FileFault(ENOTEMPTY if isinstance(node, dict) else EISDIR)
         if isinstance(existing, _File) and isinstance(node, dict):
             raise FileFault(ENOTDIR)
-        if isinstance(node, dict) and _contains(node, folder):  # a folder cannot be moved into itself
+        if isinstance(node, dict) and _contains(node, folder):  # A folder cannot be moved into itself.
             raise FileFault(EINVAL)
         old_folder, old_name = self._parent(path)
         del old_folder[old_name]
         folder[name] = node
 
     def reserve(self, size: int) -> None:
-        """Reserve free bytes; a negative size releases them.
+        """Take ``size`` from the free bytes; a negative size returns bytes.
 
-        Raises FileFault if there are not enough, and even for size 0 (a new name) if no byte is free.
+        Raises FileFault if too few bytes are free. Size 0 (a new, empty file) also needs a free byte.
         """
         if self.free_bytes is None:
             return
@@ -300,7 +300,7 @@ class FileTree:
         mounted = self.mounted(path)
         if mounted is not None:
             mount, path_in_mount = mounted
-            if path_in_mount:
+            if path_in_mount:  # A mount has no folders of its own.
                 raise FileFault(ENOENT)
             return mount.entries()
         folder = self._find(path)
@@ -317,6 +317,7 @@ class FileTree:
         folder[name] = {}
 
     def remove_folder(self, path: str) -> None:
+        """Remove a folder, which must be empty."""
         folder, name = self._parent(path)
         node = self._find(path)
         if not isinstance(node, dict):
@@ -326,6 +327,7 @@ class FileTree:
         del folder[name]
 
     def _find(self, path: str) -> _File | _Folder:
+        """Return the file or folder with this path; raises FileFault if there is none."""
         node: _File | _Folder = self._root
         for part in _parts(path):
             if not isinstance(node, dict):

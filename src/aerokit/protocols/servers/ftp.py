@@ -17,17 +17,17 @@ from aerokit.protocols.servers.host import Channel, ServerHost
 FilesT = TypeVar("FilesT", bound=FileSystem)
 
 
-_BURST_BYTES = 35_000  # size after which a burst ends
-_BURST_BLOCKS = 24  # blocks that a burst sends at once
+_BURST_BYTES = 35_000  # A burst ends after this number of bytes.
+_BURST_BLOCKS = 24  # number of blocks that a burst sends at once
 _CRC_PAUSE_S = 0.002
-_MAX_SIZE = 0xFFFFFFFF  # maximum file size, because sizes and offsets have 32 bits
+_MAX_SIZE = 0xFFFFFFFF  # maximum file size in bytes, because sizes and offsets have 32 bits in MAVFTP
 
 Op = MavFtpOpcode
 
 
 @dataclass(eq=False)
 class FtpSession:
-    """An open file."""
+    """A file that a client has opened."""
 
     number: int
     file: FileHandle
@@ -36,7 +36,7 @@ class FtpSession:
     burst: FtpPacket | None = field(default=None, repr=False)
     """Sequence number and offset of the next block."""
     burst_sent: int = 0
-    """Bytes that the burst has sent."""
+    """Number of bytes that the current burst has sent."""
 
 
 @dataclass(eq=False)
@@ -47,7 +47,7 @@ class FtpPeer:
     sessions: dict[int, FtpSession] = field(default_factory=dict)
     used_at: float = 0.0
     errno: int = 0
-    """Error of the latest failure."""
+    """Error number of the latest failed request; 0 if none failed."""
     request: FtpPacket | None = None
     """The latest request that was executed."""
     reply: FtpPacket | None = None
@@ -68,15 +68,15 @@ class SessionFtpServer(Generic[FilesT]):
     burst: int = _BURST_BLOCKS
     max_clients: ClassVar[int] = 16
     max_sessions: ClassVar[int] = 4
-    """Sessions of one client."""
+    """Maximum number of sessions of one client."""
     session_timeout_s: ClassVar[float] = 10.0
     list_prefix: ClassVar[tuple[bytes, ...]] = ()
-    """Lines before the entries of each folder."""
+    """Lines that each listing of a folder has before the folder's entries."""
     line_end: ClassVar[bytes] = b"\0"
     creates_missing: ClassVar[bool] = True
     """True if OpenFileWO creates a missing file."""
     reply_kept: ClassVar[int] = 4
-    """Size of the largest reply that is sent again, in bytes."""
+    """Maximum data size of a reply that is stored, in bytes. A stored reply answers a repeated request."""
     crc_block: ClassVar[int] = 65_536
     crc_blocks_at_once: ClassVar[int] = 8
     """Number of blocks of a file that are read for a checksum before the event loop continues."""
@@ -104,7 +104,7 @@ class SessionFtpServer(Generic[FilesT]):
         return sum(len(peer.sessions) for peer in self._peers.values())
 
     def restart(self) -> None:
-        """Drop all sessions without closing their files, as by a power failure."""
+        """Drop all sessions without closing their files, as a power failure does."""
         self._peers.clear()
 
     def close(self) -> None:
@@ -119,11 +119,11 @@ class SessionFtpServer(Generic[FilesT]):
             self.receive(FtpPacket.parse(message), channel)
 
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
-        """Return the key of the client."""
+        """Return the key under which the state of this request's client is stored."""
         return request.client
 
     def _is_repeated(self, peer: FtpPeer, request: FtpPacket, last: FtpPacket) -> bool:
-        """Return True if this request is the latest one again, and the last reply answers it.
+        """Return True if this request repeats the latest one, and ``last`` is the reply to the latest one.
 
         Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0. The last reply
         may be the end of a burst, which does not replace the blocks of the burst.
@@ -151,7 +151,7 @@ class SessionFtpServer(Generic[FilesT]):
             idle_keys = [idle for idle, peer in self._peers.items() if not peer.sessions and peer.checksum is None]
             if not idle_keys:
                 return None
-            del self._peers[idle_keys[0]]
+            del self._peers[idle_keys[0]]  # A client without open files makes room for the new one.
         peer = self._peers.setdefault(key, FtpPeer(channel))
         peer.channel = channel
         return peer
@@ -173,7 +173,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
         """Execute a request. A handler that returns None answers later."""
         handler = _HANDLERS.get(request.opcode)
-        peer.request, peer.reply = request, None
+        peer.request, peer.reply = request, None  # The reply to the previous request must not be sent again.
         try:
             answer = self._unknown(request) if handler is None else handler(self, peer, request)
         except Refused as refused:
@@ -188,7 +188,8 @@ class SessionFtpServer(Generic[FilesT]):
         return answer.replace(offset=request.offset)
 
     def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
-        # A client that got NOSESSIONSAVAILABLE repeats its request until a session is free, so it needs a new answer.
+        # NOSESSIONSAVAILABLE is not stored: the client repeats its request until a session is free, and then needs a
+        # new answer.
         if answer.size <= self.reply_kept and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
             peer.reply = answer
         self._host.send(answer.message(), peer.channel)
@@ -235,6 +236,7 @@ class SessionFtpServer(Generic[FilesT]):
             raise fault
 
     def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        """Open a file for OpenFileRO, OpenFileWO or CreateFile, and return the ACK with its size and session."""
         if len(peer.sessions) >= self.max_sessions:
             return request.refuse(MavFtpErr.NOSESSIONSAVAILABLE)
         path = self._path(request)
@@ -266,7 +268,7 @@ class SessionFtpServer(Generic[FilesT]):
             if peer.sessions.get(session.number) is not session:
                 return
             due_at = peer.used_at + self.session_timeout_s
-            if self._host.now < due_at:  # the client has sent a request meanwhile
+            if self._host.now < due_at:  # The client has sent a request since this call was scheduled.
                 self._host.call_at(due_at, close_if_due)
                 return
             peer.reply = None
@@ -289,7 +291,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge(request.size.to_bytes(4, "little"))
 
     def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
-        """Start a burst, or continue a running one from another offset. The blocks are the answer, so return None."""
+        """Start a burst, or move a running one to another offset. Return None, because the blocks are the answer."""
         session = self._opened(peer, request)
         is_running = session.burst is not None
         session.burst, session.burst_sent = request.replace(sequence=request.sequence + 1 & 0xFFFF), 0
@@ -308,7 +310,7 @@ class SessionFtpServer(Generic[FilesT]):
         self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
 
     def _send_block(self, peer: FtpPeer, session: FtpSession, burst: FtpPacket, *, may_end: bool) -> None:
-        # In `burst`, the sequence number is that of the reply, not of the request.
+        # Unlike in a request, the sequence number in `burst` is already that of the reply.
         number = session.number
         answer = burst.acknowledge(offset=burst.offset, session=number).replace(sequence=burst.sequence)
         refusal = burst.refuse(MavFtpErr.EOF).replace(sequence=burst.sequence, offset=burst.offset, session=number)
@@ -328,7 +330,7 @@ class SessionFtpServer(Generic[FilesT]):
         session.burst = None if is_complete else next_block
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        """Return as many entries of a folder as fit, from entry number ``offset`` on."""
+        """Answer with the folder's entries from number ``offset`` on: as many as fit into one message."""
         entries = self._entries(self._path(request))
         listing = b""
         for text in [*self.list_prefix, *map(_line, entries)][request.offset :]:
@@ -355,7 +357,7 @@ class SessionFtpServer(Generic[FilesT]):
 
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         old_path, _, new_path = request.data[: request.size].partition(b"\0")
-        if len(old_path) + 2 >= request.size:  # the new path is missing
+        if len(old_path) + 2 >= request.size:  # The data ends after the old path, so there is no new path.
             return self._fault(peer, request, FileFault(EINVAL))
         self.files.rename(checked_path(old_path), checked_path(new_path))
         return request.acknowledge()
@@ -364,7 +366,7 @@ class SessionFtpServer(Generic[FilesT]):
         """Compute a checksum in slices, so that a large file does not block the event loop."""
         path = self._path(request)
         is_repeated = peer.checksum is not None and request.repeats(peer.checksum)
-        if not is_repeated:
+        if not is_repeated:  # The running computation also answers a repeated request.
             file, peer.checksum = self.files.open(path), request
             self._continue_crc32(peer, request, file, 0, 0)
         return None
@@ -386,7 +388,7 @@ class SessionFtpServer(Generic[FilesT]):
             return
         with suppress(FileFault):
             file.close()
-        if peer.checksum is request:  # otherwise a newer request has replaced this one
+        if peer.checksum is request:  # A newer request may have replaced this one, which then gets no answer.
             peer.checksum, peer.used_at = None, self._host.now
             self._reply(peer, self._adapted(peer, request, answer))
 

@@ -45,7 +45,7 @@ class GimbalMount:
     vendor: str = "aerokit"
     model: str = "gimbal"
     capabilities: int = ALL_CAPABILITIES
-    """GIMBAL_DEVICE_CAP_FLAGS."""
+    """Capabilities of the gimbal (GIMBAL_DEVICE_CAP_FLAGS)."""
     can_point_at_positions: bool = True
     limits: tuple[tuple[float, float], ...]
     """Minimum and maximum of roll, pitch and yaw in radians."""
@@ -134,6 +134,7 @@ def _flags(gimbal: GimbalMount) -> int:
 
 
 def _attitude_status(gimbal: GimbalMount) -> m.GimbalDeviceAttitudeStatus:
+    """Return the attitude of the gimbal, to all (0). Its yaw is from north if it is locked, else from the nose."""
     is_from_north = gimbal.is_yaw_locked
     angles = gimbal.angles_from_north() if is_from_north else gimbal.angles()
     return m.GimbalDeviceAttitudeStatus(
@@ -197,7 +198,10 @@ class GimbalRequests:
         return whole(device_id) in (0, self._gimbal.device_id)
 
     def configure(self, command: ReceivedCommand) -> int:
-        """Set primary (params 1, 2) and secondary control (3, 4). -1 means unchanged, -2 the sender, -3 release."""
+        """Set primary control (params 1 and 2) and secondary control (params 3 and 4).
+
+        Each pair is a system and component id. -1 means unchanged, -2 the sender, -3 release.
+        """
         gimbal, sender = self._gimbal, command.sender
         numbers = [command.param1, command.param2, command.param3, command.param4]
         if not self._selects_gimbal(command.z) or not all(_RELEASE <= number <= 255 for number in numbers):
@@ -254,7 +258,7 @@ class GimbalRequests:
         return MavResult.ACCEPTED
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> bool:
-        """Apply the angles, or the rates if an angle is NaN; return False if both contain NaN."""
+        """Apply the angles; if one of them is NaN, apply the rates. Return False if a rate is NaN, too."""
         gimbal = self._gimbal
         locked = bool(flags & (Flags.YAW_LOCK | Flags.YAW_IN_EARTH_FRAME))
         if flags & (Flags.RETRACT | Flags.NEUTRAL):
@@ -287,7 +291,7 @@ class GimbalRequests:
             self.apply(message.flags, (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate))
 
     def on_manual_control(self, message: m.GimbalManagerSetManualControl, _: Channel) -> None:
-        """Apply angles, or rates from -1 to 1, which are fractions of the slew rate."""
+        """Apply the angles, or the rates. A rate is a fraction of the slew rate, from -1 to 1."""
         gimbal = self._gimbal
         if self._selects_gimbal(message.gimbal_device_id) and gimbal.is_in_control(sender_of(message)):
             rates = (0.0, message.pitch_rate * gimbal.slew_rad_s, message.yaw_rate * gimbal.slew_rad_s)
@@ -295,10 +299,10 @@ class GimbalRequests:
 
 
 def _owner(current: Owner, requested: tuple[int, int], sender: Owner) -> Owner:
-    """Return the component in control after a pair of params of the command is applied; (0, 0) if none."""
+    """Return the component that has control after the pair ``requested`` was applied to ``current``; (0, 0) if none."""
     if _SENDER in requested:
         return sender
-    if _RELEASE in requested:  # only the component in control can release it
+    if _RELEASE in requested:  # Only the component that has control can release it.
         return (0, 0) if current == sender else current
     if _UNCHANGED in requested:
         return current
@@ -306,7 +310,7 @@ def _owner(current: Owner, requested: tuple[int, int], sender: Owner) -> Owner:
 
 
 def gimbal_commands(gimbal: GimbalMount) -> dict[int, CommandHandler]:
-    """Return handlers by MAV_CMD."""
+    """Return the handler for each MAV_CMD of the gimbal protocol."""
     control = GimbalRequests(gimbal)
     return {
         MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: control.configure,
@@ -318,7 +322,7 @@ def gimbal_commands(gimbal: GimbalMount) -> dict[int, CommandHandler]:
 
 
 def gimbal_builders(gimbal: GimbalMount) -> dict[int, Builder]:
-    """Return builders by message id."""
+    """Return a builder for each message id of the gimbal protocol."""
     return {
         m.GimbalDeviceInformation.ID: lambda _: [_device_information(gimbal)],
         m.GimbalDeviceAttitudeStatus.ID: lambda _: [_attitude_status(gimbal)],
@@ -328,7 +332,7 @@ def gimbal_builders(gimbal: GimbalMount) -> dict[int, Builder]:
 
 
 def listen_for_gimbal(gimbal: GimbalMount) -> None:
-    """Register handlers of the other messages."""
+    """Register handlers for the messages, other than commands, that the gimbal receives."""
     host, control = gimbal.host, GimbalRequests(gimbal)
     host.on(m.GimbalManagerSetAttitude, control.on_attitude)
     host.on(m.GimbalManagerSetPitchyaw, control.on_pitch_and_yaw)

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from aerokit.mavlink.message import Message
 
-# The origin of a message, to which the answer is sent. Only the host knows its type.
+# Where a message came from, and where its answer is sent. Only the host knows the type.
 Channel = Any
 Handler = Callable[[Any, Channel], None]
 

@@ -13,7 +13,8 @@ from aerokit.mavlink.messages import MessageInterval
 from aerokit.protocols.servers.commands import CommandHandler, ReceivedCommand, whole
 from aerokit.protocols.servers.host import Channel, ServerHost
 
-# Returns the current messages with one id. The argument is the REQUEST_MESSAGE command, or None for a stream.
+# Function that returns the current messages with one id. Its argument is the REQUEST_MESSAGE command, or None when the
+# messages are streamed.
 Builder = Callable[["ReceivedCommand | None"], "Iterable[Message]"]
 
 
@@ -31,7 +32,7 @@ class MessageStreams:
         self._streams: dict[tuple[Channel, int], _Stream] = {}
 
     def commands(self) -> dict[int, CommandHandler]:
-        """Return the handlers by MAV_CMD."""
+        """Return the handler for each MAV_CMD that requests or streams messages."""
         return {
             MavCmd.REQUEST_MESSAGE: self._request_message,
             MavCmd.SET_MESSAGE_INTERVAL: self._set_interval,
@@ -43,7 +44,7 @@ class MessageStreams:
         self._streams.clear()
 
     def stream(self, message_id: int, interval_s: float, channel: Channel = None) -> bool:
-        """Stream messages with this id on one channel, or on all for None; an interval of 0 stops the stream.
+        """Stream messages with this id on one channel (None: on all channels). An interval of 0 stops the stream.
 
         Returns False if there are too many streams already.
         """
@@ -61,17 +62,17 @@ class MessageStreams:
         return True
 
     def _send_stream(self, key: tuple[Channel, int], stream: _Stream) -> None:
-        if self._streams.get(key) is not stream:  # Another stream has replaced this one.
+        if self._streams.get(key) is not stream:  # This stream was stopped, or replaced by another one.
             return
         channel, message_id = key
         try:
             for message in self.builders[message_id](None):
                 self._host.send(message, channel)
-        finally:  # The host reports an exception of a builder; the stream goes on.
+        finally:  # If a builder raises, the host reports the exception, and the stream continues.
             self._host.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
 
     def answer_with(self, message_id: int, command: ReceivedCommand) -> int:
-        """Send the requested messages; return DENIED for an unknown id, FAILED if there is no message."""
+        """Send the requested messages and return ACCEPTED; DENIED for an unknown id, FAILED if there is no message."""
         builder = self.builders.get(message_id)
         if builder is None:
             return MavResult.DENIED
@@ -88,7 +89,8 @@ class MessageStreams:
         message_id = whole(command.param1)
         if message_id not in self.builders:
             return MavResult.DENIED
-        self._streams.pop((None, message_id), None)  # a stream to all channels would be sent here, too
+        # A stream to all channels would also be sent to this channel, in addition to the requested stream.
+        self._streams.pop((None, message_id), None)
         is_accepted = self.stream(message_id, whole(command.param2) / 1e6, command.channel)
         return MavResult.ACCEPTED if is_accepted else MavResult.TEMPORARILY_REJECTED
 

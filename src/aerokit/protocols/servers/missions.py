@@ -47,8 +47,8 @@ MAX_ITEMS = 2000
 _TYPES = (MavMissionType.MISSION, MavMissionType.FENCE, MavMissionType.RALLY)
 _R = MavMissionResult
 
-# Accepts or refuses an uploaded list, now or later. Called with MAV_MISSION_TYPE, items, and a function that takes the
-# MAV_MISSION_RESULT.
+# Function that accepts or refuses an uploaded list, now or later. Its arguments are the MAV_MISSION_TYPE, the items,
+# and a function to call with the MAV_MISSION_RESULT.
 Validator = Callable[[int, tuple[MissionItem, ...], Callable[[int], None]], None]
 
 
@@ -96,7 +96,8 @@ class MissionServer:
     ) -> None:
         self.lists: dict[int, tuple[MissionItem, ...]] = dict.fromkeys(_TYPES, ())
         """Maps MAV_MISSION_TYPE to items. Call `store` to change the items."""
-        self._opaque_ids: dict[int, int] = {}  # Cached, because MISSION_CURRENT, which is streamed, contains them.
+        # Cache of the checksums by mission type, because MISSION_CURRENT contains them and is streamed.
+        self._opaque_ids: dict[int, int] = {}
         self.current: int = 0
         """Index of the current item of the mission."""
         self._host = host
@@ -105,7 +106,7 @@ class MissionServer:
         self._capacity = capacity
         self._uploads: dict[int, ListUpload] = {}
         self._clearing: m.MissionClearAll | None = None
-        """Request to clear that ``validate`` decides on."""
+        """MISSION_CLEAR_ALL on which ``validate`` has not decided yet."""
 
     def listen(self) -> None:
         on = self._host.on
@@ -125,7 +126,7 @@ class MissionServer:
         return bool(self._uploads)
 
     def reset(self) -> None:
-        """Drop transfers, as by a reboot. Stored items stay."""
+        """Drop running transfers, as a reboot does. The stored items are kept."""
         self._uploads.clear()
         self._clearing = None
 
@@ -172,7 +173,7 @@ class MissionServer:
         return None if message.mission_type in self.lists else _R.UNSUPPORTED
 
     def _item(self, mission_type: int, seq: int) -> MissionItem | int:
-        """Return a stored item, or the MAV_MISSION_RESULT that reports its absence."""
+        """Return the requested item; if it does not exist, the MAV_MISSION_RESULT for the answer."""
         items = self.lists.get(mission_type, ())
         return items[seq] if 0 <= seq < len(items) else _R.INVALID_SEQUENCE
 
@@ -228,7 +229,7 @@ class MissionServer:
         if refusal is not None:
             self._acknowledge(client, kind, refusal, channel)
             return
-        if running is not None:  # the client starts its own upload again
+        if running is not None:  # The same client starts its upload again.
             self._drop(running)
         if count.count > self.capacity(kind):
             self._refuse_size(count, channel)
@@ -295,6 +296,7 @@ class MissionServer:
         self._end(upload, _R.OPERATION_CANCELLED)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
+        """Process an item. Only the expected item from the client that uploads is stored."""
         upload = self._uploads.get(self._key(message.mission_type))
         if upload is None or message.mission_type != upload.mission_type:
             self._answer_item(message, _R.ERROR, channel)
@@ -306,9 +308,10 @@ class MissionServer:
             self._receive_item(upload, message)
 
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
-        """Answer an item that no upload expects. Here it is ignored, because the expected item is requested again."""
+        """Answer an item that no upload expects. Ignored here, because the expected item is requested again anyway."""
 
     def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
+        """Store the expected item of an upload, and request the next one."""
         result = self._put(upload, message)
         if result != _R.ACCEPTED:
             self._end(upload, result)
@@ -351,7 +354,7 @@ class MissionServer:
             self._acknowledge(client, kind, _R.UNSUPPORTED, channel)
         elif self._clearing is not None:
             is_repeated = (sender_of(self._clearing), self._clearing.mission_type) == (client, kind)
-            if not is_repeated:  # otherwise the answer to the first transmission follows
+            if not is_repeated:  # A repeated request is answered together with its first transmission.
                 self._acknowledge(client, kind, _R.DENIED, channel)
         elif self.transfer_is_open:
             self._acknowledge(client, kind, _R.DENIED, channel)
@@ -361,10 +364,10 @@ class MissionServer:
             self._clear(non_empty if kind == MavMissionType.ALL else [kind], request, channel)
 
     def _clear(self, kinds: list[int], request: m.MissionClearAll, channel: Channel) -> None:
-        """Clear these lists one after the other, each only if ``validate`` accepts that."""
+        """Clear these lists one after the other, as long as ``validate`` accepts."""
 
         def answer(result: int) -> None:
-            if self._clearing is not request:  # the server was reset meanwhile
+            if self._clearing is not request:  # The server was reset before the answer arrived.
                 return
             if result == _R.ACCEPTED and kinds:
                 self.store(kinds[0], ())

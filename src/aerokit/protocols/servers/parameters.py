@@ -27,7 +27,7 @@ class NamedList(Protocol):
 
 
 class ParameterLists:
-    """Sends lists: ``list_rate_hz`` parameters a second, in groups of ``burst``. A new request restarts a list."""
+    """Sends lists of ``list_rate_hz`` parameters per second, in groups of ``burst``. A new request restarts a list."""
 
     burst: int = 5
     starts_at_once: bool = False
@@ -37,8 +37,8 @@ class ParameterLists:
         self.list_rate_hz = list_rate_hz
         self._host = host
         self._listed = parameters
-        self._lists: dict[Channel, int] = {}  # channel → number of the list that is being sent there
-        self._list_number = 0  # numbers differ, so that a restart ends the earlier list on the same channel
+        self._lists: dict[Channel, int] = {}  # channel → number of the list that is being sent on it
+        self._list_number = 0  # Each list gets a new number, by which a restarted list ends the earlier one.
 
     @property
     def running_lists(self) -> int:
@@ -46,7 +46,7 @@ class ParameterLists:
         return len(self._lists)
 
     def restart(self) -> None:
-        """Stop sending all lists, as by a reboot."""
+        """Stop sending all lists, as a reboot does."""
         self._lists.clear()
 
     def start_list(self, channel: Channel) -> None:
@@ -63,7 +63,7 @@ class ParameterLists:
 
     def _send_from(self, index: int, channel: Channel, number: int) -> None:
         """Send the group of parameters from ``index`` on, and schedule the next group of list ``number``."""
-        if self._lists.get(channel) != number:  # the list was stopped or restarted
+        if self._lists.get(channel) != number:  # The list was stopped, or restarted with another number.
             return
         names, end = self._listed.names, index + self.burst
         for position, name in enumerate(names[index:end], start=index):
@@ -173,6 +173,7 @@ class TypedParameterServer(ParameterProtocolServer):
             self.start_list(channel)
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
+        """Answer with the value, or with a PARAM_ERROR that has the unknown name or index."""
         name, index = request.param_id, request.param_index
         name_and_index = self.requested(name, index)
         if name_and_index is not None:
@@ -187,7 +188,7 @@ class TypedParameterServer(ParameterProtocolServer):
             self.send_error(sender_of(request), name, -1, MavParamError.DOES_NOT_EXIST, channel)
             return
         value = value_of(request, bytewise=self.bytewise)
-        # The type is ignored if values are cast to float, because ArduPilot's clients send all values as REAL32.
+        # If values are cast to float, the received type is ignored: ArduPilot's clients send all values as REAL32.
         problem = store.problem(name, value, request.param_type if self.bytewise else store.type(name))
         if problem is not None:
             param_error, _ = problem
@@ -197,7 +198,8 @@ class TypedParameterServer(ParameterProtocolServer):
         old_value = store[name]
         store.store(name, value)
         is_unchanged = settings_equal(old_value, store[name])
-        self.send(name, names.index(name), channel if is_unchanged else None)  # all programs get a changed value
+        # A changed value is sent to all programs.
+        self.send(name, names.index(name), channel if is_unchanged else None)
 
 
 def fits_param_value(type_: MavParamExtType) -> bool:
@@ -267,7 +269,7 @@ class TypedExtendedServer(ExtendedParameterServer):
         if name not in store:
             return ParamAck.VALUE_UNSUPPORTED, data, kind
         value = setting_value(data, kind)
-        if isinstance(store[name], str) and value == b"":  # an empty text looks like empty bytes on the wire
+        if isinstance(store[name], str) and value == b"":  # An empty text and empty bytes are the same on the wire.
             value = ""
         problem = store.problem(name, value, kind)
         if problem is None:

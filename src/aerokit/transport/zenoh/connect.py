@@ -40,7 +40,7 @@ OPEN_TIMEOUT_S = 5.0
 """Default time-out of `ZenohConnect.open`."""
 
 LOST_AFTER_S = 15.0
-"""Silence after which the vehicle side counts as lost, even if the network still reports it."""
+"""The vehicle side counts as lost after this silence, even if the network still reports it as alive."""
 
 _POLL_INTERVAL_S = 0.25
 
@@ -83,9 +83,10 @@ class ZenohConnect(NetworkLink):
         self._keys = KeySpace(fleet, name)
         self._options = options or NetworkOptions()
         self._open_timeout_s = open_timeout_s
-        self._takes_control = control == "take"  # False again once a beacon shows that this client has control
+        # True until a beacon shows that this client has control, so that the request is repeated.
+        self._takes_control = control == "take"
         self._tracker = VehicleSideTracker(random.getrandbits(32), "never" if control == "never" else "free")
-        self._alive: set[str] = set()  # keys of vehicle sides that the network reports
+        self._alive: set[str] = set()  # keys of the vehicle sides that are alive, as reported by the network
         self._publisher: Any = None
         self._first_beacon = asyncio.Event()
 
@@ -116,12 +117,13 @@ class ZenohConnect(NetworkLink):
             self._schedule_poll()
             return
         if self._session is None:
-            raise LinkOpenError(f"cannot open {self.address}: no network within {self._open_timeout_s:g} s")
+            reason = f"the zenoh network was not reached within {self._open_timeout_s:g} s"
+            raise LinkOpenError(f"cannot open {self.address}: {reason}")
         raise LinkOpenError(f"cannot open {self.address}: {self._describe_missing()}")
 
     def _declare(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        # This function and the callbacks run on threads of zenoh, so each callback posts to the event loop. A sample
-        # that is not a PUT is a DELETE: the vehicle side was closed, or a liveliness token has ended.
+        # This function and its callbacks run on threads of zenoh, so each callback posts its sample to the event loop.
+        # A sample that is not a PUT is a DELETE: the vehicle side was closed, or a liveliness token has ended.
         def posting(process: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
             def on_sample(sample: Any) -> None:
                 is_put, payload = sample.kind == zenoh.SampleKind.PUT, payload_of(sample)
@@ -141,7 +143,7 @@ class ZenohConnect(NetworkLink):
             session.declare_subscriber(keys.from_vehicle(client), on_frames),
             session.declare_subscriber(keys.notices(client), posting(self._on_notice)),
             session.declare_subscriber(keys.beacon, posting(self._on_beacon)),
-            # Subscribe to the whole fleet, so that the error text can list its names.
+            # The vehicle sides of the whole fleet are tracked, because the error text for a wrong name lists them.
             liveliness.declare_subscriber(KeySpace(keys.fleet, "*").alive(), on_liveliness, history=True),
             liveliness.declare_token(keys.client(client)),
         ]
@@ -160,7 +162,7 @@ class ZenohConnect(NetworkLink):
             self._deliver(data)
 
     def _on_beacon(self, data: bytes, attachment: bytes, is_put: bool) -> None:
-        if not is_put:  # the vehicle side deletes its beacon when it closes
+        if not is_put:  # A vehicle side that closes deletes its beacon.
             epoch_and_time = decode_sent_at(attachment)
             if epoch_and_time is not None and epoch_and_time[0] == self._tracker.epoch:
                 self._tracker.reset()
@@ -172,9 +174,10 @@ class ZenohConnect(NetworkLink):
         self._first_beacon.set()
         if self._takes_control:
             self._takes_control = beacon.lease_holder != self.client
-            self._put(b"", self._requested_mode())
+            self._put(b"", self._requested_mode())  # An empty datagram with mode "take" requests control.
 
     def _on_notice(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:
+        """Report that the vehicle side has refused messages of this client."""
         notice = RefusalNotice.decode(data)
         if notice is None:
             return
@@ -192,7 +195,7 @@ class ZenohConnect(NetworkLink):
     # ---------------------------------------------------------------------------------- sending
 
     def _requested_mode(self) -> ControlMode | None:
-        """Return the control mode for the next stamp; None: the mode of this client."""
+        """Return the control mode for the next stamp; None stands for the usual mode of this client."""
         return "take" if self._takes_control else None
 
     def _put(self, data: bytes, mode: ControlMode | None) -> None:
@@ -202,7 +205,7 @@ class ZenohConnect(NetworkLink):
             return
         try:
             self._publisher.put(data, attachment=stamp.encode())
-        except Exception:  # zenoh's error after the end of the session
+        except Exception:  # zenoh raises various errors after its session has ended.
             self._drop(1)
 
     # ---------------------------------------------------------------------------------- supervision
@@ -216,6 +219,7 @@ class ZenohConnect(NetworkLink):
     def _poll(self) -> None:
         tracker, now = self._tracker, self._now()
         if tracker.epoch is not None and tracker.is_silent(now):
+            # The end of the liveliness token shows a loss earlier than a long silence does.
             if self._keys.alive(tracker.epoch) not in self._alive:
                 self._lose("the vehicle side has left the network")
                 return
@@ -225,7 +229,7 @@ class ZenohConnect(NetworkLink):
         self._schedule_poll()
 
     def _describe_missing(self) -> str:
-        names = sorted({key.split("/")[2] for key in self._alive})  # aerokit/FLEET/NAME/alive/EPOCH
+        names = sorted({key.split("/")[2] for key in self._alive})  # A key is aerokit/FLEET/NAME/alive/EPOCH.
         keys = self._keys
         if keys.name in names:
             return f"{keys.name} is on the network, but sent nothing for {self._open_timeout_s:g} s"

@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
 
 LEASE_TIMEOUT_S = 5.0
-"""Silence of the holder after which the control lease is free."""
+"""The control lease becomes free after this silence of its holder."""
 
 NOTICE_INTERVAL_S = 0.5
-"""Minimum interval of notices about refused messages of one kind; set-points come 20 times a second."""
+"""Minimum interval of notices about one message type, because set-points may be refused 20 times a second."""
 
 # Messages that change nothing on the vehicle except its streams. Any client may send them.
 READ_MESSAGES = frozenset(
@@ -83,7 +83,7 @@ _MISSION_WRITES = ("MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_WRITE_PARTIAL_
 
 def is_read_only(frame: Frame) -> bool:
     """Return True if any client may send this frame. Unknown messages count as commands."""
-    if frame.message_id in _READ_IDS:  # the common case, without decoding
+    if frame.message_id in _READ_IDS:  # Most frames need not be decoded.
         return True
     if frame.message_id in (CommandLong.ID, CommandInt.ID):
         return getattr(_decoded(frame), "command", 0) in READ_COMMANDS
@@ -94,7 +94,7 @@ def is_read_only(frame: Frame) -> bool:
 
 
 def rejection_frames(answer: bytes) -> tuple[bytes, ...]:
-    """Return the frames of an answer that reject a command; all others are ignored."""
+    """Return the frames of a notice's ``answer`` that reject a command. All other frames are ignored."""
     return tuple(frame.raw for frame in Framer().receive(answer) if _is_rejection(_decoded(frame)))
 
 
@@ -127,7 +127,7 @@ class ControlLease:
             self._received_at = now
 
     def acquire(self, client: str, now: float) -> bool:
-        """Acquire the lease if it is free. Return True if the client holds it."""
+        """Acquire the lease for a client if it is free. Return True if the client now holds the lease."""
         if self.holder(now) is None:
             self.take(client, now)
         return self._holder == client
@@ -152,8 +152,9 @@ class ClientFilter:
         self._client, self._lease = client, lease
         self._framer = _framer()
         self._nonce: int | None = None  # nonce of the program that uses this client name
-        self._nonce_at = 0.0  # time at which that program was last heard
-        self._notices: dict[str, tuple[float, int]] = {}  # message name → time of the last notice, refusals since then
+        self._nonce_at = 0.0  # time of the last datagram from that program
+        # Message name → time of the last notice, and the number of refused messages since then.
+        self._notices: dict[str, tuple[float, int]] = {}
 
     def receive(self, data: bytes, mode: ControlMode, now: float, nonce: int = 0) -> tuple[bytes, list[RefusalNotice]]:
         """Process a fresh datagram. Return the accepted frames, and the notices for the client.
@@ -166,7 +167,7 @@ class ClientFilter:
         accepted: list[bytes] = []
         notices: list[RefusalNotice] = []
         frames = self._framer.receive(data, now)
-        if self._framer.waiting:  # datagrams have complete frames: drop a partial one
+        if self._framer.waiting:  # A datagram consists of complete frames, so a partial frame at its end is dropped.
             self._framer = _framer()
         may_control = mode != "never" and not is_namesake
         for frame in frames:
@@ -184,7 +185,7 @@ class ClientFilter:
         return b"".join(accepted), notices
 
     def _is_namesake(self, nonce: int, mode: ControlMode, now: float) -> bool:
-        """Return True if another program recently used this name, unless this program takes control."""
+        """Return True if another program recently used this client name, unless this program takes control."""
         if self._nonce not in (None, nonce) and mode != "take" and now - self._nonce_at <= LEASE_TIMEOUT_S:
             return True
         self._nonce, self._nonce_at = nonce, now
@@ -217,7 +218,7 @@ class ClientFilter:
         name = f"message {frame.message_id}" if message is None else message.NAME
         answer = b"" if message is None or is_late else _answer(frame, message, reason)
         noticed_at, unreported = self._notices.get(name, (-NOTICE_INTERVAL_S, 0))
-        # A notice with an answer is never delayed, because the program waits for it.
+        # A notice with an answer is sent at once, because the client waits for the answer to its command.
         if not answer and now - noticed_at < NOTICE_INTERVAL_S:
             self._notices[name] = (noticed_at, unreported + 1)
             return []
@@ -229,7 +230,7 @@ class ClientFilter:
 
 def _framer() -> Framer:
     framer = Framer()
-    framer.keep_unknown = True  # the lease holder may send messages of other dialects
+    framer.keep_unknown = True  # The client in control may send messages of other dialects.
     return framer
 
 
@@ -238,10 +239,11 @@ def _decoded(frame: Frame) -> Message | None:
 
 
 def _answer(frame: Frame, message: Message, reason: str) -> bytes:
-    """Return the frames by which a vehicle would reject a message; empty if none exist, or for broadcasts."""
-    fields: object = message  # `object`, because type checkers do not know that other messages have these fields, too
+    """Return the frames by which a vehicle would reject a message. Empty for broadcasts, or without such frames."""
+    fields: object = message  # The type is `object`, because the class Message does not declare these fields.
     system: int = getattr(fields, "target_system", 0)
-    component: int = getattr(fields, "target_component", 0) or 1  # the autopilot answers for all components (0)
+    # A message for all components (0) is answered by the autopilot (1).
+    component: int = getattr(fields, "target_component", 0) or 1
     answer: Message | None = None
     if message.NAME in COMMANDS:
         command: int = getattr(fields, "command", 0)
@@ -268,16 +270,16 @@ _MAX_DRIFT = 0.001  # maximum relative drift of two clocks; quartz clocks are te
 
 
 class FreshnessChecker:
-    """The vehicle side: makes beacons, and checks the stamps of received datagrams."""
+    """Used by the vehicle side: makes beacons, and checks the stamps of received datagrams."""
 
     def __init__(self, epoch: int) -> None:
         self.epoch: int = epoch
         self.late: int = 0
         """Datagrams refused because their stamp was too old, or from another vehicle side."""
         self.duplicates: int = 0
-        """Datagrams refused because an equal or later datagram was received before."""
+        """Datagrams refused because the same or a later datagram of the client was already received."""
         self._number = 0
-        self._sent: deque[tuple[int, float]] = deque()  # (number, time) of valid beacons
+        self._sent: deque[tuple[int, float]] = deque()  # (number, send time) of the beacons that stamps may refer to
         self._sequences: OrderedDict[tuple[str, int], int] = OrderedDict()
 
     def beacon(self, now: float, lease_holder: str | None = None) -> Beacon:
@@ -299,7 +301,7 @@ class FreshnessChecker:
         self._sequences[key] = stamp.sequence
         self._sequences.move_to_end(key)
         if len(self._sequences) > _MAX_NONCES:
-            self._sequences.popitem(last=False)
+            self._sequences.popitem(last=False)  # the client that was silent for longest
         return True
 
     def _is_fresh(self, stamp: Stamp) -> bool:
@@ -320,13 +322,14 @@ class DelayEstimator:
     """
 
     def __init__(self) -> None:
-        self._min_offset: float | None = None  # our time minus the sender's
+        self._min_offset: float | None = None  # smallest difference so far of our time and the sender's send time
         self._measured_at = 0.0
 
     def delay(self, sent_s: float, now: float) -> float:
         """Return the delay in seconds of data sent at ``sent_s`` on the sender's clock and received at ``now``."""
         offset = now - sent_s
         if self._min_offset is not None:
+            # The clocks may drift apart, so with time a slightly larger offset counts as no delay.
             min_offset = self._min_offset + _MAX_DRIFT * (now - self._measured_at)
             if offset > min_offset:
                 return offset - min_offset
@@ -335,7 +338,7 @@ class DelayEstimator:
 
 
 class VehicleSideTracker:
-    """The client side: tracks one vehicle side by its beacons, and makes stamps."""
+    """Used by a client: tracks one vehicle side by its beacons, and makes the stamps of datagrams."""
 
     def __init__(self, nonce: int, mode: ControlMode = "free") -> None:
         self.epoch: int | None = None
@@ -343,9 +346,9 @@ class VehicleSideTracker:
         self.lease_holder: str | None = None
         """Client that holds the control lease according to the last beacon; None: free."""
         self.late: int = 0
-        """Dropped frames and beacons that arrived too late."""
+        """Number of datagrams and beacons dropped because they arrived too late."""
         self.foreign: int = 0
-        """Dropped frames and beacons of another vehicle side with the same name."""
+        """Number of datagrams and beacons dropped because another vehicle side with the same name sent them."""
         self.received_at: float = 0.0
         """Time of the last valid beacon."""
         self._nonce, self._mode = nonce, mode
@@ -363,7 +366,7 @@ class VehicleSideTracker:
                 self.foreign += 1
                 return False
             self.epoch, self._beacon, self._delays = beacon.epoch, 0, DelayEstimator()
-        elif beacon.number <= self._beacon:
+        elif beacon.number <= self._beacon:  # A newer beacon was already received.
             return False
         if self._delays.delay(beacon.clock_s, now) > MAX_DELAY_S:
             self.late += 1
@@ -372,7 +375,7 @@ class VehicleSideTracker:
         return True
 
     def accepts(self, epoch: int, sent_s: float, now: float) -> bool:
-        """Return True if frames sent at ``sent_s``, on the vehicle side's clock, are to be delivered."""
+        """Return True if frames are to be delivered. ``sent_s`` is their send time on the vehicle side's clock."""
         if epoch != self.epoch:
             self.foreign += 1
             return False
@@ -382,7 +385,7 @@ class VehicleSideTracker:
         return True
 
     def stamp(self, now: float, mode: ControlMode | None = None) -> Stamp | None:
-        """Make the stamp of a datagram; None if nothing may be sent, because beacons are missing."""
+        """Make the stamp for a datagram. Return None if no datagram may be sent, because beacons are missing."""
         if self.epoch is None or self.is_silent(now):
             return None
         self._sequence += 1

@@ -51,7 +51,8 @@ def check_name(argument: str, name: str) -> str:
         raise InvalidArgument(f"client = {name!r} is not allowed: this name stands for all clients")
     if not _NAME.fullmatch(name):
         raise InvalidArgument(
-            f"{argument} = {name!r} is not allowed: up to 63 letters, digits, '_', '.' and '-', a letter or digit first"
+            f"{argument} = {name!r} is not allowed: a name has up to 63 letters, digits, '_', '.' and '-', and begins"
+            " with a letter or digit"
         )
     return name
 
@@ -90,7 +91,7 @@ class KeySpace(Snapshot):
         return f"{self.root}/client/{client}"
 
     def state(self, name: str) -> str:
-        """Return the key of a state's JSON, e.g. "1/position"; "**" for all."""
+        """Return the key under which a state is published as JSON. ``state`` is e.g. "1/position", or "**" for all."""
         return f"{self.root}/state/{name}"
 
 
@@ -117,7 +118,7 @@ class Beacon(Snapshot):
         clock = fields.get("clock_s")
         if not (_is_u32(epoch) and _is_u32(number) and isinstance(clock, (int, float))):
             return None
-        if not abs(clock) < _MAX_CLOCK_S:  # with infinity or NaN, late data would not be detected
+        if not abs(clock) < _MAX_CLOCK_S:  # This also refuses infinity and NaN, with which data would never be late.
             return None
         return cls(epoch, number, float(clock), holder if isinstance(holder, str) else None)  # type: ignore[arg-type]
 

@@ -36,7 +36,7 @@ MAX_CLIENTS = 64
 """Maximum number of clients. A further one is ignored unless a client has been silent for `CLIENT_TIMEOUT_S`."""
 
 CLIENT_TIMEOUT_S = 30.0
-"""Silence after which a client may be replaced by a new client."""
+"""A client may be replaced by a new client after this silence."""
 
 _MIN_BEACON_INTERVAL_S = 0.02
 _RIVAL_TIMEOUT_S = 2.5 * BEACON_INTERVAL_S
@@ -67,7 +67,7 @@ class ZenohListen(NetworkLink):
         self._freshness = FreshnessChecker(random.getrandbits(32))
         self._lease = ControlLease()
         self._clients: dict[Peer, ClientFilter] = {}
-        self._refused = 0  # number of refused messages of former clients
+        self._refused = 0  # number of frames refused from clients that have left
         self._zenoh: Any = None
         self._publisher: Any = None
         self._may_have_rival = self._is_serving = False
@@ -118,15 +118,15 @@ class ZenohListen(NetworkLink):
         if self._may_have_rival:
             with anyio.move_on_after(_RIVAL_TIMEOUT_S):
                 await self._rival_found.wait()
-                # Reached only if another vehicle side has sent a beacon before the time-out.
+                # After a time-out, the block ends in the line above. This line is reached only if a beacon arrived.
                 raise LinkOpenError(f"cannot open {self.address}: another program serves this name")
         self._is_serving = True
         self._serve(self._queue)
         self._send_beacon()
 
     def _find_rivals(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        # This function runs on a thread. A liveliness token alone does not prove that the name is in use, because the
-        # token of a killed program remains for a while.
+        # This function runs on a thread of its own. A liveliness token alone does not prove that the name is in use,
+        # because the token of a killed program remains for a while. A beacon proves it.
         def on_beacon(sample: Any) -> None:
             payload = payload_of(sample)
             if len(payload) <= MAX_PAYLOAD_BYTES:
@@ -139,7 +139,10 @@ class ZenohListen(NetworkLink):
         )
 
     def _serve(self, queue: LoopQueue[Callable[[], object]]) -> None:
-        """Declare what clients need. The callbacks run on threads of zenoh, and post to the event loop."""
+        """Declare the subscribers, publisher and token that clients need.
+
+        The callbacks run on threads of zenoh, so they post to the event loop.
+        """
         zenoh, session, keys = self._zenoh, self._session, self._keys
 
         def on_datagram(sample: Any) -> None:
@@ -181,7 +184,8 @@ class ZenohListen(NetworkLink):
         client.received_at = now
         stamp, late_before = Stamp.decode(attachment), self._freshness.late
         if not self._freshness.accepts(name, stamp, now) or stamp is None:
-            is_late = self._freshness.late > late_before  # otherwise the datagram is a duplicate
+            # A duplicate needs no notice, because its first copy was processed.
+            is_late = self._freshness.late > late_before
             if is_late:
                 self._send_notices(name, client.refuse_late(data, now))
             return
@@ -197,19 +201,19 @@ class ZenohListen(NetworkLink):
         if client is None and len(self._clients) >= MAX_CLIENTS:
             self._remove_silent_client()
         if client is None and len(self._clients) < MAX_CLIENTS:
-            with contextlib.suppress(InvalidArgument):  # the name is not from an aerokit client
+            with contextlib.suppress(InvalidArgument):  # A client of aerokit never has a name that is not allowed.
                 client = self._clients[name] = ClientFilter(check_name("client", name), self._lease)
                 client.received_at = self._now()
         return client
 
     def _remove_silent_client(self) -> None:
-        # A client that never had a liveliness token, or whose leaving was missed, must not block new clients.
+        # New clients must not be blocked by a client that has left without a notice of its liveliness token.
         oldest = min(self._clients, key=lambda name: self._clients[name].received_at)
         if self._now() - self._clients[oldest].received_at > CLIENT_TIMEOUT_S:
             self._remove_client(str(oldest))
 
     def _on_client_joined(self, name: str) -> None:
-        # Send an extra beacon, so that the client need not wait for the next periodic beacon.
+        # An extra beacon is sent now, so that the client need not wait for the next periodic one.
         if self._add_client(name) is not None and self._timer is not None:
             self._timer.cancel()
             delay_s = max(0.0, self._beacon_at + _MIN_BEACON_INTERVAL_S - self._now())
@@ -249,7 +253,7 @@ class ZenohListen(NetworkLink):
     def _put_or_drop(self, put: Callable[[], object]) -> None:
         try:
             put()
-        except Exception:  # zenoh's error after the end of the session
+        except Exception:  # zenoh raises various errors after its session has ended.
             self._drop(1)
 
     def _now(self) -> float:

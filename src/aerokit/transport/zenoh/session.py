@@ -20,7 +20,7 @@ ItemT = TypeVar("ItemT")
 MAX_QUEUED = 2048
 """Maximum number of items that wait for a blocked event loop. A further item replaces the oldest."""
 
-_MAX_PER_ITERATION = 256  # a limit, so that other tasks can run
+_MAX_PER_ITERATION = 256  # maximum number of items processed in one loop iteration, so that other tasks can run
 
 
 class LoopQueue(Generic[ItemT]):
@@ -52,7 +52,7 @@ class LoopQueue(Generic[ItemT]):
             if self._is_scheduled:
                 return
             self._is_scheduled = True
-        with contextlib.suppress(RuntimeError):  # the loop is closed
+        with contextlib.suppress(RuntimeError):  # The loop may be closed.
             self._loop.call_soon_threadsafe(self._drain)
 
     def close(self) -> None:
@@ -71,7 +71,7 @@ class LoopQueue(Generic[ItemT]):
             try:
                 process(item)
             except BaseException:
-                self._loop.call_soon(self._drain)  # process the other items
+                self._loop.call_soon(self._drain)  # The other items must be processed although this one failed.
                 raise
         self._loop.call_soon(self._drain)
 
@@ -99,18 +99,20 @@ MAX_PAYLOAD_BYTES = 65535
 
 _CONNECT_FAILED = "Unable to connect to any of"
 
-_ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")  # zenoh 1.6: "[tcp/a:1]", other versions: "[Single(tcp/a:1)]"
+# zenoh 1.6 formats endpoints as "[tcp/a:1]", other versions as "[Single(tcp/a:1)]".
+_ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")
 
 _TX = "transport/link/tx/queue"
 
-# Without this setting, each put that drops data may block the loop for a millisecond.
+# By default, zenoh waits for a millisecond before it drops data of a put(), which would block the event loop.
 _DROP_AT_ONCE = (f"{_TX}/congestion_control/drop/wait_before_drop", 0)
 
 _SETTINGS = (
-    # Batches of up to 64 KB: enough for a burst of 1000 frames, and the maximum that a broken connection delays.
+    # Number of batches of up to 64 KB that wait. It is enough for a burst of 1000 frames, and small, because a broken
+    # connection delays all data in them.
     (f"{_TX}/size/data", 4),
     (f"{_TX}/size/real_time", 4),
-    ("transport/shared_memory/enabled", False),  # the memory pool for large messages would take 16 MB
+    ("transport/shared_memory/enabled", False),  # The memory pool, which is for large messages, would take 16 MB.
 )
 
 
@@ -138,12 +140,12 @@ class NetworkLink(BaseLink):
     def __init__(self, address: str) -> None:
         super().__init__(address)
         self._session: Any = None
-        self._declared: list[Any] = []  # kept, because a declaration ends when it is garbage-collected
+        self._declared: list[Any] = []  # references to all declarations, which would end when garbage-collected
         self._queue: LoopQueue[Callable[[], object]] | None = None
         self._timer: asyncio.TimerHandle | None = None
 
     def _on_release(self, session: Any) -> None:
-        """Release objects of the session and announce the end; ``session`` is None if it is not open."""
+        """Announce the end, and release all objects of the session. ``session`` is None if no session is open."""
         raise NotImplementedError
 
     def _release(self) -> None:
@@ -193,7 +195,7 @@ def close_session(session: Any, closed: Callable[[], object]) -> None:
     """Close a session on a thread, because closing may block, and then call ``closed()``."""
 
     def work() -> None:
-        with contextlib.suppress(Exception):  # the session is closed in any case
+        with contextlib.suppress(Exception):  # If close() raises, the session is closed all the same.
             session.close()
 
     try:
@@ -223,15 +225,15 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
     try:
         config = zenoh.Config.from_file(options.config) if options.config else zenoh.Config()
     except zenoh.ZError as error:
-        raise InvalidArgument(f"{address}: config={options.config}: {_reason(error)}") from error
+        raise InvalidArgument(f"{address}: config={options.config} cannot be used: {_reason(error)}") from error
     try:
         for key, value in _settings(options):
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
-        raise InvalidArgument(f"{address}: {_reason(error)}") from error
-    defaults = () if options.config else _SETTINGS  # a configuration file replaces them
+        raise InvalidArgument(f"{address}: zenoh does not accept the options: {_reason(error)}") from error
+    defaults = () if options.config else _SETTINGS  # A configuration file replaces aerokit's settings.
     for key, value in (_DROP_AT_ONCE, *defaults):
-        with contextlib.suppress(zenoh.ZError):  # this version of zenoh does not know the option
+        with contextlib.suppress(zenoh.ZError):  # Some versions of zenoh do not know the option.
             config.insert_json5(key, json.dumps(value))
     return config
 
@@ -246,9 +248,9 @@ def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
         yield "listen/endpoints", list(options.listen)
     if not options.config and not options.scouts:
         yield "scouting/multicast/enabled", False
-        yield "scouting/delay", 0  # do not wait for discovered peers
+        yield "scouting/delay", 0  # By default, opening a session waits for peers to be discovered.
         if not options.listen:
-            yield "listen/endpoints", []  # by default, a peer listens on all interfaces
+            yield "listen/endpoints", []  # By default, a peer listens on all interfaces.
 
 
 def _reason(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""``CommandArbiter``: tracks which orders of the program are valid. Pilots and failsafes take precedence over all."""
+"""``CommandArbiter``: tracks which orders of the program are valid. Pilots and failsafes take precedence over them."""
 
 from __future__ import annotations
 
@@ -23,14 +23,16 @@ MODE_GRACE_S = 3.0
 ARM_HEARTBEAT_DELAY_S = 1.5
 """Seconds after an accepted arm command in which HEARTBEAT (1 Hz) may still report the previous state."""
 MODE_MAX_AGE_S = 2.5
-"""Maximum age in seconds of a HEARTBEAT that counts as the vehicle's present state. Two HEARTBEATs may be lost. The
-ground-station failsafes of ArduPilot and PX4 act later (FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s).
+"""Maximum age in seconds of a HEARTBEAT that counts as the vehicle's present state.
+
+Two HEARTBEATs may be lost within this time. The ground-station failsafes of ArduPilot and PX4 act later
+(FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s).
 """
 OWN_MODES_MAX_AGE_S = 10.0
-"""Seconds in which a mode that the program ordered may still appear without counting as a takeover."""
+"""For this many seconds after the program ordered a mode, a change to that mode does not count as a takeover."""
 
 STEERING, ACTION = "steering", "action"
-"""Topics. STEERING belongs to all steering orders, ACTION only to those given by actions and raw commands."""
+"""Topics of orders. All steering orders have STEERING, but only those of actions and raw commands have ACTION."""
 
 
 def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
@@ -43,8 +45,9 @@ def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
 
 
 class CommandArbiter:
-    """Keeps the orders to one vehicle, determines the newest order for each topic, and updates orders with each
-    HEARTBEAT.
+    """Keeps the orders to one vehicle, and updates them with each HEARTBEAT.
+
+    It also determines the newest order about each topic.
 
     Every order of the program is registered here: flight actions, set-points, devices, fleets and classic scripts.
     """
@@ -58,16 +61,15 @@ class CommandArbiter:
         self.arming_orders = 0
         """Number of arm and disarm commands sent."""
         self.mode_is_in_doubt: bool = False
-        """True while the result of a command that changes the mode is unknown, so that the reported mode may change
-        soon.
-        """
+        """True while the result of a mode change is unknown, so that the reported mode may still change."""
         self.mode_settles_at: float = -math.inf
         """Time until which HEARTBEAT may report the mode of an abandoned order."""
         self._any_mode_until = self._arming_accepted_at = self._disarmed_at = -math.inf
         # Time of the last change from disarmed to armed, and the order of the program that caused it, if one did.
         self._armed_at = -math.inf
         self._armed_by_program: Order | None = None
-        # The newest steering order with the auxiliary orders in progress; posted orders; commands without an answer.
+        # Three lists: the newest steering order and the auxiliary orders in progress; the posted orders; the commands
+        # that are not answered yet.
         self._orders: list[Order] = []
         self._posted: list[Order] = []
         self._sent: list[SentCommand] = []
@@ -104,7 +106,7 @@ class CommandArbiter:
         self._register(Order(self._now(), next(self._order_numbers), self._is_newest), topics)
 
     def device_order(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
-        """Create an order about a device. It supersedes earlier orders; if it is withdrawn, they become valid again."""
+        """Create an order about a device, which supersedes the previous one until the new order is withdrawn."""
         order = Order(self._now(), next(self._order_numbers), self._is_newest, ended_by=(topic,))
         order.previous = self.latest(topic) if may_be_withdrawn else None
         self._register(order, (topic,))
@@ -125,7 +127,7 @@ class CommandArbiter:
         was_flown = self.is_flown_by_program
         order = self._create_order(modes, (STEERING,), ends_flight or self._all_end_flight(modes))
         order.was_flown_before = was_flown
-        # An order that replaces one in progress gets a vehicle that may be moving.
+        # If this order replaces another one in progress, the vehicle may already be moving.
         order.may_move = self._is_steering()
         self._register(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
@@ -134,8 +136,9 @@ class CommandArbiter:
         return order
 
     def raw_order(self, subjects: Iterable[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()) -> Order:
-        """Register a raw command of the program. Without ``modes``, any mode reported afterwards may be the command's
-        effect.
+        """Register a raw command of the program as a steering order.
+
+        Without ``modes``, any mode that is reported soon afterwards may be the command's effect.
         """
         if not modes:
             self._any_mode_until = self._now() + MODE_GRACE_S
@@ -154,7 +157,7 @@ class CommandArbiter:
         for order in (*self._orders, *self._posted):
             order.on_reboot()
         self._ordered_since_disarmed.clear()
-        # Until the vehicle arms again, no earlier order counts as its present one, see `current`.
+        # This time lets `current` ignore all orders from before the reboot until the vehicle arms again.
         self._armed_by_program, self._armed_at = None, math.inf
 
     # ------------------------------------------------------------------ other orders, in blocks
@@ -166,7 +169,7 @@ class CommandArbiter:
         With ``device_order``, the order is a part of that order about a device, and ends with it.
 
         Raises:
-            OperationRejected: a newer order to the device was given.
+            OperationRejected: a newer order about the device was given.
         """
         if device_order is not None and not device_order.is_newest:
             raise OperationRejected(f"{SUPERSEDED}; the rest of the order was not sent")
@@ -183,7 +186,7 @@ class CommandArbiter:
     def post(
         self, subjects: Sequence[Subject], *, modes: Collection[Mode] = (), armed: bool | None = None
     ) -> Iterator[Order]:
-        """Create a posted order, valid for the duration of the block.
+        """Create a posted order, which is valid during the `with` block.
 
         A newer order about the first subject ends it. The posted order itself ends earlier posted orders about any of
         its subjects and, if it steers, the action in progress.
@@ -191,7 +194,7 @@ class CommandArbiter:
         is_steering = subjects[0] != "arm"
         if is_steering:
             self._notify_steering()
-            if self.newest is not None:  # The mode of the posted order is no takeover by another party.
+            if self.newest is not None:  # A change to a mode of the posted order is not a takeover.
                 self.newest.expect(modes)
         self._supersede_arming(armed)
         now = self._now()
@@ -226,7 +229,7 @@ class CommandArbiter:
         armed: bool | None = None,
         is_done: Callable[[], bool] = lambda: False,
     ) -> Iterator[SentCommand]:
-        """Track one command of this order for the duration of the block; see :class:`SentCommand`."""
+        """Track one command of this order during a `with` block; see :class:`SentCommand`."""
         sent = SentCommand(
             order,
             mode_now=self._telemetry.mode.latest,
@@ -255,7 +258,7 @@ class CommandArbiter:
             self._arming_accepted_at = self._now()
 
     def _supersede_arming(self, armed: bool | None) -> None:
-        """End earlier orders to arm or disarm, before a command to do so is sent; None: the command does neither."""
+        """End earlier orders to arm or disarm, because a command that does so is sent. None: some other command."""
         if armed is None:
             return
         self.arming_orders += 1
@@ -409,12 +412,12 @@ class CommandArbiter:
     def _on_arming(self) -> None:
         """Decide whether the program or another party has armed the vehicle."""
         self._armed_at = self._telemetry.armed.updated_at
-        is_under_way = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
+        is_being_armed = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
         was_accepted = math.isfinite(self._arming_accepted_at)
         is_effect = was_accepted and was_armed_by_order(self._disarmed_at, self._arming_accepted_at)
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
-        self._armed_by_program = self._create_order(modes, ()) if is_under_way or is_effect else None
+        self._armed_by_program = self._create_order(modes, ()) if is_being_armed or is_effect else None
 
     def _active_orders(self) -> tuple[Order, ...]:
         """Orders that process the reports of the vehicle."""

@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 FORCE_REBOOT = 20190226
 """param6 of PREFLIGHT_REBOOT_SHUTDOWN that makes ArduPilot reboot even while armed (GCS_Common.cpp)."""
 REASONS_S = 3.0
-"""Seconds in which a vehicle answers a request to run its pre-arm checks, and reports the reasons."""
+"""A vehicle that is requested to run its pre-arm checks reports the failures within this many seconds."""
 POLL_INTERVAL_S = 0.1
 """Poll interval in seconds while waiting for a reboot."""
-# MAV_STATE_BOOT and MAV_STATE_CALIBRATING.
+# Values of HEARTBEAT.system_status during a boot: MAV_STATE_BOOT and MAV_STATE_CALIBRATING.
 BOOTING = (1, 2)
 REBOOT_ANSWER_S = 3.0
 """Seconds to wait for the acknowledgement of a reboot command."""
@@ -61,10 +61,9 @@ class ArmingActions(VehicleBase):
         return self._health.missing_for_flight()
 
     async def why_not_armable(self) -> list[str]:
-        """Return the reasons why arming would be refused now, in the present mode; an empty list means that none is
-        known.
+        """Return the reasons why arming in the present mode would be refused now; an empty list if none is known.
 
-        What only a flight needs is not listed, see :meth:`missing_for_flight`.
+        :meth:`missing_for_flight` also lists what is needed only for a flight.
 
         Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) if it supports that, and collects its status
         texts. Also reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
@@ -80,7 +79,7 @@ class ArmingActions(VehicleBase):
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
-                texts. If the pre-arm checks fail, the vehicle is asked for its reasons three seconds before the end.
+                texts. Three seconds before this error, a vehicle whose pre-arm checks fail is asked for its reasons.
         """
         telemetry = self.telemetry
         cells = (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home, telemetry.armed)
@@ -136,7 +135,7 @@ class ArmingActions(VehicleBase):
                 sent to the vehicle as a STATUSTEXT right before the command, and ArduPilot writes this text into its
                 flight log. PX4 logs only texts that have the vehicle's own system id.
             timeout: seconds for HEARTBEAT to report armed after the command was accepted.
-            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no such limit.
 
         Raises:
             InvalidArgument: there is no such mode, it does not allow arming, or the reason is too long. Nothing was
@@ -169,12 +168,12 @@ class ArmingActions(VehicleBase):
     async def _arm_with_fallback_mode(
         self, may_change_mode: bool, force: bool, timeout: float, max_silence_s: float | None
     ) -> None:
-        """Arm in the present mode; after a refusal there, change a mode that a parameter may exclude from arming."""
+        """Arm in the present mode. If a parameter may forbid arming in this mode, change the mode after a refusal."""
         try:
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
-            is_excluded = may_change_mode and self._is_in_optional_mode()
-            other_mode = self.autopilot.mode_to_arm_in() if is_excluded else None
+            may_be_forbidden = may_change_mode and self._is_in_optional_mode()
+            other_mode = self.autopilot.mode_to_arm_in() if may_be_forbidden else None
             if other_mode is None:
                 raise
             await self._change_to_arming_mode(other_mode)
@@ -207,7 +206,7 @@ class ArmingActions(VehicleBase):
         Args:
             force: also disarm in flight: **the vehicle falls**.
             timeout: seconds for HEARTBEAT to report disarmed after the command was accepted.
-            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no such limit.
 
         Raises:
             CommandRejected: the vehicle refused, usually because it is flying.
@@ -221,7 +220,7 @@ class ArmingActions(VehicleBase):
             try:
                 await self._sender.send_arm(order, False, force=force)
             except CommandRejected as error:
-                # ArduCopter refuses to disarm in the air without a status text (AP_Arming_Copter.cpp, disarm).
+                # ArduCopter sends no status text when it refuses to disarm in the air (AP_Arming_Copter.cpp, disarm).
                 raise self._session.with_reasons(error, started, self._reason_if_flying()) from None
             await self._await_armed(False, order, started, timeout, max_silence_s)
 
@@ -235,7 +234,7 @@ class ArmingActions(VehicleBase):
     async def _await_armed(
         self, armed: bool, order: Order, started: float, timeout: float, max_silence_s: float | None
     ) -> None:
-        """Wait until a HEARTBEAT received after ``started`` reports the state."""
+        """Wait until a HEARTBEAT received after ``started`` reports that the vehicle is armed, or disarmed."""
         cell = self.telemetry.armed
         await await_progress(
             self._session,
@@ -243,9 +242,7 @@ class ArmingActions(VehicleBase):
             is_done=lambda: cell.latest is armed and cell.updated_at > started,
             # A mode change or a failsafe does not keep the vehicle from disarming.
             failure_reason=lambda: order.takeover_reason if armed else None,
-            describe=lambda: (
-                "; ".join(self._session.texts_since(started)) or "the vehicle sent no status text about it"
-            ),
+            describe=lambda: "; ".join(self._session.texts_since(started)) or "the vehicle sent no status text",
             timeout=timeout,
             max_silence_s=max_silence_s,
         )
@@ -263,20 +260,16 @@ class ArmingActions(VehicleBase):
                     f"arm: the vehicle is armed already, in {self.telemetry.mode_name}; nothing was sent"
                 )
             return arming_mode
-        # A stream has its own mode, and the mode that a booting vehicle reports may still change.
+        # A set-point stream needs its own mode. A booting vehicle may still change its mode by itself.
         is_booting = self.telemetry.system_status.latest in BOOTING
-        if (
-            self._flight_cleanup.stop_stream is not None
-            or is_booting
-            or not self.telemetry.is_confirmed_disarmed
-            or not self._health.unarmable_mode()
-            or self._is_in_optional_mode()
-        ):
+        must_keep_mode = self._flight_cleanup.stop_stream is not None or is_booting
+        may_arm_in_mode = not self._health.unarmable_mode() or self._is_in_optional_mode()
+        if must_keep_mode or may_arm_in_mode or not self.telemetry.is_confirmed_disarmed:
             return None
         return self.autopilot.mode_to_arm_in()
 
     def _is_in_optional_mode(self) -> bool:
-        """Return True if only the vehicle knows whether its mode allows arming, which it decides by a parameter."""
+        """Return True if a parameter of the vehicle decides whether its present mode allows arming."""
         mode = self.telemetry.mode.latest
         is_optional = mode is not None and mode.name in self.autopilot.armable_by_option
         return is_optional and self.telemetry.is_confirmed_disarmed and self._flight_cleanup.stop_stream is None
@@ -288,9 +281,10 @@ class ArmingActions(VehicleBase):
         await self._wait_until_armable()
         self._sender.raise_if_ended(order)
         if self._arbiter.arming_orders != arming_orders_before:
-            raise OperationRejected("arm(): superseded by another arm or disarm command; the arm command was not sent")
+            raise OperationRejected("arm(): another arm or disarm command was given; the arm command was not sent")
         if not self._arbiter.is_state_recent:
-            raise HeartbeatTimeout(f"arm(): {self._session.describe_link()}; the arm command was not sent")
+            link = self._session.describe_link()
+            raise HeartbeatTimeout(f"arm(): the vehicle is silent; {link}; the arm command was not sent")
 
     async def _wait_until_armable(self) -> None:
         """Wait briefly until SYS_STATUS no longer reports that the pre-arm checks fail, after a change of the mode."""
@@ -334,7 +328,9 @@ class ArmingActions(VehicleBase):
                 return
         if unanswered is not None:
             raise CommandTimeout(f"{unanswered}; the command is sent only once, and may still be executed")
-        raise OperationTimeout(f"reboot: no restart within {timeout:g} s; {self._session.describe_link()}")
+        raise OperationTimeout(
+            f"reboot: the vehicle did not restart within {timeout:g} s; {self._session.describe_link()}"
+        )
 
     async def _order_reboot(self, force: bool) -> None:
         """Send the command once: if only its acknowledgement was lost, a second one would cause another reboot."""

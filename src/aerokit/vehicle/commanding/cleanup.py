@@ -31,8 +31,9 @@ logger: logging.Logger = logging.getLogger("aerokit")
 class BackgroundTask:
     """Runs one background task for a vehicle. A new task replaces the previous one.
 
-    Leaving the vehicle's block waits briefly for the task. ``name`` is the task's name; ``warning_clause`` completes
-    the warning "the block of this vehicle was left …" if the task is not done by then.
+    At the end of the vehicle's `async with` block, aerokit waits briefly for the task. If the task is not done by then,
+    aerokit logs the warning "the async with block of this vehicle was left …", which ``warning_clause`` completes.
+    ``name`` is the task's name.
     """
 
     def __init__(self, session: VehicleSession, name: str, warning_clause: str) -> None:
@@ -67,7 +68,7 @@ class BackgroundTask:
 
     @contextmanager
     def protected(self) -> Iterator[None]:
-        """Ignore ``cancel`` within the block, because orders that the task itself gives would cancel it."""
+        """Ignore ``cancel`` during a `with` block, because orders that the task itself gives would cancel it."""
         scope, self._scope = self._scope, None
         try:
             yield
@@ -75,29 +76,29 @@ class BackgroundTask:
             self._scope = scope
 
     async def finish(self, within_s: float) -> None:
-        """Wait at most ``within_s`` for the task when the vehicle's block is left; log a warning if it is not done."""
+        """At the end of the vehicle's `async with` block, wait at most ``within_s`` for the task, or log a warning."""
         if self._scope is None or self._done is None or not self._session.connection.is_open:
             return
         if within_s:
-            # Shielded, because a cancelled program leaves the block too.
+            # A cancelled program leaves the block, too, so this wait is shielded from the cancellation.
             with anyio.CancelScope(shield=True), anyio.move_on_after(within_s):
                 await self._done.wait()
         if self._scope is not None:
             logger.warning(
-                "the block of this vehicle was left %s: %s",
+                "the async with block of this vehicle was left %s: %s",
                 self._warning_clause,
                 self._session.describe_link(),
             )
 
 
-# Seconds that leaving the block waits for the acknowledgement of a hold.
+# Seconds to wait for the acknowledgement of a hold at the end of the vehicle's `async with` block.
 HOLD_CLOSE_TIMEOUT_S = 1.5
 
 # Maximum number of attempts to hold a vehicle that was silent. Attempts count from the end of the silence.
 MAX_HOLD_ATTEMPTS = 3
 
-# For a hold that was sent without waiting: seconds until it is sent again if not acknowledged, and maximum number of
-# times that it is sent again.
+# A hold that was sent without waiting is repeated if it is not acknowledged within this many seconds, and at most this
+# many times.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
 # NaN means the present position. With it, the vehicle can brake instead of flying back to a point that it has passed.
@@ -124,8 +125,9 @@ class FlightCleanup:
         await self.stop_in(mode, self._arbiter.order(mode))
 
     async def stop_in(self, mode: Mode, order: Order) -> None:
-        """Order the vehicle to hold even if it already is in the hold mode, because PX4 in LOITER may be flying to a
-        place.
+        """Order the vehicle to hold, even if it already is in the hold mode.
+
+        PX4 may be flying to a place in LOITER, its hold mode.
         """
         if self._holds_by_reposition:
             await self._sender.send_long(order, *STOP_HERE)
@@ -197,7 +199,7 @@ class FlightCleanup:
                     return
                 await self._session.wait_for_heartbeat()
                 if not order.end and not self._session.telemetry.is_confirmed_disarmed:
-                    # A new steering order cancels the task, but not if the task itself gives it.
+                    # A new steering order cancels this task, except for the order that the task gives here.
                     with self._task.protected():
                         order = self._arbiter.order(*order.modes, mode)
                     await self.stop_in(mode, order)
@@ -216,16 +218,17 @@ class FlightCleanup:
         return self._task.is_open
 
     async def finish(self) -> None:
-        """Wait briefly for the acknowledgement of a hold when the vehicle's block is left. The hold is repeated
-        meanwhile.
+        """At the end of the vehicle's `async with` block, wait briefly for the acknowledgement of a hold.
+
+        The hold is repeated while it is not acknowledged.
         """
         await self._task.finish(HOLD_CLOSE_TIMEOUT_S if self._arbiter.is_state_recent else 0)
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
-        """Hold the vehicle if the vehicle's block is left while a call in this block waits for the order.
+        """Hold the vehicle if its `async with` block ends during this `with` block, in which a call awaits the order.
 
-        A vehicle that has hit the ground must hold too, because its target may still be in the air.
+        The vehicle must also hold after it has hit the ground, because its target may still be in the air.
         """
         self._flight = order
         try:
@@ -245,7 +248,7 @@ class FlightCleanup:
 
     @contextmanager
     def preparing(self, mode: Mode) -> Iterator[Order]:
-        """Give the order to change to this mode, then prepare a stream in the block. The preparation may wait.
+        """Give the order to change to ``mode``. The caller prepares a stream in the `with` block, and may wait there.
 
         Raises:
             BusyError: another stream is open.
@@ -258,15 +261,15 @@ class FlightCleanup:
             yield order
             self._sender.raise_if_ended(order)
             if not self._arbiter.is_state_recent:
-                raise HeartbeatTimeout(f"{self._session.describe_link()}; nothing was sent")
+                raise HeartbeatTimeout(f"the vehicle is silent: {self._session.describe_link()}; nothing was sent")
         except BaseException:
             self.hold_in_background(order)
             raise
 
     def end_flights(self) -> None:
-        """End the flights of other tasks and hold the vehicle, when the vehicle's block is left."""
+        """At the end of the vehicle's `async with` block, end the flights of other tasks, and hold the vehicle."""
         if self.stop_stream is not None:
-            self.stop_stream("the block of its vehicle was left")
+            self.stop_stream("the async with block of its vehicle was left")
         if self._flight is not None:
             self.hold_in_background(self._flight)
 
@@ -280,14 +283,14 @@ ARM_WATCH_S = 15.0
 """Seconds for which aerokit monitors the vehicle after an abandoned arm order, and disarms it if the order arms it."""
 
 ARM_ACK_WAIT_S = 3.0
-"""Seconds after a HEARTBEAT that reports armed, in which the COMMAND_ACK of the arm order may still arrive."""
+"""The COMMAND_ACK of an arm order may arrive this many seconds after the HEARTBEAT that reports armed."""
 
-# Seconds that leaving the vehicle's block waits for the outcome of an abandoned arm order.
+# Seconds to wait for the outcome of an abandoned arm order at the end of the vehicle's `async with` block.
 ARM_CLOSE_TIMEOUT_S = 1.5
 
 
 class ArmCleanup:
-    """Monitors the vehicle after an arm order was abandoned, and disarms it if that order still takes effect."""
+    """Monitors the vehicle after an arm order was abandoned, and disarms the vehicle if the order still arms it."""
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender) -> None:
         self._session, self._arbiter, self._sender = session, arbiter, sender
@@ -301,7 +304,7 @@ class ArmCleanup:
         return f"it may still be executed{hint}; if it arms the vehicle within {ARM_WATCH_S:g} s, aerokit disarms it"
 
     def watch(self, order: Order, was_armed: bool) -> None:
-        """Start monitoring: the abandoned arm command may have been received, or may still arrive."""
+        """Start watching whether the vehicle arms after all, because the abandoned arm command may still arrive."""
         self._session.connection.discard_unsent()  # An arm command that is still unsent must not be sent later.
         self._task.start(partial(self._watch_arming, order, was_armed, self._arbiter.arming_orders))
 
@@ -325,7 +328,7 @@ class ArmCleanup:
             await self._disarm_again(order, arming_orders_before, last_disarmed_at)
 
     async def _wait_until_armed(self, was_armed: bool) -> bool:
-        """Return True once the vehicle arms, False if the link ends before.
+        """Return True once the vehicle arms; False if the link ends first.
 
         A vehicle that was armed before the order must disarm first.
         """
@@ -379,7 +382,7 @@ class ArmCleanup:
         self._task.cancel()
 
     async def finish(self) -> None:
-        """Wait briefly for the outcome of a cancelled arm order when the vehicle's block is left.
+        """At the end of the vehicle's `async with` block, wait briefly for the outcome of a cancelled arm order.
 
         Log a warning if the outcome stays unknown.
         """

@@ -69,7 +69,7 @@ class Eight(ClosedPath):
 
 
 class PathFlight:
-    """Moves a set-point straight to the start of a path, stops it there, and moves it along the path to a stop.
+    """Moves a set-point straight to the start of a path, stops it there, and then moves it along the path to its end.
 
     ``start`` is the vehicle's position relative to the centre of the path (north, east, down). ``centre`` is the
     position of the centre in the local frame. ``heading`` returns the heading in degrees for a place relative to the
@@ -98,7 +98,7 @@ class PathFlight:
         return self._phase >= self._last_phase
 
     def advance(self, seconds: float) -> TrajectorySetpoint:
-        """Move the set-point on by this time, and return it."""
+        """Move the set-point on by this many seconds, and return it."""
         return self._advance_on_path(seconds) if self.is_on_path else self._advance_to_path(seconds)
 
     def _advance_to_path(self, seconds: float) -> TrajectorySetpoint:
@@ -124,13 +124,14 @@ class PathFlight:
         self._phase = min(self._phase + self._present_speed_m_s * seconds / metres_per_radian, self._last_phase)
         if self.is_complete:
             self._present_speed_m_s = 0.0
-        place, tangent, curvature = self._path.at(self._phase)
+        place, tangent, second_derivative = self._path.at(self._phase)
         phase_rate = self._present_speed_m_s / math.hypot(*tangent)
         # The part of the second derivative that is parallel to the path would change the speed, so it is subtracted.
-        parallel = (curvature[0] * tangent[0] + curvature[1] * tangent[1]) / (tangent[0] ** 2 + tangent[1] ** 2)
+        (north_1, east_1), (north_2, east_2) = tangent, second_derivative
+        parallel_factor = (north_2 * north_1 + east_2 * east_1) / (north_1**2 + east_1**2)
         centripetal = (
-            (curvature[0] - parallel * tangent[0]) * phase_rate**2,
-            (curvature[1] - parallel * tangent[1]) * phase_rate**2,
+            (north_2 - parallel_factor * north_1) * phase_rate**2,
+            (east_2 - parallel_factor * east_1) * phase_rate**2,
         )
         return self._setpoint(place, 0.0, (tangent[0] * phase_rate, tangent[1] * phase_rate, 0.0), centripetal)
 
@@ -158,13 +159,14 @@ class TurnCounter:
     def __init__(self, radius_m: float, *, clockwise: bool) -> None:
         self._radius_m, self._direction = radius_m, 1 if clockwise else -1
         self._tolerance_m = max(MIN_TOLERANCE_M, TOLERANCE_SHARE * radius_m)
-        self._bearing: float | None = None  # from the centre, while the vehicle is near the circle
+        # Bearing from the centre to the vehicle in radians; None while the vehicle is not near the circle.
+        self._bearing: float | None = None
         self.rounds: float = 0.0
         self.is_on_path: bool = False
         """True while the vehicle is near the circle."""
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Process a place relative to the centre."""
+        """Process a reported position of the vehicle, in metres from the centre."""
         self.is_on_path = abs(math.hypot(north_m, east_m) - self._radius_m) <= self._tolerance_m
         bearing_before, self._bearing = self._bearing, math.atan2(east_m, north_m) if self.is_on_path else None
         if bearing_before is not None and self._bearing is not None:
@@ -177,13 +179,13 @@ class LobeCounter:
 
     def __init__(self, major_m: float, axis_deg: float) -> None:
         self._half_m, self._axis = major_m / 2, math.radians(axis_deg)
-        self._lobe = 0  # the last lobe that the vehicle was in: 1 or -1; 0 before the first one
+        self._lobe = 0  # The last lobe that the vehicle was in is 1 or -1; 0 means that it was in none yet.
         self.rounds: float = 0.0
         self.is_on_path: bool = False
         """True while the vehicle is in one of the lobes."""
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Process a place relative to the centre."""
+        """Process a reported position of the vehicle, in metres from the centre."""
         along = north_m * math.cos(self._axis) + east_m * math.sin(self._axis)
         self.is_on_path = abs(along) > self._half_m
         lobe = int(math.copysign(1, along)) if self.is_on_path else 0

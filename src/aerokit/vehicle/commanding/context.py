@@ -36,11 +36,14 @@ class VehicleContext:
         self.health: Health = Health(session)
         self.vehicle_position: VehiclePosition = VehiclePosition(session)
         self.on_finish: list[Callable[[], None]] = []
-        """Callbacks for when the vehicle's block is left. They may send, but must not wait."""
+        """Callbacks for the end of the vehicle's `async with` block. They may send messages, but must not wait."""
         session.on_reboot.append(self.arbiter.on_reboot)
 
     async def finish(self) -> bool:
-        """When the vehicle's block is left: hold the vehicle and return True if a flight was abandoned."""
+        """At the end of the vehicle's `async with` block, hold the vehicle if a flight was abandoned.
+
+        Returns True if a flight was abandoned.
+        """
         for callback in tuple(self.on_finish):
             callback()
         self.flight_cleanup.end_flights()

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots import TakeOff
     from aerokit.vehicle.commanding.order import Order
 
-# The values of MAV_LANDED_STATE for a flying vehicle, with their names in error texts.
+# Maps the values of MAV_LANDED_STATE that mean that the vehicle is flying to their names in error texts.
 IN_THE_AIR: dict[int | None, str] = {
     MavLandedState.IN_AIR: "in the air",
     MavLandedState.TAKEOFF: "taking off",
@@ -40,7 +40,7 @@ MIN_FLYING_HEIGHT_M = 2.0
 # Metres of climb that show that the vehicle executes a take-off command.
 CLIMB_DETECTED_M = 0.5
 
-# Seconds for a mode change, as by default in `set_mode`.
+# Time-out in seconds of a mode change, the same as the default of `set_mode`.
 MODE_TIMEOUT_S = 6.0
 
 # A submarine that leaves the surfacing mode below this depth has not surfaced. Home is at the surface.
@@ -58,7 +58,7 @@ class FlightActions(VehicleBase):
         timeout: float = 60.0,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Take off and climb to ``altitude_m`` above home; returns at that altitude.
+        """Take off and climb to ``altitude_m`` above home. Returns when the vehicle is at that altitude.
 
         The vehicle must be armed. If the autopilot requires another mode for a take-off, aerokit changes the mode.
         After a cancellation or a time-out, aerokit orders the vehicle to hold where it is.
@@ -66,7 +66,7 @@ class FlightActions(VehicleBase):
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
             timeout: seconds until the vehicle is at that altitude.
-            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no such limit.
 
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
@@ -118,7 +118,7 @@ class FlightActions(VehicleBase):
             f"the vehicle is {state or 'probably in the air'}{height} and can only take off from the ground;"
             " go_to() climbs"
         )
-        # The text of ``error`` already lists its own reasons.
+        # The text of ``error`` already lists its own reasons, so the constructor gets only the new one.
         explained = CommandRejected(f"{error}", command=error.command, result=error.result, reasons=(reason,))
         explained.reasons = (*error.reasons, reason)
         return explained
@@ -180,14 +180,14 @@ class FlightActions(VehicleBase):
             )
 
     async def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Land at the present position; returns when the vehicle is on the ground.
+        """Land at the present position. Returns when the vehicle is on the ground.
 
         The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation the
         vehicle continues to land.
 
         Args:
-            timeout: seconds until it is on the ground; None: no limit.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            timeout: seconds until the vehicle is on the ground; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             NotSupported: this type of vehicle has no landing mode. Nothing was sent.
@@ -211,7 +211,7 @@ class FlightActions(VehicleBase):
     async def return_to_launch(
         self, *, timeout: float | None = 600.0, max_silence_s: float | None = MAX_SILENCE_S
     ) -> None:
-        """Return to launch; the call ends on the ground, or above it if the autopilot does not land by itself.
+        """Return to launch. Returns on the ground, or above home if the autopilot does not land by itself.
 
         Raises the same errors as :meth:`land`.
         """
@@ -312,7 +312,7 @@ class ModeActions(VehicleBase):
         await self._sender.change_mode(found_mode, self._arbiter.order(found_mode), timeout)
 
     async def hold(self) -> None:
-        """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's hold mode.
+        """Stop and stay (a fixed wing circles). Returns when HEARTBEAT reports the autopilot's hold mode.
 
         The mode is BRAKE on Copter, LOITER on Plane and boats, HOLD on Rover, POSHOLD on Sub and LOITER on PX4.
 

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 __all__ = ["FollowStream"]
 
-# The rate of set-points, and the delay of the event loop above which the stream stops.
+# The rate of set-points in Hz, and the delay of the event loop in seconds above which the stream stops.
 RATE_HZ, MAX_LAG_S = 10.0, 1.0
-# The maximum distance, and height above or below, that the vehicle can be ordered to keep.
+# The vehicle can be ordered to keep at most this distance from the target, and at most this height above or below it.
 MAX_DISTANCE_M = 1000.0
 MIN_COURSE_SPEED_M_S = 0.5
 """Minimum ground speed at which the course of the target is used."""
@@ -83,7 +83,7 @@ class FollowedTarget:
         self._interval_s = 0.0
 
     def read(self) -> TargetState | None:
-        """Read the vehicle or call the function that is the target, and return the target's latest state."""
+        """Return the target's latest state. If the target is a vehicle or a function, this reads or calls it."""
         if isinstance(self._target, HasTelemetry):
             self._read_vehicle(self._target.telemetry)
         elif not isinstance(self._target, AsyncIterable) and (position := self._target()) is not None:
@@ -94,7 +94,7 @@ class FollowedTarget:
         position, velocity = telemetry.position, telemetry.velocity.latest
         if position.latest is None or not math.isfinite(position.age):
             return
-        # The time is computed from the age, because the target's connection may have another clock.
+        # The target's connection may have another clock, so the time is computed from the age of the position.
         received_at = self._now() - position.age
         speeds = ZERO if velocity is None else (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
         # The target's altitude is relative to its own home, which may be higher or lower than the follower's.
@@ -111,7 +111,7 @@ class FollowedTarget:
             InvalidArgument: the object is not a `Position`.
         """
         if not isinstance(position, Position):
-            raise InvalidArgument(f"position = {short_repr(position)} is not allowed: a Position")
+            raise InvalidArgument(f"position = {short_repr(position)} is not allowed: it must be a Position")
         latest, now = self.latest, self._now()
         if latest is not None and now - latest.reported_at < MIN_INTERVAL_S:
             return
@@ -168,7 +168,7 @@ class FollowStream(SteeringStream[TargetState]):
             raise InvalidArgument("target is not allowed: a vehicle cannot follow itself")
         if not (autopilot.setpoints.global_position and autopilot.setpoints.velocity):
             raise NotSupported(f"follow: {autopilot.firmware} does not support position set-points; nothing was sent")
-        unknown = TargetState(Position(0.0, 0.0), ZERO, -math.inf, -math.inf)  # replaced when the block is entered
+        unknown = TargetState(Position(0.0, 0.0), ZERO, -math.inf, -math.inf)  # replaced when the stream is entered
         super().__init__(context, self._encode_place, unknown, RATE_HZ, valid_for_s, MAX_LAG_S)
         self._target, self._tracker = target, FollowedTarget(target, self._now)
         self._encode_position = SetpointEncoder(context).position
@@ -280,7 +280,7 @@ class FollowStream(SteeringStream[TargetState]):
             state = self._tracker.read()
             if state is not None:
                 self._replace_value(state)
-                self._set_at = state.reported_at  # The value expires by the age of the target's position.
+                self._set_at = state.reported_at  # The age of a value is the age of the target's position.
         except (Exception, asyncio.CancelledError) as error:
             # The program's function raises CancelledError if it reads the result of a cancelled task.
             self._end_reason = f"the position of the target raised {error!r}"

@@ -16,15 +16,22 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.telemetry import Telemetry
 
 SETTLING_S, SETTLED_M_S = 0.5, 2.0
-"""A vehicle on the ground moves up or down slower than this for at least this time, even on a ship. A vehicle whose
-motors stop while it climbs is slower than this for 0.4 s at most."""
+"""A vehicle on the ground moves up or down slower than this speed for at least this time, even on a ship.
+
+A vehicle whose motors stop while it climbs is slower than this speed for 0.4 s at most.
+"""
 
 UNSETTLED_S, UNSETTLED_M = 5.0, 2.0
-"""A vehicle whose height has changed by less than this distance for this time is on the ground, whatever velocity it
-reports."""
+"""A vehicle whose height changes by less than this distance in this time is on the ground.
+
+This applies whatever velocity the vehicle reports, because the velocity may be wrong.
+"""
 
 IMPACT_M_S = 6.0
-"""Sink rate in m/s that no landing has right before touchdown. Autopilots descend at 5 m/s at most, and slow down."""
+"""A vehicle that sinks this fast right before it stops does not land, but falls.
+
+Autopilots descend at 5 m/s at most, and slow down before the touchdown.
+"""
 
 IMPACT_STOP_S = 0.7
 """A descent at ``IMPACT_M_S`` that ends within this time is an impact. Autopilots need longer to brake."""
@@ -42,7 +49,10 @@ IMPACT_HEIGHT_M = 3.0
 """If the height changes by this distance after a sudden stop, the stop was not on the ground."""
 
 MIN_DROP_M = 1.0
-"""A vehicle that falls to ``IMPACT_M_S`` loses 1.8 m. If it lost less than this, its velocity jumped."""
+"""A vehicle that falls until it sinks at ``IMPACT_M_S`` loses 1.8 m of height.
+
+If it has lost less height than this constant, only its reported velocity has jumped.
+"""
 
 MAX_SLIDE_M_S = 8.0
 """A vehicle that is faster than this over ground is not on the ground yet: a fixed wing may have levelled off."""
@@ -58,7 +68,7 @@ class ImpactDetector:
         self._telemetry = telemetry
         self._updated_at = self._sank_fast_at = -math.inf
         self._max_sink_m_s = 0.0
-        # Sink rate before the impact, and height of the place of the impact.
+        # Sink rate before the impact, and height of the vehicle at the impact. Both are None without an impact.
         self._impact_m_s: float | None = None
         self._impact_height_m: float | None = None
         # Height before the descent; None if it is unknown.
@@ -71,27 +81,28 @@ class ImpactDetector:
         velocity = cell.latest
         if velocity is None or cell.updated_at == self._updated_at:
             return
-        # Velocities may arrive less often than the time that an impact takes.
+        # An impact may take less time than passes between two velocities.
         interval_s = min(cell.updated_at - self._updated_at, MAX_INTERVAL_S)
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = cell.updated_at
         height_m = self._current_height()
-        if velocity.down_m_s >= IMPACT_M_S:
+        if velocity.down_m_s >= IMPACT_M_S:  # The vehicle sinks as fast as before an impact.
             is_new_descent = cell.updated_at - self._sank_fast_at > max_stop_s
             self._max_sink_m_s = velocity.down_m_s if is_new_descent else max(self._max_sink_m_s, velocity.down_m_s)
             self._sank_fast_at = cell.updated_at
         elif abs(velocity.down_m_s) < STILL_M_S and cell.updated_at - self._sank_fast_at <= max_stop_s:
+            # The vehicle has suddenly stopped. If it has lost no height, only its reported velocity has jumped.
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
                 self._impact_m_s, self._impact_height_m = self._max_sink_m_s, height_above_home(self._telemetry)
         elif _has_changed(self._impact_height_m, height_above_home(self._telemetry), IMPACT_HEIGHT_M):
-            self._impact_m_s = self._impact_height_m = None
+            self._impact_m_s = self._impact_height_m = None  # The vehicle flies on, so it did not hit the ground.
         if velocity.down_m_s < STILL_M_S and cell.updated_at - self._sank_fast_at > max_stop_s:
             self._top_m = height_m
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S
         self._has_stopped = self._impact_m_s is not None and (self._has_stopped or is_slow)
 
     def describe(self) -> str:
-        """Return the impact as a clause; empty if there was none, or the vehicle has left the place of the impact."""
+        """Return a clause about the impact; empty if there was none, or if the vehicle has flown on since."""
         if self._impact_m_s is None or not self._has_stopped:
             return ""
         return f"{HIT_GROUND} at {self._impact_m_s:.1f} m/s"
@@ -117,7 +128,7 @@ class GroundCheck:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Process every velocity that arrives within the block, rather than only the last one before each check."""
+        """During a `with` block, process every velocity at its arrival, instead of only the last one at each check."""
         detach = self._session.telemetry.velocity.observe(lambda *_: self._impact.update())
         try:
             yield
@@ -145,7 +156,7 @@ class GroundCheck:
         return self._has_settled(now, velocity.updated_at) and not self._impact.describe()
 
     def failure_reason(self, in_flight: Callable[[], str | None]) -> str | None:
-        """Return a clause if a vehicle that is reported on the ground falls or fell; before that, ``in_flight()``."""
+        """Return a clause if the vehicle falls or fell. Before it is reported on the ground, return ``in_flight()``."""
         return self.fall() if self.is_pending else in_flight()
 
     def fall(self) -> str | None:

@@ -182,7 +182,7 @@ class Guided:
             version_text = "of unknown version" if version is None else str(version.firmware)
             raise NotSupported(
                 f"{session.autopilot.firmware} {version_text} ignores SET_ACTUATOR_CONTROL_TARGET; only PX4 before 1.14"
-                " executes it. Use vehicle.guided.attitude_rate()"
+                " executes this message. Use vehicle.guided.attitude_rate()"
             )
         return SetpointStream(self._context, self._encode.actuators, initial, rate_hz, valid_for_s, max_lag_s)
 
@@ -234,7 +234,7 @@ class SetpointStream(SteeringStream[SetpointT]):
 
         Raises:
             InvalidArgument: a value is out of range; the previous set-point remains in force until it expires.
-            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+            SetpointStreamStopped: the stream has ended by itself, or its `async with` block was left.
         """
         check_kind("setpoint", setpoint, type(self._value))
         self._set(setpoint)
@@ -265,5 +265,5 @@ class SetpointStream(SteeringStream[SetpointT]):
 
     def _stop_reason(self, lag: float) -> str | None:
         if self._mode is None or not wants_motion(self._value, self._context):
-            self._stall = StallDetector(self._session)  # Begin anew, because the vehicle need not move now.
+            self._stall = StallDetector(self._session)  # While the vehicle need not move, it cannot stall.
         return super()._stop_reason(lag) or self._stall()

@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.vehicle.session.session import VehicleSession
 
-# Seconds in which status texts are collected after the vehicle was requested to run its checks.
+# After the vehicle was requested to run its checks, status texts are collected for this many seconds.
 TEXTS_S = 1.0
-# Values older than this do not describe the present state.
+# Values older than this many seconds do not describe the present state.
 HEALTH_MAX_AGE_S = 5.0
 PREARM_REPORT_INTERVAL_S = 35.0
-"""Seconds in which ArduPilot surely repeats its pre-arm failures, which it does every 30 s."""
+"""ArduPilot repeats its pre-arm failures every 30 s, so each one is reported within this many seconds."""
 CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
-"""Reason that is given if no other one explains a refusal to arm."""
+"""The reason for a refusal to arm if no other reason is known."""
 RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
 
@@ -82,7 +82,7 @@ class Health:
         return [*heartbeats, *too_old, *from_before_silence]
 
     async def why_not_armable(self) -> list[str]:
-        """Return why arming would be refused now. The vehicle is requested to run its checks if it supports that."""
+        """Return why arming would be refused now. A vehicle that can run its checks on request runs them first."""
         if self._telemetry.is_armed:
             return []
         return list(await self.arming_reasons(self._session.connection.now()))
@@ -139,7 +139,7 @@ class Health:
             await self._request_texts(since)
 
     async def _request_texts(self, since: float) -> None:
-        """Request the vehicle to run its pre-arm checks, unless it has sent texts about arming since this time."""
+        """Let the vehicle run its pre-arm checks, unless it has sent texts about arming since this time."""
         if self.arming_texts(since) or not self._autopilot.runs_prearm_checks:
             return
         requested_at = self._session.connection.now()
@@ -155,7 +155,7 @@ class Health:
         return [text for text in self._session.texts_since(since) if self._autopilot.arming_reason(text) is not None]
 
     def _failing(self) -> list[str]:
-        """Return failing sensors, missing estimates, and a missing GPS fix if it is their cause."""
+        """Return failing sensors and missing estimates. If estimates are missing, also report a missing GPS fix."""
         return [*self._failing_sensors(), *self._missing_estimates()]
 
     def _missing_estimates(self) -> list[str]:
@@ -171,12 +171,11 @@ class Health:
     def _checks_fail(self) -> bool:
         """Return True if the vehicle reports that its pre-arm checks do not pass.
 
-        In a mode that does not allow arming, PX4 evaluates the requirements of that mode, which say nothing about
-        arming.
+        In a mode that does not allow arming, PX4 evaluates the requirements of that mode instead of those for arming.
         """
         sensors = self._telemetry.sensors.latest
-        says_nothing = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
-        return sensors is not None and sensors.prearm_checks_pass is False and not says_nothing
+        is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
+        return sensors is not None and sensors.prearm_checks_pass is False and not is_meaningless
 
     def _failing_sensors(self) -> list[str]:
         """Return failing sensors.
@@ -186,8 +185,9 @@ class Health:
         receiver.
         """
         sensors = self._telemetry.sensors.latest
-        says_nothing = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
-        if sensors is None or sensors.prearm_checks_pass is True or says_nothing:
+        # In a mode that does not allow arming, PX4 reports the requirements of that mode instead of those for arming.
+        is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
+        if sensors is None or sensors.prearm_checks_pass is True or is_meaningless:
             return []
         return [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing if self._is_required(name)]
 

@@ -52,9 +52,9 @@ class ManeuverActions(VehicleBase):
         timeout: float | None = None,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Fly circles around a place; returns when the vehicle's reported positions have gone around it ``turns``
-        times.
+        """Fly circles around a place.
 
+        Returns when the vehicle's reported positions have gone around the place ``turns`` times.
         Afterwards a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit
         orders the vehicle to hold.
 
@@ -74,7 +74,7 @@ class ManeuverActions(VehicleBase):
                 autopilot. A fixed wing ignores it.
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             NotSupported: this type of vehicle cannot circle a place. Nothing was sent.
@@ -131,7 +131,7 @@ class ManeuverActions(VehicleBase):
             clockwise: direction in the first lobe, as seen from above.
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
         """
         from aerokit.vehicle.commanding.closed_paths import Eight, LobeCounter
         from aerokit.vehicle.commanding.rounds import RoundFlight
@@ -143,7 +143,7 @@ class ManeuverActions(VehicleBase):
         if rounds is not None:
             check_range("rounds", rounds, 0, MAX_ROUNDS, above=True)
             if rounds * 2 != int(rounds * 2):
-                raise InvalidArgument(f"rounds = {rounds!r} is not allowed: a multiple of 0.5")
+                raise InvalidArgument(f"rounds = {rounds!r} is not allowed: it must be a multiple of 0.5")
         is_flown_by_px4 = self._is_on_wings and self.autopilot.circles_by == "orbit"
         if not is_flown_by_px4 and (self._is_on_wings or not self.autopilot.setpoints.trajectory):
             raise NotSupported(f"figure_eight: {self.autopilot.firmware} has no such manoeuvre; nothing was sent")
@@ -189,7 +189,7 @@ class ManeuverActions(VehicleBase):
             max_distance_m: a place farther away than this many metres is refused.
             timeout: seconds in total. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle
                 moves.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             InvalidArgument: a value is out of range, or ``turns`` was given without ``radius_m``. Nothing was sent.
@@ -290,7 +290,7 @@ class ManeuverActions(VehicleBase):
     def _is_on_wings(self) -> bool:
         """True for a fixed wing and for a VTOL in forward flight, which cannot stop."""
         vtol_state = self.telemetry.vtol_state.latest
-        if vtol_state:  # neither unknown nor MAV_VTOL_STATE_UNDEFINED (0), so the vehicle is a VTOL
+        if vtol_state:  # Only a VTOL reports a state other than MAV_VTOL_STATE_UNDEFINED (0).
             return vtol_state == MavVtolState.FW
         return self.vehicle_type == MavType.FIXED_WING
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from aerokit.events import LinkState
     from aerokit.vehicle.session.session import VehicleSession
 
-# Values of ``req_stream_id`` and ``target_component`` in REQUEST_DATA_STREAM.
+# In REQUEST_DATA_STREAM, 0 means all groups of messages (``req_stream_id``) and all components (``target_component``).
 ALL_GROUPS = ALL_COMPONENTS = 0
 
 # Seconds until the first streamed message must arrive after a request.
@@ -79,7 +79,7 @@ def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
 
 
 async def _request_repeatedly(session: VehicleSession, rate_hz: float, monitor: _StreamMonitor) -> None:
-    """Request all streams by REQUEST_DATA_STREAM, again when none arrives or when an event requires it."""
+    """Request all streams by REQUEST_DATA_STREAM. Repeat the request while none arrives, and after some events."""
     retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
     rate = max(1, round(rate_hz))
     while True:
@@ -96,7 +96,7 @@ async def _request_repeatedly(session: VehicleSession, rate_hz: float, monitor: 
 
 
 async def _request_missing(session: VehicleSession, rate_hz: float, cleanup: ExitStack) -> None:
-    """Request the states that a vehicle which streams by itself does not stream."""
+    """Request those common states that the vehicle does not stream by itself."""
     await anyio.sleep(FIRST_MESSAGE_TIMEOUT_S)
     telemetry = session.telemetry
     missing = [name for name in REQUIRED_STATES if not telemetry.cells[name].is_known]
@@ -120,7 +120,7 @@ class _StreamMonitor:
             cleanup.callback(bus.attach_event(event_type, self._on_event))
 
     def reset(self) -> None:
-        """Forget what was received before a new request."""
+        """Forget the messages and events that arrived before a new request."""
         self.has_received, self.must_request = False, asyncio.Event()
 
     def _on_message(self, message: Message) -> None:
@@ -237,7 +237,7 @@ class MessagingActions(VehicleBase):
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
-            ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
+            ConnectionClosed, LinkLost: the connection has ended, or this vehicle's `async with` block was left.
         """
         self._session.send(message)
         self.note_sent(message)
@@ -250,7 +250,7 @@ class MessagingActions(VehicleBase):
             self._arbiter.record_own_arming(message.param1 == 1)
         elif subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
             names = self.telemetry.mode_names
-            modes: tuple[Mode, ...] = ()  # An empty tuple: any mode may be the effect of the message.
+            modes: tuple[Mode, ...] = ()  # An empty tuple means that any mode may be the effect.
             if isinstance(message, (CommandInt, CommandLong)):
                 params = (message.param1, message.param2, message.param3, message.param4)
                 modes = self.autopilot.modes_of_command(message.command, params, names)
@@ -266,8 +266,8 @@ class MessagingActions(VehicleBase):
     ) -> Iterator[PostedOrder]:
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
-        Within the block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged or
-        their effect is reported. The retries also end when a newer order about the same subject is given, when the
+        In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
+        or their effect is reported. The retries also end when a newer order about the same subject is given, when the
         vehicle changes to a mode that neither this order nor another order of the last ten seconds explains, and, if
         the order is about motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
         vehicle hold nor monitors late arming; use the actions for that.
@@ -283,9 +283,9 @@ class MessagingActions(VehicleBase):
             InvalidArgument: there is no subject, or ``"arm"`` was given without ``armed``. Nothing was sent.
         """
         if not subjects:
-            raise InvalidArgument("posted: subjects are missing: pass 'mode', 'motion' or 'arm'")
+            raise InvalidArgument("posted() needs at least one subject: 'mode', 'motion' or 'arm'")
         if "arm" in subjects and armed is None:
-            raise InvalidArgument("posted: subject 'arm' requires armed=True or armed=False")
+            raise InvalidArgument("posted(): the subject 'arm' requires armed=True or armed=False")
         with (
             self._arbiter.post(subjects, modes=modes, armed=armed) as order,
             PostedOrder(self._session, self._arbiter, self._sender, order) as posted,
@@ -310,7 +310,7 @@ class MessagingActions(VehicleBase):
         ``vehicle.component(100).subscribe(...)``.
 
         Raises:
-            InvalidArgument: no type, a rate out of range, or a message that the dialect does not contain.
+            InvalidArgument: no type was given, the rate is out of range, or the dialect does not contain a message.
         """
         return self._session.subscriber.subscribe(types, capacity, overflow, rate_hz, entire_system=True)
 
@@ -359,9 +359,7 @@ class MessagingActions(VehicleBase):
 
     @property
     def is_armed(self) -> bool:
-        """True if the last heartbeat reports armed; False before the first one, and after a reboot until the next
-        one.
-        """
+        """True if the last heartbeat reports armed; False while the state is unknown."""
         return self.telemetry.is_armed
 
     @property
@@ -394,8 +392,9 @@ class MessagingActions(VehicleBase):
         return self._session.describe_link()
 
     def describe_now(self) -> str:
-        """Return a clause about the reported state: ``holding in BRAKE, still armed, 9 m above home, last heartbeat
-        0.3 s ago``.
+        """Return a clause about the reported state.
+
+        For example: ``holding in BRAKE, still armed, 9 m above home, last heartbeat 0.3 s ago``.
         """
         return self._context.describe_now()
 

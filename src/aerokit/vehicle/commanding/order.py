@@ -1,5 +1,4 @@
-"""Orders of this program to one vehicle: tracks whether they are still valid, and whether their commands may be
-repeated.
+"""Orders of this program to one vehicle: whether they are still valid, and whether their commands may be repeated.
 
 docs/reliability.md has the table of all orders. Only commands listed there are sent again.
 """
@@ -64,8 +63,10 @@ CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
 }
 """Maps the name of a message to the subjects that it changes. Commands and mission items are not in this table."""
 FAILSAFE_STATES = (MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMINATION)
-"""Values of HEARTBEAT.system_status while a failsafe is active. PX4 reports them seconds before the failsafe changes
-the mode (COM_FAIL_ACT_T). An order that arrives in between cancels the failsafe.
+"""Values of HEARTBEAT.system_status while a failsafe is active.
+
+PX4 reports them seconds before the failsafe changes the mode (COM_FAIL_ACT_T). An order that arrives in between cancels
+the failsafe.
 """
 # Values of MISSION_ITEM.current for an item that ArduPilot executes at once instead of storing it: 2 is a place to fly
 # to, 3 a new altitude (GCS_Common.cpp).
@@ -157,9 +158,7 @@ class Order:
         self.armed = armed
         """True if the order arms the vehicle, False if it disarms it, None if it does neither."""
         self.may_move = False
-        """True once the vehicle may move because of this order or an earlier order. It must then hold if the order is
-        abandoned.
-        """
+        """True once the vehicle may move because of this or an earlier order; if abandoned, it must then hold."""
         self.was_refused: bool = False
         """True if the vehicle refused the order, and therefore continues its previous task."""
         self.was_flown_before: bool = False
@@ -174,14 +173,13 @@ class Order:
         self.failsafe: str = ""
         """The failsafe that became active after the order, as a clause; empty if there was none."""
         self.unexplained: str = ""
-        """A mode change that may be the effect of a raw command or a pilot's action, as a clause; empty if there was
-        none.
-        """
+        """A clause about a mode change by a raw command or another party, which is unclear; empty if there was none."""
         self.has_lost_mode: bool = False
         """True if the vehicle has changed to a mode that the order does not explain."""
         self.mode_lost_at: float = -math.inf
-        """Time at which the vehicle reported that mode. CURRENT_MODE may report it before the HEARTBEAT that reports
-        the mode and, after a landing, disarming.
+        """Time at which the vehicle first reported a mode that the order does not explain.
+
+        CURRENT_MODE may report the mode before the HEARTBEAT that reports the mode and, after a landing, disarming.
         """
         self.is_confirmed: bool = False
         """True once a change to one of the order's modes, or to its armed state, was reported."""
@@ -227,8 +225,8 @@ class Order:
         self.previous = None
 
     def close(self) -> None:
-        """End the posted order because its block was left."""
-        self.takeover_reason = self.takeover_reason or "its block was left"
+        """End the posted order, because its `with` block was left."""
+        self.takeover_reason = self.takeover_reason or "its `with` block was left"
 
     def clear_failsafe(self) -> None:
         """Ignore the reported failsafe, because the program has given a new order since."""
@@ -254,7 +252,7 @@ class Order:
             # An earlier order of the program has taken effect, so only another party can restore the mode before it.
             self._accepted_modes -= self._modes_before
         elif not was_reported_before or reported_at < self._any_mode_until:
-            # The first report of a mode, or perhaps the effect of a raw command.
+            # This is the first report of a mode, or the mode may be the effect of a raw command.
             if was_reported_before and number not in self._accepted_modes:
                 self.unexplained = f"the mode changed to {mode}"
             self._accepted_modes.add(number)

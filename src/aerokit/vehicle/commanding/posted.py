@@ -38,7 +38,8 @@ class PostedOrder:
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender, order: Order) -> None:
         self._session, self._arbiter, self._sender, self._order = session, arbiter, sender, order
-        # Collects refusals that follow the acceptance of the last command; closed by the next command or the block.
+        # Collects refusals that follow the acceptance of the last command. The next command or the end of the `with`
+        # block closes it.
         self._refusal_watch = ExitStack()
         self._refusals: list[CommandAck] = []
         self._was_left = False
@@ -67,7 +68,8 @@ class PostedOrder:
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
 
         Raises:
-            InvalidArgument: a parameter is not a number or does not fit, or the block was left. Nothing was sent.
+            InvalidArgument: a parameter is not a number or does not fit, or the `with` block was left. Nothing was
+                sent.
             OperationRejected: the order has ended: it was superseded or taken over.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
@@ -104,13 +106,14 @@ class PostedOrder:
             component_id: as for :meth:`command`.
 
         Raises:
-            InvalidArgument: the mode is not one of the modes of the order, or the block was left. Nothing was sent.
+            InvalidArgument: the mode is not one of the modes of the order, or the `with` block was left. Nothing was
+                sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             OperationTimeout: the vehicle accepted the mode but stayed in another mode.
         """
         if mode not in self._order.modes:
-            raise InvalidArgument(f"mode = {mode} is not allowed: it is not a mode of this order")
+            raise InvalidArgument(f"mode = {mode} is not allowed: this order does not lead to this mode")
         for attempts_left in reversed(range(MAX_MODE_ATTEMPTS)):
             try:
                 self._prepare(MavCmd.DO_SET_MODE)
@@ -169,8 +172,8 @@ class PostedOrder:
         await self._sender.run_command(order, send, command, *params, modes=order.modes, armed=order.armed, **options)
 
     def _prepare(self, command: int) -> None:
-        """Prepare to send a command: from now on, collect refusals that follow an acceptance of it."""
+        """Prepare to send a command: from now on, collect refusals that follow an acceptance of the command."""
         if self._was_left:
-            raise InvalidArgument(f"the block of this order was left: {command_name(command)} was not sent")
+            raise InvalidArgument(f"the `with` block of this order was left: {command_name(command)} was not sent")
         self._refusal_watch.close()
         self._refusals = self._refusal_watch.enter_context(self._session.refusals_of(command))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 POLL_INTERVAL_S = 0.25
-"""Maximum seconds between two evaluations of the state, as during a silence of the vehicle."""
+"""The state is evaluated at least this often (in seconds), even while the vehicle is silent."""
 
 MAX_SILENCE_S = 10.0
 """Default number of seconds without a heartbeat after which an operation fails."""
@@ -40,10 +40,10 @@ FALL_EVIDENT_S = 0.5
 """After falling for this time, a vehicle sinks faster than ``FALL_SINK_M_S``, even with air resistance."""
 
 HIT_GROUND = "the vehicle hit the ground"
-"""Beginning of the clause about an impact."""
+"""Beginning of each clause about an impact."""
 
 FALL_STOP_S = 1.5
-"""Maximum seconds from a fast descent to a standstill on the ground that together count as a fall."""
+"""A vehicle on the ground has fallen if it stood still at most this many seconds after a fast descent."""
 
 
 async def await_progress(
@@ -61,7 +61,7 @@ async def await_progress(
 ) -> None:
     """Return when ``is_done()`` has been true for ``held_for`` seconds.
 
-    All functions are called every ``POLL_INTERVAL_S``, and whenever the mode, the arming or the landed state changes;
+    The functions are called every ``POLL_INTERVAL_S``, and whenever the mode, the arming or the landed state changes;
     with ``at_positions`` also at each new position. ``operation`` is the name for error texts.
 
     Raises:
@@ -91,7 +91,7 @@ async def await_progress(
                 reason += _height_when_disarmed(session)
                 raise OperationRejected(f"{operation}: {reason}", reasons=_reasons(session, reason, started))
             if max_silence_s is not None and session.watch.silent_for_s > max_silence_s:
-                raise HeartbeatTimeout(f"{operation}: {session.describe_link()}")
+                raise HeartbeatTimeout(f"{operation}: the vehicle is silent; {session.describe_link()}")
             if timeout is not None and now - started >= timeout:
                 raise OperationTimeout(
                     f"{operation}: not done within {timeout:g} s; {describe()}; {session.describe_link()}"
@@ -166,8 +166,9 @@ class StallDetector:
         return self._place is not None and self._there_since - self._sank_fast_at <= FALL_STOP_S
 
     def __call__(self, timeout_s: float = STALL_TIMEOUT_S) -> str | None:
-        """Return a clause with the time for which the vehicle has not moved; None if it moves or its position is
-        unknown.
+        """Return a clause if the vehicle has not moved for ``timeout_s`` seconds, otherwise None.
+
+        While the position is unknown, the result is None.
         """
         now, cell = self._session.connection.now(), self._session.telemetry.position
         here = cell.latest
@@ -216,8 +217,9 @@ MAX_METRES_PER_DEGREE = 112_000
 """Upper limit in metres for one degree of latitude, or of longitude at the equator."""
 
 MAX_DISTANCE_M = 100_000.0
-"""A place farther away than this is treated as a mistake (swapped coordinates, a lost sign), unless the caller raises
-the limit.
+"""A place farther away than this counts as a mistake, unless the caller raises the limit.
+
+Typical mistakes are swapped coordinates and a lost sign.
 """
 
 
@@ -239,9 +241,7 @@ class VehiclePosition:
 
     @property
     def arrival_radius_m(self) -> float:
-        """Distance in metres at which the vehicle counts as arrived. It includes the circle that the vehicle was
-        ordered to fly.
-        """
+        """Distance from the target in metres at which the vehicle counts as arrived, even if it circles the target."""
         return max(self._autopilot.arrival_radius_m, CIRCLE_MARGIN * self._circle_m)
 
     def distance_to(self, target: Position) -> float:
@@ -260,10 +260,10 @@ class VehiclePosition:
     def check_reach(
         self, name: str, places: Iterable[Position | None], max_distance_m: float, *, are_items: bool = False
     ) -> None:
-        """Raise InvalidArgument for a place farther away than the limit; accept all places while the position is
-        unknown.
+        """Raise InvalidArgument for a place farther away than ``max_distance_m``.
 
-        With ``are_items``, ``places`` has one entry for each item of a plan: None for an item without a place.
+        While the vehicle's position is unknown, all places are accepted. With ``are_items``, ``places`` has one entry
+        for each item of a plan: None for an item without a place.
         """
         check_range("max_distance_m", max_distance_m, 0, math.inf, above=True)
         here = self._telemetry.position.latest
@@ -281,14 +281,15 @@ class VehiclePosition:
             if distance_m > max_distance_m:
                 where = f"{name}, item {index}" if are_items else name
                 raise InvalidArgument(
-                    f"{where} = {place.latitude_deg:.7f}, {place.longitude_deg:.7f} is not allowed: it is"
+                    f"{where} = {place.latitude_deg:.7f}, {place.longitude_deg:.7f} is not allowed: the place is"
                     f" {distance_m / 1000:,.0f} km away, more than max_distance_m = {max_distance_m:,.0f}; nothing was"
-                    " sent. Pass a greater max_distance_m to allow it"
+                    " sent. Pass a greater max_distance_m to allow this place"
                 )
 
     def remaining_distance(self, target: Position) -> float:
-        """Return the remaining distance. For ground vehicles it is horizontal, because their altitude has no fixed
-        origin.
+        """Return the remaining distance to ``target`` in metres.
+
+        For ground vehicles this is the horizontal distance, because their altitude has no fixed origin.
         """
         if self._autopilot.is_surface_vehicle:
             return self.distance_to(Position(target.latitude_deg, target.longitude_deg))
@@ -296,7 +297,7 @@ class VehiclePosition:
 
     @staticmethod
     def height_above(here: Position, target: Position) -> float:
-        """Return how many metres ``here`` is above ``target``; 0 if that is unknown."""
+        """Return how many metres ``here`` is above ``target``; 0 if no altitude is known for both."""
         for here_m, target_m in (
             (here.altitude_relative_m, target.altitude_relative_m),
             (here.altitude_amsl_m, target.altitude_amsl_m),
@@ -334,8 +335,8 @@ class VehiclePosition:
         altitude = relative_m if relative_m is not None else amsl_m
         if altitude is None:
             raise InvalidArgument(
-                f"target = {target} is not allowed: it has no altitude, and the vehicle's own altitude is unknown; give"
-                " the target altitude_relative_m or altitude_amsl_m"
+                f"target = {target} is not allowed: the target has no altitude, and the vehicle's own altitude is"
+                " unknown; give the target altitude_relative_m or altitude_amsl_m"
             )
         check_range("altitude", altitude, -12_000, 100_000)
         if is_relative and not self.accepts_relative_altitude:

@@ -25,11 +25,12 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint
 
-# Interval at which set-points are computed; rate at which the latest is sent; seconds for which it may be sent.
+# Seconds between computed set-points, rate in Hz at which the latest one is sent, and seconds for which it stays valid.
 SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
 RADIUS_ERROR_M, CIRCLE_REPORT_S = 0.5, 2.0
-"""Deviation in metres from which a reported radius counts as wrong, and seconds in which PX4 may still report the
-previous circle.
+"""Deviation in metres from which a reported radius counts as wrong.
+
+For CIRCLE_REPORT_S seconds after the command, PX4 may still report the previous circle.
 """
 LAG_ROUNDS = 0.02
 """Fraction of a round by which the count may lag although the vehicle is at the end of its path."""
@@ -40,10 +41,10 @@ FRAME_TIMEOUT_S = 5.0
 
 
 class RoundFlight:
-    """One flight around a place, or to the place if there is no ``counter``. Without ``rounds``, it lasts until
-    cancelled.
+    """One flight around a place, or to the place if there is no ``counter``.
 
-    ``limits`` are max_distance_m, timeout and max_silence_s. The constructor raises if the vehicle cannot fly there.
+    Without ``rounds``, the flight lasts until cancelled. ``limits`` are max_distance_m, timeout and max_silence_s. The
+    constructor raises if the vehicle cannot fly there.
     """
 
     def __init__(
@@ -59,7 +60,8 @@ class RoundFlight:
         self._operation, self._center, self._counter = operation, center, counter
         self._rounds = math.inf if rounds is None else rounds
         max_distance_m, self._timeout, self._max_silence_s = limits
-        self._wrong_circle = ""
+        # Why the vehicle does not fly the ordered circle; empty if it does. Such a vehicle is ordered to hold.
+        self._circle_problem = ""
         position = context.vehicle_position
         self._place = position.command_place(center)
         position.check_reach("center", [center], max_distance_m)
@@ -105,7 +107,7 @@ class RoundFlight:
             cleanup.hold_in_background(order)
             raise
         except OperationRejected:
-            if self._wrong_circle:
+            if self._circle_problem:
                 cleanup.hold_in_background(order)
             raise
 
@@ -118,7 +120,7 @@ class RoundFlight:
             """Recognise a wrong radius: PX4 accepts a radius above its limit, but then flies another radius."""
             flown_m = abs(status.radius)
             is_wrong = circle_m and abs(flown_m - circle_m) > RADIUS_ERROR_M
-            self._wrong_circle = (
+            self._circle_problem = (
                 f"the vehicle flies a circle of {flown_m:.1f} m instead of {circle_m:g} m" if is_wrong else ""
             )
 
@@ -126,12 +128,12 @@ class RoundFlight:
             refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
             refusal = next(refusals, "")
             if refusal:
-                self._wrong_circle = refusal  # so that the vehicle is ordered to hold
+                self._circle_problem = refusal
             if reason := mode_failure() or refusal:
                 return reason
             if session.connection.now() <= started + CIRCLE_REPORT_S:  # PX4 may still report the previous circle.
                 return None
-            return self._wrong_circle or None
+            return self._circle_problem or None
 
         def stall_reason() -> str | None:
             is_staying = not self._rounds and self._is_in_place

@@ -209,12 +209,10 @@ class OrderSender:
             await self.change_mode(mode, order)
 
     def mode_for(self, action: str, purpose: Purpose) -> Mode:
-        """Return the autopilot's mode for this purpose; raise NotSupported, naming ``action``, if there is no such
-        mode.
-        """
+        """Return the autopilot's mode for this purpose. Raises NotSupported for ``action`` if there is no such mode."""
         mode = self._session.autopilot.mode_for(purpose, is_vtol=self._session.telemetry.is_vtol)
         if mode is None:
-            raise NotSupported(f"{action}: {self._session.autopilot.firmware} has no mode for it")
+            raise NotSupported(f"{action}: {self._session.autopilot.firmware} has no mode for this action")
         return mode
 
     def mode_failure(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
@@ -247,7 +245,7 @@ class OrderSender:
         return failure_reason
 
     def impact_failure(self, order: Order) -> Callable[[], str]:
-        """Return a function that returns a clause once the vehicle has hit the ground during the newest order."""
+        """Return a function that returns a clause once the vehicle has hit the ground while ``order`` is the newest."""
         detector = ImpactDetector(self._session.telemetry)
 
         def failure_reason() -> str:

@@ -200,8 +200,8 @@ class SetpointEncoder:
         """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
 
         For ArduPilot, a set-point with a heading is converted to MAV_FRAME_LOCAL_NED by the present heading. In
-        MAV_FRAME_BODY_NED, ArduPilot adds each yaw to the previous target, and correcting for that by telemetry
-        oscillates.
+        MAV_FRAME_BODY_NED, ArduPilot adds each yaw to the previous target. A correction by telemetry would make the
+        vehicle's heading oscillate.
         """
         forward, right, frame = setpoint.forward_m_s, setpoint.right_m_s, MavFrame.BODY_NED
         if setpoint.yaw_deg is not None and self._session.autopilot.setpoints.body_yaw_is_relative:
@@ -249,7 +249,9 @@ class SetpointEncoder:
         """Return SET_ACTUATOR_CONTROL_TARGET."""
         check_range("group", setpoint.group, 0, 3)
         if len(setpoint.controls) != ACTUATORS_PER_GROUP:
-            raise InvalidArgument(f"controls = {setpoint.controls!r} is not allowed: {ACTUATORS_PER_GROUP} numbers")
+            raise InvalidArgument(
+                f"controls = {setpoint.controls!r} is not allowed: it must be {ACTUATORS_PER_GROUP} numbers"
+            )
         for control in setpoint.controls:
             check_range("controls", control, -1, 1)
         return SetActuatorControlTarget(self._time_ms() * 1000, setpoint.group, *self._address, setpoint.controls)

@@ -160,7 +160,7 @@ class SimpleOrder(Snapshot):
                 self.name,
                 is_done=lambda: any(is_done(text, now() - acknowledged_at) for text in texts),
                 failure_reason=failure_reason,
-                describe=lambda: "no status text reported it",
+                describe=lambda: "no status text reported the effect",
                 timeout=timeout,
             )
         finally:
@@ -180,7 +180,7 @@ class SimpleOrder(Snapshot):
         ``target`` is the id of the component that sends the message.
         """
         session, message_type = context.session, getattr(m, effect.message)
-        reports: list[Message] = []  # only the latest one
+        reports: list[Message] = []  # The list has at most one message, the latest.
         is_reported = False
         requested_at = session.connection.now()
 
@@ -222,7 +222,7 @@ def _supersession(order: Order | None) -> str | None:
 
 async def _has_message(context: VehicleContext, message_id: int, component_id: int) -> bool:
     """Request a message; return False if the vehicle refuses, which means that it does not have the message."""
-    with suppress(CommandTimeout):  # Without an answer, the vehicle may still have the message.
+    with suppress(CommandTimeout):  # A vehicle that does not answer may still have the message.
         try:
             await context.session.commands.send_long(
                 MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=2, attempt_timeout=1.0

@@ -100,7 +100,7 @@ class StickStream(SteeringStream[StickInput]):
 
         Raises:
             InvalidArgument: a position is out of range; the previous positions stay in force until they expire.
-            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+            SetpointStreamStopped: the stream has ended by itself, or its `async with` block was left.
         """
         check_kind("sticks", sticks, StickInput)
         self._set(sticks)
@@ -124,8 +124,8 @@ class StickStream(SteeringStream[StickInput]):
             source = (await known_values(self._probe, "COM_RC_IN_MODE")).get("COM_RC_IN_MODE")
             if source in (RC_ONLY, DISABLED):
                 raise OperationRejected(
-                    f"sticks: COM_RC_IN_MODE = {source:g} makes PX4 ignore MANUAL_CONTROL; set it to 1 (MAVLink only)"
-                    " or 3 (either)"
+                    f"sticks: COM_RC_IN_MODE = {source:g} makes PX4 ignore MANUAL_CONTROL; set COM_RC_IN_MODE to 1"
+                    " (MAVLink only) or 3 (transmitter or MAVLink)"
                 )
             return
         values = await known_values(self._probe, "MAV_GCS_SYSID", "SYSID_MYGCS", "RC_OVERRIDE_TIME", "RC_OPTIONS")
@@ -143,10 +143,10 @@ class StickStream(SteeringStream[StickInput]):
             if release_after_s < 0:
                 effect = "never releases the sticks if this program dies"
             raise OperationRejected(
-                f"sticks: with RC_OVERRIDE_TIME = {release_after_s:g} ArduPilot {effect}; set it to 3"
+                f"sticks: with RC_OVERRIDE_TIME = {release_after_s:g}, ArduPilot {effect}; set RC_OVERRIDE_TIME to 3"
             )
         if int(values.get("RC_OPTIONS", 0)) & IGNORE_OVERRIDES:
-            raise OperationRejected("sticks: bit 1 of RC_OPTIONS makes ArduPilot ignore overrides; clear it")
+            raise OperationRejected("sticks: bit 1 of RC_OPTIONS makes ArduPilot ignore overrides; clear this bit")
 
     def _message_of(self, sticks: StickInput) -> Message:
         for name in ("forward", "right", "throttle", "yaw"):

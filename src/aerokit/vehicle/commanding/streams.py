@@ -51,10 +51,10 @@ LEAD_TIME_S = 1.0
 class ValueStream(Generic[ValueT]):
     """Sends the latest value at a fixed rate.
 
-    The stream stops when the program no longer supplies values, blocks the event loop, or leaves the block, and
-    when the vehicle falls silent.
+    The stream stops when the program no longer supplies values, blocks the event loop, or leaves the `async with`
+    block, and when the vehicle falls silent.
 
-    Subclasses implement entering and leaving the block, and what happens when the stream stops by itself.
+    Subclasses implement `__aenter__`, `__aexit__`, and what happens when the stream stops by itself.
     """
 
     # Nouns for the stream and its value in error texts.
@@ -131,7 +131,7 @@ class ValueStream(Generic[ValueT]):
         except Exception as error:
             self._stop(str(error))
             return
-        due = max(due + self._period_s, self._now())
+        due = max(due + self._period_s, self._now())  # After a delay, ticks that were missed are not made up for.
         self._timer = asyncio.get_running_loop().call_at(due, self._tick, due)
 
     def _send(self) -> None:
@@ -196,12 +196,13 @@ class SteeringStream(ValueStream[ValueT]):
     """
 
     _prepared_order: Order | None = None
-    """The steering order, if it was already given before the block is entered; see `FlightCleanup.preparing`."""
+    """The steering order, if it was given before the stream is entered; see `FlightCleanup.preparing`."""
     _order: Order | None = None
     _mode: Mode | None = None
     _impact: ImpactDetector | None = None
-    """Ends the stream when the vehicle hits the ground; None if the values determine the thrust, so that the vehicle
-    may brake as suddenly in the air.
+    """Ends the stream when the vehicle hits the ground.
+
+    None for values that determine the thrust: they may also stop the vehicle suddenly in the air.
     """
 
     @property
@@ -256,9 +257,9 @@ class SteeringStream(ValueStream[ValueT]):
             raise self._stop_error
 
     async def _leave(self, exc: BaseException | None) -> None:
-        """Leave the block while the stream is running."""
+        """End the running stream when its `async with` block is left: make the vehicle hold."""
         self._end()
-        self._stop_error = SetpointStreamStopped(f"the block of this {self._NAME} was left")
+        self._stop_error = SetpointStreamStopped(f"the async with block of this {self._NAME} was left")
         if exc is not None:  # An exception leaves the block at once, without waiting for the confirmation of the hold.
             self._hold()
         elif not self._context.arbiter.is_state_recent:
@@ -270,13 +271,14 @@ class SteeringStream(ValueStream[ValueT]):
             order = self._context.arbiter.order(hold_mode)
             try:
                 await cleanup.stop_in(hold_mode, order)
-            except (anyio.get_cancelled_exc_class(), OperationTimeout):  # The hold may have been lost.
+            except (anyio.get_cancelled_exc_class(), OperationTimeout):  # The order to hold may have been lost.
                 cleanup.hold_in_background(order)
                 raise
 
     async def _enter(self, mode: Mode, order: Order) -> None:
-        """Change the mode. ArduPilot accepts values once it is in the mode; PX4 enters the mode once it receives
-        values.
+        """Change the mode, and begin to send values.
+
+        ArduPilot accepts values once it is in the mode. PX4 enters the mode only while it receives values.
         """
         if self._needs_stream_before_mode:
             self._begin_sending()
@@ -330,8 +332,9 @@ class TakeoverCheck:
         self._end_of_take_off = (take_off_mode, hold_mode)
 
     def raise_if_changed(self, operation: str) -> None:
-        """Raise OperationRejected if an order was given, or if the mode was changed other than by the end of a
-        take-off.
+        """Raise OperationRejected if an order was given, or if the mode was changed.
+
+        A change from the take-off mode to the hold mode is allowed, because it is the end of a take-off.
         """
         if self._arbiter.latest(STEERING) is not self._order_before:
             raise OperationRejected(f"{operation}: {SUPERSEDED} before anything was ordered")

@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 # Bits of POSITION_TARGET_TYPEMASK that make the vehicle ignore all fields but the position.
 POSITION_ONLY = 0x0DF8
 
-# param1 and param3 of DO_CHANGE_SPEED.
+# Values of param1 (type of speed) and param3 (throttle) of DO_CHANGE_SPEED.
 GROUND_SPEED, KEEP_THROTTLE = 1, -1
 
-# Interval at which a target that is not acknowledged is sent again.
+# A target that is sent without an acknowledgement is repeated at this interval in seconds.
 RESEND_S = 1.0
 
 
@@ -61,7 +61,7 @@ class TravelActions(VehicleBase):
         order was given meanwhile or another party changed the mode. After a silence, aerokit waits for the next
         heartbeat, and orders a hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
-        vehicle that does not support it.
+        vehicle that does not support this command.
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level. The vehicle keeps its
@@ -71,7 +71,7 @@ class TravelActions(VehicleBase):
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
             max_distance_m: a place farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
-            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
 
         Raises:
             InvalidArgument: the target is not on earth or too far away, or another argument is out of range. Nothing
@@ -216,7 +216,7 @@ class TravelActions(VehicleBase):
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until the vehicle has the heading.
-            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
+            max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no such limit.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
@@ -275,15 +275,14 @@ class TravelActions(VehicleBase):
             )
 
     async def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
-        """Move the home position, to a place or to the vehicle's present position, and wait until HOME_POSITION
-        reports it.
+        """Move the home position, and wait until HOME_POSITION reports the new place.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
         firmware that does not support this gets a COMMAND_LONG, which has a resolution of about a metre.
 
         Args:
-            place: latitude, longitude and an altitude above mean sea level; None: the present position.
-            timeout: seconds until HOME_POSITION reports it.
+            place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.
+            timeout: seconds until HOME_POSITION reports the new place.
 
         Raises:
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.

@@ -18,12 +18,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 POLL_INTERVAL_S, ANSWER_TIMEOUT_S = 1.0, 1.0
-"""Seconds between polls, and seconds to wait for an answer. PX4 reports the result for two seconds after the end; a
-later poll would start another tuning.
+"""Seconds between polls, and seconds to wait for an answer.
+
+PX4 reports the result for two seconds after the end of a tuning. A later poll would start another tuning.
 """
 MAX_ANSWER_AGE_S = 1.5
-"""Maximum seconds since the last answer. After a longer pause of the program or its event loop, the tuning may have
-ended.
+"""Maximum age of PX4's last answer in seconds.
+
+After a longer pause of the program or its event loop, the tuning may have ended.
 """
 TUNED_PERCENT = 95
 """Progress in percent at which PX4 has finished, and waits for disarming to save its new gains."""
@@ -75,7 +77,8 @@ class TuningActions(VehicleBase):
                     self._sender.raise_if_ended(order)
                     if percent < TUNED_PERCENT and self.connection.now() - _received_at(answer) > MAX_ANSWER_AGE_S:
                         raise CommandTimeout(
-                            "autotune: this program was blocked too long to poll PX4; PX4 may go on tuning"
+                            "autotune: this program was blocked for too long and could not poll PX4; PX4 may go on"
+                            " tuning"
                         )
         finally:
             detach()

@@ -22,16 +22,17 @@ __all__ = ["MeasurementEncoder"]
 
 NAN = math.nan
 UNKNOWN_VECTOR: Vector = (NAN, NAN, NAN)
-# Indexes of the diagonal in the upper triangle of a 6x6 covariance matrix, row by row.
+# Indexes of the diagonal elements in the upper triangle of a 6x6 matrix, row by row, and the number of its elements.
 POSITION_DIAGONAL, ORIENTATION_DIAGONAL, TRIANGLE_SIZE = (0, 6, 11), (15, 18, 20), 21
-MAX_SECTORS, UNKNOWN_DISTANCE = 72, 0xFFFF
+MAX_SECTORS, UNKNOWN_DISTANCE, UNKNOWN_OBSTACLE_ID = 72, 0xFFFF, 0xFFFF
 MAX_CENTIMETRES = 0xFFFE
 # GPS time began on 1980-01-06 and is 18 leap seconds ahead of UTC since 2017.
 GPS_EPOCH_S, LEAP_SECONDS, SECONDS_PER_WEEK = 315_964_800, 18, 604_800
 GPS_NUMBERS = ("hdop", "vdop", "horizontal_accuracy_m", "vertical_accuracy_m", "speed_accuracy_m_s", "yaw_deg")
-# Values of MAV_SENSOR_ORIENTATION.
+# Maps each direction to its MAV_SENSOR_ORIENTATION.
 ORIENTATIONS: dict[RangeDirection, int] = {"forward": 0, "right": 2, "back": 4, "left": 6, "up": 24, "down": 25}
-# A value of MAV_ESTIMATOR_TYPE, one of MAV_DISTANCE_SENSOR, and the covariance of DISTANCE_SENSOR that means "unknown".
+# The MAV_ESTIMATOR_TYPE of vision, the MAV_DISTANCE_SENSOR of a laser, and the covariance in DISTANCE_SENSOR that means
+# "unknown".
 VISION, LASER, UNKNOWN_COVARIANCE = 2, 0, 255
 LANDING_TARGET_TYPE_VISION_FIDUCIAL = 2
 # Rotations between the axes of ROS (east, north, up; forward, left, up) and the axes of MAVLink.
@@ -43,15 +44,15 @@ FLU_TO_FRD: Quaternion = (0.0, 1.0, 0.0, 0.0)
 class MeasurementEncoder:
     """Encodes measurements for one vehicle: each method returns the messages of one measurement.
 
-    A measurement that is out of range raises InvalidArgument. Time stamps are on the event loop's clock;
-    `TimesyncAnswers` lets PX4 convert them to its own clock.
+    A measurement that is out of range raises InvalidArgument. Time stamps are on the event loop's clock. PX4 converts
+    them to its own clock by the answers of `TimesyncAnswers`.
     """
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
 
     def odometry(self, value: v.OdometryMeasurement) -> tuple[Message, ...]:
-        """Return ODOMETRY in a frame that the autopilot reads."""
+        """Return ODOMETRY, converted from the axes of ROS to those of MAVLink if necessary."""
         check_range("quality", value.quality, -1, 100)
         orientation = value.orientation
         quaternion = orientation.quaternion if isinstance(orientation, Attitude) else orientation
@@ -62,9 +63,10 @@ class MeasurementEncoder:
             check_finite("velocity_m_s", *velocity)
         is_earth_frame = value.frame in ("ned", "enu")
         if value.frame in ("enu", "flu"):  # the axes of ROS
+            # The axes of the frame and the axes of the body are both converted.
             to_mavlink = ENU_TO_NED if is_earth_frame else FLU_TO_FRD
             quaternion = multiply(multiply(to_mavlink, quaternion), FLU_TO_FRD)
-            x, y, up = position  # x and y are east and north, or forward and left
+            x, y, up = position  # x and y are east and north in "enu", forward and left in "flu".
             position = (y, x, -up) if is_earth_frame else (x, -y, -up)
             velocity = None if velocity is None else (velocity[0], -velocity[1], -velocity[2])
         frame = self._session.autopilot.external.ned_frame if is_earth_frame else MavFrame.LOCAL_FRD
@@ -76,7 +78,7 @@ class MeasurementEncoder:
                 *position,
                 _normalized(quaternion),
                 *(UNKNOWN_VECTOR if velocity is None else velocity),
-                *UNKNOWN_VECTOR,
+                *UNKNOWN_VECTOR,  # turn rates
                 _triangle(value.position_variance_m2, value.orientation_variance_rad2),
                 _triangle(value.velocity_variance_m2_s2, None),
                 _reset_counter(value.reset_counter),
@@ -156,7 +158,7 @@ class MeasurementEncoder:
         )
         ignore_flags = sum(flag for field, flag in optional_fields if field is None)
         week, week_ms = _gps_time(value.unix_time_s)
-        yaw_cdeg = 0  # means "no heading"; north is sent as 36000
+        yaw_cdeg = 0  # 0 means that the yaw is unknown, so north is sent as 36000.
         if value.yaw_deg is not None:
             yaw_cdeg = round(value.yaw_deg % 360 * 100) or 36000
         return (
@@ -187,15 +189,16 @@ class MeasurementEncoder:
         check_range("first_deg", value.first_deg, -360, 360)
         count = len(value.distances_m)
         if not 1 <= count <= MAX_SECTORS:
-            raise InvalidArgument(f"distances_m has {count} distances; allowed: 1 to {MAX_SECTORS}")
+            raise InvalidArgument(f"distances_m has {count} distances, but must have 1 to {MAX_SECTORS}")
         min_cm, max_cm = _centimetres("min_m", value.min_m), _centimetres("max_m", value.max_m)
         distances = [UNKNOWN_DISTANCE] * MAX_SECTORS
         for index, distance_m in enumerate(value.distances_m):
             if distance_m is None:
                 continue
-            is_free = distance_m > value.max_m  # sent as max_distance + 1, which means "no obstacle"
+            is_free = distance_m > value.max_m  # A sector without an obstacle is sent as max_distance + 1.
             distances[index] = max_cm + 1 if is_free else _centimetres("distances_m", distance_m)
         time_us = self._time_us(value.measured_at)
+        # The fields increment_f, which the autopilots read instead of the integer field increment, and angle_offset.
         angles = (value.step_deg, value.first_deg)
         return (m.ObstacleDistance(time_us, LASER, distances, 0, min_cm, max_cm, *angles, MavFrame.BODY_FRD),)
 
@@ -204,17 +207,19 @@ class MeasurementEncoder:
         check_range("min_m", value.min_m, 0, 1e5)
         check_range("max_m", value.max_m, 0, 1e5, above=True)
         time_ms = self._time_us(value.measured_at) // 1000 & 0xFFFFFFFF
+        limits_m = (value.min_m, value.max_m)
         for point in value.points_m:
             check_finite("points_m", *point)
         return tuple(
-            m.ObstacleDistance3d(time_ms, LASER, MavFrame.BODY_FRD, UNKNOWN_DISTANCE, *point, value.min_m, value.max_m)
+            m.ObstacleDistance3d(time_ms, LASER, MavFrame.BODY_FRD, UNKNOWN_OBSTACLE_ID, *point, *limits_m)
             for point in value.points_m
         )
 
     def range_finder(self, value: v.RangeMeasurement) -> tuple[Message, ...]:
         """Return DISTANCE_SENSOR."""
         if value.direction not in ORIENTATIONS:
-            raise InvalidArgument(f"direction = {value.direction!r} is not allowed: one of {', '.join(ORIENTATIONS)}")
+            directions = ", ".join(ORIENTATIONS)
+            raise InvalidArgument(f"direction = {value.direction!r} is not allowed: it must be one of {directions}")
         if value.quality is not None:
             check_range("quality", value.quality, 1, 100)
         _check_variance(value.variance_m2)
@@ -235,11 +240,14 @@ class MeasurementEncoder:
         check_range("number", value.number, 0, 255)
         distance = math.hypot(*offset)
         if not distance > 0:
-            raise InvalidArgument("forward_m = right_m = down_m = 0 is not allowed: the target must be at a distance")
+            raise InvalidArgument(
+                "forward_m = right_m = down_m = 0 is not allowed: the target cannot be at the vehicle's own position"
+            )
         frame = MavFrame.LOCAL_FRD if value.is_level else MavFrame.BODY_FRD
         if self._session.autopilot.external.target_is_local:
             frame, offset = MavFrame.LOCAL_NED, self._in_local_frame(offset, is_level=value.is_level)
         time_us, unknown_size = self._time_us(value.measured_at), (0.0, 0.0)
+        # Angular offsets of the target from the centre of the picture, for a camera that looks straight down.
         angles = (math.atan2(value.right_m, value.down_m), -math.atan2(value.forward_m, value.down_m))
         no_rotation = (1.0, 0.0, 0.0, 0.0)
         last_fields = (LANDING_TARGET_TYPE_VISION_FIDUCIAL, 1)  # 1: the position is valid
@@ -255,14 +263,15 @@ class MeasurementEncoder:
         check_range("interval_s", value.interval_s, 0, 10, above=True)
         check_range("quality", value.quality, 0, 255)
         time_us = self._time_us(value.measured_at)
-        distance_m = -1.0 if value.distance_m is None else value.distance_m  # a negative distance means "unknown"
+        distance_m = -1.0 if value.distance_m is None else value.distance_m  # A negative distance means "unknown".
         check_finite("distance_m", distance_m)
         if self._session.autopilot.external.flow_in_radians:
             gyro = UNKNOWN_VECTOR if value.gyro_rad is None else value.gyro_rad
             interval_us = round(value.interval_s * 1e6)
             flow = (value.x_rad, value.y_rad, *gyro)
             return (m.OpticalFlowRad(time_us, 0, interval_us, *flow, 0, value.quality, 0, distance_m),)
-        # ArduPilot multiplies flow_x by the interval between messages to get rad/s (AP_OpticalFlow_MAV.cpp).
+        # ArduPilot takes flow_x times the interval between messages as the rate in rad/s (AP_OpticalFlow_MAV.cpp). The
+        # angle is therefore divided by the interval twice.
         flow_x, flow_y = (round(angle / value.interval_s**2) for angle in (value.x_rad, value.y_rad))
         for name, flow_field in (("x_rad", flow_x), ("y_rad", flow_y)):
             check_range(name, flow_field, -0x8000, 0x7FFF)
@@ -273,7 +282,9 @@ class MeasurementEncoder:
         """Return a position in the local frame; ``offset`` is relative to the vehicle, along its body axes."""
         telemetry = self._session.telemetry
         if max(telemetry.attitude.age, telemetry.local_position.age) > POSITION_MAX_AGE_S:
-            raise ValueUnknownError("landing target: the vehicle's attitude or local position is unknown, or too old")
+            raise ValueUnknownError(
+                "the landing target was not sent: the vehicle's attitude or local position is unknown or too old"
+            )
         attitude, own_position = telemetry.attitude.value, telemetry.local_position.value
         if is_level:  # The axes of the offset turn with the vehicle, but do not tilt.
             attitude = Attitude(0.0, 0.0, attitude.yaw_deg)
@@ -281,7 +292,7 @@ class MeasurementEncoder:
         return (own_position.north_m + north, own_position.east_m + east, own_position.down_m + down)
 
     def _time_us(self, measured_at: float | None) -> int:
-        """Return the time stamp in microseconds; None stands for now."""
+        """Return a time on the event loop's clock as a time stamp in microseconds. None means the present time."""
         now = self._session.connection.now()
         seconds = now if measured_at is None else measured_at
         check_range("measured_at", seconds, 0, now)
@@ -308,20 +319,21 @@ def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
 
 
 def _normalized(quaternion: Quaternion) -> Quaternion:
-    """Return the unit quaternion of the same rotation, whose w is not negative."""
+    """Return the quaternion of the same rotation that has length 1 and a w that is not negative."""
     length = math.hypot(*quaternion)
     if not 0.9 < length < 1.1:
-        raise InvalidArgument(f"orientation = {quaternion!r} is not allowed: a quaternion (w, x, y, z) of length 1")
+        raise InvalidArgument(f"orientation = {quaternion!r} is not allowed: its length must be 1")
     w, x, y, z = quaternion
     sign = -1.0 if w < 0 else 1.0
     return (sign * w / length, sign * x / length, sign * y / length, sign * z / length)
 
 
 def _triangle(linear_variance: float | None, angular_variance: float | None) -> list[float]:
-    """Return the upper triangle of a 6x6 covariance matrix whose diagonal has each of two variances three times.
+    """Return the upper triangle of a 6x6 covariance matrix with three linear and three angular variances.
 
-    An unknown linear variance is sent as NaN. An unknown angular variance is sent as 0: both autopilots then use the
-    minimum in their parameters, and ArduPilot does not accept NaN there.
+    Only the diagonal is not 0. An unknown linear variance is sent as NaN in the first element. An unknown angular
+    variance is sent as 0: both autopilots then use the minimum in their parameters, and ArduPilot does not accept NaN
+    there.
     """
     _check_variance(linear_variance)
     _check_variance(angular_variance)
@@ -350,7 +362,7 @@ def _centimetres(name: str, metres: float) -> int:
 
 
 def _gps_time(unix_time_s: float | None) -> tuple[int, int]:
-    """Return the number of the GPS week, and milliseconds since its beginning; zeros if the time is unknown."""
+    """Return the number of the GPS week, and the milliseconds since this week began; zeros if the time is unknown."""
     if unix_time_s is None:
         return 0, 0
     check_range("unix_time_s", unix_time_s, GPS_EPOCH_S, GPS_EPOCH_S + 65535 * SECONDS_PER_WEEK)

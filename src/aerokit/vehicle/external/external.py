@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["External"]
 
-# Metres by which a reported origin may differ, because ArduPilot and PX4 round it.
+# A reported origin may differ from the given one by this many metres, because ArduPilot and PX4 round it.
 ORIGIN_TOLERANCE_M = 1.0
 POLL_INTERVAL_S = 0.5
 
@@ -54,11 +54,11 @@ class External:
         self._answers = TimesyncAnswers(context.session)
 
     def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
-        """Supply pose and velocity (ODOMETRY). ArduPilot needs VISO_TYPE, PX4 EKF2_EV_CTRL."""
+        """Supply pose and velocity (ODOMETRY). Set VISO_TYPE on ArduPilot, EKF2_EV_CTRL on PX4."""
         return self._stream("odometry", OdometryMeasurement, self._encode.odometry, rate_hz, valid_for_s)
 
     def vision_position(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
-        """Supply a pose (VISION_POSITION_ESTIMATE). ArduPilot needs VISO_TYPE, PX4 EKF2_EV_CTRL."""
+        """Supply a pose (VISION_POSITION_ESTIMATE). Set VISO_TYPE on ArduPilot, EKF2_EV_CTRL on PX4."""
         return self._stream("vision_position", PoseMeasurement, self._encode.vision_position, rate_hz, valid_for_s)
 
     def vision_speed(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[SpeedMeasurement]:
@@ -70,28 +70,28 @@ class External:
         return self._stream("motion_capture", PoseMeasurement, self._encode.motion_capture, rate_hz, valid_for_s)
 
     def gps(self, *, rate_hz: float = 5.0, valid_for_s: float = 0.5) -> MeasurementStream[GpsMeasurement]:
-        """Supply a satellite position (GPS_INPUT). ArduPilot needs GPS1_TYPE 14; PX4 does not read it."""
+        """Supply a satellite position (GPS_INPUT). Set GPS1_TYPE to 14 on ArduPilot; PX4 does not read GPS_INPUT."""
         return self._stream("gps", GpsMeasurement, self._encode.gps, rate_hz, valid_for_s)
 
     def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:
         """Supply distances around the vehicle (OBSTACLE_DISTANCE).
 
-        ArduPilot needs PRX1_TYPE 2, PX4 needs CP_DIST above 0.
+        Set PRX1_TYPE to 2 on ArduPilot, CP_DIST above 0 on PX4.
         """
         return self._stream("obstacles", ObstacleSectors, self._encode.obstacles, rate_hz, valid_for_s)
 
     def obstacle_points(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstaclePoints]:
-        """Supply positions of obstacles (OBSTACLE_DISTANCE_3D). ArduPilot needs PRX1_TYPE 2; PX4 does not read them."""
+        """Supply positions of obstacles (OBSTACLE_DISTANCE_3D). Only ArduPilot reads them: set PRX1_TYPE to 2."""
         return self._stream("obstacle_points", ObstaclePoints, self._encode.obstacle_points, rate_hz, valid_for_s)
 
     def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
-        """Supply a distance (DISTANCE_SENSOR). ArduPilot needs RNGFND1_TYPE 10 and RNGFND1_ORIENT."""
+        """Supply a distance (DISTANCE_SENSOR). On ArduPilot, set RNGFND1_TYPE to 10, and RNGFND1_ORIENT."""
         return self._stream("range_finder", RangeMeasurement, self._encode.range_finder, rate_hz, valid_for_s)
 
     def landing_target(
         self, *, rate_hz: float = 20.0, valid_for_s: float = 0.3
     ) -> MeasurementStream[TargetMeasurement]:
-        """Supply the position of a landing target (LANDING_TARGET). ArduPilot needs PLND_ENABLED and PLND_TYPE 1.
+        """Supply the position of a landing target (LANDING_TARGET). On ArduPilot, set PLND_ENABLED and PLND_TYPE to 1.
 
         ``vehicle.land_on`` opens this stream itself and lands the vehicle.
         """
@@ -100,7 +100,7 @@ class External:
     def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
         """Supply optical flow (OPTICAL_FLOW; for PX4 OPTICAL_FLOW_RAD).
 
-        ArduPilot needs FLOW_TYPE 5, PX4 EKF2_OF_CTRL.
+        Set FLOW_TYPE to 5 on ArduPilot, EKF2_OF_CTRL on PX4.
         """
         return self._stream("optical_flow", FlowMeasurement, self._encode.optical_flow, rate_hz, valid_for_s)
 
@@ -112,9 +112,10 @@ class External:
         speed_accuracy_m_s: float = 1.0,
         direction_accuracy_deg: float = 15.0,
     ) -> None:
-        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE); returns at the acknowledgement.
+        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE). Returns when the vehicle acknowledges it.
 
-        No message reports the effect. ArduPilot uses the estimate in its simpler estimator (DCM), PX4 in EKF2.
+        No message reports whether the vehicle uses it. ArduPilot uses the wind in its simpler estimator (DCM), PX4 in
+        EKF2.
 
         Args:
             speed_m_s: horizontal speed, 0 to 100.
@@ -143,7 +144,7 @@ class External:
 
         Args:
             origin: latitude, longitude and altitude above mean sea level.
-            timeout: seconds until the vehicle reports it.
+            timeout: seconds to wait until the vehicle reports the origin.
 
         Raises:
             InvalidArgument: the origin has no altitude above mean sea level. Nothing was sent.
@@ -160,7 +161,7 @@ class External:
                 return
             if session.autopilot.external.origin_is_final:
                 raise OperationRejected(
-                    f"set_origin: {session.autopilot.firmware} has the origin {present_origin} and keeps it until a"
+                    f"set_origin: {session.autopilot.firmware} has the origin {present_origin}, and keeps it until a"
                     " reboot"
                 )
         latitude, longitude = round(origin.latitude_deg * 1e7), round(origin.longitude_deg * 1e7)
@@ -182,7 +183,7 @@ class External:
             except OperationTimeout:
                 continue
             return
-        report = f"it reports {cell.latest}" if cell.is_known else "it reports none"
+        report = f"it last reported {cell.latest}" if cell.is_known else "it has reported no origin"
         raise OperationTimeout(f"set_origin: the vehicle did not report the origin within {timeout:g} s; {report}")
 
     def _request_origin(self) -> None:
@@ -202,7 +203,7 @@ class External:
 
 
 def _are_close(reported: Position, ordered: Position) -> bool:
-    """Return True if both origins are the same, apart from rounding."""
+    """Return True if both origins are the same except for rounding."""
     if reported.altitude_amsl_m is None or ordered.altitude_amsl_m is None:
         return False
     has_same_altitude = abs(reported.altitude_amsl_m - ordered.altitude_amsl_m) <= ORIGIN_TOLERANCE_M

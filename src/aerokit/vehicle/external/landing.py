@@ -32,7 +32,9 @@ TargetSource: TypeAlias = (
     Callable[[], "TargetMeasurement | Awaitable[TargetMeasurement | None] | None"]
     | AsyncIterable["TargetMeasurement | None"]
 )
-"""A function that is called at the rate of the stream, or an asynchronous iterable. None: no target is visible.
+"""A function that is called at the rate of the stream, or an asynchronous iterable.
+
+Both supply a measurement, or None while no target is visible.
 """
 
 # A target counts as lost after this time without a measurement. ArduPilot's estimator keeps a target for 2 s
@@ -55,7 +57,7 @@ class LandingReport(Snapshot):
     """Report of a precision landing, made when the vehicle is on the ground and disarmed.
 
     ``last_target`` is the last measurement, and ``unseen_s`` its age at the end: a camera rarely sees the target from
-    close by. ``losses`` are the periods before it in which the target was not visible for more than a second.
+    close by. ``losses`` are the earlier periods of more than a second in which the target was not visible.
     ``climbed_m`` is how far the vehicle climbed during the landing, in a retry of ArduPilot or a search of PX4.
     ``used_target`` is False if no measurement was sent during the descent; the vehicle then landed where its firmware
     chose. ``texts`` are the vehicle's status texts since the order.
@@ -82,7 +84,7 @@ async def land_on(
     check_range("acquire_timeout", acquire_timeout, 0, 3600, above=True)
     session, mode = context.session, context.sender.mode_for("land_on", "precision_land")
     takeover_check = TakeoverCheck(context, mode)
-    # The states that convert a target to the local frame, which PX4 requires.
+    # PX4 requires targets in the local frame. These states are needed to convert them.
     local_states = ("attitude", "local_position") if session.autopilot.external.target_is_local else ()
     async with external.landing_target(rate_hz=rate_hz) as stream:
         landing = TargetLanding(context, stream)
@@ -97,7 +99,7 @@ async def land_on(
                 await landing.await_disarmed(order, timeout, max_silence_s)
             finally:
                 reader.cancel()
-                # Shielded, so that no code of the program's source runs after this call, even if the call is cancelled.
+                # Even if the call is cancelled, it waits until the program's source has ended. Hence the shield.
                 with anyio.CancelScope(shield=True):
                     await asyncio.wait([reader])
         return landing.report(is_used=stream.sent > sent_before, texts=session.texts_since(order.given_at))
@@ -109,7 +111,7 @@ class TargetLanding:
     def __init__(self, context: VehicleContext, stream: MeasurementStream[TargetMeasurement]) -> None:
         self._context, self._session, self._stream = context, context.session, stream
         self._last: TargetMeasurement | None = None
-        # When the target was last visible, and the vehicle's height then.
+        # When the target was last visible, and the vehicle's height at that time.
         self._seen_at = -math.inf
         self._seen_height_m: float | None = None
         self._lowest_m, self._climbed_m = math.inf, 0.0
@@ -135,9 +137,10 @@ class TargetLanding:
         started = self._now()
         while self._last is None:
             self._raise_error()
-            if reader.done() or self._now() - started >= timeout:
-                within = "" if reader.done() else f" within {timeout:g} s"
-                raise OperationTimeout(f"land_on: the target was not seen{within}; the landing was not ordered")
+            has_source_ended = reader.done()
+            if has_source_ended or self._now() - started >= timeout:
+                when = "before the source of targets ended" if has_source_ended else f"within {timeout:g} s"
+                raise OperationTimeout(f"land_on: the target was not seen {when}; the landing was not ordered")
             await anyio.sleep(min(POLL_INTERVAL_S, timeout))
 
     async def await_disarmed(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
@@ -147,7 +150,7 @@ class TargetLanding:
 
         def is_down() -> bool:
             height = height_above_home(self._session.telemetry)
-            if height is not None:
+            if height is not None:  # The climb above the lowest height so far shows a retry or a search.
                 self._lowest_m = min(self._lowest_m, height)
                 self._climbed_m = max(self._climbed_m, height - self._lowest_m)
             self._raise_error()
@@ -181,11 +184,12 @@ class TargetLanding:
             raise self._error
 
     def _on_target(self, target: TargetMeasurement | None) -> None:
-        """Send a target that is visible, and record it for the report."""
+        """Send the target, if it is visible, and record it for the report."""
         if target is None:
             return
         check_kind("target", target, TargetMeasurement)
-        # Without PX4's attitude or local position, the target cannot be sent, and counts as not visible.
+        # Without PX4's attitude or local position, the target cannot be converted, so it is not sent. It then counts as
+        # not visible.
         with contextlib.suppress(ValueUnknownError):
             self._stream.send(target)
             unseen_s = self._now() - self._seen_at

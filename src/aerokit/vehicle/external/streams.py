@@ -28,9 +28,9 @@ __all__ = ["EstimatorUse", "MeasurementStream", "MeasurementT"]
 MeasurementT = TypeVar("MeasurementT")
 EstimatorUse: TypeAlias = Literal["used", "not used", "unknown"]
 
-# Flag of EKF_STATUS_REPORT and ESTIMATOR_STATUS: the estimator has no position and assumes that it is constant.
+# Flag of EKF_STATUS_REPORT and ESTIMATOR_STATUS: the estimator does not know the position, and assumes a constant one.
 CONSTANT_POSITION = 1 << 7
-# Maximum age of a report of the estimator that describes its present state.
+# A report of the estimator that is older than this many seconds does not show its present state.
 ESTIMATOR_MAX_AGE_S = 2.5
 
 
@@ -38,7 +38,7 @@ class TimesyncAnswers:
     """Answers the vehicle's TIMESYNC requests with the clock of the event loop while a stream is open.
 
     PX4 needs the answers to convert the time stamps of measurements to its own clock (Timesync.cpp, sync_stamp). Until
-    PX4 knows the offset between the clocks, it uses the time of arrival. ArduPilot always does that.
+    PX4 knows the offset between the clocks, it uses the time of arrival. ArduPilot always uses the time of arrival.
     """
 
     def __init__(self, session: VehicleSession) -> None:
@@ -76,7 +76,7 @@ class MeasurementStream(Generic[MeasurementT]):
     behaves as if its sensor had failed. Of several measurements within one period, only the newest is sent. A
     measurement is dropped if it is older than ``valid_for_s`` when it is due to be sent, for example after the event
     loop was blocked. While the vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count
-    measurements. The stream ends only with the block.
+    measurements. The stream ends only with its `async with` block.
 
     Entering raises:
         NotSupported: this firmware does not read such measurements. Nothing was sent.
@@ -122,7 +122,7 @@ class MeasurementStream(Generic[MeasurementT]):
 
     @property
     def is_open(self) -> bool:
-        """True inside the block."""
+        """True inside the stream's `async with` block."""
         return self._is_open
 
     @property
@@ -130,7 +130,7 @@ class MeasurementStream(Generic[MeasurementT]):
         """Use of these measurements by the vehicle's estimator: ``"used"``, ``"not used"`` or ``"unknown"``.
 
         No message reports this, so aerokit derives it from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the
-        parameters at the beginning of the block. ``"used"``: the estimator has a position, and its parameters allow no
+        parameters when the stream was entered. ``"used"``: the estimator has a position, and its parameters allow no
         other source of it. ``"not used"``: the estimator has no position. ``"unknown"``: all other cases, for example
         if the vehicle also has a GPS, for sensors that supply no position, or without a recent report.
         """
@@ -142,7 +142,7 @@ class MeasurementStream(Generic[MeasurementT]):
         if estimator.age > ESTIMATOR_MAX_AGE_S or not self._sent:
             return "unknown"
         has_position = health.has_relative_position or health.has_absolute_position
-        # PX4 also sets this flag while the vehicle stands still on the ground.
+        # PX4 also sets CONSTANT_POSITION while the vehicle stands still on the ground.
         is_resting = self._session.telemetry.landed_state.latest == MavLandedState.ON_GROUND
         is_flag_expected = is_resting and self._session.autopilot.external.constant_position_at_rest
         assumes_constant = health.flags & CONSTANT_POSITION and not is_flag_expected
@@ -160,7 +160,7 @@ class MeasurementStream(Generic[MeasurementT]):
 
         Raises:
             InvalidArgument: a value is out of range; nothing was sent.
-            SetpointStreamStopped: the block was left or not entered.
+            SetpointStreamStopped: the `async with` block of this stream was left, or not entered.
             ValueUnknownError: PX4's attitude or local position is unknown, which a landing target requires.
             ConnectionClosed: the connection has ended.
         """
@@ -169,10 +169,10 @@ class MeasurementStream(Generic[MeasurementT]):
             raise SetpointStreamStopped(f"this {self._kind} stream is not open: use it inside its `async with` block")
         messages = self._encode(measurement)
         for message in messages:
-            message.encode()
+            message.encode()  # An invalid value raises here, and not when the timer sends the message.
         connection = self._session.connection
         if not connection.is_open:
-            connection.send(messages[0])  # If the connection has ended, this raises the error that ended it.
+            connection.send(messages[0])  # This raises the error that has ended the connection.
         now = connection.now()
         measured_at: float | None = getattr(measurement, "measured_at", None)
         if self._waiting is not None:
@@ -184,7 +184,7 @@ class MeasurementStream(Generic[MeasurementT]):
             self._timer = asyncio.get_running_loop().call_at(self._next_at, self._flush)
 
     def _flush(self) -> None:
-        """Send the waiting measurement unless it is too old."""
+        """Send the waiting measurement, unless it is too old or the vehicle is silent."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -195,7 +195,7 @@ class MeasurementStream(Generic[MeasurementT]):
         if now - measured_at > self._valid_for_s or session.watch.is_silent or not session.connection.is_open:
             self._dropped += 1
             return
-        # Keep the rate on average, but do not catch up after a pause.
+        # Periods follow each other without a gap, so that the average rate is right. After a pause, they start anew.
         next_period_at = self._next_at + self._period_s
         self._next_at = next_period_at if next_period_at > now else now + self._period_s
         for message in messages:
@@ -219,14 +219,14 @@ class MeasurementStream(Generic[MeasurementT]):
         self._timesync_answers.close()
 
     async def _check_support(self) -> dict[str, float]:
-        """Raise an error unless the vehicle uses these measurements; return the parameters that select them."""
+        """Return the parameters that select these measurements. Raise an error if the vehicle does not use them."""
         firmware, rule = self._session.autopilot.firmware, self._session.autopilot.external.kinds.get(self._kind)
         measurement = self._kind.replace("_", " ")
         if rule is None:
-            raise NotSupported(f"{measurement}: {firmware} does not read such measurements by MAVLink")
+            raise NotSupported(f"{measurement}: {firmware} does not read these measurements from MAVLink")
         required_names = [name for names, _ in rule.required for name in names]
         values = await known_values(self._probe, *required_names, *(name for name, _ in rule.sole_source))
-        for names, allowed in rule.required:  # ``names`` are those of one parameter in different firmware versions
+        for names, allowed in rule.required:  # ``names`` are the names of one parameter in several firmware versions.
             present_name = next((name for name in names if name in values), None)
             if present_name is not None and values[present_name] in allowed:
                 continue
@@ -235,7 +235,7 @@ class MeasurementStream(Generic[MeasurementT]):
             )
             choices = " or ".join(f"{value:g}" for value in allowed[:4])
             raise OperationRejected(
-                f"{measurement}: {problem}, so that {firmware} ignores the measurements;"
+                f"{measurement}: {problem}, so {firmware} ignores the measurements;"
                 f" set {names[0]} to {choices} and reboot"
             )
         return values

@@ -163,7 +163,7 @@ class MissionTracker:
             telemetry.mission_reached.observe(self._on_reached, every_arrival=True),
             telemetry.armed.observe(self._on_armed),
             session.connection.on_end(self.close),
-            lambda: self.close(ConnectionClosed("the block of this vehicle was left")),
+            lambda: self.close(ConnectionClosed("the async with block of this vehicle was left")),
         )
         session.on_reboot.append(self.forget)
 

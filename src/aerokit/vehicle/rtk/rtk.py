@@ -111,7 +111,7 @@ class Rtk:
 
         Raises:
             InvalidArgument: ``rtcm`` is empty, or a message is incomplete, damaged or too long. Nothing was sent.
-            ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
+            ConnectionClosed, LinkLost: the connection has ended, or this vehicle's `async with` block was left.
         """
         for message in rtcm_messages(rtcm):
             self._send(message)
@@ -136,7 +136,7 @@ class Rtk:
     def _send(self, message: bytes) -> None:
         """Send one RTCM message and update the statistics."""
         if self._session.is_closed:
-            raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
+            raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
         send_rtcm(self._session.connection, message, self)
         now = self._session.connection.now()
         self._messages += 1

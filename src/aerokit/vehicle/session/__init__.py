@@ -1,1 +1,1 @@
-"""Communication with one vehicle: commands, message rates, transfers, silence, signing keys."""
+"""Communication with one vehicle: commands, message rates, transfers, detection of silence, signing keys."""

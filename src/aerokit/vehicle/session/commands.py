@@ -21,22 +21,22 @@ if TYPE_CHECKING:
     from aerokit.protocols.command import OrderStatus
 
 UNSUPPORTED_RESULTS = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavResult.COMMAND_UNSUPPORTED_MAV_FRAME)
-"""MAV_RESULTs that mean that the firmware does not support the command, or does not support it in this message type."""
-# A command is not repeated before this many measured round trips, because its answer may still arrive.
-ROUND_TRIPS = 2
+"""Results of a command that the firmware does not support: not at all, or not in this message or frame."""
+# A command is repeated after this many measured round trips at the earliest: before that, its ack may still arrive.
+MIN_ROUND_TRIPS = 2
 MAX_ATTEMPT_TIMEOUT_S = 5.0
 PENDING_ACK_TIMEOUT_S = 2.0
-"""Seconds after which an expected COMMAND_ACK is considered lost."""
+"""An ack that has not arrived this many seconds after the call for its command ended is considered lost."""
 
 _Key = tuple[int, int]
 
 
 class CommandSender:
-    """The command protocol with one vehicle (https://mavlink.io/en/services/command.html).
+    """Runs the command protocol with one vehicle (https://mavlink.io/en/services/command.html).
 
     COMMAND_ACK has no request id. Commands with the same MAV_CMD to one component are therefore serialized; other
-    commands never wait for each other. When an order ends, aerokit aborts its running command and does not send its
-    waiting command. A late ack of a cancelled or unconfirmed command is not taken for the ack of the next command.
+    commands never wait for each other. When an order ends, aerokit aborts the order's running command and does not send
+    its waiting command. A late ack of a cancelled or unconfirmed command is not taken for the ack of the next command.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class CommandSender:
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
         # Maps each running command to the status of its order; None for a command without an order.
         self._order_statuses: dict[_Key, OrderStatus | None] = {}
-        # For each ack of an earlier command that may still arrive: the time since which it is expected.
+        # Acks of earlier commands that may still arrive: one entry for each ack, the time at which it was recorded.
         self._pending_acks: dict[_Key, list[float]] = {}
         self._results: dict[_Key, int] = {}
         self._accepted_at: dict[_Key, float] = {}
@@ -71,7 +71,7 @@ class CommandSender:
         for detach in self._detach:
             detach()
         self._is_closed = True
-        self._abort(ConnectionClosed("the block of this vehicle was left"))
+        self._abort(ConnectionClosed("the async with block of this vehicle was left"))
 
     async def send_long(
         self,
@@ -87,7 +87,7 @@ class CommandSender:
     ) -> CommandAck:
         """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`.
 
-        ``is_sent`` is True if `send_unconfirmed` has just sent the command, so that only repetitions are sent.
+        Pass ``is_sent=True`` if `send_unconfirmed` has just sent the command. Then this call only repeats the command.
         """
         target = self._component_id if component_id is None else component_id
         message = command_long(self._system_id, target, command, params)
@@ -124,27 +124,32 @@ class CommandSender:
         order_status: OrderStatus | None = None,
         **options: Any,
     ) -> CommandAck:
-        """Send a command with a position above mean sea level, as COMMAND_LONG if COMMAND_INT is not supported."""
+        """Send a command with a position: as COMMAND_INT, or as COMMAND_LONG if COMMAND_INT is not supported.
+
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees; ``z`` is in metres above mean sea level.
+        """
         try:
             return await self.send_int(
                 command, *params, frame=MavFrame.GLOBAL_INT, x=x, y=y, z=z, order_status=order_status, **options
             )
         except CommandRejected as error:
             is_supported = error.result not in UNSUPPORTED_RESULTS
-            if is_supported or (order_status is not None and order_status.end):
+            has_order_ended = order_status is not None and bool(order_status.end)
+            if is_supported or has_order_ended:
                 raise
-        # The place is param5 to param7 of a COMMAND_LONG, in degrees.
-        first_params = (*params, *(0.0,) * (4 - len(params)))
-        return await self.send_long(command, *first_params, x * 1e-7, y * 1e-7, z, order_status=order_status, **options)
+        # In COMMAND_LONG, the position is in param5 to param7, with latitude and longitude in degrees.
+        params_1_to_4 = (*params, *(0.0,) * (4 - len(params)))
+        position = (x * 1e-7, y * 1e-7, z)
+        return await self.send_long(command, *params_1_to_4, *position, order_status=order_status, **options)
 
     def send_unconfirmed(self, command: int, *params: float, component_id: int | None = None) -> None:
-        """Send a COMMAND_LONG once without waiting, for code that must not await."""
+        """Send a COMMAND_LONG once without waiting for its ack. For code that cannot await."""
         target = self._component_id if component_id is None else component_id
         self._connection.send(command_long(self._system_id, target, command, params))
         self._expect_acks((target, command), self._acks_of(command))
 
     def is_for_us(self, ack: CommandAck) -> bool:
-        """Return True if the ack is addressed to us. Targets are 0 in MAVLink 1 and in old firmware."""
+        """Return True if the ack is addressed to us, or to nobody (target 0), as in MAVLink 1 and old firmware."""
         is_for_our_system = ack.target_system in (0, self._connection.source_system)
         return is_for_our_system and ack.target_component in (0, self._connection.source_component)
 
@@ -180,19 +185,20 @@ class CommandSender:
         order_status: OrderStatus | None,
         is_sent: bool,
     ) -> CommandAck:
-        # For a command to all components (0), the autopilot's answer counts.
+        # A command to all components (0) is answered by many; the autopilot's ack is the one that counts.
         key = (message.target_component or self._component_id, message.command)
         self._abort_if_ended(key)
-        end_before = "" if order_status is None else order_status.end
+        # Only an order that ends while this call waits prevents the command: the caller knows of an earlier end.
+        earlier_end = "" if order_status is None else order_status.end
         async with self._locks[key]:
             if self._is_closed:
-                raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
-            if order_status is not None and order_status.end != end_before and not is_sent:
-                # The order ended while the call waited for the lock.
+                raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
+            if order_status is not None and order_status.end != earlier_end and not is_sent:
+                # The order ended while this call waited for an earlier command to complete.
                 raise CommandTimeout(f"{command_name(message.command)} was not sent: {order_status.end}")
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
-            if is_sent:  # `send_unconfirmed` has recorded the acks of this command as pending.
+            if is_sent:  # `send_unconfirmed` has recorded this command's own acks as acks of an earlier command.
                 del pending_acks[-acks_per_sending:]
             exchange = CommandExchange(
                 message,
@@ -228,44 +234,46 @@ class CommandSender:
     def _min_attempt_timeout_s(self) -> float:
         """Return the minimum time to wait for an ack.
 
-        It is limited, because round trips that were measured over a stalled link are too long.
+        This time has a maximum, because round trips that were measured while the link was stalled are too long.
         """
-        return min(ROUND_TRIPS * (self._round_trip_s() or 0.0), MAX_ATTEMPT_TIMEOUT_S)
+        return min(MIN_ROUND_TRIPS * (self._round_trip_s() or 0.0), MAX_ATTEMPT_TIMEOUT_S)
 
     def _acks_of(self, command: int) -> int:
         """Return the number of acks that the vehicle sends for this command; PX4 sends two for some commands."""
         return self._acks_per_command.get(command, 1)
 
     def _expect_acks(self, key: _Key, count: int, earlier_acks: Sequence[float] = ()) -> None:
-        """Record earlier acks, and ``count`` new ones, that may still arrive, so that the next command ignores them."""
-        if expected := [*earlier_acks, *[self._connection.now()] * count]:
-            self._pending_acks.setdefault(key, []).extend(expected)
+        """Record acks that may still arrive, so that the next command with this key ignores them.
+
+        These are ``earlier_acks``, which were recorded before, and ``count`` acks that are recorded now.
+        """
+        if recorded_at := [*earlier_acks, *[self._connection.now()] * count]:
+            self._pending_acks.setdefault(key, []).extend(recorded_at)
 
     def _pop_pending_acks(self, key: _Key) -> list[float]:
-        """Return and forget the acks that may still arrive for this key; older ones are considered lost."""
+        """Remove and return the recorded acks with this key, without those that are considered lost."""
         oldest = self._connection.now() - PENDING_ACK_TIMEOUT_S
-        return [expected_since for expected_since in self._pending_acks.pop(key, ()) if expected_since >= oldest]
+        return [recorded_at for recorded_at in self._pending_acks.pop(key, ()) if recorded_at >= oldest]
 
     def _abort(self, error: Exception) -> None:
         for run in tuple(self._runs.values()):
             run.abort(error)
 
     def _on_ack(self, ack: CommandAck) -> None:
-        """Deliver an ack to the running exchange, or count it as an expected late ack."""
+        """Deliver an ack to the call that waits for it, or remove it from the recorded acks of earlier commands."""
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         run = self._runs.get(key)
+        is_final = ack.result != MavResult.IN_PROGRESS
         is_answer = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
-        if is_answer and ack.result != MavResult.IN_PROGRESS:
+        if is_answer and is_final:
             self._results[key] = ack.result
-            # An ack without a target may be for another ground station.
+            # An ack without a target may be for another ground station, so it does not count for `accepted_at`.
             if ack.result == MavResult.ACCEPTED and ack.target_system == self._connection.source_system:
                 self._accepted_at[key] = self._connection.now()
         if run is not None:
             run.receive(ack)
-        elif (
-            key in self._pending_acks and ack.result != MavResult.IN_PROGRESS
-        ):  # After IN_PROGRESS, another ack is due.
+        elif key in self._pending_acks and is_final:
             self._pending_acks[key].pop(0)
             if not self._pending_acks[key]:
                 del self._pending_acks[key]

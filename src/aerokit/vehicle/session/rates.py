@@ -28,18 +28,21 @@ if TYPE_CHECKING:
 # Seconds between checks of the rates at which messages arrive.
 WATCH_PERIOD_S = 1.0
 
-# A received rate is averaged over this many watch periods of a second.
+# A received rate is averaged over this many periods of ``WATCH_PERIOD_S``.
 WATCH_WINDOW = 5
 
-# A stream is slow if it arrives at less than this fraction of the requested rate.
+# A stream counts as slow if it arrives at less than this fraction of the requested rate.
 SLOW_FACTOR = 0.5
 
 RETRY_INTERVAL_S = 5.0
-"""Seconds until a missing stream is requested again. Doubles with each request, up to ``MAX_RETRY_INTERVAL_S``."""
+"""If no message of a stream arrives for this many seconds after a request, the stream is requested again.
+
+The interval doubles with each further request of the stream, up to ``MAX_RETRY_INTERVAL_S``.
+"""
 
 MAX_RETRY_INTERVAL_S = 60.0
 
-# A rate in Hz that means: the rate that the autopilot itself has chosen.
+# The number in place of a rate in Hz that lets the autopilot return to its own default rate.
 AUTOPILOT_DEFAULT = 0.0
 
 
@@ -49,23 +52,23 @@ def check_rate(message_type: type[Message], hz: float) -> None:
 
 
 class _Stream:
-    """State of one message type: the rates that are needed, the rate last requested, and the count received."""
+    """One message type: the rates that callers need, the rate last requested, and the number of messages received."""
 
     def __init__(self, message_type: type[Message], component_id: int) -> None:
         self.message_type, self._component_id = message_type, component_id
-        # The needed rates; each key is an object that stands for one request.
+        # The rates that callers need. Each call of `MessageRates.request` has its own key.
         self.requests: dict[object, float] = {}
         self.is_optional = True
         self.requested_hz: float | None = None
         self.is_refused = False
         self.is_slow = False
-        # Number of messages received, now and at the last checks.
+        # Number of messages received so far, and this number at each of the last checks.
         self.count = 0
         self.counts: deque[int] = deque([0], maxlen=WATCH_WINDOW + 1)
-        # When to request the stream again if none of its messages arrives.
+        # The stream is requested again at `retry_at` if none of its messages has arrived by then.
         self.retry_interval_s = RETRY_INTERVAL_S
         self.retry_at = math.inf
-        # Number of requests in a row that were not answered, and the time of the next request after them.
+        # Number of consecutive requests without an ack, and the earliest time of the next request after them.
         self.failures = 0
         self.next_attempt_at = -math.inf
         self.detach: Detach | None = None
@@ -77,7 +80,7 @@ class _Stream:
 
     @property
     def is_due(self) -> bool:
-        """True if a rate must be requested."""
+        """True if the needed rate must be requested: it is not the one last requested, and was not refused."""
         return not self.is_refused and self.requested_hz != self.needed_hz
 
     def achieved_hz(self) -> float:
@@ -114,7 +117,7 @@ class MessageRates:
         self._group_of_message = stream_groups
         self._streams: dict[int, _Stream] = {}
         self._has_due_streams = asyncio.Event()
-        # True if the vehicle does not support SET_MESSAGE_INTERVAL, so that groups of messages are requested.
+        # True if the vehicle does not support SET_MESSAGE_INTERVAL, so that messages are requested in groups.
         self._uses_groups = False
         # Number of calls of `request_again`.
         self._reset_count = 0
@@ -122,8 +125,8 @@ class MessageRates:
     def request(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
         """Request ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called.
 
-        If an optional message (e.g. of a sensor that may be missing) does not arrive, StreamUnavailable is not
-        published.
+        If an optional message is refused or never arrives, for example because its sensor is missing, neither
+        StreamUnavailable nor StreamSlow is published.
         """
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)
@@ -143,7 +146,7 @@ class MessageRates:
         return release
 
     def request_again(self) -> None:
-        """Request everything again, as after a reboot."""
+        """Request all messages again, because the vehicle may have lost the requests, for example by a reboot."""
         for stream in self._streams.values():
             stream.requested_hz, stream.is_refused, stream.retry_interval_s = None, False, RETRY_INTERVAL_S
             stream.failures, stream.next_attempt_at = 0, -math.inf
@@ -151,14 +154,14 @@ class MessageRates:
         self._has_due_streams.set()
 
     async def run(self) -> None:
-        """Send requests for message rates until cancelled; :meth:`watch` must run concurrently."""
+        """Send the requests that are due, until cancelled. :meth:`watch`, which repeats requests, must run as well."""
         while True:
             await self._has_due_streams.wait()
             self._has_due_streams.clear()
             await self._request_all_due()
 
     async def watch(self) -> None:
-        """Check once a second at which rates messages arrive, until cancelled."""
+        """Check once a second, until cancelled, at which rates messages arrive and whether requests are due."""
         while True:
             await anyio.sleep(WATCH_PERIOD_S)
             for stream in self._streams.values():
@@ -173,7 +176,7 @@ class MessageRates:
                 stream.detach()
         self._streams.clear()
 
-    # ------------------------------------------------------------------------------- asking
+    # --------------------------------------------------------------------------- requesting
 
     def _new_stream(self, message_type: type[Message]) -> _Stream:
         stream = _Stream(message_type, self._component_id)
@@ -181,7 +184,7 @@ class MessageRates:
         return stream
 
     async def _request_all_due(self) -> None:
-        """Request the due streams one at a time, those whose requests were not answered last."""
+        """Request the due streams one at a time. Streams whose last request was not answered come last."""
         while not self._uses_groups and (stream := self._most_urgent()) is not None:
             await self._request_by_command(stream)
         if self._uses_groups:
@@ -210,11 +213,12 @@ class MessageRates:
                 return
             self._mark_refused(stream, error)
         except CommandTimeout:
-            # A reboot in the meantime has made all streams due again, so the failure does not count.
+            # If `request_again` was called meanwhile, it has reset all failures, so this one does not count either.
             if reset_count == self._reset_count:
                 stream.failures += 1
                 stream.next_attempt_at = self._connection.now() + min(2.0**stream.failures, MAX_RETRY_INTERVAL_S)
             return
+        # A refusal is an answer, too: the request is not repeated until a caller requests the stream again.
         stream.failures = 0
         stream.mark_requested(self._connection.now(), hz)
 
@@ -265,7 +269,7 @@ class MessageRates:
     # ------------------------------------------------------------------------------ watching
 
     def _watch(self, stream: _Stream) -> None:
-        """Record how many messages have arrived; request the stream again, or report it as slow, if necessary."""
+        """Record how many messages have arrived. If necessary, request the stream again, or report it as slow."""
         stream.counts.append(stream.count)
         if stream.requested_hz is None or stream.requested_hz <= 0 or stream.is_refused:
             return
@@ -286,14 +290,15 @@ class MessageRates:
         if stream.requested_hz is None or len(stream.counts) <= WATCH_WINDOW:
             return
         achieved_hz = stream.achieved_hz()
-        # No message arrived in the first period of the window.
+        # If no message arrived in the first period of the window, the stream began later, so its average is too low.
         has_just_started = achieved_hz > 0 and stream.counts[0] == stream.counts[1]
         if has_just_started and not stream.is_slow:
             return
-        # One message less is no sign of a slow stream: it may have arrived just outside of the window.
+        # One message fewer does not count as slow, because that message may have arrived just outside the window.
         min_messages = SLOW_FACTOR * stream.requested_hz * WATCH_WINDOW * WATCH_PERIOD_S - 1
-        was_slow, stream.is_slow = stream.is_slow, achieved_hz * WATCH_WINDOW * WATCH_PERIOD_S < min_messages
-        if achieved_hz == 0 and stream.is_optional:
+        was_slow = stream.is_slow
+        stream.is_slow = achieved_hz * WATCH_WINDOW * WATCH_PERIOD_S < min_messages
+        if achieved_hz == 0 and stream.is_optional:  # An optional stream may be missing altogether.
             return
         if stream.is_slow and not was_slow:
             self._connection.bus.publish(

@@ -55,15 +55,15 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
 
 
-# Interval between requests for constants that are not known yet.
+# Seconds between requests for constants that are not known yet.
 RETRY_INTERVAL_S = 3.0
 
-# Number of the first requests for the version, and the interval between them.
+# Number of requests for the version that are sent at short intervals at first, and the interval in seconds.
 EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 
 
 async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
-    """Request version, home and origin until they are known, and again after each reboot; request the modes once.
+    """Request version, home and origin until they are known, and again after each reboot. Request the modes once.
 
     Runs until the link closes.
     """
@@ -77,13 +77,13 @@ async def learn_constants(connection: Connection, commands: CommandSender, telem
         ):
             if not cell.is_known:
                 await _request(commands, message_id)
-        if not has_requested_modes:
+        if not has_requested_modes:  # Only once, because the mode names are kept when the vehicle reboots.
             has_requested_modes = await _request(commands, AvailableModes.ID)
         await anyio.sleep(RETRY_INTERVAL_S)
 
 
 async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
-    """Request the version at short intervals, because the first transfer waits for the capabilities in this message."""
+    """Request AUTOPILOT_VERSION at short intervals, because the first transfer waits for the capabilities in it."""
     version = telemetry.version
     for _ in range(EAGER_REQUESTS):
         if version.is_known:
@@ -94,7 +94,7 @@ async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
 
 
 async def _request(commands: CommandSender, message_id: int, *, attempt_timeout: float = 1.0) -> bool:
-    """Request one message, twice if necessary; return True if there was an ack, including a refusal."""
+    """Request one message, twice if necessary. Return True if the vehicle acknowledged or refused the request."""
     try:
         await commands.send_long(MavCmd.REQUEST_MESSAGE, message_id, attempts=2, attempt_timeout=attempt_timeout)
     except CommandTimeout:
@@ -114,7 +114,7 @@ RESULTS_OF_REFUSAL = (MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResul
 
 
 class VehicleSession:
-    """The autopilot of one remote system: its address, state, commands, message rates, transfers and silence.
+    """Communication with the autopilot of one system: state, commands, message rates, transfers, silence.
 
     ``on_reboot`` holds callbacks that are called when the vehicle reboots.
     """
@@ -183,7 +183,7 @@ class VehicleSession:
         """Stop sending and receiving; waiting calls raise ConnectionClosed."""
         self.is_closed = True
         self.transfers.is_closed = True
-        self._on_end(ConnectionClosed("the block of this vehicle was left"))
+        self._on_end(ConnectionClosed("the async with block of this vehicle was left"))
         for detach in self._detach:
             detach()
         self.commands.close()
@@ -192,14 +192,14 @@ class VehicleSession:
         self.rates.close()
 
     def at_close(self, *functions: Detach) -> None:
-        """Register callbacks for the end of the vehicle's block. They are called at once if it has ended already."""
+        """Register callbacks for the end of the vehicle's `async with` block; after its end, call them at once."""
         self._detach += functions
         if self.is_closed:
             for function in functions:
                 function()
 
     def register_cell(self, cell: StateCell[Any]) -> None:
-        """Close a cell with the session, and reset it when the vehicle reboots."""
+        """Add a state value: it is reset when the vehicle reboots, and closed with the session."""
         self._cells.append(cell)
         self.add_timeout_hint(cell)
         self.on_reboot.append(cell.forget)
@@ -207,22 +207,22 @@ class VehicleSession:
             cell.close(self._ended_by)
 
     def add_timeout_hint(self, *cells: StateCell[Any]) -> None:
-        """Mention rejected signatures in the time-out texts of these cells, because signatures are a likely cause."""
+        """Let the time-out texts of these cells mention rejected signatures, which are a likely cause of time-outs."""
         for cell in cells:
             cell._explain_timeout = self._describe_signatures
 
     def send(self, message: Message) -> None:
-        """Send one message unchanged; ConnectionClosed after :meth:`close`."""
+        """Send one message unchanged. Raises ConnectionClosed after :meth:`close`."""
         if self.is_closed:
-            raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
+            raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
         self.connection.send(message)
 
     # ----------------------------------------------------------------------------- receiving
 
     @contextmanager
     def streaming(self, *names: str, hz: float = ACTION_HZ) -> Iterator[None]:
-        """Request the messages of these states during the block, even if the program disabled the default rates."""
-        releases = [
+        """Request the messages of these states during a `with` block, even if the program uses no default rates."""
+        release_requests = [
             self.rates.request(message_type, hz, is_optional=True)
             for name in names
             for message_type in self.telemetry.required_messages(name)
@@ -230,26 +230,30 @@ class VehicleSession:
         try:
             yield
         finally:
-            for release in releases:
+            for release in release_requests:
                 release()
 
     def check_disarmed(self, action: str, *, is_current: bool = True) -> None:
         """Raise OperationRejected unless the vehicle is known to be disarmed.
 
-        ``is_current`` is False if the last HEARTBEAT is too old to show the present state.
+        Pass ``is_current=False`` if the last HEARTBEAT is too old to show the present state.
         """
         if not self.telemetry.is_confirmed_disarmed or not is_current:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"{action}: the vehicle is {state}; nothing was sent")
 
     async def wait_for_heartbeat(self, since: float | None = None) -> None:
-        """Wait for a HEARTBEAT that is received after ``since``; None means from now on."""
+        """Wait for a HEARTBEAT that is received after ``since``, or after this call if ``since`` is None."""
+        # Every HEARTBEAT updates `armed`.
         armed, start = self.telemetry.armed, self.connection.now() if since is None else since
         await armed.wait_until(lambda _: armed.updated_at > start, description="the next HEARTBEAT")
 
     @contextmanager
     def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
-        """Collect acks that refuse a command after an earlier ack accepted it (PX4 acks some commands twice)."""
+        """Collect the acks that refuse a command during a `with` block.
+
+        PX4 acknowledges some commands twice, so that a refusal may follow an acceptance.
+        """
         refusals: list[CommandAck] = []
 
         def collect(ack: CommandAck) -> None:
@@ -269,13 +273,13 @@ class VehicleSession:
             detach()
 
     async def wait_for_status_texts(self) -> None:
-        """Wait for status texts that explain a refusal."""
+        """Wait for a moment, because the status texts that explain a refusal may arrive after it."""
         await anyio.sleep(STATUS_TEXT_DELAY_S)
 
     def with_reasons(self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()) -> CommandRejected:
-        """Return the error with ``reasons`` and the vehicle's status texts since this time added, without duplicates.
+        """Return the error with more reasons: the vehicle's status texts from ``since`` on, and ``reasons``.
 
-        Informational texts ("ArduPilot Ready") are left out.
+        Duplicates are removed. Informational texts ("ArduPilot Ready") are left out unless they are known refusals.
         """
         texts = [
             text.text
@@ -283,7 +287,7 @@ class VehicleSession:
             if text.severity <= MavSeverity.WARNING or self.autopilot.is_refusal(text.text)
         ]
         return CommandRejected(
-            str(error).partition("\n")[0],  # without the list of reasons, which the constructor adds again
+            str(error).partition("\n")[0],  # Only the first line, because the constructor adds the reasons again.
             command=error.command,
             result=error.result,
             reasons=self.deduplicate_reasons(*error.reasons, *texts, *reasons),
@@ -308,7 +312,8 @@ class VehicleSession:
     def describe_link(self) -> str:
         """Return one line about the link's quality, for error texts."""
         received, lost = self.connection.counts(self.system_id)
-        loss = f"{100 * lost / (received + lost):.0f} % of its frames lost" if received + lost else "nothing received"
+        sent = received + lost
+        loss = f"{100 * lost / sent:.0f} % of the vehicle's frames lost" if sent else "nothing received"
         signatures = self._describe_signatures()
         signature_problems = f"{signatures}; " if signatures else ""
         texts = self.texts_since(self.connection.now() - 10.0)
@@ -330,7 +335,7 @@ class VehicleSession:
             message_type = bus.dialect.get(message_id)
             if message_type is None:
                 continue
-            if message_id in streams:
+            if message_id in streams:  # The frames of this message are decoded only when a state is read.
                 detach = bus.attach_lazily(message_type, streams[message_id].receive, system_id=self.system_id)
             else:
                 detach = bus.attach(message_type, handler, system_id=self.system_id)
@@ -354,7 +359,7 @@ class VehicleSession:
         ]
 
     def _attach_watched_streams(self) -> None:
-        """For each message without a default rate: request it while one of its cells is watched."""
+        """Arrange that a message without a default rate is requested while a state that it reports is watched."""
         for name, state in STATES.items():
             cell = self.telemetry.cells[name]
             for source in state.sources:
@@ -363,7 +368,7 @@ class VehicleSession:
                     continue
                 if self.autopilot.sends(message_type):
                     request = partial(self.rates.request, message_type, source.watched_hz, is_optional=True)
-                    cell._feed_from(*cell._feeds, WatchedStream(cell, request))
+                    cell._feed_from(*cell._feeds, WatchedStream(cell, request))  # in addition to its present feeds
 
     def _on_link_selected(self, event: LinkSelected) -> None:
         """Request all streams again, because an autopilot keeps separate rates for each of its ports."""
@@ -371,7 +376,7 @@ class VehicleSession:
             self.rates.request_again()
 
     def _on_computer_slept(self, event: ComputerSlept) -> None:
-        """Add the time of the sleep to all ages, because the loop's clock stood still meanwhile."""
+        """Add the duration of the sleep to all ages, because the loop's clock stood still while the computer slept."""
         self.watch.last_heartbeat_at -= event.seconds
         for cell in (*self.telemetry.cells.values(), *self._cells):
             cell._add_age(event.seconds)

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 
-# The vehicle sends HEARTBEAT at this interval, and its signature shows whether the vehicle has accepted the key.
+# SETUP_SIGNING is repeated at the interval of the vehicle's HEARTBEAT. The signature of HEARTBEAT shows whether the
+# vehicle has accepted the key.
 RETRY_INTERVAL_S = 1.0
 
 # The key in SETUP_SIGNING that removes the vehicle's key.
@@ -37,7 +38,7 @@ async def set_up_signing(session: VehicleSession, signing: Signing | None, timeo
                 connection.raise_if_ended()
         if has_accepted.is_set():
             return
-    texts = "; ".join(session.texts_since(started)) or "no status text about it"
+    texts = "; ".join(session.texts_since(started)) or "the vehicle sent no status text"
     if session.autopilot.signing_key_restriction:
         texts += f"; {session.autopilot.signing_key_restriction}"
     expected = "without a signature" if signing is None else f"signed with {signing.key!r}"
@@ -59,7 +60,7 @@ def _check_vehicle(session: VehicleSession) -> None:
 def _message(session: VehicleSession, signing: Signing | None) -> SetupSigning:
     if signing is None:
         return SetupSigning(session.system_id, session.component_id, NO_KEY, 0)
-    # The time stamp is a second ahead: if it were older than that of this frame, the frames that the vehicle signs from
-    # now on would be rejected as replayed.
+    # The vehicle counts its time stamps from this one on. It is a second ahead of our clock, so that the vehicle's next
+    # frames are later than those already received: frames that are not later are refused as replayed.
     timestamp = signing.timestamp_now(session.connection.unix_time()) + TIMESTAMP_TICKS_PER_S
     return SetupSigning(session.system_id, session.component_id, signing.key.secret, timestamp)

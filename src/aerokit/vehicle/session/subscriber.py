@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.rates import MessageRates
 
 SUBSCRIPTION_HZ = 4.0
-"""Rate in Hz for a subscription without a rate, to a streamed message that has no default rate."""
+"""Rate in Hz to request for a streamed message that has no default rate, if the program names no rate either."""
 
 
 def subscription_rate_hz(message_type: type[Message]) -> float | None:
-    """Return the rate for a subscription without a rate; None for messages that are sent on demand."""
+    """Return the rate to request for a subscription that names no rate; None for a message that is not a stream."""
     name = message_type.__name__
     return DEFAULT_RATES_HZ.get(name, SUBSCRIPTION_HZ if name in STREAMED_MESSAGES else None)
 
@@ -39,9 +39,10 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 
 class ComponentSubscriber:
-    """Subscriptions and cells for one component.
+    """Subscriptions to the messages of one component, and cells with its latest messages.
 
-    ``register_cell`` and ``at_close`` are methods of the session: they register a cell, and a callback for its end.
+    ``register_cell`` and ``at_close`` are methods of the session: ``register_cell`` adds a cell to the session, and
+    ``at_close`` registers a callback for the end of the session.
     """
 
     def __init__(
@@ -69,14 +70,17 @@ class ComponentSubscriber:
         *,
         entire_system: bool = False,
     ) -> Subscription[ItemT]:
-        """Return a stream of events, and of messages of this component or the ``entire_system``; request the rates."""
+        """Return a subscription to events and messages; entering it requests the rates of its messages.
+
+        The messages are those of this component, or of all components if ``entire_system`` is True.
+        """
         self._connection.check_types(types)
         message_types: list[type[Message]] = [type_ for type_ in types if issubclass(type_, Message)]
         if rate_hz is not None:
             for message_type in message_types:
                 check_rate(message_type, rate_hz)
 
-        # Called when the program enters the block of the subscription.
+        # Called when the program enters the subscription by `async with`.
         def attach(sink: Sink) -> list[Detach]:
             filtered_sink = sink if entire_system else self._of_component(sink)
             detach_callbacks = self._connection.attach(types, filtered_sink, system_id=self._system_id)
@@ -92,7 +96,10 @@ class ComponentSubscriber:
         return subscription
 
     def cell(self, message_type: type[MessageT], rate_hz: float | None) -> StateCell[MessageT]:
-        """Return the cell with the latest message of a type; always the same cell, at the last requested rate."""
+        """Return the cell with the latest message of a type.
+
+        All calls return the same cell. A call with ``rate_hz`` replaces the rate of earlier calls.
+        """
         cell = self._cells.get(message_type)
         if cell is None:
             self._connection.check_types((message_type,))
@@ -102,13 +109,13 @@ class ComponentSubscriber:
         if rate_hz is not None:
             release_previous = self._cell_rates.pop(message_type, None)
             self._cell_rates[message_type] = self._rates.request(message_type, rate_hz)
-            # The previous rate is released after the new request, because a message that nothing needs is stopped.
+            # The new request comes first: a message without any request returns to the autopilot's own rate.
             if release_previous is not None:
                 release_previous()
         return cell
 
     def listen(self, message_type: type[MessageT], callback: Callable[[MessageT], object]) -> None:
-        """Call ``callback`` with each message of a type, until the vehicle's block is left.
+        """Call ``callback`` with each message of a type, until the vehicle's `async with` block is left.
 
         Does nothing if the dialect does not contain the message.
         """
@@ -134,21 +141,22 @@ class ComponentSubscriber:
         return cell
 
     def _of_component(self, sink: Callable[..., object]) -> Sink:
-        """Return a sink that drops messages of other components and events about other components."""
+        """Return a sink that passes only messages of this component, and events about it or the whole system."""
 
         def filtered(item: Any) -> None:
             frame = getattr(item, "received_frame", None)
-            # An event without a component id is about the whole system.
-            event_source = getattr(item, "component_id", self._component_id)
-            source = event_source if frame is None else frame.component_id
-            if source == self._component_id:
+            if frame is not None:
+                component_id = frame.component_id
+            else:  # An event without a component id is about the whole system, and thus about this component, too.
+                component_id = getattr(item, "component_id", self._component_id)
+            if component_id == self._component_id:
                 sink(item)
 
         return filtered
 
 
 class WatchedStream:
-    """Feed of a cell: requests the cell's message only while the program waits for the cell or follows it.
+    """Feed of a cell that requests the cell's message only while the program waits for its values or follows them.
 
     ``request`` returns None if the message need not be requested now.
     """
@@ -164,7 +172,7 @@ class WatchedStream:
         """Do nothing, because another feed of the cell decodes the message."""
 
     def watchers_changed(self) -> None:
-        """Request the message, or release the request, as the cell needs it."""
+        """Request the message if the cell is now watched; release the request if it no longer is."""
         if not self._cell._is_watched and self._release is not None:
             self._release()
             self._release = None

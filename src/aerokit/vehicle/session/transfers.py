@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 ResultT = TypeVar("ResultT")
 
-# Seconds to wait for AUTOPILOT_VERSION, which has the capabilities.
+# Seconds to wait for AUTOPILOT_VERSION, which contains the capabilities.
 VERSION_TIMEOUT_S = 3.0
 BACKGROUND_COMMAND_TIMEOUT_S = 5.0
 
 
 class Messaging(Protocol):
-    """The part of a session that transfers use, for the autopilot or another component."""
+    """Interface of the session of an autopilot or another component, as transfers need it."""
 
     on_reboot: list[Callable[[], None]]
 
@@ -40,11 +40,11 @@ class Messaging(Protocol):
         ...
 
     def at_close(self, *functions: Detach) -> None:
-        """Register callbacks for when the vehicle's block is left."""
+        """Register callbacks for the end of the vehicle's `async with` block."""
 
 
 class Transfers:
-    """Runs exchanges with the autopilot of one vehicle and provides its capabilities."""
+    """Runs exchanges of requests and answers with one component, and provides its capabilities."""
 
     def __init__(
         self,
@@ -62,15 +62,16 @@ class Transfers:
     ) -> None:
         self.connection = connection
         self.began_at: float = connection.now()
-        """Start time of the session. Sequence numbers derive from this time, so that they differ from an earlier
-        program's.
+        """Start time of the session on the event loop's clock.
+
+        MAVFTP derives its first sequence number from this time, so that the number differs from earlier programs'.
         """
         self.system_id: int = system_id
         self.component_id: int = component_id
         self.autopilot = autopilot
         self.background = background
         self.round_trip: RoundTrip = RoundTrip()
-        """Round trip, measured by previous transfers and initially by TIMESYNC."""
+        """Round-trip time: measured by TIMESYNC at first, and by transfers from the first one on."""
         self.is_closed: bool = False
         self._is_version_unavailable = False
         self._send_command, self._request_version = send_command, request_version
@@ -83,7 +84,7 @@ class Transfers:
         ``timeout`` seconds. Cancellation ends the exchange at once.
         """
         if self.is_closed:
-            raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
+            raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
         with self.limit(timeout):
             self._init_round_trip()
             try:
@@ -91,7 +92,7 @@ class Transfers:
             except OperationTimeout as error:
                 self._explain(error)
                 raise
-            if isinstance(result, dict):  # The result of a request by name is a mapping with one answer for each name.
+            if isinstance(result, dict):  # A request for several names returns one value or exception for each name.
                 for answer in result.values():
                     if isinstance(answer, OperationTimeout):
                         self._explain(answer)
@@ -110,17 +111,17 @@ class Transfers:
 
     @contextmanager
     def limit(self, timeout: float | None) -> Iterator[None]:
-        """Limit the duration of a block: raise :class:`OperationTimeout` after this many seconds. None: no limit."""
+        """Raise :class:`OperationTimeout` if a `with` block takes more than ``timeout`` seconds. None: no limit."""
         try:
             with anyio.fail_after(timeout):
                 yield
-        except OperationTimeout:  # It was raised in the block, and is a TimeoutError, too.
+        except OperationTimeout:  # A subclass of TimeoutError, raised by the code in the block.
             raise
         except TimeoutError:
-            raise OperationTimeout(f"not done within {timeout:g} s; {self._describe()}") from None
+            raise OperationTimeout(f"the operation was not done within {timeout:g} s; {self._describe()}") from None
 
     def command_in_background(self, command: int, *params: float) -> None:
-        """Send an optional command without waiting; a failure is ignored."""
+        """Send a command without waiting for its ack. The command is optional, so a failure is ignored."""
         send = self._send_command
 
         async def send_command() -> None:
@@ -145,14 +146,14 @@ class Transfers:
     async def capabilities(self) -> int | None:
         """Return the MAV_PROTOCOL_CAPABILITY bits of the autopilot; None if it does not send them within a few seconds.
 
-        A component that does not answer is not asked again.
+        Later calls do not wait again for a component that has not answered.
         """
         if not self._version.is_known and not self._is_version_unavailable:
             with anyio.move_on_after(VERSION_TIMEOUT_S), suppress(CommandRejected, CommandTimeout):
                 if self._request_version is not None:
                     await self._request_version()
                 await self._version.wait_until(lambda _: True)
-            # An autopilot's version may still arrive, because the session requests it again and again.
+            # There is no `request_version` for an autopilot, because its session requests the version until it arrives.
             self._is_version_unavailable = self._request_version is not None and not self._version.is_known
         version = self._version.latest
         return None if version is None else version.capabilities

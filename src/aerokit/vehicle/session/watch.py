@@ -31,24 +31,24 @@ if TYPE_CHECKING:
     from aerokit.events import LinkState
     from aerokit.mavlink.frame import Frame
 
-# If the time since boot decreases by more than this, the vehicle has rebooted. Reordered messages cause a smaller
-# decrease. So does a reboot soon after another one, which is therefore not detected.
+# If the vehicle's time since boot decreases by more than this, the vehicle has rebooted. Reordered messages cause a
+# smaller decrease. A reboot soon after the previous one also causes a smaller decrease and is not detected.
 REBOOT_STEP_MS = 3000
-# The decreased time must persist for this long and in at least two messages, because one message may be late.
+# A decreased time shows a reboot only if it persists for this long and in at least two messages: one may be late.
 REBOOT_CONFIRM_S = 0.2
-# While a reboot is expected, a clock that is behind by more than this shows the reboot. A boot takes longer than this;
-# messages are delayed by less.
+# While a reboot is expected, it is detected when the vehicle's clock is behind its expected time by more than this. A
+# boot takes longer than this; messages are delayed by less.
 MIN_REBOOT_STEP_MS = 2000
-# Seconds of reports from which the speed of a simulation's clock is computed; before that, it counts as real time.
+# A simulation's clock may be faster than real time. The speed is computed once the reported times span these seconds.
 CLOCK_SPAN_S = 5.0
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
-# Maximum number of open TIMESYNC requests; older ones are considered lost.
+# Maximum number of unanswered TIMESYNC requests; older ones are considered lost.
 MAX_OPEN_REQUESTS = 64
 
 
 class VehicleWatch:
-    """Detects silence, return and reboot of one vehicle."""
+    """Detects when one vehicle falls silent, is heard again, or reboots."""
 
     reboots: int
 
@@ -64,21 +64,22 @@ class VehicleWatch:
         self.last_heartbeat_at: float = connection.now()
         self._heartbeat_read_at = connection.now()
         self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
-        self._state_watch = LinkStateTracker(
+        self._state_tracker = LinkStateTracker(
             self.link_state, connection.bus, system_id=system_id, component_id=component_id
         )
-        self._state_watch.record_activity(connection.now())
+        self._state_tracker.record_activity(connection.now())
         self._is_reported_silent = self._has_ended = False
         self.reboots = 0
-        # Per clock of the vehicle: its last time in milliseconds, and the time of the loop at which it was read.
+        # For each clock of the vehicle: its last reported time in milliseconds, and when the report was processed.
         self._last_times: dict[str, tuple[int, float]] = {}
-        # The first ``time_boot_ms`` since boot, and the time of the loop at which it was read.
+        # The first ``time_boot_ms`` after a boot, and when its message was processed.
         self._first_time: tuple[int, float] | None = None
+        # By this clock, the connection recognises a vehicle that returns from a new address.
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
-        # Per clock: a decreased time that shows a reboot if the next messages confirm it, and when it was read.
+        # For each clock: a decreased time and when it was processed. Later messages may confirm that it shows a reboot.
         self._decreased_times: dict[str, tuple[int, float]] = {}
         self._expects_reboot = False
-        # The time of the loop at which the last TIMESYNC answer arrived, and the vehicle's time in it.
+        # When the last answer to our TIMESYNC requests was processed, and the vehicle's time in milliseconds in it.
         self._last_answer = (-math.inf, 0)
         attach = connection.bus.attach
         self._detach: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
@@ -99,17 +100,17 @@ class VehicleWatch:
 
     @property
     def silent_for_s(self) -> float:
-        """Seconds since a heartbeat was processed.
+        """Seconds since the last heartbeat was processed.
 
-        If the event loop of this program was blocked, the pause does not count as silence. :attr:`last_heartbeat_at`
-        may therefore be older.
+        A heartbeat that waited while the event loop was blocked counts from its processing, so that the pause does not
+        count as silence. :attr:`last_heartbeat_at`, its time of arrival, may be earlier.
         """
         return self._connection.now() - self._heartbeat_read_at
 
     def end(self, error: Exception) -> None:
         """Mark the link as lost."""
         self._has_ended = True
-        self._state_watch.mark_lost(self._connection.now(), publish=isinstance(error, LinkLost))
+        self._state_tracker.mark_lost(self._connection.now(), publish=isinstance(error, LinkLost))
         self.link_state.close(error)
 
     def close(self) -> None:
@@ -121,7 +122,7 @@ class VehicleWatch:
     def boot_time_ms(self, now: float) -> float | None:
         """Return the vehicle's time since boot at ``now``, extrapolated from the last report; None if unknown.
 
-        The speed of a simulation is taken into account.
+        The result takes into account that the clock of a simulation may be faster than real time.
         """
         if "time_boot_ms" not in self._last_times or self._first_time is None:
             return None
@@ -132,7 +133,7 @@ class VehicleWatch:
 
     @contextmanager
     def expecting_reboot(self) -> Iterator[None]:
-        """Detect a reboot within the block even if the previous boot was very recent."""
+        """During a `with` block, detect a reboot even if the previous boot was very recent."""
         self._expects_reboot = True
         try:
             yield
@@ -142,8 +143,8 @@ class VehicleWatch:
     def on_time_answer(self, requested_at: float, milliseconds: int) -> None:
         """Process the time since boot from an answer to our TIMESYNC request.
 
-        If the request was sent after the previous answer had arrived, a lower time can only come from a reboot. A
-        second message need not confirm it, even in a fast simulation.
+        If the request was sent after the previous answer had been processed, its answer cannot be a late message. A
+        lower time then proves a reboot, without confirmation by a second message.
         """
         answered_at, milliseconds_before = self._last_answer
         if requested_at <= answered_at:
@@ -156,7 +157,7 @@ class VehicleWatch:
         """Publish VehicleSilent if heartbeats have stopped; called once a second."""
         now = self._connection.now()
         silent_for = self.silent_for_s
-        self._state_watch.check(now)
+        self._state_tracker.check(now)
         if silent_for > SILENT_AFTER_S and not self._is_reported_silent:
             self._is_reported_silent = True
             self._connection.bus.publish(VehicleSilent(now, self._system_id, silent_for))
@@ -168,13 +169,13 @@ class VehicleWatch:
         now = self._connection.now()
         silent_for, self._heartbeat_read_at = self.silent_for_s, now
         self.last_heartbeat_at = frame.received_at
-        self._state_watch.record_activity(now)
+        self._state_tracker.record_activity(now)
         if self._is_reported_silent:
             self._is_reported_silent = False
             self._connection.bus.publish(VehicleRecovered(now, self._system_id, silent_for))
 
     def _on_link_interrupted(self, event: LinkInterrupted) -> None:
-        self._state_watch.mark_lost(event.at)
+        self._state_tracker.mark_lost(event.at)
 
     def _on_boot_time(self, frame: Frame) -> None:
         """Read ``time_boot_ms`` at the start of the payload, which begins at byte 9 of ``body``."""
@@ -187,33 +188,33 @@ class VehicleWatch:
             self._record_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Process answers to our TIMESYNC requests. A vehicle sends them even if it streams no messages."""
+        """Read the vehicle's time in answers to TIMESYNC requests, which a vehicle sends even without streams."""
         frame = message.received_frame
         if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
             self._record_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
 
     def _record_time(self, frame: Frame, clock: str, milliseconds: int) -> None:
-        """Detect a reboot from a time since boot in milliseconds, ``clock`` being the message or field that has it."""
+        """Record a time since boot, and detect a reboot by it. ``clock`` names the message or field with the time."""
         now = self._now()
         milliseconds_before, read_at = self._last_times.get(clock, (milliseconds, now))
-        # How far the vehicle's clock is behind its expected time, or more if the earlier message was delayed.
+        # How far the vehicle's clock is behind its expected time, or further if the earlier message was delayed.
         behind_ms = 1000 * (frame.received_at - read_at) - (milliseconds - milliseconds_before)
         if self._expects_reboot and behind_ms > MIN_REBOOT_STEP_MS:
             self._on_reboot_detected(clock, milliseconds)
-        elif milliseconds + REBOOT_STEP_MS >= milliseconds_before:  # no reboot
+        elif milliseconds + REBOOT_STEP_MS >= milliseconds_before:  # The time has not decreased by enough for a reboot.
             self._last_times[clock] = (milliseconds, now)
             if self._first_time is None and clock == "time_boot_ms":
                 self._first_time = (milliseconds, now)
-            if self._decreased_times:  # An earlier decrease came from a late message.
+            if self._decreased_times:  # A decreased time that was reported before came from a late message.
                 self._decreased_times.pop(clock, None)
         elif self._is_decrease_confirmed(clock, milliseconds):
             self._on_reboot_detected(clock, milliseconds)
 
     def _is_decrease_confirmed(self, clock: str, milliseconds: int) -> bool:
-        """Return True if the time has continued from its decreased value for ``REBOOT_CONFIRM_S``."""
+        """Return True if the vehicle has counted on from the decreased time for ``REBOOT_CONFIRM_S`` seconds."""
         now = self._connection.now()
         decreased_ms, decreased_at = self._decreased_times.setdefault(clock, (milliseconds, now))
-        if milliseconds < decreased_ms:
+        if milliseconds < decreased_ms:  # The time has decreased further: the confirmation starts anew.
             self._decreased_times[clock] = (milliseconds, now)
             return False
         return milliseconds > decreased_ms and now - decreased_at >= REBOOT_CONFIRM_S
@@ -255,18 +256,18 @@ class LinkWatch:
 
     @property
     def round_trip_s(self) -> float | None:
-        """The last round trip in seconds; None before the first one."""
+        """The round-trip time in seconds, as measured last; None before the first answer."""
         return self._round_trip_s
 
     async def run(self, on_tick: Callable[[], None]) -> None:
-        """Report once a second until cancelled or the connection ends; calls ``on_tick`` each time."""
+        """Publish a report once a second, and call ``on_tick`` each time, until cancelled or the connection ends."""
         self.request_time()
-        self._next_request_at = self._connection.now()  # The first report sends another request.
+        self._next_request_at = self._connection.now()  # The next request follows after one second instead of two.
         while self._connection.is_open:
             started = self._connection.now()
             await anyio.sleep(REPORT_PERIOD_S)
             if self._connection.now() - started > REPORT_PERIOD_S + BLOCKED_THRESHOLD_S:
-                # The program was blocked. Heartbeats that arrived meanwhile may not have been read yet.
+                # The program blocked the event loop. Let the loop read the heartbeats that have arrived meanwhile.
                 await anyio.sleep(CHECK_INTERVAL_S)
             if self._connection.is_open:
                 if self._connection.now() >= self._next_request_at:
@@ -292,7 +293,7 @@ class LinkWatch:
         if message.tc1 != 0 and message.ts1 in self._open_requests:
             self._open_requests.remove(message.ts1)
             now = self._connection.now()
-            # A longer time between arrival and processing is a delay of this program, not of the link.
+            # An answer that was processed long after its arrival would measure this program's delay, not the link's.
             if now - frame.received_at < CHECK_INTERVAL_S:
                 self._round_trip_s = now - message.ts1 / 1e9
             self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
@@ -317,6 +318,6 @@ class LinkWatch:
         self._connection.bus.publish(report)
 
     def _count(self) -> tuple[float, tuple[int, int], int]:
-        """Return the time, the frames received from the vehicle and lost, and the bytes received on the link."""
+        """Return the time, the numbers of frames received from the vehicle and lost, and of bytes on the link."""
         total_bytes = sum(statistics.bytes for statistics in self._connection.statistics())
         return self._connection.now(), self._connection.counts(self._system_id), total_bytes

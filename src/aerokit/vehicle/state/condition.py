@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "INFO", "DEBUG")
-# An earlier time (before September 2001) shows that the vehicle's clock is not set.
+# An earlier time, which is before September 2001, shows that the vehicle's clock is not set.
 EARLIEST_UNIX_S = 1_000_000_000
 # Flags of EKF_STATUS_REPORT and ESTIMATOR_STATUS, which have the same values.
 ATTITUDE, HORIZONTAL_VELOCITY, RELATIVE_POSITION, ABSOLUTE_POSITION, ALTITUDE = 1, 2, 8, 16, 32
@@ -82,9 +82,9 @@ class SensorHealth(Snapshot):
 class EstimatorHealth(Snapshot):
     """State estimator health from EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (PX4).
 
-    ``message`` is the name of the message and ``flags`` its flags. ``missing`` names the estimates that are not good
-    yet but needed to fly by position. Ratios are innovations divided by their limits: below 1 is good. Accuracies are
-    one standard deviation, in metres.
+    ``message`` is the name of the message and ``flags`` its flags. ``missing`` names the estimates that flight by
+    position needs and that are not good yet. Ratios are innovations divided by their limits: below 1 is good.
+    Accuracies are one standard deviation, in metres.
     """
 
     message: str
@@ -126,10 +126,10 @@ class EstimatorHealth(Snapshot):
 
 
 class MissionProgress(Snapshot):
-    """The current mission item, counted from 0, and the number of items; each is None if not reported or without a
-    mission.
+    """Index of the current mission item (the first is 0), and number of items.
 
-    ``state`` is a MISSION_STATE (1 no mission, 2 not started, 3 active, 4 paused, 5 complete), 0 unknown.
+    Both are None if the vehicle has no mission, and each is None if the vehicle does not report it. ``state`` is a
+    MISSION_STATE: 0 unknown, 1 no mission, 2 not started, 3 active, 4 paused, 5 complete.
     """
 
     current: int | None
@@ -138,12 +138,12 @@ class MissionProgress(Snapshot):
 
 
 class StatusText(Snapshot):
-    """One status text. ``severity`` is a MAV_SEVERITY, 0 emergency to 7 debug. "…" stands for a lost part."""
+    """One status text. ``severity`` is a MAV_SEVERITY, 0 emergency to 7 debug. "…" replaces a part that was lost."""
 
     severity: int
     text: str
     at: float = 0.0
-    """Time at which the text was complete, in seconds of the event loop's clock."""
+    """Time at which the last part of the text was processed, in seconds of the event loop's clock."""
 
     @property
     def is_error(self) -> bool:
@@ -161,9 +161,9 @@ def mode(message: messages.Heartbeat, context: Context) -> Mode:
 
 
 def current_mode(message: messages.CurrentMode, context: Context) -> Mode | None:
-    """Return the flight mode in CURRENT_MODE. It arrives before the next HEARTBEAT, but lacks ``base_mode``."""
-    # A custom_mode of 0 is a mode or not set, so HEARTBEAT must report it. The mode also depends on base_mode, which is
-    # unknown before the first HEARTBEAT.
+    """Return the flight mode in CURRENT_MODE, which reports a change earlier than HEARTBEAT but lacks ``base_mode``."""
+    # A custom_mode of 0 may mean a mode or that none is set; only HEARTBEAT tells. The mode also depends on base_mode,
+    # which is unknown before the first HEARTBEAT.
     if not message.custom_mode or context.before is None:
         return None
     return context.autopilot.mode(message.custom_mode, context.base_mode, context.mode_names)
@@ -175,17 +175,17 @@ def armed(message: messages.Heartbeat) -> bool:
 
 
 def system_status(message: messages.Heartbeat) -> int:
-    """Return the MAV_STATE."""
+    """Return the MAV_STATE in HEARTBEAT."""
     return enum_member(MavState, message.system_status)
 
 
 def vtol_state(message: messages.ExtendedSysState) -> int:
-    """Return the MAV_VTOL_STATE."""
+    """Return the MAV_VTOL_STATE in EXTENDED_SYS_STATE."""
     return enum_member(MavVtolState, message.vtol_state)
 
 
 def landed_state(message: messages.ExtendedSysState) -> int | None:
-    """Return the MAV_LANDED_STATE."""
+    """Return the MAV_LANDED_STATE in EXTENDED_SYS_STATE; None if the vehicle does not know it."""
     if message.landed_state == MavLandedState.UNDEFINED:
         return None
     return enum_member(MavLandedState, message.landed_state)
@@ -229,7 +229,8 @@ def sensor_health(message: messages.SysStatus, context: Context) -> SensorHealth
 
 
 def ekf_health(message: messages.EkfStatusReport, context: Context) -> EstimatorHealth:
-    """Return the estimator health of ArduPilot."""
+    """Return the health of ArduPilot's estimator from EKF_STATUS_REPORT."""
+    # The fields called variances are ratios of innovations to their limits (NavEKF3_core::getVariances).
     return EstimatorHealth(
         message.NAME,
         message.flags,
@@ -244,7 +245,7 @@ def ekf_health(message: messages.EkfStatusReport, context: Context) -> Estimator
 
 
 def estimator_health(message: messages.EstimatorStatus, context: Context) -> EstimatorHealth:
-    """Return the estimator health of PX4."""
+    """Return the health of PX4's estimator from ESTIMATOR_STATUS."""
     return EstimatorHealth(
         message.NAME,
         message.flags,
@@ -261,9 +262,9 @@ def estimator_health(message: messages.EstimatorStatus, context: Context) -> Est
 
 
 def mission_progress(message: messages.MissionCurrent) -> MissionProgress:
-    """Return the mission progress. In the message, ``total`` is UINT16_MAX without a mission, and 0 if not reported."""
+    """Return the mission progress in MISSION_CURRENT."""
     state = enum_member(MissionState, message.mission_state)
-    if message.total == U16:
+    if message.total == U16:  # There is no mission. A total of 0 means that the vehicle does not report the number.
         return MissionProgress(None, None, state)
     return MissionProgress(known(message.seq, unknown=U16), known(message.total, unknown=0), state)
 

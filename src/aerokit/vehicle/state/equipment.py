@@ -47,19 +47,19 @@ _CHANNELS = attrgetter(*(f"chan{number}_raw" for number in range(1, 19)))
 
 _SERVOS = attrgetter(*(f"servo{number}_raw" for number in range(1, 17)))
 
-# GPS_RAW_INT.yaw has this value for north, because 0 means that it is unknown.
+# GPS_RAW_INT.yaw has this value for north, because 0 means that the yaw is unknown.
 NORTH_CDEG = 36000
 
-# MAV_SENSOR_ROTATION_PITCH_270.
+# The MAV_SENSOR_ORIENTATION of a sensor that looks straight down (MAV_SENSOR_ROTATION_PITCH_270).
 LOOKING_DOWN = 25
 
 GPS_FIX_TYPE_3D = 3
 
-# Largest voltage value of one cell. BATTERY_STATUS reports a pack above 65.5 V as several "cells", of which all but the
-# last have this value.
+# Largest cell voltage in BATTERY_STATUS, in mV. The total of a pack above 65.5 V is reported as several "cells", whose
+# sum is the total: all of them except the last have this value.
 FULL_CELL = 0xFFFE
 
-# DISTANCE_SENSOR.signal_quality: 0 is unknown, 1 is an invalid reading.
+# DISTANCE_SENSOR.signal_quality is 1 if the reading is invalid, and 0 if the quality is unknown.
 INVALID_QUALITY = 1
 
 OUTPUTS_PER_PORT = 16
@@ -68,7 +68,7 @@ OUTPUTS_PER_PORT = 16
 class RangeFinder(Snapshot):
     """One distance sensor. ``distance_m`` is None if the reading is invalid.
 
-    ``orientation`` is a MAV_SENSOR_ORIENTATION, 25 is down. ``quality_percent`` is None if not reported.
+    ``orientation`` is a MAV_SENSOR_ORIENTATION, for example 25: down. ``quality_percent`` is None if not reported.
     """
 
     id: int
@@ -80,7 +80,7 @@ class RangeFinder(Snapshot):
 
 
 class GpsReceiver(Snapshot):
-    """One satellite receiver. Number 0 is reported by GPS_RAW_INT, number 1 by GPS2_RAW.
+    """One satellite receiver. ``index`` is 0 for the receiver in GPS_RAW_INT, 1 for the one in GPS2_RAW.
 
     ``fix_type`` is a GPS_FIX_TYPE (0 no receiver, 1 no fix, 2 2D, 3 3D, 4 DGPS, 5 RTK float, 6 RTK fixed). The
     position is None before a fix. Accuracies are one standard deviation.
@@ -126,7 +126,7 @@ class Battery(Snapshot):
 
 
 class Power(Snapshot):
-    """Supply voltages of the board and of its servos, None if not measured, and MAV_POWER_STATUS bits."""
+    """Supply voltages of the board and of the servos (None: not measured), and MAV_POWER_STATUS bits."""
 
     board_v: float | None
     servos_v: float | None
@@ -147,7 +147,7 @@ class ServoOutputs(Snapshot):
 
 
 class Vibration(Snapshot):
-    """Vibration levels in m/s², and the clipping count of each accelerometer since boot."""
+    """Vibration levels in m/s², and how often each of three accelerometers has clipped since boot."""
 
     x_m_s2: float
     y_m_s2: float
@@ -156,7 +156,7 @@ class Vibration(Snapshot):
 
 
 def distance_sensors(message: messages.DistanceSensor, context: Context) -> tuple[RangeFinder, ...]:
-    """Return the known sensors with the sensor of this message replaced or added."""
+    """Return all sensors reported so far, with the new reading of this message's sensor."""
     quality = message.signal_quality
     is_valid = quality != INVALID_QUALITY
     sensor = RangeFinder(
@@ -165,23 +165,23 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
         message.orientation,
         message.min_distance / 100,
         message.max_distance / 100,
-        quality if quality > INVALID_QUALITY else None,  # 0 means "unknown"
+        quality if quality > INVALID_QUALITY else None,  # 0 means "unknown", 1 "invalid"
     )
     return _replaced(context.before, sensor, _id_of)
 
 
 def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
-    """Return the downward sensor reported by ArduPilot's older message RANGEFINDER."""
+    """Return all sensors reported so far, with the new reading in RANGEFINDER (older ArduPilot) as sensor 0."""
     return _replaced(context.before, RangeFinder(0, finite(message.distance), LOOKING_DOWN), _id_of)
 
 
 def first_gps(message: messages.GpsRawInt, context: Context) -> tuple[GpsReceiver, ...]:
-    """Return the known receivers, with the first receiver replaced or added."""
+    """Return all receivers reported so far, the first one with the new values of this message."""
     return _replaced(context.before, _gps_receiver(message, 0), _index_of)
 
 
 def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver, ...]:
-    """Return the known receivers, with the second receiver replaced or added."""
+    """Return all receivers reported so far, the second one with the new values of this message."""
     return _replaced(context.before, _gps_receiver(message, 1), _index_of)
 
 
@@ -189,7 +189,7 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
     has_fix = message.fix_type >= GpsFixType.TYPE_2D_FIX
     coordinates = valid_coordinates(message.lat, message.lon) if has_fix else None
     latitude, longitude = coordinates or (None, None)
-    # A yaw of 0 means that the receiver reports none, U16 that it has none at present.
+    # A yaw of 0 means that the receiver cannot measure it, U16 that the receiver can but does not at present.
     yaw_deg = None if message.yaw in (0, U16) else message.yaw % NORTH_CDEG / 100
     return GpsReceiver(
         index,
@@ -210,11 +210,11 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
 
 
 def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Battery, ...]:
-    """Return the known batteries with the battery of this message replaced or added."""
+    """Return all batteries reported so far, with the new values of this message's battery."""
     cells_mv = [millivolts for millivolts in message.voltages if millivolts != U16]
-    # 0 means that a cell from 11 to 14 is absent, because these fields are an extension of the message.
+    # Cells 11 to 14 are an extension of the message, in which an absent cell may be 0 instead of U16.
     cells_mv += [millivolts for millivolts in message.voltages_ext if millivolts not in (0, U16)]
-    # A battery whose cells are not measured reports its total voltage as one "cell", or as several; see FULL_CELL.
+    # If the cells are not measured one by one, the message reports the total as one "cell" or several (see FULL_CELL).
     is_only_total = len(cells_mv) == 1 or FULL_CELL in cells_mv
     battery = Battery(
         message.id,
@@ -224,7 +224,7 @@ def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Batter
         () if is_only_total else tuple(millivolts / 1e3 for millivolts in cells_mv),
         divided(message.temperature, 100, unknown=I16),
         message.current_consumed if message.current_consumed >= 0 else None,
-        message.energy_consumed / 36 if message.energy_consumed >= 0 else None,
+        message.energy_consumed / 36 if message.energy_consumed >= 0 else None,  # hectojoules to watt-hours
         known(message.time_remaining, unknown=0),
         enum_member(MavBatteryChargeState, message.charge_state),
     )
@@ -232,7 +232,7 @@ def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Batter
 
 
 def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery, ...] | None:
-    """Return the first battery from SYS_STATUS; None if the message has no data about it."""
+    """Return all batteries reported so far, the first with the values of SYS_STATUS; None if SYS_STATUS has none."""
     voltage = None if message.voltage_battery in (0, U16) else message.voltage_battery / 1e3
     remaining = known(message.battery_remaining, unknown=-1)
     if voltage is None and remaining is None:
@@ -242,7 +242,7 @@ def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery
 
 
 def current(centiampere: int, autopilot: Autopilot) -> float | None:
-    """Return the current in amperes; None if the message has the autopilot's value for "unknown"."""
+    """Return the current in amperes; None if the number is one of the autopilot's values for "unknown"."""
     return None if centiampere in autopilot.unknown_currents_ca else centiampere / 100
 
 
@@ -256,7 +256,7 @@ def power(message: messages.PowerStatus) -> Power:
 
 
 def rc_channels(message: messages.RcChannels) -> RcChannels:
-    """Return the channels that the receiver has."""
+    """Return the pulse widths of the channels that the RC receiver has."""
     count = min(message.chancount, 18)
     channels = _CHANNELS(message)[:count]
     return RcChannels(
@@ -265,13 +265,14 @@ def rc_channels(message: messages.RcChannels) -> RcChannels:
 
 
 def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOutputs:
-    """Return the known outputs with the sixteen outputs of the message's port (eight in MAVLink 1) replaced."""
+    """Return all outputs reported so far, with the new values of this message's port, which has 16 outputs."""
     frame = message.received_frame
+    # MAVLink 1 has no extension fields, so the message has only the first eight outputs of the port.
     count = 8 if frame is not None and frame.version == 1 else OUTPUTS_PER_PORT
     outputs: tuple[int, ...] = _SERVOS(message)[:count]
     known_outputs: tuple[int, ...] = () if context.before is None else context.before.outputs_us
     first_index = message.port * OUTPUTS_PER_PORT
-    missing = (0,) * (first_index - len(known_outputs))  # outputs of earlier ports that were not received yet
+    missing = (0,) * (first_index - len(known_outputs))  # the outputs of earlier ports that were not reported yet
     return ServoOutputs((*known_outputs[:first_index], *missing, *outputs, *known_outputs[first_index + count :]))
 
 
@@ -282,7 +283,7 @@ def vibration(message: messages.Vibration) -> Vibration:
 
 
 def _replaced(items: tuple[Any, ...] | None, item: Any, key: Callable[[Any], int]) -> tuple[Any, ...]:
-    """Return the items sorted by key, with the item of the same key replaced, or added."""
+    """Return ``items`` with ``item`` in place of the item that has the same key, or added; sorted by key."""
     other_items = (existing for existing in items or () if key(existing) != key(item))
     return tuple(sorted((item, *other_items), key=key))
 
@@ -306,12 +307,12 @@ MIN_SINE_STRAIGHT = 0.99999
 
 
 class GimbalAttitude(Snapshot):
-    """Attitude of a gimbal in degrees, None if not reported.
+    """Attitude of a gimbal in degrees. An angle that is not reported is None.
 
     ``pitch_deg`` (0 level, −90 straight down) and ``roll_deg`` are from the horizon. ``yaw_deg`` is 0 to 360 clockwise
     from north, ``yaw_from_nose_deg`` −180 to 180 clockwise from the vehicle's nose. While the vehicle's heading is
-    unknown, ``yaw_deg`` may be relative to the nose. From MOUNT_STATUS (ArduPilot before 4.3) ``yaw_deg`` is
-    unconverted, and may be relative to north or to the nose.
+    unknown, ``yaw_deg`` may be relative to the nose. ArduPilot before 4.3 reports MOUNT_STATUS, whose yaw may be
+    relative to north or to the nose; ``yaw_deg`` is then this yaw, unchanged.
     """
 
     pitch_deg: float | None
@@ -330,6 +331,7 @@ def from_orientation(message: MountOrientation, heading: float | None) -> Gimbal
 
     ``heading`` is the vehicle's heading in degrees; while it is unknown, ``yaw_deg`` is relative to the nose.
     """
+    # ``yaw_absolute`` is an extension field: 0 may mean that it was not sent.
     if message.yaw_absolute and math.isfinite(message.yaw_absolute):
         yaw = _rounded_to_360(message.yaw_absolute)
     elif heading is not None:
@@ -347,23 +349,23 @@ def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> G
     """
     pitch, roll, yaw = _euler(message.q)
     # Older gimbals send neither these flags nor ``delta_yaw``, which is an extension of the message.
-    has_delta = message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME) and math.isfinite(message.delta_yaw)
-    if has_delta and message.delta_yaw:  # PX4 also sends 0 when the difference is unknown.
-        nose_deg: float | None = math.degrees(message.delta_yaw)
+    has_delta_yaw = message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME) and math.isfinite(message.delta_yaw)
+    if has_delta_yaw and message.delta_yaw:  # PX4 also sends a ``delta_yaw`` of 0 while the heading is unknown.
+        nose_heading: float | None = math.degrees(message.delta_yaw)
     else:
-        nose_deg = heading
+        nose_heading = heading
     pitch_and_roll = (_rounded(pitch), _rounded(roll))
     if _is_from_nose(message.flags):
-        yaw_from_north = _rounded(yaw) if nose_deg is None else _rounded_to_360(yaw + nose_deg)
+        yaw_from_north = _rounded(yaw) if nose_heading is None else _rounded_to_360(yaw + nose_heading)
         return GimbalAttitude(*pitch_and_roll, yaw_from_north, _rounded_to_180(yaw))
-    yaw_from_nose = None if nose_deg is None else _rounded_to_180(yaw - nose_deg)
+    yaw_from_nose = None if nose_heading is None else _rounded_to_180(yaw - nose_heading)
     return GimbalAttitude(*pitch_and_roll, _rounded_to_360(yaw), yaw_from_nose)
 
 
 def _is_from_nose(flags: int) -> bool:
     """Return True if the yaw is relative to the vehicle's nose, False if it is relative to north.
 
-    Gimbals that set none of the newer two flags tell by YAW_LOCK.
+    Older gimbals set neither of the two flags YAW_IN_…_FRAME; their YAW_LOCK flag means "relative to north".
     """
     if flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME):
         return not flags & YAW_IN_EARTH_FRAME
@@ -379,16 +381,13 @@ def _euler(quaternion: tuple[float, ...]) -> tuple[float, float, float]:
     if not length > 0:
         return math.nan, math.nan, math.nan
     w, x, y, z = (component / length for component in quaternion)
-    sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))  # of the pitch; rounding may exceed 1
-    if abs(sine) > MIN_SINE_STRAIGHT:
-        return (
-            math.degrees(math.asin(sine)),
-            0.0,
-            math.degrees(-2 * math.copysign(1, sine) * math.atan2(x, w)),
-        )
+    sine_of_pitch = max(-1.0, min(1.0, 2 * (w * y - z * x)))  # Without the limits, rounding may exceed 1.
+    pitch = math.degrees(math.asin(sine_of_pitch))
+    if abs(sine_of_pitch) > MIN_SINE_STRAIGHT:
+        return pitch, 0.0, math.degrees(-2 * math.copysign(1, sine_of_pitch) * math.atan2(x, w))
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return math.degrees(math.asin(sine)), math.degrees(roll), math.degrees(yaw)
+    return pitch, math.degrees(roll), math.degrees(yaw)
 
 
 def _rounded(degrees: float) -> float | None:
@@ -397,10 +396,11 @@ def _rounded(degrees: float) -> float | None:
 
 
 def _rounded_to_180(degrees: float) -> float | None:
-    """Like :func:`_rounded`, for an angle from -180 to 180."""
+    """Like :func:`_rounded`, but first normalise the angle to -180 to 180."""
     return round(math.remainder(degrees, 360.0), 2) + 0.0 if math.isfinite(degrees) else None
 
 
 def _rounded_to_360(degrees: float) -> float | None:
-    """Like :func:`_rounded`, for an angle from 0 to below 360."""
+    """Like :func:`_rounded`, but first normalise the angle to 0 to below 360."""
+    # Rounding may turn 359.999 into 360, so the result is normalised again.
     return round(degrees % 360.0, 2) % 360.0 if math.isfinite(degrees) else None

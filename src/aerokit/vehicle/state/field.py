@@ -61,7 +61,7 @@ class MessageSource(Generic[T]):
         watched_hz: float | None = None,
     ) -> None:
         if message not in MESSAGE_IDS:
-            raise ValueError(f"{message} is not a message class")
+            raise ValueError(f"{message} is not the name of a message class")
         self.message: str = message
         self.decode = decode
         self.needs_context: bool = needs_context
@@ -122,7 +122,7 @@ class StateField(Generic[T]):
         return names or f"{message_type(self.sources[0].message).NAME}, which {autopilot.firmware} does not send,"
 
 
-# The greatest value of an integer field, by which MAVLink often denotes "unknown".
+# The greatest values of integer fields (unsigned and signed). In many fields of MAVLink they mean "unknown".
 U8, U16, I16 = 0xFF, 0xFFFF, 0x7FFF
 
 
@@ -159,8 +159,8 @@ def divided(value: int, divisor: int, *, unknown: int) -> float | None:
     return None if value == unknown else value / divisor
 
 
-# Even if no value is read, a frame is decoded after at most this many seconds. The next frame replaces it, and may lack
-# some of its values: without a fix, for example, the position is missing.
+# Even if the program reads no value, a frame is decoded every this many seconds. An undecoded frame is replaced by the
+# next one, which may lack some of its values: without a fix, for example, the position is missing.
 MAX_DECODE_DELAY_S = 5.0
 
 # Number of bytes before the payload in ``Frame.body``.
@@ -168,12 +168,12 @@ _HEADER_LENGTH = 9
 
 
 class StreamedMessage:
-    """One message type of a vehicle's autopilot. Keeps the latest frame and decodes it on access.
+    """One message type of a vehicle's autopilot. Keeps the latest frame, and decodes it when a value is read.
 
     ``instance_at`` is the offset in the payload of the byte that distinguishes several instances; the latest frame of
-    each instance is kept. ``apply(frame, message)`` decodes the frame, unless its message is given, and updates the
-    cells. While one of ``cells`` has observers, each frame is decoded when it arrives. Frames arrive in the event
-    loop's thread; any thread may read. ``lock`` protects the state.
+    each instance is kept. ``apply(frame, message)`` decodes the frame, unless its message is given, and updates
+    ``cells``. While one of the cells has observers, each frame is decoded when it arrives. Frames arrive in the event
+    loop's thread, but any thread may read a cell, so ``lock`` protects this object.
     """
 
     __slots__ = (
@@ -197,22 +197,22 @@ class StreamedMessage:
     ) -> None:
         self._component_id, self._cells, self._apply, self._lock = component_id, cells, apply, lock
         self._instance_at = None if instance_at is None else instance_at + _HEADER_LENGTH
-        # The next frame that arrives from this time on is decoded at once.
+        # The first frame that arrives at or after this time is decoded at once.
         self._decode_from = -math.inf
         self._is_watched = False
         self.pending: dict[int, Frame | Message] = {}
-        """Frames that are not decoded yet, by instance."""
+        """The latest frame of each instance, until it is decoded (or its message, until that is applied)."""
 
     def receive(self, frame: Frame, message: Message | None = None) -> None:
-        """Process a frame of the vehicle's system, and ``message`` if it is decoded. Ignore other components."""
+        """Process a frame of the vehicle's system. ``message`` is the decoded frame, if it was decoded already."""
         if frame.component_id != self._component_id:
             return
         if self._is_watched or frame.received_at >= self._decode_from:
             self._decode_from = frame.received_at + MAX_DECODE_DELAY_S
-            # Observers must be called in the loop's thread, so another thread must not decode the frame.
+            # The lock keeps a thread that reads from decoding the frame: only the loop's thread may call observers.
             with self._lock:
                 if self.pending:
-                    self.catch_up()  # Earlier frames must be applied first.
+                    self.catch_up()  # Frames that arrived earlier must be applied first.
                 self._apply(frame, message)
             return
         instance, instance_at = 0, self._instance_at
@@ -225,8 +225,8 @@ class StreamedMessage:
         """Decode the pending frames in the order of their arrival."""
         with self._lock:
             to_apply: list[tuple[Frame, Message | None]] = []
-            # All frames are removed before the first one is decoded. A decoder may read the previous value, which calls
-            # this function again.
+            # All frames are removed before the first one is decoded, because a decoder may read the previous value of
+            # a cell, and this access calls `catch_up` again.
             while self.pending:
                 _, pending = self.pending.popitem()
                 if isinstance(pending, Frame):
@@ -238,7 +238,7 @@ class StreamedMessage:
                 self._apply(frame, message)
 
     def watchers_changed(self) -> None:
-        """Switch between decoding on arrival and on access when observers come and go."""
+        """Decode frames on arrival from now on if a cell has observers, otherwise on access."""
         self._is_watched = any(cell._is_watched for cell in self._cells)
 
     def forget(self) -> None:

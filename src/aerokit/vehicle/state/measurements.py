@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 __all__ = ["ActuatorControls", "AirPressure", "Aircraft", "Altitude", "Imu", "Odometry", "RawImu", "WinchStatus"]
 
-# Factors: thousandths of g to m/s², milligauss to microtesla, hectopascal to pascal, radians to degrees.
+# Conversion factors: thousandths of g to m/s², milligauss to microtesla, hectopascal to pascal, radians to degrees.
 MG_M_S2, MGAUSS_UT, HPA_PA, RAD_DEG = 9.80665e-3, 0.1, 100.0, math.degrees(1)
-# ALTITUDE.altitude_terrain below NO_TERRAIN_M means unknown, and so does a sensor temperature of 0.
+# An ALTITUDE.altitude_terrain below this, and a sensor temperature of exactly 0, mean that the value is unknown.
 NO_TERRAIN_M, UNKNOWN_TEMPERATURE = -1000.0, 0
 MAX_AIRCRAFT = 64
 
@@ -77,7 +77,10 @@ class AirPressure(Snapshot):
 
 
 class Altitude(Snapshot):
-    """Altitudes of PX4 in metres; None if unknown. ``monotonic_m`` never jumps, but its zero is arbitrary."""
+    """Altitudes of PX4 in metres (ALTITUDE). An unknown altitude is None.
+
+    ``monotonic_m`` never jumps, but its zero is arbitrary.
+    """
 
     monotonic_m: float | None
     amsl_m: float | None
@@ -120,8 +123,8 @@ class Aircraft(Snapshot):
 class WinchStatus(Snapshot):
     """Line and motor of a winch; unknown values are None. ``flags`` are MAV_WINCH_STATUS_FLAG bits.
 
-    ``speed_m_s`` is positive while the line runs out. ArduCopter measures neither: it reports the ordered speed, and a
-    length calculated from this speed.
+    ``speed_m_s`` is positive while the line runs out. ArduCopter measures neither speed nor length: it reports the
+    ordered speed, and a length calculated from this speed.
     """
 
     length_m: float | None
@@ -155,7 +158,7 @@ def highres_imu(message: messages.HighresImu, context: Context) -> Imu:
 
 
 def scaled_imu(message: messages.ScaledImu) -> Imu:
-    """Decode SCALED_IMU, which has thousandths of g, of rad/s and of gauss."""
+    """Return the readings in SCALED_IMU, whose units are thousandths of g, of rad/s and of gauss."""
     return Imu(
         _scaled(MG_M_S2, message.xacc, message.yacc, message.zacc),
         _scaled(RAD_DEG / 1000, message.xgyro, message.ygyro, message.zgyro),
@@ -189,7 +192,7 @@ def odometry(message: messages.Odometry) -> Odometry:
 
 
 def _covariance(values: tuple[float, ...]) -> tuple[float, ...] | None:
-    """Return the covariance; None if its first element is NaN, which means that all are unknown."""
+    """Return the covariance; None if its first element is NaN, which means that the whole matrix is unknown."""
     return None if math.isnan(values[0]) else tuple(values)
 
 
@@ -203,15 +206,15 @@ def air_pressure(message: messages.ScaledPressure) -> AirPressure:
 
 
 def ground_truth(message: messages.HilStateQuaternion) -> Position | None:
-    """Return the position in HIL_STATE_QUATERNION, the truth of PX4's simulation; None if it is invalid."""
+    """Return the true position in PX4's simulation (HIL_STATE_QUATERNION); None if the coordinates are invalid."""
     coordinates = valid_coordinates(message.lat, message.lon)
     return None if coordinates is None else Position(*coordinates, message.alt / 1000)
 
 
 def simulation_state(message: messages.SimState) -> Position | None:
-    """Return the position in SIM_STATE, the truth of ArduPilot's simulation; None if it is invalid."""
+    """Return the true position in ArduPilot's simulation (SIM_STATE); None if the position is invalid."""
     latitude, longitude = message.lat_int, message.lon_int
-    # Firmware that does not send the extension fields lat_int and lon_int sends less exact numbers.
+    # Firmware that does not send the extension fields lat_int and lon_int sends only lat and lon, which are less exact.
     if not (latitude or longitude) and abs(message.lat) <= 90 and abs(message.lon) <= 180:
         latitude, longitude = round(message.lat * 1e7), round(message.lon * 1e7)
     coordinates, altitude_m = valid_coordinates(latitude, longitude), finite(message.alt)
@@ -226,7 +229,7 @@ def altitude(message: messages.Altitude) -> Altitude:
         finite(message.altitude_local),
         finite(message.altitude_relative),
         None if terrain is None or terrain < NO_TERRAIN_M else terrain,
-        None if clearance is None or clearance < 0 else clearance,
+        None if clearance is None or clearance < 0 else clearance,  # A negative value means "not measured".
     )
 
 
@@ -235,7 +238,7 @@ def actuator_controls(message: messages.ActuatorControlTarget) -> ActuatorContro
 
 
 def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft, ...]:
-    """Return the aircraft reported so far, at most 64, with the aircraft of this message last."""
+    """Return the last 64 aircraft reported, each once, with the aircraft of this message last."""
 
     def if_valid(flag: AdsbFlags, value: float) -> float | None:
         return value if message.flags & flag else None

@@ -41,7 +41,7 @@ __all__ = [
     "wind_of_covariance",
 ]
 
-# Positions within 0.01 degrees of 0°N 0°E are treated as missing.
+# A position counts as missing if it is less than this (0.01 degrees) from 0°N 0°E in both coordinates.
 MIN_COORDINATE = 100_000
 # Two altitudes in GLOBAL_POSITION_INT that differ by at most this much count as equal.
 SAME_ALTITUDE_MM = 100
@@ -110,8 +110,9 @@ class Attitude(Snapshot):
 
 
 class Wind(Snapshot):
-    """Wind speed in m/s. ``direction_deg`` (0 to 360) is where the wind comes from; ``down_m_s`` is None if not
-    reported.
+    """Wind speed in m/s. ``direction_deg`` (0 to 360) is where the wind comes from.
+
+    ``down_m_s`` is the vertical wind speed, None if not reported.
     """
 
     speed_m_s: float
@@ -120,9 +121,9 @@ class Wind(Snapshot):
 
 
 def valid_coordinates(latitude: int, longitude: int) -> tuple[float, float] | None:
-    """Convert 1e-7 degrees to degrees; return None without a fix, and for a place that is not on earth.
+    """Convert 1e-7 degrees to degrees; return None for a place near 0°N 0°E, and for numbers out of range.
 
-    Without a fix, autopilots report 0, 0 or a place near 0, 0: ArduPlane was observed to dead-reckon from there.
+    Autopilots without a fix report 0, 0 or a place near it: ArduPlane was observed to dead-reckon from 0, 0.
     """
     if abs(latitude) < MIN_COORDINATE and abs(longitude) < MIN_COORDINATE:
         return None
@@ -132,9 +133,10 @@ def valid_coordinates(latitude: int, longitude: int) -> tuple[float, float] | No
 
 
 def position(message: messages.GlobalPositionInt, context: Context) -> Position | None:
-    """Return the position, None before the first fix.
+    """Return the position; None before the first fix.
 
-    Until home is set, ``relative_alt`` is the altitude above mean sea level, so the result has no relative altitude.
+    Until home is set, ``relative_alt`` repeats the altitude above mean sea level. The result then has no relative
+    altitude.
     """
     coordinates = valid_coordinates(message.lat, message.lon)
     if coordinates is None:
@@ -145,14 +147,14 @@ def position(message: messages.GlobalPositionInt, context: Context) -> Position 
 
 
 def global_velocity(message: messages.GlobalPositionInt) -> Velocity | None:
-    """Return the velocity over ground, None before the first fix."""
+    """Return the velocity over ground; None before the first fix."""
     if valid_coordinates(message.lat, message.lon) is None:
         return None
     return Velocity(message.vx / 100, message.vy / 100, message.vz / 100)
 
 
 def heading_deg(message: messages.GlobalPositionInt) -> float | None:
-    """Return the heading, 0 to below 360."""
+    """Return the heading in degrees, 0 to below 360; None if it is unknown."""
     return None if message.hdg == U16 else message.hdg / 100 % 360
 
 
@@ -177,7 +179,7 @@ def ground_speed_m_s(message: messages.VfrHud) -> float:
 
 
 def air_speed_m_s(message: messages.VfrHud) -> float | None:
-    """Return the airspeed; NaN of PX4 without a sensor becomes None."""
+    """Return the airspeed; None for NaN, which PX4 sends without a sensor."""
     return finite(message.airspeed)
 
 
@@ -192,7 +194,7 @@ def throttle_percent(message: messages.VfrHud) -> float:
 
 
 def attitude(message: messages.Attitude) -> Attitude:
-    """Return Euler angles and rates."""
+    """Return the attitude in ATTITUDE as Euler angles and rates in degrees."""
     degrees = math.degrees
     return Attitude(
         degrees(message.roll),
@@ -205,7 +207,7 @@ def attitude(message: messages.Attitude) -> Attitude:
 
 
 def attitude_of_quaternion(message: messages.AttitudeQuaternion) -> Attitude:
-    """Return the attitude from a quaternion."""
+    """Return the attitude in ATTITUDE_QUATERNION as Euler angles and rates in degrees."""
     rates = (
         math.degrees(message.rollspeed),
         math.degrees(message.pitchspeed),
@@ -223,18 +225,18 @@ def home(message: messages.HomePosition) -> Home | None:
 
 
 def origin(message: messages.GpsGlobalOrigin) -> Position | None:
-    """Return the origin of the local frame."""
+    """Return the origin of the local frame; None if its coordinates are invalid."""
     coordinates = valid_coordinates(message.latitude, message.longitude)
     return None if coordinates is None else Position(*coordinates, message.altitude / 1e3)
 
 
 def wind(message: messages.Wind) -> Wind:
-    """Return the wind reported by ArduPilot, as the direction that it comes from."""
+    """Return the wind in WIND (ArduPilot), whose direction is where the wind comes from."""
     return Wind(message.speed, geo.wrap_360(message.direction), finite(message.speed_z))
 
 
 def wind_of_covariance(message: messages.WindCov) -> Wind | None:
-    """Return the wind reported by PX4, which is the vector in which the air moves."""
+    """Return the wind in WIND_COV (PX4), which has the velocity of the air; None if this is unknown."""
     if not (math.isfinite(message.wind_x) and math.isfinite(message.wind_y)):
         return None
     comes_from = math.degrees(math.atan2(-message.wind_y, -message.wind_x))

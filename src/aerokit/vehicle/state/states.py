@@ -49,7 +49,9 @@ if TYPE_CHECKING:
 
 
 class States:
-    """State cells: each has ``.value`` (raises ValueUnknownError before the first value), ``.latest`` (None before it),
+    """The states of a vehicle, each of which is a cell.
+
+    A cell has ``.value`` (raises ValueUnknownError before the first value), ``.latest`` (None before the first value),
     ``.age`` in seconds, ``.source``, ``.fresh(within=s)``, ``await .wait_until(predicate, held_for=s)`` and
     ``.changes()``.
     """
@@ -71,7 +73,7 @@ class States:
     vtol_state: StateField[int] = StateField(
         MessageSource("ExtendedSysState", condition.vtol_state, hz=5.0), eager=True
     )
-    """MAV_VTOL_STATE: 1 to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
+    """MAV_VTOL_STATE: 1 going to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
 
     landed_state: StateField[int] = StateField(
         MessageSource("ExtendedSysState", condition.landed_state, hz=5.0),
@@ -136,7 +138,7 @@ class States:
         MessageSource("SysStatus", equipment.main_battery, needs_context=True, fallback=True),
         waits_for="BATTERY_STATUS or SYS_STATUS",
     )
-    """All batteries (BATTERY_STATUS, else SYS_STATUS)."""
+    """All batteries (BATTERY_STATUS, or SYS_STATUS if that is missing)."""
 
     power: StateField[Power] = StateField(MessageSource("PowerStatus", equipment.power, hz=1.0))
     """Supply voltages of the board and of its servos (POWER_STATUS)."""
@@ -253,7 +255,7 @@ class States:
 STATES: Mapping[str, StateField[Any]] = {
     name: value for name, value in vars(States).items() if isinstance(value, StateField)
 }
-"""All declarations by name of the state."""
+"""Maps the name of each state to its declaration."""
 
 
 def _sources_by_message() -> dict[str, list[tuple[StateField[Any], MessageSource[Any]]]]:
@@ -268,11 +270,11 @@ SOURCES: Mapping[str, list[tuple[StateField[Any], MessageSource[Any]]]] = _sourc
 """Maps the name of a message class to the states that the message reports, each with its `MessageSource`."""
 
 LAZY = tuple(name for name, sources in SOURCES.items() if not any(field.eager for field, _ in sources))
-"""Message classes that are decoded only when one of their states is accessed."""
+"""Names of the message classes that are decoded only when one of their states is accessed."""
 
 DEFAULT_RATES_HZ: Mapping[str, float] = {
     name: max(source.hz for _, source in sources if source.hz is not None)
     for name, sources in SOURCES.items()
     if any(source.hz is not None for _, source in sources)
 }
-"""Default rates in Hz by name of the message class."""
+"""Maps the name of a message class to its default rate in Hz."""

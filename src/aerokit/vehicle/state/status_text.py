@@ -19,9 +19,9 @@ CHUNK_LENGTH = 50
 CHUNK_TIMEOUT_S = 2.0
 """Seconds to wait for the next chunk of a text."""
 MAX_RECENT_TEXTS = 64
-# Maximum number of chunks of one text. A longer text is invalid, and is passed on in parts.
+# Maximum number of chunks of one text. A text with more chunks is invalid, and is passed on as several texts.
 MAX_CHUNKS = 20
-# Maximum number of incomplete texts, over all components.
+# Maximum number of incomplete texts of all components together. Beyond it, the oldest text is discarded.
 MAX_OPEN = 16
 ELLIPSIS = "…"
 
@@ -31,8 +31,8 @@ _Sender = tuple[int, int]
 class StatusTextAssembler:
     """Joins the chunks of long texts (https://mavlink.io/en/messages/common.html#STATUSTEXT).
 
-    A text ends with the first chunk that is not full. If a chunk is missing, or the end does not arrive within two
-    seconds, the text is passed on with "…" in place of the missing part. Trailing tabs and spaces are removed.
+    A text ends with the first chunk that is not full. If a chunk is missing, or the next chunk does not arrive within
+    two seconds, the text is passed on with "…" in place of the missing part. Trailing whitespace is removed.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class StatusTextAssembler:
         self._recent: deque[StatusText] = deque(maxlen=MAX_RECENT_TEXTS)
 
     def receive(self, message: Statustext, now: float) -> list[StatusText]:
-        """Process one message and return the texts that are complete now."""
+        """Process one message. Return the texts that it completes, and truncated texts whose next chunk is overdue."""
         truncated_texts = self.expire(now)
         chunk = _bytes_of(message)
         if message.id == 0:
@@ -51,7 +51,7 @@ class StatusTextAssembler:
         return truncated_texts + texts
 
     def expire(self, now: float) -> list[StatusText]:
-        """Return the incomplete texts whose next chunk has not arrived for two seconds."""
+        """Remove the incomplete texts whose next chunk has not arrived for two seconds; return them as truncated."""
         overdue = [key for key, text in self._incomplete.items() if now - text.last_chunk_at > CHUNK_TIMEOUT_S]
         texts = [self._incomplete.pop(key).truncated(now) for key in overdue]
         self._recent.extend(texts)
@@ -67,13 +67,13 @@ class StatusTextAssembler:
         self._recent.clear()
 
     def _add_chunk(self, message: Statustext, chunk: bytes, now: float) -> Iterator[StatusText]:
-        """Add a chunk to its text, and yield the texts that are complete or truncated now."""
+        """Add a chunk to its text. Yield the text if it is now complete, and an earlier text that remains truncated."""
         key = (_sender(message), message.id)
         text = self._incomplete.get(key)
         if text is not None and message.chunk_seq < text.next_seq:
             if message.chunk_seq == text.next_seq - 1 and text.last_chunk == chunk:
-                return  # The same chunk was already received by another link.
-            # Another text with the same id has begun, so the end of this one was lost.
+                return  # This chunk has already arrived over another link.
+            # A new text with the same id begins, so the end of the previous text was lost.
             yield self._incomplete.pop(key).truncated(now)
             text = None
         if text is None:
@@ -90,7 +90,7 @@ class StatusTextAssembler:
 
 
 class _IncompleteText:
-    """An incomplete text: the chunks of it that were received, at least one."""
+    """A text whose end has not arrived yet, made of the chunks received so far."""
 
     last_chunk: bytes
     last_chunk_at: float
@@ -119,8 +119,9 @@ def _sender(message: Statustext) -> _Sender:
 
 
 def _bytes_of(message: Statustext) -> bytes:
-    """Return the undecoded text of a chunk, because a multi-byte character may be split between two chunks."""
+    """Return the text of a chunk as bytes, because a multi-byte character may be split between two chunks."""
     frame = message.received_frame
+    # In the payload, the text follows one byte for the severity.
     data = message.text.encode() if frame is None else frame.payload[1 : 1 + CHUNK_LENGTH]
     return data.split(b"\0")[0]
 

@@ -28,7 +28,7 @@ watched": only while your program waits for the state or follows its changes; re
 
 
 def documentation() -> dict[str, tuple[str, str]]:
-    """Return type and documentation of each state by name, from the source."""
+    """Read states.py; return a mapping of each state's name to its type and its documentation."""
     module = ast.parse(Path(states.__file__).read_text(encoding="utf-8"))
     (states_class,) = (node for node in module.body if isinstance(node, ast.ClassDef))
     type_and_text: dict[str, tuple[str, str]] = {}
@@ -42,7 +42,7 @@ def documentation() -> dict[str, tuple[str, str]]:
 
 
 def rendered() -> str:
-    """Return the whole page."""
+    """Return the text of docs/states.md."""
     texts = documentation()
     return HEAD + "".join(_row(name, *texts[name], field) for name, field in states.STATES.items())
 

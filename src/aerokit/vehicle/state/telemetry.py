@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.state.condition import StatusText
 
-# Seconds for which a fallback message is ignored after a better message.
+# A fallback message is ignored for this many seconds after a better message has reported the state.
 FALLBACK_DELAY_S = 2.0
-# Limit to the memory that a vehicle with invalid AVAILABLE_MODES can fill.
+# Maximum number of mode names to store. A faulty vehicle could send AVAILABLE_MODES with ever new modes.
 MAX_MODE_NAMES = 256
 
 Handler = Callable[[Any, Source], None]
@@ -34,10 +34,10 @@ Handler = Callable[[Any, Source], None]
 class Telemetry(States):
     """All state cells of one vehicle, updated by its messages.
 
-    Only messages of system ``system_id``, component ``component_id`` (the autopilot) are processed, and messages that
-    the program itself has built. ``handles`` maps message ids to handlers of messages, ``streams`` maps them to
-    handlers of undecoded frames. ``clock`` returns seconds. If ``autopilot`` is None, the first HEARTBEAT determines
-    it.
+    It processes messages of component ``component_id`` (the autopilot) of system ``system_id``, and messages without a
+    frame, which the program itself has built. ``handles`` maps message ids to handlers of messages; ``streams`` maps
+    them to handlers of undecoded frames. ``clock`` returns seconds. If ``autopilot`` is None, the first HEARTBEAT shows
+    which autopilot this is.
     """
 
     autopilot: Autopilot
@@ -67,6 +67,7 @@ class Telemetry(States):
         handlers = {name: self._handler(name) for name in (*SOURCES, "AvailableModes")}
         self._handlers = {MESSAGE_IDS[name]: self._receiver(name, handler) for name, handler in handlers.items()}
         self._streams = {MESSAGE_IDS[name]: self._streamed_message(name, handlers[name]) for name in LAZY}
+        # When a cell is read, it lets these streams decode the frames that they have kept.
         for cell_name, cell in self._cells.items():
             lazy_messages = (source.message for source in STATES[cell_name].sources if source.message in LAZY)
             cell._feed_from(*(self._streams[MESSAGE_IDS[name]] for name in lazy_messages))
@@ -80,7 +81,7 @@ class Telemetry(States):
 
     @property
     def streams(self) -> Mapping[int, StreamedMessage]:
-        """Handlers of frames by message id. These frames are decoded when one of their cells is accessed."""
+        """Handlers of frames by message id. They decode a frame only when one of its values is read."""
         return self._streams
 
     def accepts(self, frame: Frame) -> bool:
@@ -94,18 +95,18 @@ class Telemetry(States):
             handler(message)
 
     def expire(self, now: float) -> None:
-        """Publish status texts whose last chunk did not arrive. Call this about once a second."""
+        """Publish status texts whose end has not arrived in time. Call this about once a second."""
         self._publish_texts(self._texts.expire(now), self._source("Statustext"))
 
     def forget(self) -> None:
-        """Make all states unknown, as after a reboot; status texts are kept."""
+        """Make all states unknown, because the vehicle has rebooted. The recent status texts are kept."""
         for stream in self._streams.values():
             stream.forget()
         for cell in self._cells.values():
             cell.forget()
 
     def close(self, error: BaseException) -> None:
-        """End all waits with ``error``."""
+        """Let all calls that wait for a state raise ``error``."""
         for cell in self._cells.values():
             cell.close(error)
 
@@ -118,7 +119,7 @@ class Telemetry(States):
 
     @property
     def mode_names(self) -> Mapping[int, str]:
-        """Names of the modes in AVAILABLE_MODES that are in no built-in table, by custom_mode."""
+        """Names of modes by custom_mode, from AVAILABLE_MODES: the modes that no built-in table contains."""
         return self._mode_names
 
     @property
@@ -133,9 +134,7 @@ class Telemetry(States):
 
     @property
     def is_armed(self) -> bool:
-        """True if the last heartbeat reports armed; False before the first one, and after a reboot until the next
-        one.
-        """
+        """True if the last heartbeat reports armed; False while the state is unknown."""
         return self.armed.latest is True
 
     @property
@@ -163,20 +162,20 @@ class Telemetry(States):
         """Return the status texts received at or after this time (64 at most), oldest first."""
         return self._texts.recent(at)
 
-    # -------------------------------------------------------------------------- the machinery
+    # ------------------------------------------------------------------------ updating cells
 
     def _cell_of(self, name: str) -> StateCell[Any]:
         return self._cells[name]
 
     def _time_of_arrival(self) -> float:
-        """Return the reception time of the message being decoded."""
+        """Return when the message that is being processed arrived; the present time if it has no frame."""
         return self._clock() if self._arrived_at is None else self._arrived_at
 
     def _source(self, class_name: str) -> Source:
         return Source(self.system_id, self.component_id, message_type(class_name).NAME)
 
     def _receiver(self, class_name: str, handler: Handler) -> Callable[[Any], None]:
-        """Return a function that passes messages to the handler, but only those of the vehicle's autopilot."""
+        """Return a function that passes only the messages of the vehicle's autopilot to ``handler``."""
         source = self._source(class_name)
 
         def on_message(message: Message) -> None:
@@ -188,8 +187,8 @@ class Telemetry(States):
         return on_message
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
-        """Process a message. Its values get the time at which its frame arrived, regardless of when it is decoded."""
-        # Calls may be nested: a handler may read a cell, and thereby decode another message.
+        """Process a message. Its values get the time at which its frame arrived, which may be long before this call."""
+        # Calls may be nested: a handler may read a cell, and the cell then decodes another message.
         outer_arrived_at = self._arrived_at
         self._arrived_at = None if frame is None else frame.received_at
         try:
@@ -211,7 +210,7 @@ class Telemetry(States):
             for update in updates:
                 update(message, source)
 
-        # A ground station or companion may send heartbeats with the autopilot's ids.
+        # A ground station or companion may send heartbeats with the autopilot's ids; these update no cell.
         def on_heartbeat(message: Any, source: Source) -> None:
             if self._is_of_autopilot(message):
                 update_all(message, source)
@@ -221,7 +220,10 @@ class Telemetry(States):
         return updates[0] if len(updates) == 1 else update_all
 
     def _cell_update(self, cell: StateCell[Any], message_source: MessageSource[Any]) -> Handler:
-        """Return the function that updates one cell from one type of message. Decoded values of None are ignored."""
+        """Return the function that updates one cell from one type of message.
+
+        A decoder returns None if the message does not have the value. The cell then keeps its previous value.
+        """
         decode, context = message_source.decode, self._context
         assert decode is not None
 
@@ -245,7 +247,7 @@ class Telemetry(States):
         return update_as_fallback if message_source.fallback else chosen_update
 
     def _streamed_message(self, class_name: str, handler: Handler) -> StreamedMessage:
-        """Return the object that keeps the frames of a message class, and decodes them when a cell is accessed."""
+        """Create the object that keeps the latest frame of a message class, and decodes it when a value is read."""
         source, message_class = self._source(class_name), message_type(class_name)
         decode = decoder_of(message_class)
 
@@ -268,7 +270,7 @@ class Telemetry(States):
             and self._time_of_arrival() - cell.updated_at < FALLBACK_DELAY_S
         )
 
-    # ------------------------------------------------------------- messages of more than a value
+    # --------------------------------------------------------- messages with special handling
 
     def _is_of_autopilot(self, heartbeat: messages.Heartbeat) -> bool:
         """Return False for the heartbeat of a ground station or companion that uses the autopilot's ids."""
@@ -291,8 +293,8 @@ class Telemetry(States):
             self._mode_names[message.custom_mode] = name
 
     def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
-        # The time stamp is that of processing, so that a text that explains a refusal is not older than the refused
-        # command.
+        # A text gets the time of its processing, not of its arrival. Otherwise a text that explains a refusal could be
+        # older than the refused command.
         self._publish_texts(self._texts.receive(message, self._clock()), source)
 
     def _publish_texts(self, texts: Iterable[StatusText], source: Source) -> None:
