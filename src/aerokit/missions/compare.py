@@ -322,7 +322,8 @@ def _same_place(
 
 def _float_step(value: float) -> float:
     """Return the distance between a 32-bit float and its neighbour."""
-    return math.ldexp(1.0, math.frexp(value)[1] - 24)
+    significant_bits = 24
+    return math.ldexp(1.0, math.frexp(value)[1] - significant_bits)
 
 
 def _same_altitude(expected: MissionItem, actual: MissionItem, storage: ItemStorage) -> bool:

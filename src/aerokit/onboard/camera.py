@@ -90,7 +90,7 @@ class CameraDriver:
         gimbal_id: int = 0,
     ) -> None:
         for name, text in (("vendor", vendor), ("model", model)):
-            if len(text.encode()) > 32:
+            if len(text.encode()) > 32:  # the size of the fields in CAMERA_INFORMATION
                 raise InvalidArgument(f"{name} = {text!r} is not allowed: it must have at most 32 bytes")
         self.vendor: str = vendor
         self.model: str = model

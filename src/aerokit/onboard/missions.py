@@ -138,7 +138,8 @@ class ComponentMissions:
             return False
 
     def _do_set_current(self, request: CommandRequest, index: int) -> None:
-        if not self._server.set_current(index):
+        is_accepted = self._server.set_current(index)
+        if not is_accepted:
             raise InvalidArgument(f"the mission cannot continue at item {index}")
 
 

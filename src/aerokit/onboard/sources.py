@@ -58,7 +58,7 @@ class ComponentSources:
         """
         if not 0 < len(distances_m) <= MAX_DISTANCES:
             raise InvalidArgument(f"distances_m has {len(distances_m)} values; 1 to {MAX_DISTANCES} are allowed")
-        if not 0 <= min_m < max_m <= 655:
+        if not 0 <= min_m < max_m <= 655:  # The fields have 16 bits, for centimetres.
             raise InvalidArgument(
                 f"min_m, max_m = {min_m}, {max_m} are not allowed: both must be 0 to 655, and min_m below max_m"
             )

@@ -140,7 +140,8 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             consecutive_missing = 0
             available = 1 if self._link.is_autopilot_attached else MAX_CAPTURES
             for index in range(max(0, count - available), count):
-                consecutive_missing = 0 if await self._log.fetch(index) else consecutive_missing + 1
+                capture = await self._log.fetch(index)
+                consecutive_missing = consecutive_missing + 1 if capture is None else 0
                 if consecutive_missing == MAX_CONSECUTIVE_MISSING:
                     break
             return self.captures()

@@ -118,7 +118,10 @@ class CaptureLog:
         self._requested.add(index)  # The answer, an old index, must not count as a reset of the camera.
         try:
             for _ in range(FETCH_ATTEMPTS):
-                if self.has(index) or await self._request(index):
+                if self.has(index):
+                    break
+                is_deleted = await self._request(index)
+                if is_deleted:
                     break
         finally:
             self._requested.discard(index)

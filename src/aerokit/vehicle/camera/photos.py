@@ -84,7 +84,8 @@ class Shutter:
                         if not is_old or capture.index not in known_indices:
                             return self._checked(capture)
                     round_trip_s = self.link.round_trip_s or 0.0
-                    if await new_captures.wait(max(CHECK_INTERVAL_S, 2.0 * round_trip_s)):
+                    has_arrived = await new_captures.wait(max(CHECK_INTERVAL_S, 2.0 * round_trip_s))
+                    if has_arrived:
                         continue
                     status = await self.status()
                     if status is None:
@@ -271,7 +272,8 @@ class PhotoInterval:
                 await self._fetch_missing()
                 continue
             patience_s = max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S  # longer than the interval
-            if await self._new_captures.wait(patience_s):
+            has_arrived = await self._new_captures.wait(patience_s)
+            if has_arrived:
                 silent_checks = 0
                 continue
             silent_checks += 1

@@ -161,7 +161,10 @@ class GimbalRegistry:
 
     def _on_status(self, message: GimbalManagerStatus) -> None:
         device = self._managed_device(message, message.gimbal_device_id)
-        if device is not None and device.update_status(message) and device is self.first:
+        if device is None:
+            return
+        is_newest = device.update_status(message)
+        if is_newest and device is self.first:
             self.placeholder.set_controllers(message)
 
     def _on_manager(self, message: GimbalManagerInformation) -> None:

@@ -120,7 +120,8 @@ class GimbalOrders:
             await send()
         except CommandRejected:
             self.raise_if_taken()
-            if not self.claim_if_denied(command):
+            was_claimed = self.claim_if_denied(command)
+            if not was_claimed:  # The manager refused for another reason.
                 raise
             await send()
 
@@ -183,7 +184,8 @@ class GimbalOrders:
         attitude = self.session.telemetry.attitude.latest
         heading = 0.0 if attitude is None else attitude.yaw_deg
         yaw_from_nose = yaw if from_nose else math.remainder(yaw - heading, 360.0)
-        if not await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, yaw_from_nose):
+        were_angles_sent = await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, yaw_from_nose)
+        if not were_angles_sent:
             # MOUNT_CONTROL, for older firmware, has a yaw from north, and all angles in centidegrees.
             yaw_from_north = yaw + heading if from_nose else yaw
             message = MountControl(

@@ -268,7 +268,8 @@ class PointingMixin(GimbalMixin):
         async def send() -> None:
             flags = LEVEL if from_nose else LOCKED
             # The gimbal manager's command has no roll, so an order with roll uses the mount command.
-            if roll_deg or not await orders.send_pitch_yaw(order, pitch_deg, yaw_deg, flags=flags):
+            was_sent = not roll_deg and await orders.send_pitch_yaw(order, pitch_deg, yaw_deg, flags=flags)
+            if not was_sent:
                 await orders.send_mount_angles(order, pitch_deg, roll_deg, yaw_deg, from_nose=from_nose)
 
         angles = ordered_angles(pitch_deg, yaw_deg, roll_deg or None, from_nose=from_nose)
@@ -330,7 +331,8 @@ class PointingMixin(GimbalMixin):
         orders, order = self._orders, self._orders.begin_order()
 
         async def send() -> None:
-            if not await orders.send_pitch_yaw(order, NAN, NAN, flags=flag):
+            is_supported = await orders.send_pitch_yaw(order, NAN, NAN, flags=flag)
+            if not is_supported:
                 await orders.send_mount_mode(order, mode)
 
         if not wait:

@@ -95,7 +95,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._order = orders.begin_order()
         self._in_use.enter_context(orders.device.in_use())
         try:
-            if not await orders.send_pitch_yaw(self._order, NAN, NAN, *self._value, flags=self._flags):
+            is_supported = await orders.send_pitch_yaw(self._order, NAN, NAN, *self._value, flags=self._flags)
+            if not is_supported:
                 orders.raise_not_supported("has no gimbal manager, which is needed for rates")
             self._began_at = self._now()
             orders.context.on_finish.append(self._finish)

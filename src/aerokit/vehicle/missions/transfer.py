@@ -238,7 +238,8 @@ class PlanTransfer(Generic[PlanT]):
         if len(items) == self._offset:  # The plan is empty, except for home.
             await self.clear()
             return
-        if only_changes and await self._send_changes(items, method, verify=verify):
+        is_done = only_changes and await self._send_changes(items, method, verify=verify)
+        if is_done:
             return
         self._cache.forget(self._context.now())
         if await self._uses_file(method, is_upload=True):
@@ -346,7 +347,8 @@ class PlanTransfer(Generic[PlanT]):
         # The vehicle's plan is unknown until all parts are confirmed, because the call may fail or be cancelled.
         self._cache.forget(self._context.now())
         for part in _consecutive_ranges(changed_seqs):
-            if not await self._send_part(items[part.start : part.stop], part.start, verify=verify):
+            is_supported = await self._send_part(items[part.start : part.stop], part.start, verify=verify)
+            if not is_supported:
                 return False
             vehicle_items[part.start : part.stop] = items[part.start : part.stop]
         self._cache.set(vehicle_items, self._context.now())
@@ -386,7 +388,8 @@ class PlanTransfer(Generic[PlanT]):
         if not autopilot.reports_mission_checksum or reading_takes_s < CHECKSUM_INTERVAL_S:
             return False
         checksum = mission_checksum(items)
-        if not await self._context.wait_for_plan_id(self._type, checksum):
+        has_arrived = await self._context.wait_for_plan_id(self._type, checksum)
+        if not has_arrived:
             return False
         self._cache.set(items, self._context.now())
         return True

@@ -104,7 +104,8 @@ class ParameterAccess:
                 from aerokit.vehicle.parameters.store import ParameterCache
 
                 cached_list = _CachedList(self, ParameterCache(None if cache is True else cache), idle_timeout_s)
-                if await cached_list.load_if_current(refresh):
+                is_loaded = await cached_list.load_if_current(refresh)
+                if is_loaded:
                     return self.store.table
             await self._download(method, idle_timeout_s, on_progress)
             if cached_list is not None:

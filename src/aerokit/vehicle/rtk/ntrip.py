@@ -242,8 +242,9 @@ class NtripClient:
                         continue
                     self._reconnects += 1
                     logger.info("%s: connected again", self._name)
-                    if await self._forward(response):
-                        pause_s = MIN_RETRY_S  # The caster sent corrections, so the next attempt may follow soon.
+                    message_count = await self._forward(response)
+                    if message_count > 0:  # The connection was useful, so the next attempt may follow soon.
+                        pause_s = MIN_RETRY_S
         except (ConnectionClosed, LinkLost) as error:
             self._problem = f"the vehicle's connection has ended: {error}"
         finally:
