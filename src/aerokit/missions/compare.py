@@ -332,7 +332,7 @@ def _same_altitude(expected: MissionItem, actual: MissionItem, storage: ItemStor
     if not has_place(expected.command):
         return any(_close(stored, actual.z) for stored in _stored_values(expected, "z", storage))
     if storage not in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
-        return False
+        return False  # Only ArduPilot rounds altitudes.
     if expected.command in RALLY_COMMANDS:  # ArduPilot stores whole metres.
         return math.isfinite(expected.z) and _close(math.trunc(expected.z), actual.z)
     return abs(expected.z - actual.z) <= ALTITUDE_TOLERANCE_M

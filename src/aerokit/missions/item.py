@@ -228,7 +228,7 @@ class MissionItem(Snapshot):
                 altitude_amsl_m=altitude if frame == MavFrame.GLOBAL else None,
                 altitude_relative_m=altitude if frame == MavFrame.GLOBAL_RELATIVE_ALT else None,
             )
-        except InvalidArgument:
+        except InvalidArgument:  # Items of vehicles and files may have coordinates out of range.
             return None
 
     def _key(self) -> tuple[Any, ...]:

@@ -56,7 +56,7 @@ def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapt
     streams.builders.update(camera_builders(adapter))
     for command, handler in camera_commands(adapter).items():
         if command == MavCmd.STORAGE_FORMAT and not overrides(camera, CameraDriver, "format_storage"):
-            continue
+            continue  # The command stays UNSUPPORTED.
         services.commands.add_raw(command, partial(_run, handler))
     services.commands.handlers.update(legacy_requests(streams))
     return adapter

@@ -259,7 +259,7 @@ class CameraLink(CameraOrders):
                 self._session.background.start(self._identify_again, "aerokit camera after silence")
 
     async def _identify_again(self) -> None:
-        with suppress(AerokitError):
+        with suppress(AerokitError):  # The next call to the camera identifies it again, and raises the error.
             await self.identify()
 
     def _on_reboot(self) -> None:

@@ -162,7 +162,7 @@ class Shutter:
         async def has_started() -> bool | None:
             status = await self.reliable_status()
             if status is None or before is None:
-                return None
+                return None  # Without both reports, the number of pictures cannot be compared.
             return status.is_in_series or status.is_capturing or status.image_count > before.image_count
 
         command = (START, self.link.device, seconds, count, 0)

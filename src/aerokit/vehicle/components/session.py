@@ -157,7 +157,7 @@ class _WebDownload:
         self._is_aborted = True
         for connection in self._connections:
             if connection.sock is not None:
-                with suppress(OSError):
+                with suppress(OSError):  # The connection may have ended already.
                     connection.sock.shutdown(SHUT_RDWR)
 
     def _connect_with(self, connection_type: type[HTTPConnection]) -> Callable[..., HTTPConnection]:

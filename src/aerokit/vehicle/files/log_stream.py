@@ -59,11 +59,11 @@ class UlogAssembler:
         if not self._has_header:
             self._has_header = self._is_aligned = data.startswith(MAGIC)
             if not self._has_header:
-                return b""
+                return b""  # The log begins with its header, so nothing before the header is used.
             prefix, data = data[:HEADER_BYTES], data[HEADER_BYTES:]
         elif not self._is_aligned:
             if first_offset == NO_MESSAGE_START:
-                return b""
+                return b""  # The rest of a message whose beginning was lost.
             self._is_aligned, data = True, data[first_offset:]
             gap_ms = round(1000 * (now - self._received_at))
             prefix = DROPOUT + min(0xFFFF, gap_ms).to_bytes(2, "little")  # The field has 16 bits.

@@ -360,7 +360,7 @@ async def log_path(
     for directory in directories:
         try:
             entries = await files.list(directory, idle_timeout_s=idle_timeout_s)
-        except FileError:
+        except FileError:  # The vehicle has no such directory.
             continue
         numbered: dict[int, FileEntry] = {}
         for entry in entries:
@@ -383,7 +383,7 @@ async def listed_logs(
     for directory in directories:
         try:
             entries = await files.list(directory, idle_timeout_s=idle_timeout_s)
-        except FileError:
+        except FileError:  # The vehicle has no such directory.
             continue
         logs = await _list_in(files, directory, idle_timeout_s)
         return None if entries and not logs else logs

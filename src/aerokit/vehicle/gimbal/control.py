@@ -76,7 +76,7 @@ class ReleaseCommand:
             self._send()
 
         async def send_until_acknowledged() -> None:
-            with suppress(AerokitError):
+            with suppress(AerokitError):  # This task runs in the background, so no call waits for its errors.
                 if not is_sent:
                     await self._session.wait_for_heartbeat()
                     if not self._is_still_due():
@@ -280,7 +280,7 @@ class GimbalControl:
 
         try:
             await wait(STATUS_TIMEOUT_S)
-        except OperationTimeout:
+        except OperationTimeout:  # The manager may not send its status by itself, or the message was lost.
             orders.ask_in_background(GimbalManagerStatus.ID)
             await wait(CONFIRM_TIMEOUT_S - STATUS_TIMEOUT_S)
         device = orders.device

@@ -235,7 +235,7 @@ class GimbalOrders:
         """Return the manager. If none is known, first ask the device whether it is its own manager."""
         device = self.device
         if device.manager_id is None and device.component_id:
-            with suppress(CommandRejected, CommandTimeout):
+            with suppress(CommandRejected, CommandTimeout):  # The autopilot then counts as the manager.
                 await self.ask(GimbalManagerInformation.ID, device.component_id, attempts=1)
                 await self.wait_for(lambda: device.manager_id, GimbalManagerInformation, MANAGER_TIMEOUT_S)
         return self.manager_id
@@ -256,6 +256,7 @@ class GimbalOrders:
         Returns True if control was claimed.
         """
         commands, manager_id = self.session.commands, self.manager_id
+        # An open control block has requested control itself, and reports if it loses control.
         if self.device.control_blocks or commands.last_result(command, manager_id) != MavResult.DENIED:
             return False
         commands.forget_result(command, manager_id)  # One denial must not lead to a second claim.

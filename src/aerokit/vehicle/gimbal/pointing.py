@@ -347,7 +347,7 @@ class PointingMixin(GimbalMixin):
     def _check_limits(self, pitch: float, roll: float, yaw: float | None) -> None:
         device = self._orders.device
         if device.manager_information is None or not device.checks_limits:
-            return
+            return  # The program has not requested the limits by `information()`.
         limits = information_of(device.device_id, self._orders.manager_id, device.manager_information, device=None)
         checks = (
             ("pitch_deg", pitch, limits.pitch_deg),

@@ -342,7 +342,7 @@ class ParameterAccess:
             async with self._writing:
                 await self._upload_pack(parameters, idle_timeout_s, on_progress)
             answers = await self._read_back(parameters, idle_timeout_s)
-        except (FileError, FileTimeout, NotSupported):
+        except (FileError, FileTimeout, NotSupported):  # With "auto", all parameters are set one by one instead.
             if method == "ftp":
                 raise
         not_applied = [param for param in parameters if not self._was_applied(param, answers.get(param.name))]

@@ -221,7 +221,7 @@ class NtripClient:
             if not self._session.is_closed:
                 await self._ended.wait()
             if writer is not None:
-                with suppress(OSError):
+                with suppress(OSError):  # The connection may have failed before it was closed.
                     await writer.wait_closed()
 
     async def _run(self, response: _Response) -> None:
@@ -334,6 +334,7 @@ class NtripClient:
     async def _read_source_table(self, response: _Response) -> dict[str, bool]:
         """Read a source table: map each mount point to True if it needs the position (field ``nmea``)."""
         text = b""
+        # If the table does not arrive completely, use the rows that have arrived.
         with suppress(OSError, ValueError, EOFError, asyncio.TimeoutError):
             async for data in response.body():
                 text += data
