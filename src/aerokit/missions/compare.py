@@ -327,7 +327,7 @@ def _float_step(value: float) -> float:
 
 
 def _same_altitude(expected: MissionItem, actual: MissionItem, storage: ItemStorage) -> bool:
-    if expected.command in FENCE_COMMANDS or _close(expected.z, actual.z):
+    if expected.command in FENCE_COMMANDS or _close(expected.z, actual.z):  # A fence has no altitudes.
         return True
     if not has_place(expected.command):
         return any(_close(stored, actual.z) for stored in _stored_values(expected, "z", storage))

@@ -148,7 +148,7 @@ def _missing_fields(plan: Any) -> Iterator[tuple[str, list[str]]]:
     """Yield each object of a plan with the names of the required fields that it lacks."""
     mission, fence, rally = (_member(plan, key) for key in ("mission", "geoFence", "rallyPoints"))
     document_keys = ["fileType", "version"]
-    if mission is None and fence is None and rally is None:
+    if mission is None and fence is None and rally is None:  # A plan needs one of the three, usually the mission.
         document_keys.append("mission")
     yield _missing_in("the document", plan, *document_keys)
     yield _missing_in("mission", mission, "version", "items")

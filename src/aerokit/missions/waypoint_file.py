@@ -70,6 +70,7 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
     ]
     if not rows or version[2] != "110" or not rows[0].is_home():
         return Mission([row.item() for row in rows])
+    # In the file, jump targets count home as an item, unlike in `Mission`.
     home = rows[0].home()
     return Mission(shift_jumps([row.item() for row in rows[1:]], -1), home)
 

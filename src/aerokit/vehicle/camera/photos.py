@@ -109,7 +109,8 @@ class Shutter:
         """Request the capture of the ordered picture, if the status shows that it was taken."""
         if before is not None:
             was_taken = status.image_count > before.image_count
-            return await self.log.fetch(before.image_count) if was_taken else None
+            new_index = before.image_count  # Indices begin at 0.
+            return await self.log.fetch(new_index) if was_taken else None
         # Without a status from before an accepted order, the newest picture counts as the ordered one.
         newest = status.image_count - 1
         if is_accepted and not status.is_capturing and newest >= 0 and newest not in known_indices:

@@ -325,8 +325,9 @@ class GimbalControl:
         release.send_soon()
 
     def _end(self) -> None:
+        """Forget the control that this block has requested or has. Sends nothing."""
         self._is_ended = True
-        self._lost.set()
+        self._lost.set()  # Calls of `until_lost` end too.
         requests = self._orders.registry.control_requests
         if self._control_request in requests:
             requests.remove(self._control_request)
