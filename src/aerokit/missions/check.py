@@ -124,7 +124,7 @@ def _check_frame(where: str, item: MissionItem, mission_type: int) -> None:
     _check_integer(where, "frame", item.frame, 0xFF)
     if item.frame not in _FRAMES:
         raise _wrong(where, "frame", item.frame, "a MAV_FRAME")
-    if mission_type and item.frame not in GLOBAL_FRAMES:
+    if mission_type != MavMissionType.MISSION and item.frame not in GLOBAL_FRAMES:
         raise _wrong(where, "frame", item.frame, _GLOBAL_TEXT)
     if item.command in DESTINATIONS and item.frame not in GLOBAL_FRAMES | LOCAL_FRAMES:
         raise _wrong(where, "frame", item.frame, _FRAME_TEXT)

@@ -83,7 +83,8 @@ def answer_pings(host: ComponentHost) -> None:
     def on_timesync(message: m.Timesync, channel: Channel) -> None:
         if message.tc1 == 0:  # A TIMESYNC with another value is an answer.
             own_time_ns = int(host.now * 1e9)
-            host.send(m.Timesync(own_time_ns, message.ts1, *channel), channel)
+            sender_system, sender_component = channel
+            host.send(m.Timesync(own_time_ns, message.ts1, sender_system, sender_component), channel)
 
     host.on(m.Ping, on_ping)
     host.on(m.Timesync, on_timesync)

@@ -238,7 +238,7 @@ class CameraLink(CameraOrders):
             if frame is not None and frame.component_id == component_id and self._is_from_this_camera(message):
                 callback(message)
 
-        if bus.dialect.get(message_type.ID) is not None:
+        if bus.dialect.get(message_type.ID) is not None:  # The user's dialect may lack a message.
             self._session.at_close(bus.attach(message_type, on_message, system_id=self._session.system_id))
 
     def _is_from_this_camera(self, message: Any) -> bool:

@@ -133,6 +133,7 @@ class GimbalRegistry:
         if device_id > MAX_GIMBAL_NUMBER and device_id != component_id:
             return None  # The message is about another component.
         has_own_id = component_id > MAX_GIMBAL_NUMBER and component_id != self._session.component_id
+        # A sender with its own component id may send 0 for itself.
         is_sender = device_id > MAX_GIMBAL_NUMBER or (device_id == 0 and has_own_id)
         number = 0 if is_sender else device_id or 1  # Older autopilots send 0 for their gimbal.
         return self._marked_discovered(self.device(component_id, number))
