@@ -165,7 +165,7 @@ class _WebDownload:
 
         def connect(host: str, **options: Any) -> HTTPConnection:
             if self._is_aborted:
-                raise OSError("aborted")
+                raise OSError("the download was aborted")
             connection = connection_type(host, **options)
             self._connections.append(connection)
             return connection

@@ -154,7 +154,7 @@ class FileChannel:
                         await self._close(session, path, idle_timeout_s)
                     continue
                 pause_s = SESSION_TIMEOUT_S.get(error.code)
-                # The pause may exceed the caller's idle time-out by one second.
+                # The extra second lets the default idle time-out of 10 s suffice for PX4's 10.5 s.
                 if not may_wait or pause_s is None or pause_s > idle_timeout_s + 1.0:
                     raise
                 may_wait = False

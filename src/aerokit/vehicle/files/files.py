@@ -388,6 +388,7 @@ def _content_of(source: str | os.PathLike[str]) -> bytes:
 
 def _parse_entry(text: bytes) -> FileEntry | None:
     """Parse one entry of a listing; return None for an entry that is not a file or a subdirectory."""
+    # The kind is D for a directory and F for a file. MAVFTP also has S for an entry to skip.
     kind, name_and_size = text[:1], text[1:].decode("utf-8", "replace")
     name, _, size_text = name_and_size.partition("\t")
     if kind == b"D" and name_and_size not in (".", ".."):

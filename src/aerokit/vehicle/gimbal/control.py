@@ -87,7 +87,7 @@ class ReleaseCommand:
                 except CommandTimeout:
                     if not self._is_target_silent():
                         raise
-                    # The target did not hear the command, so repeat it when the target is back.
+                    # The target did not receive the command, so repeat it when the target is back.
                     await self._wait_target_heartbeat()
                     if self._is_still_due():
                         self._send()

@@ -399,6 +399,7 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             with vehicle_context.arbiter.changing_mode():
                 await vehicle_context.sender.send_long(order, MavCmd.MISSION_START, modes=(mode,))
+                # Only PX4 refuses after it has accepted, and PX4 does not get this command.
                 await vehicle_context.sender.await_mode(
                     mode, order, refusals=[], timeout=timeout, reported_since=order.given_at
                 )
