@@ -202,7 +202,7 @@ def test_add_copies_command_and_sets_target(
     cmds.add(cmd)
     assert (cmds[3] is cmd, cmds[3].seq, cmd.seq) == (False, 4, 0)
     assert (cmd.target_system, cmds[3].target_system) == (1, 1)
-    with pytest.raises(TypeError, match="None is not allowed: a Command"):
+    with pytest.raises(TypeError, match="None is not a Command"):
         cmds.add(None)
 
 

@@ -217,7 +217,7 @@ def test_rotate_falls_back_to_mount_messages(stage: Stage) -> None:
 def test_gimbal_angles_must_be_numbers(stage: Stage, wrong: Any) -> None:
     gimbal = stage.vehicle.gimbal
     for angles in ((wrong, 0, 0), (0, wrong, 0), (0, 0, wrong)):
-        with pytest.raises(ValueError, match="a finite number of degrees"):
+        with pytest.raises(ValueError, match="must be a finite number of degrees"):
             gimbal.rotate(*angles)
     assert commands(stage, lambda: None) == []
 

@@ -57,7 +57,7 @@ def test_background_call_replaces_older_of_same_kind(loop: LoopThread) -> None:
     other = orders.start("home", for_ever, "home")
     second = orders.start("mode", soon)
     second.result(LIMIT_S)
-    with pytest.raises(ConnectionClosed, match="mode: a newer order"):
+    with pytest.raises(ConnectionClosed, match="mode: the order was cancelled or replaced"):
         first.result(LIMIT_S)
     assert not other.done()
     assert "home" not in ended

@@ -97,7 +97,7 @@ def test_install_with_another_dronekit_raises(monkeypatch: pytest.MonkeyPatch) -
     other = types.ModuleType("dronekit")
     other.__file__ = "/elsewhere/dronekit/__init__.py"
     monkeypatch.setitem(sys.modules, "dronekit", other)
-    with pytest.raises(ImportError, match=r"another dronekit was imported before, from /elsewhere/"):
+    with pytest.raises(ImportError, match=r"another dronekit was already imported from /elsewhere/"):
         install()
     uninstall()
     assert sys.modules["dronekit"] is other

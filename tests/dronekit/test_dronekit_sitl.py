@@ -90,7 +90,7 @@ def test_sitl_port_in_use_raises() -> None:
 def test_sitl_invalid_position_or_system_raises() -> None:
     with pytest.raises(InvalidArgument, match="both lat and lon"):
         start_default(lat=1.0)
-    with pytest.raises(InvalidArgument, match="not one of"):
+    with pytest.raises(InvalidArgument, match="one of copter"):
         SITL().download("boat", "stable")
 
 
@@ -124,7 +124,7 @@ def test_sim_option_serves_vehicle(
     ("arguments", "text"),
     [
         (["--sim", "--vehicle", "coptr"], "did you mean 'copter'"),
-        (["--sim", "--home", "x"], "is not LAT,LON,ALT"),
+        (["--sim", "--home", "x"], "it must be LAT,LON,ALT"),
         (["-m", "no_such_module"], "No module named no_such_module"),
     ],
 )

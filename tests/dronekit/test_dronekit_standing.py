@@ -73,7 +73,7 @@ def test_unanswered_arming_warns_about_late_effect(
     vehicle.armed = True
     vehicle._handler.calls.wait(LIMIT_S)
     (record,) = caplog.records
-    assert record.message.endswith("; it may still be carried out, and is not monitored")
+    assert record.message.endswith("; the vehicle may still execute the command, which is not monitored any more")
 
 
 def test_pilot_takeover_before_order_arrives_is_kept(

@@ -65,7 +65,7 @@ async def test_ten_members_land_by_policy_after_one_is_lost() -> None:
             PolicyCompleted,
         ]
         assert received[2].orders == dict.fromkeys(others, "land")
-        with pytest.raises(FleetError, match="0 of 10 succeeded") as caught:
+        with pytest.raises(FleetError, match="0 of 10 members succeeded") as caught:
             result.raise_for_errors()
         assert set(caught.value.errors) == set(stage.copters)
 

@@ -143,7 +143,7 @@ async def test_fleet_invalid_arguments_are_rejected(options: dict[str, Any], mat
 
 
 async def test_fleet_without_sources_is_rejected() -> None:
-    with pytest.raises(InvalidArgument, match="needs an address"):
+    with pytest.raises(InvalidArgument, match="needs at least one address"):
         async with aerokit.fleet():
             raise AssertionError
 
@@ -258,7 +258,7 @@ def test_fleet_result_shows_failed_and_skipped_members() -> None:
     result = FleetResult("land", {"a": None, "b": error}, failed={"b": error}, stopped={}, skipped={"c": "lost"})
     assert repr(result) == "<FleetResult of land: 1 of 2 done; failed: b; skipped: c>"
     assert dict(result) == {"a": None, "b": error}
-    with pytest.raises(aerokit.errors.FleetError, match=r"land: 1 of 2 succeeded\n  - b: no"):
+    with pytest.raises(aerokit.errors.FleetError, match=r"land: 1 of 2 members succeeded\n  - b: no"):
         result.raise_for_errors()
 
 

@@ -130,7 +130,7 @@ async def test_missions_upload_and_start_together() -> None:
             await stage.fleet.start_missions()
         (await stage.fleet.wait_ready()).raise_for_errors()
         (await stage.fleet.upload(missions)).raise_for_errors()
-        with pytest.raises(OperationRejected, match="not armed: north/1, north/2, north/3"):
+        with pytest.raises(OperationRejected, match="members not armed: north/1, north/2, north/3"):
             await stage.fleet.start_missions()
         (await stage.fleet.arm()).raise_for_errors()
         (await stage.fleet.start_missions()).raise_for_errors()

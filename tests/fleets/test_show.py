@@ -112,11 +112,11 @@ async def test_invalid_show_is_rejected() -> None:
         near = Show.from_points({"north/1": circle(0, 0, 5), "north/2": circle(0, 3, 5)})
         with pytest.raises(OperationRejected, match=r"within 2\.\d m"):
             await stage.fleet.fly_show(near, ORIGIN)
-        with pytest.raises(InvalidArgument, match="'x' is not one of"):
+        with pytest.raises(InvalidArgument, match="'x' is not a member"):
             await stage.fleet.fly_show(Show.from_points({"x": circle(0, 0, 5)}), ORIGIN)
         stage.copters["north/2"].faults.silent = True
         far = Show.from_points({"north/1": circle(0, 0, 5), "north/2": circle(0, 30, 5)})
-        with pytest.raises(FleetError, match="TIMESYNC was not answered"):
+        with pytest.raises(FleetError, match="did not answer TIMESYNC"):
             await stage.fleet.fly_show(far, ORIGIN)
         assert not stage.modes_ordered("north/2")
 
@@ -182,7 +182,7 @@ def test_show_file_round_trip(tmp_path: FilePath) -> None:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("", "line 1 is not name,t_s"),
+        ("", "line 1 must be name,t_s"),
         ("name,t_s,north_m,east_m,up_m\na,0,1,2\n", "line 2"),
         ("name,t_s,north_m,east_m,up_m\na,0,1,2,3\na,1,x,2,3\n", "line 3"),
         ("name,t_s,north_m,east_m,up_m\na,1,1,2,3\na,0,1,2,3\n", "decrease at 0 s"),

@@ -1,4 +1,4 @@
-"""Text for events, for the terminal monitor and ``aerokit events``."""
+"""Texts of events for the terminal monitor and ``aerokit events``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def event_details(event: Event) -> str:
     parts = []
     for name, value in fields.items():
         if name in ("at", "system_id") or (name == "before" and "after" in fields):
-            continue
+            continue  # `before` is shown together with `after`
         if name == "after":
             before = fields.get("before")
             parts.append(format_value(value) if before is None else f"{format_value(before)} → {format_value(value)}")

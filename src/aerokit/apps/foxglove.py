@@ -1,4 +1,4 @@
-"""Vehicles live in Foxglove: ``async with foxglove_bridge(connection): ...``.
+"""Shows vehicles live in Foxglove: ``async with foxglove_bridge(connection): ...``.
 
 Needs foxglove-sdk (``pip install 'aerokit-mavlink[foxglove]'``); see docs/convert.md. ``aerokit convert``
 writes the same topics to an ``.mcap`` file.
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
 __all__ = ["FoxgloveBridge", "foxglove_bridge"]
 
 MAX_RATE_HZ = 100.0
-# Maximum number of queued messages for each viewer. If the queue is full, the SDK drops the oldest message.
+# Maximum number of messages that are queued for each viewer. If a queue is full, the SDK drops its oldest message.
 _MAX_BACKLOG = 512
-# Maximum time to wait until the SDK has closed the port.
+# How long to wait until the SDK has closed the port.
 _PORT_CLOSE_TIMEOUT_S = 2.0
 _LINK_INTERVAL_S = 1.0
 
 
 class FoxgloveBridge:
-    """A running server for viewers, from :func:`foxglove_bridge`."""
+    """A running server for Foxglove viewers. :func:`foxglove_bridge` yields it."""
 
     def __init__(self, server: Any, vehicles: Mapping[int, Vehicle], host: str) -> None:
         self._server = server
@@ -73,15 +73,15 @@ async def foxglove_bridge(
     and only while a viewer subscribes to the topic; docs/convert.md lists the topics. There is no password: every
     client that can reach the port can see all data.
 
-    foxglove-sdk runs the server on two threads, which start with the first bridge of a process. The server and its
-    sockets end with the block; the idle threads end with the process.
+    foxglove-sdk runs the server on two threads, which start with the first bridge of the process. The server and its
+    sockets are closed at the end of the block; the threads stay, idle, until the process ends.
 
     Args:
         connection: a connection from :func:`aerokit.open_connection`.
         host: address to listen on; ``"0.0.0.0"`` for all interfaces.
         port: TCP port, 0 to 65535; 0 for any free port.
         rate_hz: maximum rate of each topic, above 0, at most 100.
-        messages: names of MAVLink messages to show unconverted; ``*`` and ``?`` are wildcards: ``["GPS_*"]``.
+        messages: names of MAVLink messages to show without conversion; ``*`` and ``?`` are wildcards: ``["GPS_*"]``.
         rates: maps message classes to the rates in Hz that are requested from each vehicle, as in
             :func:`aerokit.connect`; ``{}`` requests nothing.
         on_found: called with each new vehicle, in the event loop.
@@ -93,7 +93,7 @@ async def foxglove_bridge(
         ModuleNotFoundError: foxglove-sdk is not installed.
     """
     if not 0 < rate_hz <= MAX_RATE_HZ:
-        raise InvalidArgument(f"rate_hz = {rate_hz} is not allowed: above 0, at most {MAX_RATE_HZ:g}")
+        raise InvalidArgument(f"rate_hz = {rate_hz} is not allowed: it must be above 0 and at most {MAX_RATE_HZ:g}")
     if not 0 <= port <= 65535:
         raise InvalidArgument(f"port = {port} is not allowed: 0 to 65535")
     message_types = _message_types(connection, messages)
@@ -135,11 +135,11 @@ def _serve(channels: _TopicChannels, host: str, port: int) -> Any:
             message_backlog_size=_MAX_BACKLOG,
         )
     except RuntimeError as error:
-        raise LinkOpenError(f"cannot serve Foxglove on {host} port {port}: {error}") from None
+        raise LinkOpenError(f"cannot listen for Foxglove on {host}, port {port}: {error}") from None
 
 
 async def _stop(server: Any, host: str) -> None:
-    """Stop the server, and wait until its thread has closed the socket, which happens after ``stop`` returns."""
+    """Stop the server, and wait until its thread has closed the socket, which ``stop`` itself does not wait for."""
     port = server.port
     server.stop()
     with anyio.move_on_after(_PORT_CLOSE_TIMEOUT_S, shield=True):
@@ -154,18 +154,18 @@ async def _repeat(action: Callable[[], None], interval_s: float) -> None:
 
 
 class _Listener:
-    """Receives subscriptions of viewers, on threads of the SDK."""
+    """Receives the subscriptions of viewers. The SDK calls its methods on threads of the SDK."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, channels: _TopicChannels) -> None:
         self._loop, self._channels = loop, channels
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        # Send the current value to the new viewer. `publish` sends new values only.
+        # `publish` sends new values only, so the new viewer gets the current value here.
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._channels.send_again, channel.topic)
 
     def on_unsubscribe(self, client: Any, channel: Any) -> None:
-        pass  # publish() skips topics without viewers
+        pass  # nothing to do, because publish() skips topics without viewers
 
 
 class _TopicChannels:
@@ -182,8 +182,8 @@ class _TopicChannels:
         self._messages: dict[tuple[int, int, int], Message] = {}
 
     def send_again(self, topic: str) -> None:
-        """Send the current value of a topic again, for a new viewer. Texts are sent from the buffer."""
-        if not topic.endswith("/log"):
+        """Send the current value of a topic again, because a new viewer has subscribed."""
+        if not topic.endswith("/log"):  # otherwise the other viewers would get all texts again
             self._sent_at.pop(topic, None)  # so that `publish` sends the current value
 
     def on_message(self, message: Message) -> None:
@@ -218,6 +218,7 @@ class _TopicChannels:
                 continue
             if self._needs_sending(name, cell.updated_at, partial(topics.state_topic, system_id, state, value)):
                 self._send(name, cell.updated_at, topics.state_fields(value))
+        # The link's statistics change with every frame, so they are sent at an interval.
         name, now = topics.vehicle_topic(system_id, "link"), self._connection.now()
         if now - self._sent_at.get(name, -_LINK_INTERVAL_S) >= _LINK_INTERVAL_S:
             link = overview(vehicle)["link"]
@@ -225,6 +226,7 @@ class _TopicChannels:
                 self._send(name, now, link)
 
     def _publish_pose(self, system_id: int, vehicle: Vehicle) -> None:
+        """Send the location, and the pose in the map frame, which combines position and attitude."""
         position, attitude = vehicle.position.latest, vehicle.attitude.latest
         if position is None:
             return
@@ -251,9 +253,9 @@ class _TopicChannels:
                 self._send(name, text.at, topics.log_entry(self._to_unix_time(text.at), system_id, text))
 
     def _needs_sending(self, name: str, updated_at: float, make_topic: Callable[[], Topic]) -> bool:
-        """Return True if a viewer subscribes to the topic, and the value is newer than the last value sent.
+        """Return True if a viewer subscribes to the topic and the value is newer than the last value sent.
 
-        Creates the channel of the topic with its first value.
+        Creates the channel when the topic has its first value; the type of a channel depends on the value.
         """
         channel = self._channels.get(name)
         if channel is None:

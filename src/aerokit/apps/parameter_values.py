@@ -1,4 +1,4 @@
-"""Check of parameter values against metadata, for ``aerokit params`` and ``aerokit serve``."""
+"""Checks parameter values against metadata, for ``aerokit params`` and ``aerokit serve``."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 def check_values(metadata: Metadata | None, values: Mapping[str, float], force: str) -> None:
-    """Raise InvalidArgument with all values that the metadata does not allow. Unknown names are accepted.
+    """Raise InvalidArgument if the metadata does not allow a value; the text lists all such values.
 
-    ``force`` is the option with which the user can set such values, too; it appears in the error text.
+    Names without metadata are accepted. The text names ``force``, the option that sets such values nevertheless.
     """
     if metadata is None:
         return
@@ -27,9 +27,9 @@ def check_values(metadata: Metadata | None, values: Mapping[str, float], force: 
 
 
 def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: str) -> ParameterWrite:
-    """Return the result with a note that says if the value was set without a check of its range.
+    """Add a note to the result if the value was set without a check of its range; return the result.
 
-    ``option`` is the option that gives the metadata; it appears in the note.
+    The note names ``option``, the option that gives the metadata.
     """
     if result.error is not None or result.outcome == "unchanged":
         return result
@@ -43,7 +43,7 @@ def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: s
 
 
 def _problem(metadata: Metadata, name: str, value: float) -> str | None:
-    """Return the reason why the value is not allowed, with the name and unit that the user gave; None if it is."""
+    """Return why the value is not allowed, with the name and unit that the user gave; None if it is allowed."""
     entry, convert = metadata_entry(metadata, name)
     problem = None if entry is None else entry.problem(convert(value))
     if problem is None or entry is None or entry.name == name:
@@ -52,7 +52,7 @@ def _problem(metadata: Metadata, name: str, value: float) -> str | None:
 
 
 def metadata_entry(metadata: Metadata, name: str) -> tuple[ParameterMetadata | None, Callable[[float], float]]:
-    """Return the metadata of a parameter under any of its names, and the conversion to its unit."""
+    """Return the metadata of a parameter under any of its names, and a function that converts values to its unit."""
     from aerokit.parameters.renames import resolve_rename
 
     for spelling in (name, name.upper()):

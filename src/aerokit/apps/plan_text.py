@@ -1,4 +1,4 @@
-"""Text of plans in either file format: .plan (QGroundControl) or QGC WPL 110."""
+"""Parses plans in both file formats: .plan (QGroundControl) and QGC WPL 110."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ def parse_plan_text(text: str, name: str) -> Plan:
     """Parse the text of a .plan or QGC WPL 110 file, and check the parts of the plan.
 
     Raises:
-        FileFormatError: the text has neither format. The error begins with ``name`` and the position.
-        InvalidArgument: an item cannot be sent.
+        FileFormatError: the text has neither format. The error text begins with ``name`` and the position.
+        InvalidArgument: an item of the plan cannot be sent to a vehicle.
     """
     from aerokit.missions import Plan, parse_plan, parse_waypoints
 

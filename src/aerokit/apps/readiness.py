@@ -1,4 +1,4 @@
-"""Words for what a vehicle lacks: whether it cannot arm, or arms but is not ready to fly by itself."""
+"""Texts about what a vehicle lacks, either to arm, or to fly by itself after arming."""
 
 from __future__ import annotations
 
@@ -13,37 +13,40 @@ _OWN_FLIGHT_PURPOSES: tuple[Literal["setpoint", "mission", "return"], ...] = ("s
 
 
 class Readiness(NamedTuple):
-    """Reasons of a disarmed vehicle, in two groups. A reason is in one of them."""
+    """Reasons why a disarmed vehicle cannot arm or fly, in two groups without duplicates."""
 
     against_arming: tuple[str, ...]
-    """Why arming is refused in the present mode."""
+    """Reasons why the vehicle refuses to arm in its present mode."""
     against_flight: tuple[str, ...]
-    """The rest that is missing for take-off and for flight in the modes that need a position."""
+    """Other reasons, which prevent a take-off and modes that need a position."""
     is_known: bool = True
-    """False if the vehicle does not report whether it arms. ``against_arming`` then has the missing reports."""
+    """False if it is unknown whether the vehicle arms. ``against_arming`` then names the reports that are missing."""
 
     @property
     def prefix(self) -> str:
-        """Words before the reasons against arming."""
+        """Words to print before the reasons in ``against_arming``."""
         return "cannot arm" if self.is_known else "not known whether it arms"
 
 
 def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None) -> Readiness:
-    """Group what the vehicle lacks.
+    """Return what a vehicle lacks, grouped by whether it prevents arming.
 
     Args:
-        vehicle: its state is used; nothing is sent.
-        reasons: result of ``why_not_armable()``. None: the vehicle was not asked, and SYS_STATUS decides.
+        vehicle: the vehicle, whose known state is used. Nothing is sent to it.
+        reasons: result of ``vehicle.why_not_armable()``; None: decide by SYS_STATUS.
     """
     missing, sensors = vehicle.missing_for_flight(), vehicle.sensors.latest
-    passes = sensors is not None and sensors.prearm_checks_pass is True
+    checks_pass = sensors is not None and sensors.prearm_checks_pass is True
     only_estimates = all(_is_about_estimates(text) for text in (missing if reasons is None else reasons))
-    if passes and only_estimates:  # ArduCopter arms in STABILIZE without a position, for example
+    # For example, ArduCopter without a position arms in STABILIZE.
+    if checks_pass and only_estimates:
         return Readiness((), tuple(dict.fromkeys([*(reasons or ()), *missing])))
     against = tuple(missing if reasons is None else reasons)
     is_known = not any(text.startswith(("heartbeats (", "sensors (")) for text in against)
-    bare = {vehicle.autopilot.arming_reason(text) for text in against}
-    return Readiness(against, tuple(text for text in missing if text not in against and text not in bare), is_known)
+    # The same reason may be in a status text of the autopilot, there with a prefix.
+    without_prefix = {vehicle.autopilot.arming_reason(text) for text in against}
+    others = tuple(text for text in missing if text not in against and text not in without_prefix)
+    return Readiness(against, others, is_known)
 
 
 def _is_about_estimates(text: str) -> bool:
@@ -51,19 +54,19 @@ def _is_about_estimates(text: str) -> bool:
 
 
 def own_flight_modes(vehicle: Vehicle) -> str:
-    """Return the names of the modes in which the vehicle flies by itself: ``GUIDED, AUTO, RTL``."""
+    """Return the names of the modes in which the vehicle flies by itself, such as ``GUIDED, AUTO, RTL``."""
     mode_for, is_vtol = vehicle.autopilot.mode_for, vehicle.is_vtol
     modes = (mode_for(purpose, is_vtol=is_vtol) for purpose in _OWN_FLIGHT_PURPOSES)
     return ", ".join(dict.fromkeys(mode.name for mode in modes if mode is not None))
 
 
 def arms_but(vehicle: Vehicle) -> str:
-    """Return the words for a vehicle that lacks something for flight only."""
+    """Return words for a vehicle that can arm, but not fly by itself."""
     return f"arms in {vehicle.mode_name}, but cannot take off by itself or fly {own_flight_modes(vehicle)}"
 
 
 def readiness_lines(vehicle: Vehicle, found: Readiness) -> list[str]:
-    """Return lines of text. Empty if nothing is missing."""
+    """Return the reasons as lines of text; empty if nothing is missing."""
     lines = [f"{f'{found.prefix}: ' if place == 0 else '  '}{text}" for place, text in enumerate(found.against_arming)]
     if found.against_flight:
         words = "also missing for flight" if lines else arms_but(vehicle)

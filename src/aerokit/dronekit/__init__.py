@@ -1,4 +1,4 @@
-"""The classic API of DroneKit-Python 2.9, blocking and thread-safe: unmodified programs run.
+"""The blocking, thread-safe API of DroneKit-Python 2.9. Programs for DroneKit run unmodified.
 
 ```python
 from aerokit.dronekit import VehicleMode, connect
@@ -10,8 +10,8 @@ vehicle.close()
 ```
 
 A program with ``import dronekit`` runs unchanged with ``python -m aerokit.dronekit program.py`` (or ``aerokit run
-program.py``). ``import aerokit.dronekit as dronekit`` is the one-line port. :func:`install` makes ``import dronekit``
-work in a test runner. docs/from-dronekit.md lists the differences from DroneKit.
+program.py``). To port a program by one line, write ``import aerokit.dronekit as dronekit``. :func:`install`
+makes ``import dronekit`` work in a test runner. docs/from-dronekit.md lists the differences from DroneKit.
 
 Programs can move to the new API function by function: ``vehicle.sync`` is the blocking API on the same connection,
 ``vehicle.aio`` the asynchronous vehicle.
@@ -62,10 +62,10 @@ if TYPE_CHECKING:
     from aerokit.dronekit.runner import install
     from aerokit.dronekit.vehicle import Vehicle, connect, default_still_waiting_callback
 
-monotonic = time  # DroneKit exports the package `monotonic`; its only function is `monotonic`
+monotonic = time  # DroneKit exports the package `monotonic`, whose only function `time` has, too
 
 basestring: tuple[type[str], type[bytes]] = (str, bytes)
-"""String types for ``isinstance`` checks in programs that also ran on Python 2."""
+"""The string types, for ``isinstance`` checks in programs that were written for Python 2."""
 
 __all__ = [
     "APIException",

@@ -1,4 +1,4 @@
-"""The attributes of a vehicle and its location: how messages update them and when listeners are notified."""
+"""The attributes of a vehicle and of its location, which messages update, and the notification of their listeners."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 
 # Names of MAV_STATE by value.
 STATES = ("UNINIT", "BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL", "EMERGENCY", "POWEROFF")
-# Flags of EKF_STATUS_REPORT, which are also those of ESTIMATOR_STATUS.
+# Flags of EKF_STATUS_REPORT. ESTIMATOR_STATUS has the same flags.
 POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
     EkfStatusFlags.POS_HORIZ_ABS.value,
     EkfStatusFlags.CONST_POS_MODE.value,
     EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
 )
 FACING_DOWN = 25  # MAV_SENSOR_ROTATION_PITCH_270
-NO_MODE = (None, "INITIALISING", "MAV")  # names that stand for no mode, while the vehicle boots
+NO_MODE = (None, "INITIALISING", "MAV")  # mode names while the vehicle boots and has no flight mode yet
 GLOBAL_FRAMES = ("location.global_relative_frame", "location.global_frame")
 LOCAL_FRAME = "location.local_frame"
 
@@ -70,7 +70,7 @@ class Locations(HasObservers, LocationPrivates):
         if message is None:
             return LocationGlobal(None, None, None)
         latitude, longitude = _position_of(message)
-        if message.alt == 0 and not self._has_altitude:  # 0 may stand for an unknown altitude
+        if message.alt == 0 and not self._has_altitude:  # the vehicle may send 0 for an unknown altitude
             return LocationGlobal(latitude, longitude, None)
         return LocationGlobal(latitude, longitude, message.alt / 1000.0)
 
@@ -99,7 +99,7 @@ class Locations(HasObservers, LocationPrivates):
         self._core.listeners.announce("location")
 
     def _announce(self, frame: str) -> None:
-        """Notify listeners of this object, then listeners of the vehicle, which use the prefix ``location.``."""
+        """Notify this object's listeners of ``name``, then the vehicle's listeners of ``location.name``."""
         self._dk_listeners.announce(frame)
         self._core.listeners.announce(f"location.{frame}")
 
@@ -110,7 +110,9 @@ def _position_of(message: m.GlobalPositionInt) -> tuple[float | None, float | No
 
 
 class VehicleAttributes(VehicleCore):
-    """DroneKit's attributes of a vehicle. Reading one returns the latest value without waiting, on any thread.
+    """DroneKit's attributes of a vehicle.
+
+    Reading an attribute returns the latest value without waiting, on any thread.
 
     Each message is stored by a single assignment, so that values read together are from the same message.
     """
@@ -130,6 +132,7 @@ class VehicleAttributes(VehicleCore):
     def __init__(self, handler: MAVConnection) -> None:
         super().__init__(handler)
         core = self._dk
+        # Core.on() and Core.announce() return an object that holds the latest message of the type.
         self._location = Locations(self)
         core.on(m.Heartbeat, self._dk_on_heartbeat)
         self._dk_position = core.announce(m.GlobalPositionInt, "velocity")
@@ -155,7 +158,10 @@ class VehicleAttributes(VehicleCore):
 
     @property
     def system_status(self) -> SystemStatus | Any:
-        """HEARTBEAT.system_status by name (``'STANDBY'``, ``'ACTIVE'`` …); None before the first, or if unknown."""
+        """HEARTBEAT.system_status by name (``'STANDBY'``, ``'ACTIVE'`` …).
+
+        None before the first HEARTBEAT, or if the number has no name.
+        """
         heartbeat = self._dk_heartbeat
         if heartbeat is None or heartbeat.system_status >= len(STATES):
             return None
@@ -184,7 +190,7 @@ class VehicleAttributes(VehicleCore):
 
     @property
     def battery(self) -> Battery | Any:
-        """Voltage, current and level of the main battery (SYS_STATUS); None before the first."""
+        """Voltage, current and level of the main battery; None before the first SYS_STATUS."""
         message = self._dk_sys_status.message
         if message is None:
             return None
@@ -199,26 +205,31 @@ class VehicleAttributes(VehicleCore):
 
     @OverridableProperty
     def wind(self) -> Wind:
-        """Wind direction (from) in degrees and speed in m/s (WIND of ArduPilot)."""
+        """Direction from which the wind blows, in degrees, and its speed in m/s (ArduPilot's WIND)."""
         return Wind(*self._dk_wind.values("direction", "speed", "speed_z"))
 
     @property
     def ekf_ok(self) -> bool:
-        """True if the estimator allows flight: absolute position when armed, existing or predicted when disarmed."""
+        """True if the estimator's position is good enough for flight.
+
+        An armed vehicle needs an absolute position. For a disarmed vehicle, a predicted position is enough.
+        """
         return self._dk_ekf_ok
 
     @property
     def is_armable(self) -> bool:
-        """True if the vehicle has booted and has a GPS fix and a (predicted) position; on PX4, if its checks pass.
+        """True if the vehicle has booted and seems ready to arm.
 
-        The vehicle's own arming checks may still fail. :meth:`Vehicle.arm` reports the reasons.
+        ArduPilot needs a GPS fix and a predicted position; on PX4, the vehicle's pre-arm checks must pass. The
+        vehicle's other arming checks may still fail. :meth:`Vehicle.arm` reports the reasons.
         """
         if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False
         aio = self._dk.aio_or_none
-        if aio is not None and aio.autopilot.prearm_depends_on_mode:  # PX4
+        if aio is not None and aio.autopilot.prearm_depends_on_mode:  # PX4, whose checks are a bit of SYS_STATUS
             status = self._dk_sys_status.message
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
+        # Like DroneKit: any fix (2D or better), and a predicted position of the estimator.
         gps = self._dk_gps.message
         return gps is not None and gps.fix_type > 1 and bool((self._dk_ekf_flags or 0) & PRED_POS_HORIZ_ABS)
 
@@ -235,7 +246,7 @@ class VehicleAttributes(VehicleCore):
 
     @property
     def last_heartbeat(self) -> float | Any:
-        """Seconds since the autopilot's last HEARTBEAT; None before the first."""
+        """Seconds since the autopilot's last HEARTBEAT; None before the first HEARTBEAT."""
         return None if self._dk.aio_or_none is None else self._dk.aio_or_none.heartbeat_age
 
     @property
@@ -246,7 +257,7 @@ class VehicleAttributes(VehicleCore):
     # ----------------------------------------------------------------------------- receiving
 
     def _dk_on_heartbeat(self, message: m.Heartbeat) -> None:
-        if not is_autopilot(message):  # a ground station or companion that uses the autopilot's ids
+        if not is_autopilot(message):  # sent by a ground station or companion that uses the autopilot's ids
             return
         self._handler.match_mavlink_version(message)
         self._dk_heartbeat = message
@@ -257,8 +268,8 @@ class VehicleAttributes(VehicleCore):
         self._dk.ready.mark("last_heartbeat")
 
     def _dk_on_distance_sensor(self, message: m.DistanceSensor) -> None:
-        is_needed = self._dk_rangefinder.message is None  # RANGEFINDER takes precedence
-        if message.orientation == FACING_DOWN and is_needed:
+        has_rangefinder_message = self._dk_rangefinder.message is not None  # RANGEFINDER takes precedence
+        if message.orientation == FACING_DOWN and not has_rangefinder_message:
             self._dk_distance_down = message.current_distance / 100.0
             self._dk.listeners.announce("rangefinder")
 

@@ -1,4 +1,4 @@
-"""``Channels`` and ``ChannelsOverride``: RC input, and overriding it."""
+"""``Channels``: the vehicle's RC input. ``ChannelsOverride``: values that replace it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.dronekit.core import VehicleCore
 
 MIN_CHANNELS, MAX_CHANNELS = 8, 18
-UNUSED = 0xFFFF  # in RC_CHANNELS: no such channel; in an override: leave the channel unchanged
+UNUSED = 0xFFFF  # RC_CHANNELS: the channel does not exist; RC_CHANNELS_OVERRIDE: the channel stays unchanged
 NUMBERS = tuple(str(number) for number in range(1, MAX_CHANNELS + 1))
 ALL_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS))
 FIRST_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS[:MIN_CHANNELS]))
@@ -29,7 +29,7 @@ MISSING: Any = object()
 class _ChannelDict(dict[Any, Any], Python2Mapping[Any]):
     """A dict of channels, whose keys are numbers as strings or integers.
 
-    Its views are those of a copy, because values are received while programs iterate.
+    ``keys()``, ``values()`` and ``items()`` are views of a copy, because messages change the dict at any time.
     """
 
     def __getitem__(self, channel: str | int) -> Any:
@@ -52,11 +52,11 @@ class _ChannelDict(dict[Any, Any], Python2Mapping[Any]):
 
     @classmethod
     def fromkeys(cls, channels: Iterable[Any], value: Any = None) -> dict[Any, Any]:
-        return dict.fromkeys(channels, value)  # a plain dict, because this class belongs to a vehicle
+        return dict.fromkeys(channels, value)  # a plain dict: instances of this class belong to a vehicle
 
 
 def _unsupported(name: str) -> Any:
-    """Return a method that raises TypeError."""
+    """Return a method that raises TypeError; ``name`` appears in the text."""
 
     def refuse(*_: object, **__: object) -> NoReturn:
         raise TypeError(f"{name} is not supported on Channels object")
@@ -85,7 +85,7 @@ class Channels(_ChannelDict):
 
     @property
     def count(self) -> int:
-        """Number of channels. Can be set to 8 to 18; other values raise ValueError."""
+        """Number of channels. Programs can set it to 8 to 18; other numbers raise ValueError."""
         return self._count
 
     @count.setter
@@ -108,7 +108,7 @@ class Channels(_ChannelDict):
 
     # --------------------------------------------------------------------------------- private
 
-    if not TYPE_CHECKING:  # the base class dict has these methods with other types
+    if not TYPE_CHECKING:  # hidden from type checkers, because dict has these methods with other types
         __setitem__, __delitem__, __ior__ = map(_unsupported, ("__setitem__", "__delitem__", "__ior__"))
         clear, pop, popitem = map(_unsupported, ("clear", "pop", "popitem"))
         setdefault, update = map(_unsupported, ("setdefault", "update"))
@@ -124,11 +124,12 @@ class Channels(_ChannelDict):
         self._store(first_index, FIRST_VALUES(message))
 
     def _store(self, first_index: int, received: tuple[int, ...]) -> None:
-        """Set channels from number ``first_index + 1`` on, up to the number of channels."""
+        """Store values of consecutive channels, the first of which has the number ``first_index + 1``."""
         with self._changing:
             numbers = NUMBERS[first_index : self._count]
             values = (None if value == UNUSED else value for value in received)
-            dict.update(self, dict(zip(numbers, values, strict=False)))  # one update, so that readers see all or none
+            # One call, so that other threads see all new values or none.
+            dict.update(self, dict(zip(numbers, values, strict=False)))
         self._core.listeners.notify("channels", self)
 
     def _set_count(self, count: int) -> None:
@@ -154,7 +155,7 @@ class ChannelsOverride(_ChannelDict):
         self._core = core_of(vehicle)
         self.count = MIN_CHANNELS
         """Number of channels that can be overridden."""
-        self._released: set[str] = set()  # those above 8 are released again with every message
+        self._released: set[str] = set()  # channels above 8 in this set are released again with every message
         self._changing = threading.RLock()
 
     def __setitem__(self, channel: str | int, value: float | None) -> None:
@@ -168,7 +169,7 @@ class ChannelsOverride(_ChannelDict):
         return self
 
     def update(self, *others: Any, **more: Any) -> None:
-        """Override these channels in addition, with one message."""
+        """Override these channels with one message; other overrides stay."""
         self._change(dict(*others, **more))
 
     def clear(self) -> None:
@@ -176,7 +177,10 @@ class ChannelsOverride(_ChannelDict):
         self._replace({})
 
     def pop(self, channel: str | int, default: Any = MISSING) -> Any:
-        """Release a channel and return its value, or ``default``, or raise KeyError."""
+        """Release a channel and return its value.
+
+        If the channel is not overridden, return ``default``, or raise KeyError without a default.
+        """
         with self._changing:
             if channel in self:
                 value = self[channel]
@@ -195,7 +199,7 @@ class ChannelsOverride(_ChannelDict):
             return last_channel, self.pop(last_channel)
 
     def setdefault(self, channel: str | int, default: Any = None) -> Any:
-        """Override a channel unless it is overridden; return its value."""
+        """Override a channel unless it is already overridden; return the value of its override."""
         with self._changing:
             if channel not in self:
                 self._change({channel: default})
@@ -210,17 +214,18 @@ class ChannelsOverride(_ChannelDict):
             self._apply({**self.copy(), **self._checked(overrides)})
 
     def _apply(self, overrides: dict[str, int]) -> None:
-        """Make these the only overrides; a value of 0 releases its channel."""
+        """Replace all overrides by these; a value of 0 releases its channel."""
         active = {channel: value for channel, value in overrides.items() if value}
+        # Earlier releases are repeated, in case their message was lost.
         released = (self._released | self.keys()) - active.keys()
-        self._send(active, released)  # before anything changes here, because sending may fail
+        self._send(active, released)  # may raise, so this dict changes only afterwards
         for channel in self.keys() - active.keys():
             dict.pop(self, channel)
         dict.update(self, active)
         self._released = released
 
     def _checked(self, overrides: Mapping[Any, float | None]) -> dict[str, int]:
-        """Return the values by channel number (a string); 0 releases the channel."""
+        """Check overrides; return microseconds by channel number as a string (0: release the channel)."""
         checked: dict[str, int] = {}
         for channel, value in overrides.items():
             number = int(channel)
@@ -233,7 +238,7 @@ class ChannelsOverride(_ChannelDict):
         aio = self._core.check_link()
         if aio.connection.mavlink_version == 1 and any(int(channel) > MIN_CHANNELS for channel in active):
             raise APIException("channels above 8 need MAVLink 2, and this vehicle uses MAVLink 1")
-        # 0 releases a channel up to 8, and leaves a channel above 8 unchanged.
+        # 0 releases channels 1 to 8 and leaves higher channels unchanged; RELEASE_UPPER releases higher channels.
         values = [active.get(number, 0) for number in NUMBERS]
         for channel in released:
             if int(channel) > MIN_CHANNELS:
@@ -242,7 +247,10 @@ class ChannelsOverride(_ChannelDict):
 
 
 def _checked_value(number: int, value: Any) -> int:
-    """Return microseconds, 0 to release the channel; InvalidArgument names the channel."""
+    """Check a channel's value and return it in microseconds (0: release the channel).
+
+    Raises InvalidArgument, whose text names the channel.
+    """
     if value is None:
         return 0
     with contextlib.suppress(TypeError, ValueError, OverflowError):
@@ -250,5 +258,6 @@ def _checked_value(number: int, value: Any) -> int:
         if 0 <= microseconds <= UNUSED:
             return int(microseconds)
     raise InvalidArgument(
-        f"channel {number} = {value!r} is not allowed: microseconds, usually 1000 to 2000, or None to release it"
+        f"channel {number} = {value!r} is not allowed: expected microseconds (usually 1000 to 2000), or None, which"
+        " releases the channel"
     )

@@ -28,9 +28,10 @@ logger: logging.Logger = logging.getLogger("dronekit.mavlink")
 
 vehicle_logger: logging.Logger = logging.getLogger("dronekit")
 
-CLOSE_TIMEOUT_S = 2.0  # maximum time for which close() waits for the answers to recent orders
+CLOSE_TIMEOUT_S = 2.0  # maximum time that close() waits for the answers to recent orders
 
-SHARED_KINDS = {"disarm": "arm"}  # an order replaces the previous one of its kind; disarming also replaces arming
+# A new call replaces the previous call of its kind. Disarming also replaces arming, and vice versa.
+SHARED_KINDS = {"disarm": "arm"}
 
 CoroutineFunction = Callable[..., Awaitable[object]]
 
@@ -49,7 +50,7 @@ class ClassicConnection:
         self.target_system = target_system
         """System id of the vehicle, 0 until it is found."""
         self.listener_thread: ListenerThread = ListenerThread()
-        self.listener_thread.on_called = loop.activity.feed
+        self.listener_thread.on_called = loop.activity.feed  # a callback that returns shows that the program is running
         self.loop = loop
         self._context = context
         self.connection: Connection = context.value
@@ -59,7 +60,7 @@ class ClassicConnection:
         self.supports_mavlink_2 = False
         """True once the vehicle has reported that it supports MAVLink 2, even if it still sends version 1."""
         self.note_sent: Callable[[Message], None] = lambda message: None
-        """Called on the loop with each sent message, because it may overrule earlier orders."""
+        """Called on the loop with each sent message, because a message may overrule earlier orders."""
         self.vehicle: Any = None
         self._is_closed = threading.Event()
         self._closing = threading.Lock()
@@ -71,11 +72,11 @@ class ClassicConnection:
         )
 
     def send(self, message: Message, *, to: int | None = None) -> None:
-        """Send a message, in the order of the calls, from any thread, without blocking.
+        """Send a message without blocking, from any thread. Messages are sent in the order of the calls.
 
         Raises InvalidArgument if a field is out of range, and APIException if the connection is closed.
         """
-        message.encode()  # errors are raised here, in the caller, rather than on the loop
+        message.encode()  # so that the caller gets the error of an invalid field, which would be logged on the loop
         with classic_errors():
             self.connection.raise_if_ended()
             self.calls.post(self._send, message, to)
@@ -122,7 +123,7 @@ class ClassicConnection:
         return self._is_closed.is_set()
 
     def is_of_another_vehicle(self, system_id: int) -> bool:
-        """Return True if this system has an autopilot and is not the connected vehicle."""
+        """Return True if the system with this id has an autopilot but is not the connected vehicle."""
         return system_id != self.target_system and any(
             source[0] == system_id and is_autopilot(heartbeat)
             for source, heartbeat in self.connection.heartbeats.items()
@@ -143,7 +144,7 @@ def _on_dropped(
     listener_thread: ListenerThread,
     close_callbacks: list[Callable[[], object]],
 ) -> None:
-    """Clean up after a connection was garbage collected. Runs on the loop, which ends afterwards."""
+    """Clean up after the program dropped a connection without closing it. Runs on the loop, which ends afterwards."""
     vehicle_logger.warning("the connection to %s was closed: the program dropped it without close()", address)
     atexit.unregister(exit_callback)
     listener_thread.stop()
@@ -175,27 +176,27 @@ class BackgroundCalls:
         """Describes the vehicle's state in the warning about a rejected command."""
 
     def start(self, kind: str, function: CoroutineFunction, *args: Any, **kwargs: Any) -> BackgroundCall:
-        """Start a call, from any thread, without blocking. First messages are sent in the order of these calls.
+        """Start a call without blocking, from any thread. Calls send their first messages in the order of their start.
 
         Raises ConnectionClosed if the connection was closed.
         """
-        order = BackgroundCall(kind)
-        self._pending.add(order)
-        order.add_done_callback(self._pending.discard)
+        call = BackgroundCall(kind)
+        self._pending.add(call)
+        call.add_done_callback(self._pending.discard)
         try:
-            self._loop.call_soon(self._begin, order, functools.partial(function, *args, **kwargs))
+            self._loop.call_soon(self._begin, call, functools.partial(function, *args, **kwargs))
         except ConnectionClosed:
-            order.cancel()
+            call.cancel()
             raise
-        return order
+        return call
 
-    def cancel(self, order: BackgroundCall) -> None:
-        """Cancel a call, so that it sends nothing more. From any thread, without blocking."""
+    def cancel(self, call: BackgroundCall) -> None:
+        """Cancel a call without blocking, from any thread. The call then sends nothing more."""
         with contextlib.suppress(ConnectionClosed):
-            self._loop.call_soon(self._cancel, order)
+            self._loop.call_soon(self._cancel, call)
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
-        """Call a function on the loop that neither blocks nor raises, in order with other calls."""
+        """Call a function on the loop after all earlier calls. The function must neither block nor raise."""
         if self._loop.is_current:
             function(*args)
         else:
@@ -207,43 +208,44 @@ class BackgroundCalls:
         if pending and not self._loop.is_current:
             concurrent.futures.wait(pending, timeout)
 
-    def _begin(self, order: BackgroundCall, function: CoroutineFunction) -> None:
-        kind = SHARED_KINDS.get(order.kind, order.kind)
+    def _begin(self, call: BackgroundCall, function: CoroutineFunction) -> None:
+        kind = SHARED_KINDS.get(call.kind, call.kind)
         if kind in self._newest:
-            self._cancel(self._newest[kind])
-        if order.set_running_or_notify_cancel():
-            name = f"dronekit {order.kind}"
-            order.task = asyncio.get_running_loop().create_task(self._run(order, function), name=name)
-            order.task.add_done_callback(lambda _: self._end(kind, order))
-            self._newest[kind] = order
+            self._cancel(self._newest[kind])  # the new call replaces it
+        if call.set_running_or_notify_cancel():
+            name = f"dronekit {call.kind}"
+            call.task = asyncio.get_running_loop().create_task(self._run(call, function), name=name)
+            call.task.add_done_callback(lambda _: self._end(kind, call))
+            self._newest[kind] = call
 
-    def _cancel(self, order: BackgroundCall) -> None:
-        if order.task is not None and order in self._newest.values():
-            order.task.cancel()
+    def _cancel(self, call: BackgroundCall) -> None:
+        if call.task is not None and call in self._newest.values():
+            call.task.cancel()
 
-    def _end(self, kind: str, order: BackgroundCall) -> None:
-        if self._newest.get(kind) is order:
+    def _end(self, kind: str, call: BackgroundCall) -> None:
+        if self._newest.get(kind) is call:
             del self._newest[kind]
-        if not order.done():  # its task was cancelled
-            reason = "a newer order replaced it, it was cancelled, or the connection was closed"
-            order.set_exception(ConnectionClosed(f"{order.kind}: {reason}"))
+        if not call.done():  # the task was cancelled before it had a result
+            reason = "the order was cancelled or replaced by a newer one, or the connection was closed"
+            call.set_exception(ConnectionClosed(f"{call.kind}: {reason}"))
 
-    async def _run(self, order: BackgroundCall, function: CoroutineFunction) -> None:
+    async def _run(self, call: BackgroundCall, function: CoroutineFunction) -> None:
+        """Await the function, log its failure, and set the result of the call."""
         try:
             await function()
         except Exception as error:
             if not isinstance(error, ConnectionClosed):
-                text = str(error)  # the exception itself would keep stack frames, and thus the vehicle, alive
+                text = str(error)  # a logged exception would keep its stack frames, and thus the vehicle, alive
                 if isinstance(error, CommandRejected) and self.describe is not None:
-                    text += f" ({self.describe()})"  # a rejection rarely names its cause
-                vehicle_logger.warning("%s: %s", order.kind, text)
-            order.set_exception(error)
+                    text += f" ({self.describe()})"  # the vehicle's answer rarely names the cause of a rejection
+                vehicle_logger.warning("%s: %s", call.kind, text)
+            call.set_exception(error)
         else:
-            order.set_result(None)
+            call.set_result(None)
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
-    # Tasks that earlier calls have just created send their first messages before `function` is called.
+    # Called one iteration later, so that tasks of earlier calls, which were just created, send their messages before.
     asyncio.get_running_loop().call_soon(function, *args)
 
 
@@ -262,16 +264,16 @@ def weak_callback(method: Callable[..., object]) -> Callable[..., None]:
 
 IGNORE = 0xFFFF
 RELEASE = 0
-RELEASE_UPPER = 0xFFFE  # releases a channel above 8, for which 0 means "ignore"
+RELEASE_UPPER = 0xFFFE  # releases a channel above 8; 0 leaves such a channel unchanged
 
 CHANNELS_OF_MAVLINK_1 = 8
 CHANNELS = 18
 
-RELEASE_COPIES = 3  # because the message is not acknowledged, and a frame may be lost
+RELEASE_COPIES = 3  # sent several times, because the message is not acknowledged and a frame may be lost
 
 
 class OverrideRelease:
-    """The channels that this connection overrides, by target; releases them when the connection ends.
+    """Records the RC channels that this connection overrides, and releases them when the connection ends.
 
     https://mavlink.io/en/messages/common.html#RC_CHANNELS_OVERRIDE
     """
@@ -283,7 +285,7 @@ class OverrideRelease:
         self._overridden: dict[tuple[int, int], set[int]] = {}
 
     def note_sent(self, message: Message) -> None:
-        """Record the channels of a sent RC_CHANNELS_OVERRIDE; ignores other messages."""
+        """Record which channels a sent RC_CHANNELS_OVERRIDE overrides or releases; ignore other messages."""
         if not isinstance(message, RcChannelsOverride):
             return
         target = message.target_system, message.target_component
@@ -293,16 +295,16 @@ class OverrideRelease:
             is_upper = channel > CHANNELS_OF_MAVLINK_1
             if value == (RELEASE_UPPER if is_upper else RELEASE):
                 overridden.discard(channel)
-            elif value not in (IGNORE, RELEASE):  # above channel 8, 0 means "ignore", too
+            elif value not in (IGNORE, RELEASE):  # above channel 8, RELEASE (0) leaves the channel unchanged, too
                 overridden.add(channel)
 
     def send(self, connection: Connection) -> None:
-        """Release overridden channels, unless ``is_enabled`` is False (loop thread). Never raises."""
+        """Send the release of all overridden channels, unless ``is_enabled`` is False (loop thread). Never raises."""
         for (system, component), channels in self._overridden.items():
             if self.is_enabled and channels:
                 values = [_release_value(channel, channel in channels) for channel in range(1, CHANNELS + 1)]
                 message = RcChannelsOverride(system, component, *values)
-                with contextlib.suppress(AerokitError):  # the link may be closed
+                with contextlib.suppress(AerokitError):  # the link may already be closed
                     for _ in range(RELEASE_COPIES):
                         connection.send(message)
 

@@ -32,17 +32,17 @@ if TYPE_CHECKING:
     from aerokit.dronekit.values import LocationGlobal
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-# Fields of MAVLink 1; the later `mission_type` is not part of a command's text.
+# The fields of MAVLink 1, in the order of a command's text. DroneKit has no `mission_type`, which MAVLink 2 added.
 FIELDS: list[str] = MAVLink_mission_item_message.fieldnames[:14]
 PARAM_FIELDS: list[str] = FIELDS[7:11]
-# Fields that are compared to detect a changed mission.
+# Fields whose change makes a mission different from the vehicle's mission.
 CONTENT_FIELDS: tuple[str, ...] = ("frame", "command", "autocontinue", *FIELDS[7:])
 AMSL_FRAMES = (0, 5)  # MAV_FRAME_GLOBAL and MAV_FRAME_GLOBAL_INT
-# How far the first row of a waypoint file may be from home to count as home: about ten metres, two in altitude.
+# The first row of a waypoint file counts as home if it is this close to home; 1e-4 degrees are about ten metres.
 HOME_TOLERANCE_DEG, HOME_TOLERANCE_M = 1e-4, 2.0
 
 
-if TYPE_CHECKING:  # pymavlink's classes have no useful annotations
+if TYPE_CHECKING:  # pymavlink's class has no useful annotations
 
     class _MissionItem:
         target_system: int
@@ -70,19 +70,19 @@ class Command(_MissionItem):
     """A waypoint, or another mission item, of ``vehicle.commands``: a MISSION_ITEM of pymavlink.
 
     Args:
-        target_system: ignored; set when the command is added.
+        target_system: ignored; adding the command sets it.
         target_component: ignored.
-        seq: ignored; set when the command is added.
-        frame: MAV_FRAME: reference of ``z``; 0: sea level, 3: home, 10: terrain.
+        seq: ignored; adding the command sets it.
+        frame: MAV_FRAME, which is the reference of ``z``; 0: sea level, 3: home, 10: terrain.
         command: MAV_CMD.
         current: ignored, except that 1 in the first row of a waypoint file marks home.
         autocontinue: 0 makes PX4 stay at the item; ArduPilot always continues.
-        param1: first parameter of the command.
-        param2: second parameter.
-        param3: third parameter.
-        param4: fourth parameter.
-        x: latitude in degrees, or parameter 5; metres in a local frame.
-        y: longitude, or parameter 6.
+        param1: parameter 1 of the command.
+        param2: parameter 2.
+        param3: parameter 3.
+        param4: parameter 4.
+        x: latitude in degrees, metres in a local frame, or parameter 5.
+        y: longitude in degrees, metres in a local frame, or parameter 6.
         z: altitude in metres, or parameter 7.
     """
 
@@ -105,7 +105,7 @@ class Command(_MissionItem):
     ) -> None:
         numbers = (param1, param2, param3, param4, x, y, z)
         super().__init__(target_system, target_component, seq, frame, command, current, autocontinue, *numbers)
-        self._fieldnames = FIELDS
+        self._fieldnames = FIELDS  # without `mission_type`, which DroneKit's text of a command does not show
 
 
 class SequenceState(Snapshot):
@@ -114,7 +114,7 @@ class SequenceState(Snapshot):
     items: tuple[Command, ...] = ()
     home: Command | None = None
     is_changed: bool = False
-    """True after clear, add or assignment, until uploaded or downloaded."""
+    """True after a change by the program, until the next upload or download succeeds."""
 
 
 class CommandSequence:
@@ -129,8 +129,10 @@ class CommandSequence:
         self._vehicle, self._core = vehicle, core_of(vehicle)
         self._lock = threading.Lock()
         self._state = SequenceState()
-        self._vehicle_content: tuple[tuple[Any, ...], ...] = ()  # of the vehicle's mission, as last known
-        self._download_number = 0  # of the latest download; an earlier download must not replace its result
+        # Content of the vehicle's mission after the last download or upload.
+        self._vehicle_content: tuple[tuple[Any, ...], ...] = ()
+        # Number of the latest download. The result of an earlier download, which may arrive later, is ignored.
+        self._download_number = 0
         self._download: BackgroundCall | None = None
         self._current = vehicle._dk_current_command
 
@@ -159,8 +161,8 @@ class CommandSequence:
     def upload(self, timeout: float | None = None) -> None:
         """Upload the commands, and return when the vehicle has confirmed them.
 
-        Sends nothing if nothing changed since the last download or upload. The sequence itself does not change, so that
-        a failed upload can be repeated.
+        Sends nothing if the commands have not changed since the last download or upload. The sequence
+        itself does not change, so that a failed upload can be repeated.
 
         Args:
             timeout: seconds in total; None: no limit, but ten seconds without progress raise TimeoutError.
@@ -175,21 +177,21 @@ class CommandSequence:
             content = _content_of(self._state.items)
             if not self._state.is_changed and content == self._vehicle_content:
                 return
-            uploaded = self._state = self._state.replace(is_changed=True)  # until the vehicle has confirmed
+            uploaded = self._state = self._state.replace(is_changed=True)  # stays True unless the vehicle confirms
         aio = self._core.check_link()
-        # No limit of distances, because DroneKit has none and its programs must run unchanged.
+        # DroneKit does not limit the distance of waypoints, and its programs must run unchanged.
         options = {"timeout": timeout, "max_distance_m": math.inf}
         self._core.run(aio.mission.upload, _mission_of(uploaded.items, aio), **options)
         with self._lock:
             self._vehicle_content = content
-            if self._state is uploaded:  # not changed during the upload
+            if self._state is uploaded:  # the program has not changed the sequence during the upload
                 self._state = uploaded.replace(is_changed=False)
 
     @property
     def next(self) -> int:
-        """``seq`` of the current command: ``commands[commands.next - 1]``; 0 before the mission starts.
+        """``seq`` of the current command, which is ``commands[commands.next - 1]``; 0 before the mission starts.
 
-        Setting the attribute selects the next command (0: restart), without waiting.
+        Set it to select the next command (0: restart the mission). Setting it does not wait.
         """
         return self._current.seq
 
@@ -203,7 +205,8 @@ class CommandSequence:
         """Remove all commands from the sequence; :meth:`upload` sends the change. Waits for a running download."""
         self._wait_for_download()
         with self._lock:
-            if self._core.ready.failure_of({"commands"}) is not None:  # an empty sequence replaces the failed download
+            # After a failed download, the program can continue with an empty sequence.
+            if self._core.ready.failure_of({"commands"}) is not None:
                 self._core.ready.mark("commands")
             self._state = SequenceState((), self._state.home, is_changed=True)
 
@@ -211,7 +214,7 @@ class CommandSequence:
         """Append a copy of a command; :meth:`upload` sends the change. Waits for a running download.
 
         ``cmd`` is a :class:`Command` or a MISSION_ITEM of pymavlink (else TypeError); its ``target_system`` is set. The
-        first row of a waypoint file, which is home, is stored separately. Raises APIException if the last download has
+        first row of a waypoint file is home; it is stored separately. Raises APIException if the last download has
         failed.
         """
         self._require_downloaded()
@@ -247,11 +250,14 @@ class CommandSequence:
             items = list(self._state.items)
             position = len(items) if index == len(items) else _checked_index(index, len(items))
             command.seq = position + 1
-            items[position : position + 1] = [command]  # appends if `position` is the end
+            items[position : position + 1] = [command]  # appends at the end, as pymavlink does
             self._state = self._state.replace(items=tuple(items), is_changed=True)
 
     def rows(self) -> tuple[Command, ...]:
-        """Return the rows of a waypoint file: home (zeros if unknown) and the commands; empty if neither is known."""
+        """Return the rows of a waypoint file: home and the commands.
+
+        Home is all zeros if it is unknown. Empty if there is neither home nor a command.
+        """
         state = self._state
         if state.home is not None:
             return (state.home, *state.items)
@@ -261,7 +267,7 @@ class CommandSequence:
         return (*unknown_home, *state.items)
 
     def _append(self, cmd: Command) -> int:
-        """Append a command, or store it as home; return its number."""
+        """Append a command, or store it if it is home; return its ``seq`` (0: home)."""
         with self._lock:
             state = self._state
             if not state.items and _is_home_row(cmd, self._vehicle._home_location):
@@ -281,7 +287,7 @@ class CommandSequence:
         self._store_download(number, mission)
 
     def _store_download(self, number: int, mission: Mission) -> None:
-        """Store a downloaded mission (loop thread)."""
+        """Store a downloaded mission. Runs on the loop thread."""
         home, connection = mission.home, self._core.aio.connection
         own_ids = connection.source_system, connection.source_component
         home_command, *items = _commands_of(mission, own_ids)
@@ -303,20 +309,20 @@ class CommandSequence:
                 self._core.ready.fail("commands", failure)
 
     def _require_downloaded(self) -> None:
-        """Wait for a running download; raise if it has failed."""
+        """Wait for a running download; raise APIException if the last download has failed."""
         self._wait_for_download()
         if (failure := self._core.ready.failure_of({"commands"})) is not None:
             raise type(failure)(f"{failure}; call download() again, or clear()") from failure.__cause__
 
     def _wait_for_download(self) -> None:
-        # As in DroneKit, clear() and add() after download() apply to the downloaded mission.
+        # As in DroneKit, clear() and add() change the mission that a running download yields.
         while (download := self._download) is not None and not download.done():
             with classic_errors():
                 self._core.handler.loop.wait_for(when_done(download))
 
 
 class WaypointLoader:
-    """Read-only ``vehicle._wploader``: commands with home as number 0."""
+    """``vehicle._wploader``, read only: the commands of the mission, with home as number 0."""
 
     def __init__(self, commands: CommandSequence) -> None:
         self._commands = commands
@@ -345,14 +351,14 @@ def _command_from(cmd: Any) -> Command:
     try:
         fields = {name: getattr(cmd, name) for name in FIELDS}
     except AttributeError:
-        raise TypeError(f"{cmd!r} is not allowed: a Command") from None
+        raise TypeError(f"{cmd!r} is not a Command") from None
     if hasattr(cmd, "get_type") and cmd.get_type() == "MISSION_ITEM_INT":
         fields["x"], fields["y"] = in_degrees(MissionItem(cmd.command, cmd.frame, x=cmd.x, y=cmd.y))
     return Command(**fields)
 
 
 def _content_of(commands: Iterable[Command]) -> tuple[tuple[Any, ...], ...]:
-    """Return the content of commands for comparison; NaN equals NaN."""
+    """Return the values of commands as tuples for comparison, in which NaN equals NaN."""
     return tuple(tuple(_comparable(getattr(command, name)) for name in CONTENT_FIELDS) for command in commands)
 
 
@@ -363,8 +369,8 @@ def _comparable(value: Any) -> Any:
 def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
     """Return True if a command is the home row of a waypoint file rather than a waypoint.
 
-    The home row is a waypoint without parameters whose altitude is above sea level. It has ``current`` set, is all
-    zeros, or is at home.
+    The home row is a waypoint without parameters whose altitude is above sea level. In addition, its ``current`` is 1,
+    its position is all zeros, or its position is that of home.
     """
     if cmd.command != MavCmd.NAV_WAYPOINT or cmd.frame not in AMSL_FRAMES:
         return False
@@ -379,7 +385,7 @@ def _is_at_home(cmd: Command, home: LocationGlobal | None) -> bool:
     try:
         distance_deg = max(abs(cmd.x - home.lat), abs(cmd.y - home.lon) * math.cos(math.radians(home.lat)))
         return bool(distance_deg <= HOME_TOLERANCE_DEG and abs(cmd.z - home.alt) <= HOME_TOLERANCE_M)
-    except TypeError:  # upload() reports values that are not numbers
+    except TypeError:  # a value is not a number, for which upload() raises later
         return False
 
 
@@ -387,14 +393,14 @@ def _mission_of(commands: Sequence[Command], vehicle: AsyncVehicle) -> Mission:
     """Convert commands to a mission for this vehicle; InvalidArgument names a field that is not a number."""
     items: Iterable[MissionItem] = [_item_of(command, index) for index, command in enumerate(commands)]
     if not vehicle.autopilot.home_is_item_0:
-        # ArduPilot takes coordinates 0, 0 for the current position; other autopilots need the actual coordinates.
+        # For ArduPilot, coordinates 0, 0 mean the current position. Other autopilots need the actual coordinates.
         here = vehicle.telemetry.position.latest or vehicle.telemetry.home.latest
         items = convert_from_ardupilot(items, None if here is None else (here.latitude_deg, here.longitude_deg))
     return Mission(shift_jumps(items, -1))
 
 
 def _commands_of(mission: Mission, own_ids: tuple[int, int]) -> tuple[Command, ...]:
-    """Convert a mission to home (zeros if unknown) and commands; ``own_ids`` are the target system and component."""
+    """Convert a mission to commands for the system and component ``own_ids``. The first is home (zeros if unknown)."""
     items = mission.to_items(home_is_item_0=True)
     return tuple(_command_of(item, seq, own_ids) for seq, item in enumerate(items))
 
@@ -407,17 +413,17 @@ def _item_of(cmd: Command, index: int) -> MissionItem:
         z, autocontinue = float(cmd.z), bool(cmd.autocontinue)
         return MissionItem(command, frame, param1, param2, param3, param4, x, y, z, autocontinue)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InvalidArgument(f"commands[{index}] is not allowed: {error}, in {cmd}") from None
+        raise InvalidArgument(f"commands[{index}] is not allowed: {error}; the command is {cmd}") from None
 
 
 def _wire_number(value: Any, command: int, frame: int) -> int | float:
-    """Return x or y for MISSION_ITEM_INT. Fractions of values that are not positions are cut off, as in ArduPilot."""
+    """Convert x or y to the value for MISSION_ITEM_INT. Like ArduPilot, truncates values that are not coordinates."""
     number = from_degrees(float(value), command, frame)
     return int(number) if isinstance(number, float) and abs(number) < 1e9 else number
 
 
 def _command_of(item: MissionItem, seq: int, own_ids: tuple[int, int]) -> Command:
-    # A command is a MISSION_ITEM, which has other frames than MISSION_ITEM_INT.
+    # DroneKit's commands have the frames of MISSION_ITEM, which differ from those of MISSION_ITEM_INT.
     item = item.replace(frame=int(canonical_frame(item.frame)))
     message = to_wire_float(item, seq, target_system=own_ids[0], target_component=own_ids[1])
     return Command(*(getattr(message, name) for name in FIELDS))

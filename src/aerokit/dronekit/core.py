@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Attributes that `wait_ready(True)` waits for.
 DEFAULT_ATTRIBUTES = ("parameters", "gps_0", "armed", "mode", "attitude")
 
-WAIT_STEP_S = 0.2  # longer waits are split, so that Ctrl-C and a lost link are noticed
+WAIT_STEP_S = 0.2  # longer waits are split into steps, so that Ctrl-C and a lost link end them
 SILENCE_WARNING_S = 5
 TICK_INTERVAL_S = 0.05
 IDLE_TICK_INTERVAL_S = 1.0
@@ -42,7 +42,7 @@ class Readiness:
     def __init__(self) -> None:
         self.names: set[str] = set()
         self.fetchers: dict[str, Callable[[], None]] = {}
-        """Functions that request the value of an attribute; called repeatedly while a program waits for it."""
+        """Maps attributes to functions that request the value; called repeatedly while a program waits for it."""
         self._failures: dict[str, APIException] = {}
         self._changed = threading.Condition()
 
@@ -62,17 +62,17 @@ class Readiness:
             self.names.discard(name)
 
     def fail(self, name: str, error: APIException) -> None:
-        """Record that the attribute gets no value. Programs that wait for the attribute raise this error."""
+        """Record that reading the attribute has failed. Programs that wait for the attribute raise this error."""
         with self._changed:
             self._failures[name] = error
             self._changed.notify_all()
 
     def failure_of(self, names: set[str]) -> APIException | None:
-        """Return the error that leaves one of these attributes without a value, or None."""
+        """Return the error with which reading one of these attributes has failed, or None."""
         return next(filter(None, map(self._failures.get, names)), None)
 
     def wait_for_change(self, names: set[str], max_wait_s: float) -> None:
-        """Wait for a change while one of these attributes is missing, for the smaller of ``max_wait_s`` and 0.2 s."""
+        """Wait for a change if one of these attributes is missing, at most ``max_wait_s`` and at most 0.2 s."""
         with self._changed:
             missing = names - self.names
             if missing and self.failure_of(missing) is None:
@@ -80,7 +80,10 @@ class Readiness:
 
 
 class LatestMessage(Generic[MessageT]):
-    """The latest message of a type from the autopilot, and its handlers. Decodes only when a value is read."""
+    """The latest message of a type from the autopilot, and the handlers of the type.
+
+    A message is decoded only if a handler needs it, or when :attr:`message` is read.
+    """
 
     def __init__(self, message_type: type[MessageT], ready: set[str], listeners: Listeners) -> None:
         self._decode: Callable[[bytes, Frame], MessageT] = decoder_of(message_type)
@@ -88,14 +91,14 @@ class LatestMessage(Generic[MessageT]):
         self._listeners = [listeners]
         self._announced_names: set[str] = set()
         self._handlers: list[Callable[[MessageT], object]] = []
-        self._latest: Frame | MessageT | None = None  # a frame until it is decoded
-        self._decoded: MessageT | None = None  # from the latest frame, or from an earlier one
+        self._latest: Frame | MessageT | None = None  # a Frame if the latest message was not decoded on arrival
+        self._decoded: MessageT | None = None  # the last message that `message` decoded, perhaps of an older frame
         self.component_id = 0
         """Component id of the autopilot; messages of other components are ignored."""
 
     @property
     def message(self) -> MessageT | None:
-        """The message, or None before the first. Decoded on first access, on any thread."""
+        """The latest message, or None before the first. Decodes it on first access, on any thread."""
         latest = self._latest
         if not isinstance(latest, Frame):
             return latest
@@ -105,7 +108,7 @@ class LatestMessage(Generic[MessageT]):
         return decoded
 
     def values(self, *fields: str) -> tuple[Any, ...]:
-        """Return these fields of the message; None for each before the first message."""
+        """Return the values of these fields of the latest message; None for each before the first message."""
         message = self.message
         return tuple([None if message is None else getattr(message, field) for field in fields])
 
@@ -121,7 +124,7 @@ class LatestMessage(Generic[MessageT]):
             self._listeners.append(listeners)
 
     def on_frame(self, frame: Frame, message: MessageT | None = None) -> None:
-        """Receive a frame of the vehicle's system, with the message if the frame is decoded already (loop thread)."""
+        """Receive a frame of the vehicle's system, and its message if it is already decoded (loop thread)."""
         if frame.component_id != self.component_id:
             return
         if self._must_decode():
@@ -136,7 +139,7 @@ class LatestMessage(Generic[MessageT]):
             handler(message)
 
     def _must_decode(self) -> bool:
-        """Return True unless the handlers only announce attributes that have a value and no listeners."""
+        """Return False if all handlers only announce attributes, and these have a value but no listeners."""
         names = self._announced_names
         if not names or not names <= self._ready_names:
             return True
@@ -148,7 +151,7 @@ class LatestMessage(Generic[MessageT]):
 
 
 class Core:
-    """Shared by the parts of a classic vehicle: the asynchronous vehicle, messages, listeners and orders."""
+    """State that the parts of a classic vehicle share: the asynchronous vehicle, messages, listeners and orders."""
 
     def __init__(self, handler: MAVConnection, owner: object) -> None:
         self.handler = handler
@@ -157,7 +160,7 @@ class Core:
         self.listeners: Listeners = Listeners(owner, handler.listener_thread, self.ready.mark)
         """Listeners of the vehicle's attributes."""
         self.heartbeat_limit_s: float = 0.0
-        """Silence after which orders raise, in seconds; 0: no limit."""
+        """Orders raise APIException after this many seconds without a heartbeat; 0: never."""
         self.aio_or_none: AsyncVehicle | None = None
         """The asynchronous vehicle; None before it is connected."""
         self._tasks: BackgroundTasks | None = None
@@ -201,7 +204,9 @@ class Core:
         *names: str,
         listeners: Listeners | None = None,
     ) -> LatestMessage[MessageT]:
-        """Call a handler with messages of the autopilot (loop thread, by weak reference); return the latest message.
+        """Call a handler with each message of this type from the autopilot; return the holder of the latest message.
+
+        The handler is called on the loop thread and held by a weak reference.
 
         If the handler only announces attributes, pass their ``names``. The handler is then called only while these
         attributes have listeners on the vehicle or in ``listeners``.
@@ -213,7 +218,7 @@ class Core:
         return latest
 
     def announce(self, message_type: type[MessageT], *names: str) -> LatestMessage[MessageT]:
-        """Announce these attributes with each message of this type; return the latest message."""
+        """Notify the listeners of these attributes of each message; return the holder of the latest message."""
 
         def announce(_: MessageT) -> None:
             for name in names:
@@ -222,16 +227,19 @@ class Core:
         return self.on(message_type, announce, *names)
 
     def begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
-        """Start receiving once the vehicle is connected (loop thread). The loop gets weak references only."""
+        """Start receiving once the vehicle is connected (loop thread).
+
+        The loop gets weak references only, so that a vehicle that the program drops can be garbage collected.
+        """
         self.aio_or_none, self._tasks = aio, tasks
         self.handler.target_system = aio.system_id
-        _ = aio.parameters  # created first, so that it receives each PARAM_VALUE before our handlers do
+        _ = aio.parameters  # creates the object now, so that it receives each PARAM_VALUE before our handlers do
         for message_type, latest in self._latest.items():
             latest.component_id = aio.component_id
             aio.connection.bus.attach_lazily(message_type, weak_callback(latest.on_frame), system_id=aio.system_id)
 
     def watch_link(self) -> None:
-        """Report the age of the last heartbeat to listeners 20 times a second; log when silence begins and ends."""
+        """Report the age of the last heartbeat to its listeners 20 times a second; log when silence begins and ends."""
         aio = self.aio
         if not aio.connection.is_open:
             return
@@ -239,13 +247,13 @@ class Core:
         self.listeners.notify("last_heartbeat", age)
         if (age > SILENCE_WARNING_S) != self._is_silent:
             self._is_silent = not self._is_silent
-            post = self.handler.listener_thread.post  # because log handlers of the program may block
+            post = self.handler.listener_thread.post  # not on the loop, because the program's log handlers may block
             if self._is_silent:
                 post(self.logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENCE_WARNING_S)
             else:
                 post(self.logger.info, "...link restored.")
         wait_s = TICK_INTERVAL_S
-        # Ticks are rare if possible, because each wakes the process, which costs as much as a few messages.
+        # Without a listener, waits longer, because each wake-up costs as much as a few messages.
         if not self._is_silent and not self.listeners.has_listener("last_heartbeat"):
             wait_s = max(wait_s, min(IDLE_TICK_INTERVAL_S, SILENCE_WARNING_S - age))
         asyncio.get_running_loop().call_later(wait_s, weak_callback(self.watch_link))
@@ -257,7 +265,7 @@ class Core:
     # ------------------------------------------------------------------------------- sending
 
     def run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any:
-        """Run a coroutine function on the loop and wait for it; its errors become those of DroneKit."""
+        """Run a coroutine function on the loop and wait for its result. Errors are converted to those of DroneKit."""
         self.check_link()
         with classic_errors():
             return self.handler.loop.run(function, *args, **kwargs)
@@ -269,7 +277,7 @@ class Core:
             return self.handler.calls.start(kind, function, *args, **kwargs)
 
     def command(self, kind: str, command: int, *params: float, **options: Any) -> BackgroundCall:
-        """Send a command to all components without waiting; only the autopilot's answer counts."""
+        """Send a command to all components of the vehicle without waiting. Only the autopilot's answer counts."""
         options.setdefault("retries", max_attempts(command, params) - 1)
         return self.order(kind, self.check_link().command, command, *params, component_id=0, **options)
 
@@ -279,7 +287,7 @@ class Core:
 
 
 def _recording_activity(original: property) -> property:
-    """Return a property that also records that the program is running, so that our heartbeat continues."""
+    """Wrap a property, so that reading it also shows that the program is running and our heartbeat must continue."""
     getter = original.fget
     assert getter is not None
 
@@ -292,11 +300,11 @@ def _recording_activity(original: property) -> property:
 
 
 class VehicleCore(HasObservers):
-    """A vehicle and its core. The prefix ``_dk`` avoids collisions with names of subclasses."""
+    """Base class of the vehicle, with its core. The prefix ``_dk`` avoids collisions with names in subclasses."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        # Only properties of our own classes are wrapped; those of a program's subclass stay as they are.
+        # Wraps the properties of our own classes only, not those of a program's subclass.
         if cls.__module__.startswith("aerokit."):
             for name, member in list(vars(cls).items()):
                 if isinstance(member, property) and not name.startswith("_"):
@@ -325,12 +333,12 @@ class VehicleCore(HasObservers):
             types: names of attributes, including your own; ``wait_ready(True)`` is ``'parameters'``, ``'gps_0'``,
                 ``'armed'``, ``'mode'`` and ``'attitude'``.
             timeout: seconds; None: no limit.
-            raise_exception: raise when the time is over.
+            raise_exception: raise TimeoutError after ``timeout``; otherwise return False.
             still_waiting_callback: called with the missing names.
             still_waiting_interval: seconds between these calls.
 
         Returns:
-            True if all of them have values.
+            True if all these attributes have values; False after ``timeout``, unless ``raise_exception`` is true.
 
         Raises:
             TimeoutError: a value is missing after ``timeout``, and ``raise_exception`` is true.
@@ -348,13 +356,13 @@ class VehicleCore(HasObservers):
             now = time.monotonic()
             if now >= deadline:
                 if raise_exception:
-                    # The text is DroneKit's; the cause names what is missing.
+                    # The text is that of DroneKit. The cause of the exception names the missing values.
                     error = TimeoutError(f"wait_ready experienced a timeout after {timeout} seconds.")
                     raise error from LookupError(f"not received: {', '.join(sorted(missing))}")
                 return False
             self._dk.check_link()
             if (failure := ready.failure_of(missing)) is not None:
-                if raise_exception:  # a new exception, because several threads may wait and raise
+                if raise_exception:  # a new exception, because several threads may raise it
                     raise type(failure)(str(failure)) from failure.__cause__
                 return False
             for name in ready.fetchers.keys() & missing:
@@ -367,5 +375,5 @@ class VehicleCore(HasObservers):
 
 
 def core_of(vehicle: VehicleCore) -> Core:
-    """Return the core of a vehicle. Parts of a vehicle are constructed with the vehicle, as in DroneKit."""
+    """Return the core of a vehicle, for parts that are constructed with the vehicle, as in DroneKit."""
     return vehicle._dk

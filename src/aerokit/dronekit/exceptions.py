@@ -10,16 +10,16 @@ from aerokit.errors import AerokitError, FileFormatError, InvalidArgument, Opera
 
 
 class APIException(Exception):
-    """Failure of the vehicle or its link; the aerokit error is its ``__cause__`` or ``__context__``."""
+    """The vehicle or its link failed. The error of aerokit is the ``__cause__`` or ``__context__``."""
 
 
 class TimeoutError(APIException, builtins.TimeoutError):  # noqa: A001 - the name is DroneKit's
-    """An answer or state did not arrive in time. The built-in ``TimeoutError`` catches it, too."""
+    """An answer or a state did not arrive in time. ``except`` with the built-in ``TimeoutError`` catches it, too."""
 
 
 @contextmanager
 def classic_errors() -> Iterator[None]:
-    """Convert errors of aerokit to those of DroneKit; errors about arguments and files stay ValueErrors."""
+    """Convert errors of aerokit to those of DroneKit, but not errors about arguments and files (ValueErrors)."""
     try:
         yield
     except (InvalidArgument, FileFormatError):

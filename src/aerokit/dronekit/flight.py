@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 HOME_TIMEOUT_S = 10.0
 ORDER_POLL_INTERVAL_S = 0.02
-ARMED_ORDER_KINDS = ("disarm", "arm")  # by the wanted value of `armed`
+ARMED_ORDER_KINDS = ("disarm", "arm")  # the index is the wanted value of `armed` (False or True)
 
 
 class FlightMethods(VehicleAttributes):
     """Orders that change modes, arm and move the vehicle.
 
-    Setters and ``simple_…`` methods return immediately: the order is sent and repeated until it is acknowledged; a
+    Setters and ``simple_…`` methods return immediately. Their order is sent and repeated until it is acknowledged; a
     rejection is logged as a warning of the logger ``dronekit``. :meth:`arm`, :meth:`disarm` and ``wait_…`` methods
-    wait. All raise APIException while the link is down.
+    wait for the effect. All methods raise APIException while the link is down.
     """
 
     _dk_arming: BackgroundCall | None = None
@@ -41,11 +41,11 @@ class FlightMethods(VehicleAttributes):
 
     @property
     def mode(self) -> VehicleMode:
-        """The flight mode of the last HEARTBEAT, by pymavlink's name; ``UNKNOWN`` before the first.
+        """The flight mode of the last HEARTBEAT, by pymavlink's name; ``UNKNOWN`` before the first HEARTBEAT.
 
-        Set it to a :class:`VehicleMode`, a name or, on ArduPilot, a number: the order is sent at once
-        (MAV_CMD_DO_SET_MODE, or SET_MODE for old firmware). :meth:`wait_for_mode` waits. Raises KeyError, without
-        sending, if the vehicle has no such mode.
+        Set it to a :class:`VehicleMode`, a name or, on ArduPilot, a number. Setting it sends the order at once
+        (MAV_CMD_DO_SET_MODE, or SET_MODE for old firmware) and does not wait; :meth:`wait_for_mode` waits. Raises
+        KeyError, without sending, if the vehicle has no such mode.
         """
         return VehicleMode(self._flightmode)
 
@@ -72,8 +72,8 @@ class FlightMethods(VehicleAttributes):
     def armed(self) -> bool:
         """True if HEARTBEAT reports armed motors.
 
-        Setting a value that is neither reported nor already ordered sends an order: **propellers may start to turn**.
-        :meth:`arm` waits, and raises the reason if arming is refused.
+        Set it to arm or disarm: **propellers may start to turn**. Setting it does not wait, and sends nothing if the
+        vehicle already reports the value. :meth:`arm` waits, and raises the reason if arming is refused.
         """
         return self._armed
 
@@ -95,17 +95,18 @@ class FlightMethods(VehicleAttributes):
         return order is not None and order.kind == ARMED_ORDER_KINDS[value] and not order.done()
 
     def arm(self, wait: bool = True, timeout: float | None = None) -> None:
-        """Arm the motors: **propellers may start to turn**. With ``wait``, wait until HEARTBEAT reports that.
+        """Arm the motors: **propellers may start to turn**. With ``wait``, wait until HEARTBEAT reports armed motors.
 
         Raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle refuses; the text has its reasons.
         """
         self._dk_change_armed(True, wait, timeout, "failed to arm vehicle")
 
     def disarm(self, wait: bool = True, timeout: float | None = None) -> None:
-        """Stop the motors, like :meth:`arm`. The vehicle refuses in the air."""
+        """Disarm the motors; arguments and errors as for :meth:`arm`. A vehicle in the air refuses."""
         self._dk_change_armed(False, wait, timeout, "failed to disarm vehicle")
 
     def _dk_change_armed(self, value: bool, wait: bool, timeout: float | None, failure_text: str) -> None:
+        """Arm or disarm, unless the vehicle already reports the value and no opposite order is pending."""
         is_overruling = self._dk_is_changing_to(not value)
         if self._armed == value and not is_overruling:
             self._dk.check_link()
@@ -114,7 +115,7 @@ class FlightMethods(VehicleAttributes):
         if wait:
 
             def is_done() -> bool:
-                # While the opposite order is pending, the value may be reported although it is about to change.
+                # A HEARTBEAT may still report `value` although the overruled opposite order is about to change it.
                 return self._armed == value and (order.done() or not is_overruling)
 
             self._dk_wait_for_order(order, is_done, timeout, failure_text)
@@ -135,16 +136,19 @@ class FlightMethods(VehicleAttributes):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()
         send = functools.partial(self._dk.order, "takeoff", flight_orders.take_off, aio)
-        if not aio.autopilot.repositions_amsl:  # the altitude is above home, and the command changes no mode
+        if not aio.autopilot.repositions_amsl:  # ArduPilot: altitude above home; the command does not change the mode
             return send((), MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
         plan = aio.autopilot.take_off(altitude, self._dk_known_home().alt, is_vtol=aio.is_vtol)
         mode = aio.autopilot.mode_for("take_off")
         if plan is None or plan.command is None or mode is None:
-            raise APIException("take-off: this vehicle has no take-off command")
+            raise APIException("simple_takeoff: this vehicle has no take-off command")
         return send((mode,), plan.command, *plan.params)
 
     def wait_simple_takeoff(self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None) -> None:
-        """Call :meth:`simple_takeoff` and wait like :meth:`wait_for_alt`; TimeoutError as soon as the order fails."""
+        """Call :meth:`simple_takeoff` and wait like :meth:`wait_for_alt`.
+
+        Raises TimeoutError as soon as the order fails.
+        """
         if alt is not None:
             order = self._dk_take_off(float(alt))
             has_reached = self._dk_altitude_condition(float(alt), epsilon, is_relative=True)
@@ -158,22 +162,23 @@ class FlightMethods(VehicleAttributes):
     ) -> None:
         """Fly to a location; returns immediately and does not report the arrival.
 
-        In GUIDED mode only (PX4: LOITER): the mode is not changed, so that a pilot who has taken over keeps control. A
-        rejection is logged as a warning of the logger ``dronekit``.
+        Works in GUIDED mode only (PX4: LOITER). The mode is not changed, so that a pilot who has taken over keeps
+        control. A rejection is logged as a warning of the logger ``dronekit``.
 
         Args:
-            location: latitude and longitude in degrees; altitude in metres above sea level or home, by its class.
-            airspeed: m/s; sets the attribute.
-            groundspeed: m/s; sets the attribute.
+            location: latitude and longitude in degrees, and the altitude in metres above sea level (LocationGlobal) or
+                home (LocationGlobalRelative).
+            airspeed: m/s; like setting :attr:`airspeed`.
+            groundspeed: m/s; like setting :attr:`groundspeed`.
 
         Raises:
-            ValueError: the location has another type, or a missing or wrong number. Nothing was sent.
+            ValueError: the location has another type, or one of its numbers is missing or wrong. Nothing was sent.
         """
         aio = self._dk.check_link()
         modes = flight_orders.reposition_modes(aio)
         target = self._dk_target(location, is_relative=not modes)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
-            flight_orders.check_speed(name, speed)
+            flight_orders.check_speed(name, speed)  # before anything is sent
         if modes and self._flightmode not in map(str, modes):
             reason = f"not sent in mode {self._flightmode}: set mode {modes[0]} first"
             self._dk.order("goto", flight_orders.reject, reason)
@@ -185,7 +190,10 @@ class FlightMethods(VehicleAttributes):
             self.groundspeed = groundspeed
 
     def _dk_target(self, location: object, *, is_relative: bool) -> tuple[int, int, float]:
-        """Return latitude and longitude in 1e-7 degrees, and the altitude above home (``is_relative``) or sea level."""
+        """Convert a location to latitude and longitude in 1e-7 degrees and an altitude in metres.
+
+        The altitude is above home with ``is_relative``, otherwise above sea level.
+        """
         if not isinstance(location, (LocationGlobal, LocationGlobalRelative)):
             raise ValueError("Expecting location to be LocationGlobal or LocationGlobalRelative.")
         latitude, longitude, altitude = flight_orders.checked_location(location)
@@ -199,7 +207,7 @@ class FlightMethods(VehicleAttributes):
 
     @property
     def airspeed(self) -> float | Any:
-        """Airspeed in m/s (VFR_HUD), None if unknown. Setting it works like setting :attr:`groundspeed`."""
+        """Airspeed in m/s (VFR_HUD); None if unknown. Set it to change the airspeed (MAV_CMD_DO_CHANGE_SPEED)."""
         speed = self._dk_vfr_hud.values("airspeed")[0]
         return None if speed is None or math.isnan(speed) else speed
 
@@ -209,7 +217,7 @@ class FlightMethods(VehicleAttributes):
 
     @property
     def groundspeed(self) -> float | Any:
-        """Ground speed in m/s (VFR_HUD). Setting it sends MAV_CMD_DO_CHANGE_SPEED."""
+        """Ground speed in m/s (VFR_HUD). Set it to change the ground speed (MAV_CMD_DO_CHANGE_SPEED)."""
         return self._dk_vfr_hud.values("groundspeed")[0]
 
     @groundspeed.setter
@@ -224,10 +232,10 @@ class FlightMethods(VehicleAttributes):
 
     @property
     def home_location(self) -> LocationGlobal | Any:
-        """Home location, a new object each time; None until HOME_POSITION or a downloaded mission has it.
+        """Home location, a new object each time; None until HOME_POSITION or a downloaded mission reports home.
 
-        Setting it sends MAV_CMD_DO_SET_HOME and changes the attribute at once. Raises ValueError, without sending, for
-        another type, or a missing or wrong number.
+        Set it to a LocationGlobal to move home (MAV_CMD_DO_SET_HOME); the attribute changes at once. Raises ValueError,
+        without sending, for another type or for a missing or wrong number.
         """
         home = self._home_location
         return None if home is None else LocationGlobal(home.lat, home.lon, home.alt)
@@ -253,7 +261,7 @@ class FlightMethods(VehicleAttributes):
             self._dk.run(self._dk_fetch_home)
         home = self.home_location
         if home is None:
-            raise APIException("the vehicle has no home yet: it sets home with the first good position")
+            raise APIException("the vehicle has not reported home yet: it sets home when it has a good position")
         return home
 
     async def _dk_fetch_home(self) -> None:
@@ -271,7 +279,7 @@ class FlightMethods(VehicleAttributes):
         interval: float = 0.1,
         errmsg: str | None = None,
     ) -> None:
-        """Wait until ``condition()`` is true: call it every ``interval`` seconds on the caller's thread.
+        """Wait until ``condition()`` is true; it is called every ``interval`` seconds on the caller's thread.
 
         Raises TimeoutError with the text ``errmsg`` after ``timeout`` seconds (None: no limit).
         """
@@ -283,13 +291,13 @@ class FlightMethods(VehicleAttributes):
             self._handler.wait_closed(min(interval, max(deadline - time.monotonic(), 0.0)))
 
     def wait_for_armable(self, timeout: float | None = None) -> None:
-        """Wait until :attr:`is_armable`. Raises TimeoutError after ``timeout`` seconds."""
+        """Wait until :attr:`is_armable` is true. Raises TimeoutError after ``timeout`` seconds."""
         self.wait_for(lambda: self.is_armable, timeout, errmsg="the vehicle did not become armable")
 
     def wait_for_alt(self, alt: float, epsilon: float = 0.1, rel: bool = True, timeout: float | None = None) -> None:
         """Wait until the altitude is within ``epsilon`` metres of ``alt``, or has passed it.
 
-        ``rel``: above home, otherwise above sea level. Raises TimeoutError after ``timeout`` seconds.
+        With ``rel``, ``alt`` is above home, otherwise above sea level. Raises TimeoutError after ``timeout`` seconds.
         """
         has_reached = self._dk_altitude_condition(alt, epsilon, is_relative=rel)
         self.wait_for(has_reached, timeout, errmsg="failed to reach specified altitude")
@@ -306,7 +314,8 @@ class FlightMethods(VehicleAttributes):
             if altitude is None:
                 return False
             start = altitude if start is None else start
-            return abs(altitude - alt) <= epsilon or (start < alt <= altitude) or (altitude <= alt < start)
+            has_passed = start < alt <= altitude or altitude <= alt < start  # on the way up, or down
+            return abs(altitude - alt) <= epsilon or has_passed
 
         return has_reached
 
@@ -325,7 +334,7 @@ class FlightMethods(VehicleAttributes):
         def is_over() -> bool:
             if is_done():
                 return True
-            # Asks is_done again, because the effect may have arrived together with the failure.
+            # Calls is_done again, because the effect may have been reported between the first call and the failure.
             if order.done() and order.exception() is not None and not is_done():
                 self._dk.check_link()  # raises if the link is lost, which is the more useful error
                 raise TimeoutError(f"{failure_text}: {order.exception()}") from order.exception()

@@ -40,7 +40,7 @@ POSITION_ONLY = 0x0DF8  # type_mask that ignores velocity, acceleration, yaw and
 
 ARMED_TIMEOUT_S = 10.0
 
-MISSION_CURRENT_TIMEOUT_S = 1.5  # time to wait for MISSION_CURRENT after MISSION_SET_CURRENT
+MISSION_CURRENT_TIMEOUT_S = 1.5  # how long to wait for MISSION_CURRENT after MISSION_SET_CURRENT
 
 MAX_SEQ = 0xFFFF
 
@@ -53,30 +53,34 @@ def mode_name(vehicle: AsyncVehicle, custom_mode: int) -> str:
 
 
 def find_mode(vehicle: AsyncVehicle, mode: str | int) -> Mode:
-    """Return a mode by its name (in capitals, or as reported) or, on ArduPilot, its number; KeyError if unknown."""
+    """Return a mode by its name or, on ArduPilot, its number; KeyError if the vehicle has no such mode.
+
+    The name must be in capitals, or spelled as the vehicle reports it.
+    """
     autopilot = _autopilot_with_mode_numbers(vehicle)
     if isinstance(mode, int) and autopilot.modes_are_numbered:
         return Mode(mode_name(vehicle, mode), mode)
     try:
         found = autopilot.find_mode(mode, vehicle.telemetry.mode_names)
     except InvalidArgument as error:
-        raise KeyError(mode) from error  # its text lists the available modes
-    except (AttributeError, TypeError):  # not a string
+        raise KeyError(mode) from error  # the cause's text lists the available modes
+    except (AttributeError, TypeError):  # `mode` is not a string
         raise KeyError(mode) from None
     if not isinstance(mode, str) or not (mode.isupper() or mode == found.name):
         raise KeyError(mode)
+    # PX4 gets the base_mode that pymavlink would send.
     return found if autopilot.modes_are_numbered else found.replace(base_mode=_px4_flags(found.name))
 
 
 def _px4_flags(name: str) -> int:
-    # MAV_MODE_FLAG as pymavlink sends them; PX4 evaluates only the flag for custom modes.
+    # pymavlink's MAV_MODE_FLAG for a mode. PX4 evaluates only the flag for custom modes.
     from pymavlink.mavutil import px4_map
 
     return int(px4_map.get(name, (CUSTOM_MODE_ENABLED,))[0])
 
 
 def _autopilot_with_mode_numbers(vehicle: AsyncVehicle) -> Autopilot:
-    # Like pymavlink, use ArduPilot's mode numbers for unknown autopilots such as iNav.
+    # For autopilots without known mode numbers, such as iNav, ArduPilot's mode numbers are used, as by pymavlink.
     if vehicle.autopilot.modes.numbers:
         return vehicle.autopilot
     return autopilot_for(m.Heartbeat(vehicle.vehicle_type, MavAutopilot.ARDUPILOTMEGA, 0, 0, 0, 0))
@@ -94,10 +98,10 @@ async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
         with vehicle.posted(*topics, armed=value) as order:
             await order.command(MavCmd.COMPONENT_ARM_DISARM, float(value), component_id=0)
             await order.wait_confirmed(ARMED_TIMEOUT_S)
-    except CommandRejected:
+    except CommandRejected:  # the vehicle certainly does not execute the command
         raise
     except (OperationRejected, OperationTimeout) as error:
-        error.args = (f"{error}; it may still be carried out, and is not monitored",)
+        error.args = (f"{error}; the vehicle may still execute the command, which is not monitored any more",)
         raise
 
 
@@ -109,8 +113,8 @@ async def take_off(vehicle: AsyncVehicle, modes: tuple[Mode, ...], command: int,
 async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
     """Send DO_REPOSITION; if it is unsupported, send SET_POSITION_TARGET_GLOBAL_INT.
 
-    Latitude and longitude are in 1e-7 degrees; the altitude is above home, or above sea level if the autopilot's
-    reposition command uses that (PX4).
+    Latitude and longitude are in 1e-7 degrees. The altitude is in metres: on PX4, whose reposition command needs it,
+    above sea level, otherwise above home.
     """
     is_amsl = vehicle.autopilot.repositions_amsl
     flags = MavDoRepositionFlags.CHANGE_MODE if is_amsl else 0
@@ -127,6 +131,7 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
             )
         except CommandRejected as error:
             is_unsupported = error.result == MavResult.UNSUPPORTED and not is_amsl
+            # The second message is sent only if no newer order or mode change has ended this order.
             may_still_order = not order.end and vehicle.heartbeat_age <= MODE_MAX_AGE_S
             if not is_unsupported or not may_still_order:
                 raise
@@ -137,8 +142,8 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
     """Return the modes in which a reposition command may be sent.
 
-    The command itself sets the first of these modes (PX4). Empty if the command does not change the mode: such a
-    vehicle refuses the command in wrong modes.
+    On PX4, the command itself sets the first of these modes. On other autopilots the result is empty: the command does
+    not change the mode, and the vehicle refuses the command in wrong modes.
     """
     if not aio.autopilot.repositions_amsl:
         return ()
@@ -148,12 +153,15 @@ def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
 
 
 async def reject(reason: str) -> None:
-    """Fail with a reason, which is logged like a rejection by the vehicle."""
+    """Raise APIException with a reason, which is then logged like a rejection by the vehicle."""
     raise APIException(reason)
 
 
 def checked_location(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
-    """Return latitude and longitude in 1e-7 degrees and altitude in metres; InvalidArgument names a bad attribute."""
+    """Check a location; return latitude and longitude in 1e-7 degrees, and the altitude in metres.
+
+    Raises InvalidArgument, whose text names the wrong attribute.
+    """
     for name, limit in (("lat", 90.0), ("lon", 180.0), ("alt", math.inf)):
         value = getattr(location, name)
         try:
@@ -161,31 +169,32 @@ def checked_location(location: LocationGlobal | LocationGlobalRelative) -> tuple
         except TypeError:
             is_good = False
         if not is_good:
-            allowed = "a number of metres" if limit == math.inf else f"-{limit:g} to {limit:g} degrees"
+            allowed = "it must be a finite number" if limit == math.inf else f"-{limit:g} to {limit:g} degrees"
             raise InvalidArgument(f"location.{name} = {value!r} is not allowed: {allowed}")
     return round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt)
 
 
 def check_speed(name: str, speed: float | None) -> None:
     if speed is not None and not math.isfinite(speed):
-        raise InvalidArgument(f"{name} = {speed!r} is not allowed: a number of m/s")
+        raise InvalidArgument(f"{name} = {speed!r} is not allowed: it must be a finite number of m/s")
 
 
 class CurrentCommand:
     """MISSION_CURRENT and MISSION_SET_CURRENT of one vehicle.
 
-    ArduPilot counts home as item 0, and is at 0 before it flies a mission. PX4 counts the first item as 0. This class
-    then reports the first item as 1, and 0 while no mission is active.
+    ArduPilot counts home as item 0, and reports 0 before it flies a mission. PX4 counts the first item as 0; for PX4
+    this class reports the first item as 1, and 0 while no mission is active.
     """
 
     def __init__(self, core: Core) -> None:
         self._core = core
-        self._chosen: int | None = None  # command that was chosen on PX4 and not yet passed
+        # Index of the item that was set as current on PX4, until the vehicle reports another item.
+        self._chosen: int | None = None
         self._latest = core.on(m.MissionCurrent, self._on_current)
 
     @property
     def seq(self) -> int:
-        """The current or next command; 0 before the first MISSION_CURRENT."""
+        """``seq`` of the current command; 0 before the first MISSION_CURRENT."""
         message = self._latest.message
         if message is None:
             return 0
@@ -211,25 +220,28 @@ class CurrentCommand:
         return is_at_start_or_end and not self._core.aio.is_armed
 
     async def _choose(self, seq: int) -> None:
-        """Send MISSION_SET_CURRENT once, like DroneKit. Without confirmation, send a command with retries."""
+        """Set the current command on the vehicle.
+
+        Like DroneKit, sends ArduPilot one MISSION_SET_CURRENT. If that is not confirmed, sends a command with retries.
+        """
         aio = self._core.aio
         if not aio.autopilot.home_is_item_0:
             await aio.mission.set_current(max(seq - 1, 0))
-            self._chosen = seq - 1
+            self._chosen = seq - 1  # -1 is the index of no item
             return
         aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))
         with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):
             await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
             return
         if aio.heartbeat_age > MODE_MAX_AGE_S:
-            raise APIException(f"the vehicle is silent and did not confirm next = {seq}, which may or may not be set")
-        if seq == 0:
+            raise APIException(f"the vehicle is silent; it may or may not have set the next command to {seq}")
+        if seq == 0:  # home, which mission.set_current() cannot set, because it counts the items after home
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:
             await aio.mission.set_current(seq - 1)
 
 
-# ArduPilot answers when it has finished, or after half a minute if the vehicle moves.
+# ArduPilot answers when the calibration is done, or after half a minute if the vehicle moves.
 CALIBRATION_TIMEOUT_S = 35.0
 
 REBOOT_TIMEOUT_S = 3.0
@@ -247,22 +259,22 @@ class Maintenance(VehicleCore):
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 1)
 
     def send_calibrate_magnetometer(self) -> None:
-        """Calibrate the compasses: turn the vehicle about all axes until it reports success."""
+        """Calibrate the compasses: turn the vehicle around all axes until it reports success."""
         if self._dk.check_link().autopilot.calibrates_compasses_by_command:
-            self._dk_calibrate(MavCmd.DO_START_MAG_CAL, 0, 1, 1)  # all compasses; retry; save automatically
+            self._dk_calibrate(MavCmd.DO_START_MAG_CAL, 0, 1, 1)  # parameters: all compasses, retry, save the result
         else:
             self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 1)
 
     def send_calibrate_vehicle_level(self) -> None:
-        """Set the current attitude as level."""
+        """Store the current attitude as level."""
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 2)
 
     def send_calibrate_barometer(self) -> None:
-        """Set the current pressure as altitude 0."""
+        """Store the current air pressure as that of altitude 0."""
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 1)
 
     def send_calibrate_accelerometer(self, simple: bool = False) -> None:
-        """Calibrate the accelerometers in six poses that the vehicle requests by text; with ``simple``, level only."""
+        """Calibrate the accelerometers in six poses, which the vehicle's texts request; with ``simple``, level only."""
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 4 if simple else 1)
 
     def _dk_calibrate(self, command: int, *params: float) -> None:
@@ -289,15 +301,15 @@ class Maintenance(VehicleCore):
         self._dk.send(PlayTune(self._dk.target_system, 0, text[:first_size], text[first_size:]))
 
     def reboot(self) -> None:
-        """Reboot the autopilot, which then does not answer for some seconds. It refuses while armed.
+        """Reboot the autopilot, which then does not answer for some seconds. An armed vehicle refuses.
 
-        The command is sent once. Without an answer a warning is logged, and the vehicle may have rebooted.
+        The command is sent once. If it is not answered, a warning is logged; the vehicle may have rebooted.
         """
         shutdown = MavCmd.PREFLIGHT_REBOOT_SHUTDOWN
         self._dk.command("reboot", shutdown, 1, attempt_timeout=REBOOT_TIMEOUT_S)
 
     def send_capabilities_request(self, vehicle: Any, name: str, m: Any) -> None:
-        """Request AUTOPILOT_VERSION once. The arguments of a message listener are ignored."""
+        """Request AUTOPILOT_VERSION once. Can be used as a message listener, whose arguments it ignores."""
         self._dk.check_link()
         self._dk.send(command_long(self._dk.target_system, 0, MavCmd.REQUEST_AUTOPILOT_CAPABILITIES, (1,)))
 
@@ -311,7 +323,7 @@ def _tune_text(tune: str | bytes) -> str:
         text = tune.encode() if isinstance(tune, str) else tune
         notes = text.rstrip(b"\0").decode("ascii")
     except (UnicodeError, AttributeError):
-        raise InvalidArgument(f"tune = {tune!r} is not allowed: ASCII text") from None
+        raise InvalidArgument(f"tune = {tune!r} is not allowed: it must be ASCII text") from None
     if "\0" in notes or len(notes) > sum(TUNE_SIZES):
         raise InvalidArgument(f"tune of {len(notes)} characters is not allowed: at most {sum(TUNE_SIZES)}, without NUL")
     return notes

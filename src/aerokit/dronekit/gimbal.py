@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 HOME_TIMEOUT_S = 10.0
-MAX_ANGLE_DEG = 360.0  # limit of vehicle.aio.gimbal; larger angles, which sums may yield, are reduced
+MAX_ANGLE_DEG = 360.0  # limit of vehicle.aio.gimbal; larger angles are reduced by whole turns
 UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None)
 
 
 class Gimbal(GimbalPrivates):
-    """The first gimbal: its attitude, and orders to it.
+    """The first gimbal of a vehicle: its attitude, and orders to turn it.
 
     :attr:`pitch`, :attr:`roll` and :attr:`yaw` are None until the vehicle reports a gimbal. Orders return immediately.
     A newer order replaces an unanswered order. A rejection is logged as a warning of the logger ``dronekit``. Raises
@@ -50,7 +50,7 @@ class Gimbal(GimbalPrivates):
     def yaw(self) -> float | None:
         """Yaw in degrees clockwise from north, 0 to 360.
 
-        With MOUNT_STATUS (ArduPilot before 4.3) the reference of the angle depends on the firmware.
+        ArduPilot before 4.3 reports the angle in MOUNT_STATUS, whose reference depends on the firmware.
         """
         return self._attitude.yaw_deg
 
@@ -67,12 +67,12 @@ class Gimbal(GimbalPrivates):
     __repr__ = __str__
 
     def rotate(self, pitch: float, roll: float, yaw: float) -> None:
-        """Turn the gimbal and keep this direction while the vehicle moves.
+        """Turn the gimbal to a direction, which it keeps while the vehicle moves.
 
         Args:
             pitch: degrees from the horizon: 0 is level, -90 straight down.
-            roll: degrees from the horizon. If not 0, a command is used that stabilises yaw relative to the vehicle:
-                the camera points at ``yaw`` at first, but then turns with the vehicle.
+            roll: degrees from the horizon. The only command with a roll stabilises yaw relative to the vehicle. With a
+                roll other than 0, the camera therefore points at ``yaw`` at first, but then turns with the vehicle.
             yaw: degrees clockwise from north.
         """
         pitch, yaw, roll = _checked("pitch", pitch), _checked("yaw", yaw), _checked("roll", roll)
@@ -80,7 +80,7 @@ class Gimbal(GimbalPrivates):
         self._core.order("gimbal", gimbal.point, pitch, yaw, roll_deg=roll, wait=False)
 
     def target_location(self, roi: LocationGlobalRelative | LocationGlobal) -> None:
-        """Point the camera at a location; a copter without a gimbal turns itself. Zeros as location end the order."""
+        """Point the camera at a location; a copter without a gimbal turns itself. A location of zeros ends this."""
         if not isinstance(roi, (LocationGlobal, LocationGlobalRelative)):
             raise InvalidArgument("Expecting roi to be LocationGlobal or LocationGlobalRelative.")
         is_all_zeros = not any(checked_location(roi))
@@ -104,15 +104,15 @@ class Gimbal(GimbalPrivates):
         self._attitude = attitude
         core = self._core
         source = core.aio.gimbal.attitude.source
-        # DroneKit does not report MOUNT_ORIENTATION as ``mount``.
+        # As in DroneKit, MOUNT_ORIENTATION does not notify the listeners of ``mount``.
         if source is not None and source.message != "MOUNT_ORIENTATION":
             core.listeners.notify("mount", self.mount_status)
         core.listeners.notify("gimbal", self)
 
 
 async def _point_above_home(aio: AsyncVehicle, target: Position) -> None:
-    # An autopilot that takes altitudes above sea level needs home for the conversion. Programs point the camera right
-    # after connecting, when home may still be unknown.
+    # If the autopilot takes altitudes above sea level, the conversion needs home, which may still be unknown when a
+    # program points the camera right after connecting.
     if aio.autopilot.repositions_amsl:
         await aio.home.wait_until(lambda _: True, timeout=HOME_TIMEOUT_S, description="home")
     await aio.look_at(target)
@@ -124,5 +124,5 @@ def _checked(name: str, value: float) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
-        raise InvalidArgument(f"{name} = {value!r} is not allowed: a finite number of degrees")
+        raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a finite number of degrees")
     return number if abs(number) <= MAX_ANGLE_DEG else math.remainder(number, 360.0)

@@ -15,7 +15,7 @@ from aerokit.sync.thread_future import ThreadFuture
 
 logger: logging.Logger = logging.getLogger("dronekit")
 
-MAX_QUEUED_CALLS = 10_000  # beyond this, calls that `offer` adds are dropped
+MAX_QUEUED_CALLS = 10_000  # `offer` drops calls while this many are queued
 JOIN_TIMEOUT_S = CALL_TIMEOUT_S = 2.0
 
 
@@ -40,26 +40,26 @@ class ListenerThread:
         self._kept_alive: dict[int, object] = {}
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
-        """Queue a call, from any thread, without blocking. Ignored once stopped."""
+        """Queue a call without blocking, from any thread. Ignored after :meth:`stop`."""
         if self._thread is None:
             self._start()
         if not self.is_stopped:
             self._calls.put((function, args))
 
     def offer(self, function: Callable[..., object], *args: Any) -> None:
-        """Like :meth:`post`, but drop the call while 10,000 calls are queued. Used for values that repeat."""
+        """Queue a call like :meth:`post`, but drop it while 10,000 calls are queued. For values that repeat."""
         if self._calls.qsize() < MAX_QUEUED_CALLS:
             self.post(function, *args)
             return
         if not self.dropped:
-            logger.warning("a listener blocks the callback thread; further values are dropped")
+            logger.warning("a listener blocks the callback thread; further values are dropped while the queue is full")
         self.dropped += 1
 
     def call(self, function: Callable[..., object], *args: Any) -> None:
-        """Queue a call and wait for it. Call directly if the caller runs on this thread, or if the thread has ended.
+        """Queue a call and wait for it, at most two seconds, because the caller may hold a lock that a callback needs.
 
-        If the caller runs on the thread of an event loop or of other listeners, does not wait, to avoid deadlocks.
-        Other callers wait at most two seconds, because they may hold a lock that a callback needs.
+        On this thread, or after it has ended, the function is called directly. On the thread of an event loop or of
+        other listeners, the call is queued without waiting, because waiting could cause a deadlock.
         """
         if self.is_current or self.is_stopped:
             function(*args)
@@ -77,7 +77,7 @@ class ListenerThread:
 
         self.post(call_and_finish)
         deadline = time.monotonic() + CALL_TIMEOUT_S
-        # Waits in short steps, so that Ctrl-C works on every system.
+        # Waits in short steps, because on some systems Ctrl-C does not interrupt a long wait.
         while not called.wait(0.2) and not self.is_stopped and time.monotonic() <= deadline:
             pass
 
@@ -97,10 +97,10 @@ class ListenerThread:
         with self._lock:
             self.is_stopped = True
         self._kept_alive.clear()
-        self._calls.put((_nothing, ()))  # wakes the thread, which then sees that it is stopped
+        self._calls.put((_nothing, ()))  # wakes the thread, which then notices `is_stopped`
 
     def join(self) -> None:
-        """Wait at most two seconds until the thread has ended; a callback may block."""
+        """Wait until the thread has ended, at most two seconds, because a callback may block."""
         if self._thread is not None and not self.is_current:
             self._thread.join(JOIN_TIMEOUT_S)
 
@@ -122,14 +122,14 @@ class ListenerThread:
                 return
             try:
                 function(*args)
-            except BaseException:  # including SystemExit, which would end this thread only
+            except BaseException:  # including SystemExit, which would end only this thread, not the program
                 logger.exception("Exception in a callback")
             self.on_called()
-            del function, args  # otherwise they stay alive until the next call
+            del function, args  # the thread would keep them alive until the next call
 
 
 class _Thread(threading.Thread):
-    """Marks threads that run callbacks."""
+    """A thread that runs callbacks; its class distinguishes it from other threads."""
 
 
 def _must_not_wait() -> bool:

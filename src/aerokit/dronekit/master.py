@@ -28,9 +28,10 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
 
 MAX_MESSAGES = 1000
-MESSAGE_MAX_AGE_S = 5.0  # older messages are dropped, for programs that rarely read
-FIRST_LOOKUP_TIMEOUT_S = 1.0  # time to wait for a message, because none is stored before the first access
-SIGNAL_CHECK_INTERVAL_S = 0.2  # longer waits are split, so that Ctrl-C and a closed connection are noticed
+MESSAGE_MAX_AGE_S = 5.0  # drops older messages, so that a program that reads rarely gets recent ones
+# A look-up waits for its message until this long after the first access, because none is stored before.
+FIRST_LOOKUP_TIMEOUT_S = 1.0
+SIGNAL_CHECK_INTERVAL_S = 0.2  # longer waits are split into steps, so that Ctrl-C and a closed connection end them
 
 
 class Master:
@@ -44,20 +45,20 @@ class Master:
         own_ids = connection.connection
         self.source_system: int = own_ids.source_system
         self.source_component: int = own_ids.source_component
-        """Own component id."""
+        """Component id of this program."""
         self.mav: MessageFactory = MessageFactory(self._send, self.source_system, self.source_component)
-        """Creates and sends messages."""
+        """Object with a method for each message, which creates and sends it."""
         self.messages: Inbox = Inbox(connection)
         """The last message of every type by name, from the first access on."""
 
     @property
     def target_system(self) -> int:
-        """System id of the vehicle, 0 until it is found."""
+        """System id of the vehicle; 0 until the vehicle is found."""
         return self._connection.target_system
 
     @property
     def target_component(self) -> int:
-        """Component id of the vehicle's autopilot, 0 until it is found."""
+        """Component id of the vehicle's autopilot; 0 until the vehicle is found."""
         component_id, _ = self._autopilot()
         return component_id
 
@@ -72,7 +73,7 @@ class Master:
 
     @property
     def flightmode(self) -> str:
-        """Name of the flight mode, ``UNKNOWN`` before the first HEARTBEAT."""
+        """Name of the flight mode; ``UNKNOWN`` before the first HEARTBEAT."""
         _, heartbeat = self._autopilot()
         if heartbeat is None or heartbeat.received_frame is None:
             return "UNKNOWN"
@@ -84,7 +85,7 @@ class Master:
     # --------------------------------------------------------------------------------- modes
 
     def mode_mapping(self) -> dict[str, Any] | None:
-        """Return mode names and numbers (PX4: three numbers each), or None if the modes are unknown."""
+        """Return a dict of mode names to numbers (PX4: to three numbers), or None if the modes are unknown."""
         _, heartbeat = self._autopilot()
         if heartbeat is None:
             return None
@@ -98,6 +99,7 @@ class Master:
         _, heartbeat = self._autopilot()
         is_px4 = heartbeat is not None and heartbeat.autopilot == MavAutopilot.PX4
         vehicle = self._connection.vehicle
+        # Vehicle.mode accepts names and ArduPilot's numbers, but not PX4's three numbers.
         if vehicle is not None and (isinstance(mode, str) or not is_px4):
             vehicle.mode = mode
             return
@@ -158,7 +160,7 @@ class Master:
         self.mav.mission_clear_all_send(self.target_system, self.target_component)
 
     def waypoint_count_send(self, seq: int) -> None:
-        """Announce a mission of ``seq`` items."""
+        """Send MISSION_COUNT, which starts the upload of ``seq`` items."""
         self.mav.mission_count_send(self.target_system, self.target_component, seq)
 
     def waypoint_request_list_send(self) -> None:
@@ -168,7 +170,7 @@ class Master:
         self.mav.mission_request_send(self.target_system, self.target_component, seq)
 
     def waypoint_set_current_send(self, seq: int) -> None:
-        """Continue the mission at an item."""
+        """Send MISSION_SET_CURRENT, so that the mission continues at an item."""
         self.mav.mission_set_current_send(self.target_system, self.target_component, seq)
 
     # ----------------------------------------------------------------------------- receiving
@@ -182,8 +184,8 @@ class Master:
     ) -> Any:
         """Return the next message of one type, several types or any type that satisfies pymavlink's ``condition``.
 
-        From the first call on, the last 1,000 messages of the last five seconds are kept. Without a match, returns None
-        at once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). Raises APIException if
+        The first call starts storing messages: up to 1,000, for up to five seconds. If none matches, returns None at
+        once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). Raises APIException if
         the connection is closed.
         """
         types = (type,) if isinstance(type, str) else type
@@ -192,7 +194,7 @@ class Master:
         def matches(message: Any) -> bool:
             return bool(mavutil.evaluate_condition(condition, {message.get_type(): message}))
 
-        may_wait = blocking and not self._connection.loop.is_current  # the loop's thread receives, and must not wait
+        may_wait = blocking and not self._connection.loop.is_current  # a wait on the loop's thread would stop reception
         return self.messages.next_match(names, matches, timeout if may_wait else 0.0)
 
     def wait_heartbeat(self, blocking: bool = True, timeout: float | None = None) -> Any:
@@ -204,11 +206,11 @@ class Master:
         return getattr(self.messages.get(type), field, default)
 
     def time_since(self, mtype: str) -> float:
-        """Return the age of the last message of a type, or the time since the first access, in seconds."""
+        """Return the age of the last message of a type in seconds; without one, the time since the first access."""
         return self.messages.age_s(mtype)
 
     def param(self, name: str, default: float | None = None) -> float | None:
-        """Return a parameter if it is known, otherwise ``default``."""
+        """Return the value of a parameter if it is known, otherwise ``default``."""
         vehicle = self._connection.vehicle
         if vehicle is None:
             return default
@@ -216,12 +218,12 @@ class Master:
         return value
 
     def location(self, relative_alt: bool = False) -> Any:
-        """Return ``lat``, ``lon`` (degrees), ``alt`` (metres) and ``heading`` (degrees) from new messages.
+        """Wait for a 3D GPS fix and for new messages; return the vehicle's location as ``mavutil.location``.
 
-        Waits for a 3D GPS fix. The altitude is above home (``relative_alt``) or above sea level.
+        ``alt`` is in metres above home with ``relative_alt``, otherwise above sea level.
         """
         gps = self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
-        hud = self.recv_match(type="VFR_HUD", blocking=True)
+        hud = self.recv_match(type="VFR_HUD", blocking=True)  # like pymavlink, which takes the altitude from it
         position = self.recv_match(type="GLOBAL_POSITION_INT", blocking=True)
         alt = position.relative_alt * 1e-3 if relative_alt else hud.alt
         return mavutil.location(gps.lat * 1e-7, gps.lon * 1e-7, alt, hud.heading)
@@ -236,7 +238,7 @@ class Master:
         self._connection.send(from_pymavlink(message, target), to=target or None)
 
     def _autopilot(self) -> tuple[int, Heartbeat | None]:
-        """Return component id and last heartbeat of the vehicle's autopilot."""
+        """Return the component id and the last HEARTBEAT of the vehicle's autopilot."""
         for source, heartbeat in self._connection.connection.heartbeats.copy().items():
             if source[0] == self.target_system and is_autopilot(heartbeat):
                 return source[1], heartbeat
@@ -246,8 +248,8 @@ class Master:
 class Inbox(Mapping[str, Any]):
     """The last message of every type by name, and a queue of unread messages, as pymavlink objects.
 
-    Messages are received from the first access on. Look-ups in the first second wait for a message. Contains messages
-    of the vehicle, of radios and of ground stations, but not of other vehicles.
+    Reception starts with the first access. Look-ups in the first second after that wait for their message. Messages of
+    radios and ground stations are included, but not those of other vehicles.
     """
 
     def __init__(self, connection: ClassicConnection) -> None:
@@ -268,7 +270,7 @@ class Inbox(Mapping[str, Any]):
         return None
 
     def age_s(self, name: str) -> float:
-        """Return the age of the last message of this type, or the time since the first access."""
+        """Return the age of the last message of this type; without one, the time since the first access."""
         self._start()
         frame = self._latest.get(_id_of(name))
         if frame is None:
@@ -280,7 +282,7 @@ class Inbox(Mapping[str, Any]):
         message_id = _id_of(name)
         while (frame := self._latest.get(message_id)) is None and self._may_wait():
             with self._frame_arrived:
-                self._frame_arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)
+                self._frame_arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)  # short, so that _may_wait() ends in time
         if frame is None:
             raise KeyError(name)
         return message_of(frame)
@@ -302,14 +304,14 @@ class Inbox(Mapping[str, Any]):
         if loop.is_current:
             observe_frames(weak_callback(self._on_frame))
         else:
-            loop.call(observe_frames, weak_callback(self._on_frame))  # blocks, so that no later message is missed
+            loop.call(observe_frames, weak_callback(self._on_frame))  # blocks until attached, to miss no later message
 
     def _may_wait(self) -> bool:
         is_young = self._started_at is not None and time.monotonic() < self._started_at + FIRST_LOOKUP_TIMEOUT_S
         return is_young and self._connection.connection.is_open and not self._connection.loop.is_current
 
     def _on_frame(self, frame: Frame, peer: Peer) -> None:
-        # Runs on the loop's thread.
+        # This runs on the loop's thread.
         if self._connection.is_of_another_vehicle(frame.system_id):
             return
         with self._frame_arrived:
@@ -318,7 +320,7 @@ class Inbox(Mapping[str, Any]):
             self._frame_arrived.notify_all()
 
     def _pop(self, deadline: float | None) -> Frame | None:
-        """Return the oldest frame that is recent enough; None if there is none before the deadline."""
+        """Remove and return the oldest frame that is not too old; wait for one until the deadline, then return None."""
         now = self._connection.connection.now
         while True:
             with self._frame_arrived:

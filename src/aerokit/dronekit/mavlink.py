@@ -43,7 +43,7 @@ MAX_OPEN_ATTEMPTS, RETRY_INTERVAL_S = 3, 1.0
 
 
 class MAVConnection(ClassicConnection):
-    """A link that is open until it is closed, with an event loop on a separate thread.
+    """An open link to a vehicle, with an event loop on a separate thread.
 
     ``ip`` is a connection string of DroneKit, pymavlink (a bare ``host:port`` and ``udp:`` listen) or aerokit. A lost
     link is reopened. ``use_native`` is ignored.
@@ -89,7 +89,7 @@ class MAVConnection(ClassicConnection):
     # ----------------------------------------------------------------------------- receiving
 
     def forward_message(self, fn: FunctionT) -> FunctionT:
-        """Decorator: call ``fn(connection, message)`` on the listener thread with every message (of pymavlink)."""
+        """Decorator: call ``fn(connection, message)`` on the listener thread with every message (pymavlink's)."""
         self.message_listeners.append(fn)
         if len(self.message_listeners) == 1:
             self.loop.call_soon(self.connection.observe_frames, self._forward)
@@ -103,7 +103,7 @@ class MAVConnection(ClassicConnection):
         return fn
 
     def pipe(self, target: MAVConnection) -> MAVConnection:
-        """Forward everything received here to ``target``, and vice versa; return ``target``."""
+        """Forward all messages received on this connection to ``target``, and vice versa; return ``target``."""
         target.target_system = self.target_system
         self.loop.call_soon(self.connection.observe_frames, lambda frame, peer: target.write_frame(frame))
         target.loop.call_soon(target.connection.observe_frames, lambda frame, peer: self.write_frame(frame))
@@ -135,7 +135,7 @@ class MAVConnection(ClassicConnection):
     @_accept_input.setter
     def _accept_input(self, value: bool) -> None:
         """Discard received bytes if False, so that programs can test a silent link."""
-        # An attribute of the instance hides the method that the link calls.
+        # The instance attribute takes the place of the method that the link calls with received bytes.
         if value:
             vars(self.connection).pop("bytes_received", None)
         else:
@@ -169,11 +169,11 @@ class MAVConnection(ClassicConnection):
         for listener in tuple(listeners):
             try:
                 listener(self, *args)
-            except BaseException:  # including SystemExit, which would end the listener thread only
+            except BaseException:  # including SystemExit, which would end only the listener thread
                 logger.exception("Exception in a listener of the connection")
 
     def write_frame(self, frame: Frame) -> None:
-        """Write a frame unchanged, from any thread; ignored once the connection is closed."""
+        """Send a frame unchanged, from any thread. Ignored after the connection is closed."""
         with contextlib.suppress(ConnectionClosed):
             self.loop.call_soon(self._write_raw, frame)
 
@@ -207,7 +207,7 @@ def _open(
     overrides: OverrideRelease,
     heartbeat: OwnHeartbeat | None,
 ) -> OpenContext[Connection]:
-    """Open the link. A refused connection is retried, because a program may have just started a simulator."""
+    """Open the link. Retries if the connection is refused: the program may have just started a simulator."""
     own_ids: dict[str, Any] = {"source_system": source_system, "source_component": source_component}
     try:
         _check_address(ip)
@@ -221,7 +221,7 @@ def _open(
                 if attempt == MAX_OPEN_ATTEMPTS - 1 or not isinstance(error.__context__, ConnectionRefusedError):
                     _raise_classic(error)
                 time.sleep(RETRY_INTERVAL_S)
-        raise AssertionError("the last attempt returns or raises")
+        raise AssertionError("unreachable: the last attempt returns or raises")
     except BaseException:
         loop.close()
         raise
@@ -231,7 +231,7 @@ def _open(
 async def _with_override_release(
     opened: contextlib.AbstractAsyncContextManager[Connection], overrides: OverrideRelease
 ) -> AsyncIterator[Connection]:
-    """Release overridden RC channels as the last message, however the connection ends."""
+    """Wrap a connection, so that its last message releases overridden RC channels, however it ends."""
     async with opened as connection:
         try:
             yield connection
@@ -241,34 +241,34 @@ async def _with_override_release(
 
 def _check_address(ip: object) -> None:
     if not isinstance(ip, str):
-        raise InvalidArgument(f"ip = {ip!r} is not a connection string; accepted are\n{ACCEPTED_FORMS}")
+        raise InvalidArgument(f"ip = {ip!r} is not a connection string; accepted forms:\n{ACCEPTED_FORMS}")
     try:
         parse_address(ip)
     except InvalidArgument as error:
-        from aerokit.transport.serial import AddressError  # also the SerialException that pymavlink raises
+        from aerokit.transport.serial import AddressError  # a subclass of the SerialException that pymavlink raises
 
         raise AddressError(str(error)) from None
 
 
 def _raise_classic(error: LinkOpenError) -> NoReturn:
-    """Raise the operating system's exception type, which programs catch."""
+    """Raise a failure to open a link as an exception of the operating system's type, which programs catch."""
     cause = error.__context__
     if isinstance(cause, OSError):
         if cause.errno is not None:
             raise type(cause)(cause.errno, str(error)) from error
         raise type(cause)(str(error)) from error
-    if isinstance(cause, ValueError):  # pyserial: unsupported baud rate
+    if isinstance(cause, ValueError):  # raised by pyserial for an unsupported baud rate
         raise ValueError(str(error)) from error
     raise error
 
 
 def mavudpin_multi(device: str, baud: int | None = None, **_: Any) -> MAVConnection:
-    """Open a listening UDP connection, which answers all senders."""
+    """Listen on a UDP port, and send to every address from which data was received."""
     return MAVConnection(f"udpin:{device}")
 
 
 class MAVWriter:
-    """A file-like object whose ``write`` puts bytes into a queue, for programs that build MAVLink themselves."""
+    """A file-like object whose ``write`` puts bytes into a queue, for programs that encode MAVLink themselves."""
 
     def __init__(self, queue: queue.Queue[bytes]) -> None:
         self.queue = queue
@@ -277,5 +277,5 @@ class MAVWriter:
         self.queue.put(pkt)
 
     def read(self) -> NoReturn:
-        """Raise RuntimeError, because the object is write only."""
-        raise RuntimeError("a MAVWriter is write only")
+        """Raise RuntimeError, because a MAVWriter can only be written to."""
+        raise RuntimeError("a MAVWriter cannot be read, only written to")

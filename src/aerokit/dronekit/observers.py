@@ -23,25 +23,25 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("dronekit")
 
 AttributeListener = Callable[[Any, str, Any], object]
-"""``listener(object, name, value)``, for an attribute or for a message of pymavlink."""
+"""Called as ``listener(object, name, value)``; the value is that of an attribute, or a message of pymavlink."""
 
 ListenerT = TypeVar("ListenerT", bound=AttributeListener)
 
-# Name under which listeners get all attributes or messages.
+# A listener that is registered under this name is called for all attributes or messages.
 EVERY_NAME = "*"
 
-_registration_lock = threading.Lock()  # for adding and removing listeners of any object
+_registration_lock = threading.Lock()  # shared by all objects, for adding and removing listeners
 
 
 class Listeners:
-    """Listeners by attribute or message name. Can be used from any thread.
+    """The listeners of an object, by the name of the attribute or message. Can be used from any thread.
 
     Listeners run on the listener thread, in the order of the values. For each value, the listeners of its name run
-    before those of ``'*'``. Listeners may block, raise and remove themselves. Without a listener thread they run on the
-    notifying thread. ``on_value(name)`` is called for every value, with or without listeners.
+    before those of ``'*'``. Listeners may block, raise exceptions and remove themselves. Without a listener thread they
+    run on the notifying thread. ``on_value(name)`` is called for every value, with or without listeners.
     """
 
-    kind = "attribute"  # in log messages
+    kind = "attribute"  # the word for a name in log messages
 
     def __init__(
         self, owner: object, thread: ListenerThread | None, on_value: Callable[[str], None] | None = None
@@ -49,7 +49,7 @@ class Listeners:
         self._owner, self._thread, self._on_value = owner, thread, on_value
         self.by_name: dict[str, tuple[AttributeListener, ...]] = {}
         self.last_values: dict[str, Any] = {}
-        """Values of attributes whose listeners are notified of changes only."""
+        """The last values of attributes whose listeners are called only on changes."""
 
     def add(self, name: str, listener: AttributeListener) -> None:
         """Add a listener, unless it is already registered."""
@@ -79,9 +79,10 @@ class Listeners:
         return name in self.by_name or EVERY_NAME in self.by_name
 
     def notify(self, name: str, value: Any, cache: bool = False, *, waits: bool = False) -> None:
-        """Notify listeners of a value. With ``cache``, notify only of changes; without it, skip values under high load.
+        """Call the listeners of a name with a value. Returns immediately or, with ``waits``, after the calls.
 
-        Returns immediately or, with ``waits``, after the listeners have run.
+        With ``cache``, listeners are called only if the value has changed. Without it, values are skipped while too
+        many calls are queued.
         """
         if cache:
             if name in self.last_values and self.last_values[name] == value:
@@ -95,29 +96,29 @@ class Listeners:
             self.deliver(name, value)
         elif waits:
             self._thread.call(self.deliver, name, value)
-        elif cache:  # a change must not be lost
+        elif cache:  # offer() could drop the call, but a change must not be lost
             self._thread.post(self.deliver, name, value)
         else:
             self._thread.offer(self.deliver, name, value)
 
     def announce(self, name: str) -> None:
-        """Call :meth:`notify` with the value of the owner's attribute, which is read only if there are listeners."""
+        """Call :meth:`notify` with the owner's attribute of this name. Reads the attribute only if it has listeners."""
         if self.has_listener(name):
             self.notify(name, attrgetter(name)(self._owner))
         elif self._on_value is not None:
             self._on_value(name)
 
     def deliver(self, attr_name: str, value: Any) -> None:
-        """Call the listeners of this name, then those of every name."""
+        """Call the listeners of this name, then the listeners of ``'*'``."""
         for name in (attr_name, EVERY_NAME):
             for listener in self.by_name.get(name, ()):
                 try:
                     listener(self._owner, attr_name, value)
-                except BaseException:  # including SystemExit, which would end the listener thread only
+                except BaseException:  # including SystemExit, which would end only the listener thread
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
     def _keep_owner(self) -> None:
-        # These listeners refer to their owner, so it stays alive while it has any, even if the program has dropped it.
+        # Keeps the owner alive while it has listeners, even if the program has dropped it: they get it as an argument.
         if self._thread is not None:
             self._thread.keep(self, has_listeners=bool(self.by_name))
 
@@ -147,15 +148,15 @@ class HasObservers:
 
     @staticmethod
     def _dk_normalized(attr_name: str) -> str:
-        """Return the name under which listeners of an attribute are stored; parameters override it."""
+        """Return the name under which listeners of an attribute are stored. ``Parameters`` overrides this method."""
         return attr_name
 
     def add_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
-        """Call ``observer(self, attr_name, value)`` when the attribute is updated, or the parameter changed.
+        """Call ``observer(self, attr_name, value)`` when the attribute is updated, or when the parameter changes.
 
         Listeners of sensor values are called with every message. Listeners of states (``mode``, ``armed``,
-        ``system_status``, ``ekf_ok``) are called on changes. ``'*'`` stands for every name. A registered listener is
-        not added again. Names are not checked, because programs may define more attributes.
+        ``system_status``, ``ekf_ok``) are called on changes. ``'*'`` stands for every name. A listener that is
+        already registered is not added again. Names are not checked, because programs may define more attributes.
         """
         self._dk_listeners.add(self._dk_normalized(attr_name), observer)
 
@@ -168,9 +169,9 @@ class HasObservers:
         return listener_decorator(self.add_attribute_listener, name)
 
     def notify_attribute_listeners(self, attr_name: str, value: Any, cache: bool = False) -> None:
-        """Call the listeners of an attribute and wait for them; with ``cache`` only if the value has changed.
+        """Call the listeners of an attribute, and wait for them. With ``cache``, only if the value has changed.
 
-        Call it from message listeners for attributes of your own.
+        Message listeners of your program can use it to announce your own attributes.
         """
         self._dk_listeners.notify(self._dk_normalized(attr_name), value, cache, waits=True)
 
@@ -178,8 +179,8 @@ class HasObservers:
 class MessageListeners(Listeners):
     """Message listeners of a vehicle, called on the listener thread. Imports pymavlink for the first listener.
 
-    Listeners get messages of all components of the vehicle, and of radios, ground stations and so on, but not of other
-    vehicles on the link.
+    Listeners get the messages of all components of the vehicle and of all other systems, such as radios and ground
+    stations, except those of other vehicles.
     """
 
     kind = "message"
@@ -192,7 +193,7 @@ class MessageListeners(Listeners):
 
     def add(self, name: str, listener: AttributeListener) -> None:
         """Add a listener for every message of this name, or for every message (``'*'``)."""
-        _pymavlink()  # takes 60 ms, which would block reception at the first message
+        _pymavlink()  # imported here, because the 60 ms would delay reception at the first message
         super().add(str(name), listener)
         self._attach_now()
 
@@ -203,7 +204,7 @@ class MessageListeners(Listeners):
         self._attach_now()
 
     def start(self) -> None:
-        """Start receiving, once the vehicle is connected (loop thread)."""
+        """Start receiving. Called on the loop thread when the vehicle is connected."""
         self._is_started = True
         self._attach()
 
@@ -213,12 +214,12 @@ class MessageListeners(Listeners):
         if self._handler.loop.is_current:
             self._attach()
         else:
-            with contextlib.suppress(AerokitError):  # the connection is closed
+            with contextlib.suppress(AerokitError):  # the connection may be closed
                 # Blocks until attached, so that no message is missed after add() has returned.
                 self._handler.loop.call(self._attach)
 
     def _attach(self) -> None:
-        """Subscribe to all messages, or to those that have listeners."""
+        """Subscribe to the messages that have listeners, or to all messages if there is a listener for ``'*'``."""
         names = list(self.by_name.copy())
         if EVERY_NAME in names:
             names = [EVERY_NAME]
@@ -261,7 +262,7 @@ def message_of(frame: Frame) -> Any:
 
 @cache
 def _pymavlink() -> tuple[Any, Callable[..., Any]]:
-    """Import pymavlink's ``mavutil`` and our conversion to its messages, once the first of them is needed."""
+    """Import pymavlink's ``mavutil`` and our conversion to its messages when they are first needed."""
     from pymavlink import mavutil
 
     from aerokit.mavlink.pymavlink import to_pymavlink

@@ -34,13 +34,15 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.writing import ResolvedParameter
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-VERSION_TIMEOUT_S = 1.0  # time to wait for AUTOPILOT_VERSION, which shows whether the list is available as a file
+# How long to wait for AUTOPILOT_VERSION, which shows whether the parameters can be downloaded as a file.
+VERSION_TIMEOUT_S = 1.0
 READ_TIMEOUT_S = 30.0
 RETRY_DELAY_S = 1.0
 
-MIN_ATTEMPT_S = 1.0  # on slow links ROUND_TRIPS round trips, if longer
-LAST_WAIT_SHARE = 0.5  # the answer to the last attempt is awaited for this share of an attempt's time
-ROUND_TRIPS = 3
+# An attempt to set a parameter takes ROUND_TRIPS round trips of the link, at least MIN_ATTEMPT_S. After the last
+# attempt, the answer is awaited for LAST_WAIT_SHARE of an attempt's time.
+MIN_ATTEMPT_S, ROUND_TRIPS = 1.0, 3
+LAST_WAIT_SHARE = 0.5
 
 ROUNDING = 0.01  # ArduPilot adds this value before it truncates a number to an integer
 
@@ -54,7 +56,7 @@ class ParameterDownload:
     def __init__(self, core: Core, store_all: Callable[[ParameterTable], None]) -> None:
         self._core, self._store_all = core, store_all
         self.is_complete = False
-        """True once the whole list was received; a reboot of the vehicle does not reset it."""
+        """True after a complete download. It stays True when the vehicle reboots."""
         self._ended: asyncio.Event | None = None
         self._has_warned = False
 
@@ -66,12 +68,12 @@ class ParameterDownload:
             self._core.background(lambda: _download(aio, on_success, on_failure, on_ended))
 
     def request(self) -> None:
-        """Like :meth:`begin`, from any thread; ignored once the connection is closed."""
+        """Begin the download, from any thread. Ignored after the connection is closed."""
         with contextlib.suppress(AerokitError):
             self._core.handler.calls.post(self.begin)
 
     async def wait_for(self, name: str) -> None:
-        """Wait until the parameter is received, alone or with the list, or is known not to exist."""
+        """Wait until the parameter is received, alone or with the list, or reported as missing by the vehicle."""
         if self.is_complete:
             await self._request(name)
             return
@@ -104,7 +106,7 @@ class ParameterDownload:
     async def _request(self, name: str) -> bool:
         """Request a parameter under all its names; return True if it was received or the vehicle reported it missing.
 
-        While the list is being sent, a missing answer does not show that the parameter is missing.
+        While the vehicle sends the list, it may not answer, so a missing answer does not mean a missing parameter.
         """
         from aerokit.parameters.renames import other_names
 
@@ -115,7 +117,7 @@ class ParameterDownload:
             return False
         if any(isinstance(answer, Parameter) for answer in answers):
             return True
-        # With a code, the vehicle itself has reported the parameter missing; without one, it did not answer.
+        # A rejection with a code is the vehicle's answer that the parameter is missing; without a code, no answer came.
         return all(isinstance(answer, ParameterRejected) and answer.code is not None for answer in answers)
 
 
@@ -132,13 +134,14 @@ async def _download(
         return
     except AerokitError as error:
         on_failure(error)
-        await anyio.sleep(RETRY_DELAY_S)  # a program that waits starts the next download as soon as this one has ended
+        # A program that waits for parameters starts the next download as soon as this one has ended.
+        await anyio.sleep(RETRY_DELAY_S)
     finally:
         on_ended()
 
 
 async def _method(vehicle: AsyncVehicle) -> DownloadMethod:
-    """Wait briefly for AUTOPILOT_VERSION, which decides between list and file."""
+    """Return the method of the download. Waits briefly for AUTOPILOT_VERSION, which shows if a file is available."""
     version = vehicle.telemetry.version
     with anyio.move_on_after(VERSION_TIMEOUT_S):
         await version.wait_until(lambda _: True)
@@ -146,7 +149,7 @@ async def _method(vehicle: AsyncVehicle) -> DownloadMethod:
 
 
 class ParameterValues:
-    """Parameters as reported, kept through reboots. One thread writes, any thread reads."""
+    """The parameters that the vehicle has reported; reboots do not clear them. One thread writes, any thread reads."""
 
     def __init__(self) -> None:
         self._parameters: dict[str, Parameter] = {}
@@ -166,7 +169,7 @@ class ParameterValues:
         return resolve_known(name, self._parameters)
 
     def get(self, name: str) -> float | None:
-        """Return the value of exactly this upper-case name, or None."""
+        """Return the value of this upper-case name, or None. Does not try other names of the parameter."""
         parameter = self._parameters.get(name)
         return None if parameter is None else float(parameter.value)
 
@@ -174,7 +177,7 @@ class ParameterValues:
         """Store a parameter; return True if it is new or changed."""
         name, previous = parameter.name, self._parameters.get(parameter.name)
         if previous is None and len(self._parameters) >= MAX_PARAMETERS:
-            return False
+            return False  # limits memory, because a sender can make up names
         if previous is None and name != name.upper():
             self._spelling_of_upper[name.upper()] = name
         self._parameters[name] = parameter
@@ -182,10 +185,10 @@ class ParameterValues:
 
 
 async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int) -> AerokitError | None:
-    """Set a parameter; return None when confirmed, otherwise the error.
+    """Set a parameter. Return None if the vehicle confirms the value, otherwise the error.
 
-    Fractions for integer parameters are cut off, as in ArduPilot. PARAM_SET is sent once; without an answer the value
-    is requested, for ``retries`` + 1 attempts in total.
+    Values of integer parameters are truncated, as in ArduPilot. PARAM_SET is sent once. If it is not answered, the
+    value is requested, with ``retries`` + 1 attempts in total.
     """
     idle_timeout_s = (retries + LAST_WAIT_SHARE) * _attempt_s(aio)
     try:
@@ -207,7 +210,7 @@ def convert_to_type(name: str, value: float, type: ParameterType) -> int | float
 
 
 def _attempt_s(aio: AsyncVehicle) -> float:
-    """Return the seconds for one attempt on this link."""
+    """Return how long an attempt to set a parameter takes on this link, in seconds."""
     report = aio.link_quality.latest
     if report is None or report.round_trip_s is None:
         return MIN_ATTEMPT_S
@@ -220,13 +223,14 @@ WAIT_TIMEOUT_S = 30.0
 class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers):
     """Maps names to values: ``vehicle.parameters['RTL_ALT']``, ``vehicle.parameters['RTL_ALT'] = 30``.
 
-    Names are upper-cased, values are floats. The list is downloaded in the background after connecting, and stays valid
-    through reboots and lost links; changes that the vehicle reports are included. Reading a missing value requests only
+    Names are converted to upper case; values are floats. All parameters are downloaded in the background after
+    connecting. They are not downloaded again after a reboot or a lost link; changes that the vehicle reports are
+    included. Reading a missing value requests only
     that value; iterating waits for the whole list. :func:`len` returns the number received so far.
 
     Old and new names of parameters that ArduPilot renamed both work; values are converted, and a warning is logged.
-    Listeners get ``(parameters, name, value)`` when a value is received first or has changed. Waiting raises
-    APIException while the link is down, and TimeoutError after 30 seconds.
+    Listeners are called as ``listener(parameters, name, value)`` when a value is new or has changed. Methods that wait
+    raise APIException while the link is down, and TimeoutError after 30 seconds.
     """
 
     def __init__(self, vehicle: VehicleCore) -> None:
@@ -253,7 +257,8 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
     ) -> float | None:
         """Return a value, or ``default`` if the vehicle has no such parameter.
 
-        The second argument is not the default. If it is false, only known values count, and nothing is requested.
+        Note that the second argument is not the default. If it is false, nothing is requested: ``default`` is returned
+        unless the value is already known.
         """
         if isinstance(name, str) and (value := self._values.get(name.upper())) is not None:
             return value
@@ -276,7 +281,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         return iter(self._values.copy())
 
     def wait_ready(self, **kwargs: Any) -> None:
-        """Wait until all parameters are received, as ``Vehicle.wait_ready``. Restarts a failed download."""
+        """Wait until all parameters are received, like ``Vehicle.wait_ready``. Restarts a failed download."""
         self._vehicle.wait_ready("parameters", **kwargs)
 
     # ------------------------------------------------------------------------------- writing
@@ -290,20 +295,20 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
     def set(self, name: str, value: float, retries: int = 3, wait_ready: bool = False) -> bool:
         """Set a parameter, and wait until the vehicle has confirmed it.
 
-        Fractions for integer parameters are cut off. ``parameters[name] = value`` does the same.
+        Values of integer parameters are truncated. ``parameters[name] = value`` does the same.
 
         Args:
             name: in any case.
             value: any number.
-            retries: number of retries without an answer, one second each. 0 does not wait: the value is confirmed in
-                the background, and the result is False.
-            wait_ready: wait for the download of all parameters first; not necessary.
+            retries: how often the value is requested again, once a second, if the vehicle does not answer. With 0, the
+                method returns False at once, and the confirmation is checked in the background.
+            wait_ready: wait for the download of all parameters first, which is not necessary.
 
         Returns:
             True if the vehicle has confirmed the value. If not, the reason is logged as an error: no answer, unknown
             parameter, or a value that the vehicle or the parameter's type does not accept.
 
-        InvalidArgument, a ValueError: the name is not a string, or the value not a number.
+        Raises InvalidArgument, a ValueError, if the name is not a string or the value is not a number.
         """
         name, number = _upper_name(name), number_of(name, value)
         if wait_ready:
@@ -313,7 +318,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         if resolved is not None:
             vehicle_name = resolved.name
             if resolved.renamed is not None:
-                converted = resolved.renamed.to_vehicle(number)  # not rounded: set_parameter converts to integers
+                converted = resolved.renamed.to_vehicle(number)  # set_parameter converts to integers
                 warn_of_rename(resolved.renamed)
         core = self._core
         if retries <= 0:
@@ -329,7 +334,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
     def on_attribute(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, attr_name: str | list[str] | tuple[str, ...]
     ) -> Callable[[ListenerT], ListenerT]:
-        """Decorator: add a listener for one parameter name or a list of names."""
+        """Decorator: add a listener for one or several parameters, by name or list of names."""
         return super().on_attribute(attr_name)
 
     @staticmethod
@@ -340,7 +345,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         if not isinstance(name, str):
             return None
         name = name.upper()
-        is_settled = self._is_settled  # read before find(), because the last values may arrive between both
+        is_settled = self._is_settled  # read before find(), because the last value may arrive in between
         resolved = self._values.find(name)
         if resolved is None and waits and not is_settled and _is_valid_name(name):
             self._core.run(self._wait_for, name)
@@ -349,7 +354,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
 
     @property
     def _is_settled(self) -> bool:
-        """True if no unknown parameters can exist: the list is complete and has the reported length."""
+        """True if all parameters are known: the list was received, and has the length that the vehicle reports."""
         return self._download.is_complete and self._count <= len(self._values)
 
     async def _wait_for(self, name: str) -> None:
@@ -367,12 +372,12 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         self._download.begin()
 
     def _on_value(self, message: ParamValue) -> None:
-        # The table of vehicle.aio.parameters has processed this message before; its values have the right types.
+        # vehicle.aio.parameters has already processed this message, and has the value with the right type.
         self._count = message.param_count
         self._store(message.param_id)
 
     def _on_changed(self, event: ParameterChanged) -> None:
-        # This includes downloads that the program started with vehicle.aio.
+        # The event also reports the values of downloads that the program started with vehicle.aio.
         if event.system_id == self._core.target_system:
             self._store(event.name)
 

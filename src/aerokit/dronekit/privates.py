@@ -11,13 +11,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-HEARTBEAT_TIMEOUT_S = 5.0  # as in DroneKit, which reports a link time-out after this silence
+HEARTBEAT_TIMEOUT_S = 5.0  # DroneKit reports a link time-out after this many seconds without a heartbeat
 
 
 class OverridableProperty(Generic[T]):
     """A property that an instance attribute of the same name overrides.
 
-    It is used for names that DroneKit 2.9 lacks, because subclasses of its Vehicle may use these names.
+    Used for names that DroneKit 2.9 does not have: a program's subclass of Vehicle may assign its own attributes to
+    them.
     """
 
     def __init__(self, getter: Callable[[Any], T]) -> None:
@@ -50,7 +51,7 @@ def _velocity(index: int) -> OverridableProperty[Any]:
 
 
 def _message_fields(latest_message: str, *fields: str) -> tuple[OverridableProperty[Any], ...]:
-    """Return a property for each field of the message in this ``LatestMessage`` attribute of the vehicle."""
+    """Return a property for each of these fields of a message. ``latest_message`` names the vehicle's LatestMessage."""
     return tuple(attribute_path(f"{latest_message}.message.{field}") for field in fields)
 
 
@@ -60,7 +61,7 @@ def _last_heartbeat_time(vehicle: Any) -> float:
 
 
 class VehiclePrivates:
-    """Private attributes of DroneKit's Vehicle. Reading works; assigning sets an instance attribute."""
+    """The private attributes of DroneKit's Vehicle, for reading. Assigning creates an instance attribute instead."""
 
     _pitch, _yaw, _roll, _pitchspeed, _yawspeed, _rollspeed = _message_fields(
         "_dk_attitude", "pitch", "yaw", "roll", "pitchspeed", "yawspeed", "rollspeed"
@@ -121,7 +122,7 @@ class GimbalPrivates:
 
 
 class Python2Mapping(Mapping[str, T]):
-    """A mapping with the methods that Python 3 removed."""
+    """A mapping with Python 2's methods, such as ``has_key`` and ``iteritems``."""
 
     def has_key(self, name: object) -> bool:
         return name in self

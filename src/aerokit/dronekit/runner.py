@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from aerokit.dronekit.sitl import ServedVehicle
 else:
-    Loader = MetaPathFinder = object  # importing them takes longer than the rest of this package
+    Loader = MetaPathFinder = object  # importing the real classes takes longer than importing the rest of this package
 
 ALIAS, PACKAGE = "dronekit", "aerokit.dronekit"
 
@@ -39,8 +39,8 @@ def install() -> None:
     """Make ``import dronekit`` and ``from dronekit.lib import …`` import :mod:`aerokit.dronekit`.
 
     ``import dronekit_sitl`` imports :mod:`aerokit.dronekit.sitl`, unless another ``dronekit_sitl`` was imported before.
-    Takes precedence over an installed DroneKit. Idempotent. Use it in test runners (in ``conftest.py``) and embedding
-    programs.
+    Takes precedence over an installed DroneKit. Idempotent. Call it in the ``conftest.py`` of a test run, or in a
+    program that runs DroneKit programs.
 
     Raises:
         ImportError: another ``dronekit`` was imported before.
@@ -52,8 +52,8 @@ def install() -> None:
     if present is not None:
         where = getattr(present, "__file__", None) or "an unknown file"
         raise ImportError(
-            f"another dronekit was imported before, from {where}: call aerokit.dronekit.install() before anything"
-            " imports it",
+            f"another dronekit was already imported from {where}: call aerokit.dronekit.install() before the first"
+            " import of dronekit",
             name=ALIAS,
         )
     sys.modules[ALIAS] = package
@@ -61,7 +61,7 @@ def install() -> None:
 
 
 def uninstall() -> None:
-    """Undo :func:`install`. Modules that were imported in between stay usable. Does nothing without ``install``."""
+    """Undo :func:`install`, if it was called. Modules that were imported under the alias stay usable."""
     if sys.modules.get(ALIAS) is not sys.modules.get(PACKAGE):
         return
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _SubmoduleFinder)]
@@ -80,7 +80,7 @@ def _own_name(name: str) -> str | None:
 
 
 class _SubmoduleFinder(MetaPathFinder):
-    """Makes ``dronekit.mavlink`` the same module object as ``aerokit.dronekit.mavlink``."""
+    """Import finder that makes ``dronekit.mavlink`` the same module object as ``aerokit.dronekit.mavlink``."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -99,7 +99,7 @@ class _SubmoduleLoader(Loader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        module.__spec__ = self._own_spec  # the import system has replaced it
+        module.__spec__ = self._own_spec  # restored, because the import system has set the spec of the alias
 
 
 FAILED, CANNOT_OPEN = 1, 2
@@ -112,10 +112,10 @@ RUNPY_FILES = (runpy.__file__, "<frozen runpy>")
 def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> None:
     """Run a DroneKit program in this process, and return when its main program has ended.
 
-    The program's environment is that of ``python program.py arguments…``: ``sys.argv``, its folder first in
-    ``sys.path``, ``__name__ == '__main__'``. ``import dronekit`` imports :mod:`aerokit.dronekit`, also afterwards. A
-    folder or zip file with a ``__main__.py`` is a program, too. Afterwards ``sys`` is restored, and open vehicles are
-    closed.
+    The program finds the environment of ``python program.py arguments…``: ``sys.argv``, its folder first in
+    ``sys.path``, and ``__name__ == '__main__'``. A folder or zip file with a ``__main__.py`` is a program, too. At the
+    end ``sys`` is restored, and open vehicles are closed; ``import dronekit`` continues to import
+    :mod:`aerokit.dronekit`.
 
     Args:
         path: the program.
@@ -138,7 +138,7 @@ def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> N
 
 
 def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> int:
-    """Run the program that a command line names, in this process. Its exceptions propagate.
+    """Run the program that a command line names in this process. Exceptions of the program propagate.
 
     Args:
         arguments: ``program.py arguments…`` or ``-m module arguments…``.
@@ -164,7 +164,7 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
         return FAILED
     sys.excepthook = _print_program_traceback
     if not getattr(sys.flags, "safe_path", False):
-        del sys.path[:1]  # remove the folder of this command
+        del sys.path[:1]  # the folder of this command; the program's own folder takes its place
     run = _run_module if options.module else _run_file
     try:
         run(options.program, program_arguments)
@@ -205,12 +205,12 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _split_at_program(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
-    """Return the arguments up to the program, and the arguments of the program."""
-    is_value = False
+    """Split a command line after the program: return the arguments up to it, and the program's own arguments."""
+    is_option_value = False
     for count, argument in enumerate(arguments, 1):
-        if not is_value and not argument.startswith("-"):
+        if not is_option_value and not argument.startswith("-"):
             return arguments[:count], arguments[count:]
-        is_value = not is_value and argument in OPTIONS_WITH_VALUE
+        is_option_value = not is_option_value and argument in OPTIONS_WITH_VALUE
     return arguments, []
 
 
@@ -228,7 +228,10 @@ def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
 
 
 def _module_error(module: str) -> str | None:
-    """Return Python's error text for ``-m``, or None. The program's folder is the working directory."""
+    """Return the error text that ``python -m`` prints if it cannot run the module; None if it can.
+
+    Modules are searched in the working directory, too.
+    """
     sys.path.insert(0, os.getcwd())
     try:
         spec = importlib.util.find_spec(module)
@@ -245,7 +248,7 @@ def _module_error(module: str) -> str | None:
 
 
 def _missing_main_error(path: str) -> str | None:
-    """Return Python's error text for a folder without ``__main__``, or None."""
+    """Return the error text that Python prints for a folder without a ``__main__.py``, otherwise None."""
     return f"can't find '__main__' module in {path!r}" if _lacks_main(path) else None
 
 
@@ -258,7 +261,7 @@ def _lacks_main(path: str) -> bool:
 def _file_error(path: str) -> str | None:
     try:
         io.open_code(os.path.abspath(path)).close()
-    except IsADirectoryError:  # a folder with a __main__.py is a program
+    except IsADirectoryError:  # not an error here, because a folder with a __main__.py is a program
         return None
     except OSError as error:
         return error.strerror
@@ -276,7 +279,7 @@ def _run_file(path: str, arguments: Sequence[str]) -> None:
     if os.path.isdir(path) or path.endswith(".pyc") or zipfile.is_zipfile(path):
         runpy.run_path(path, run_name="__main__")
         return
-    # Not by runpy, which removes the module `__main__` when the main program ends, while threads may still need it.
+    # Does not use runpy, which removes the module `__main__` at the end, although threads may still need it.
     path = os.path.abspath(path)
     with io.open_code(path) as file:
         source = file.read()
@@ -303,16 +306,17 @@ def _restored_sys() -> Iterator[None]:
 
 
 def _print_program_traceback(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-    """Print a traceback without the frames of this module, like Python for its own frames."""
+    """Print a traceback without the frames of this module, as if ``python program.py`` had printed it."""
     error.__traceback__ = _without_our_frames(traceback)
     sys.__excepthook__(kind, error, error.__traceback__)
 
 
 def _without_our_frames(traceback: TracebackType | None) -> TracebackType | None:
     entry = traceback
+    # Skip our frames up to the one that runs the program, then those of runpy.
     while entry is not None and entry.tb_frame.f_code not in (_run_file.__code__, _run_module.__code__):
         entry = entry.tb_next
-    if entry is None:  # the error is ours
+    if entry is None:  # the error did not happen in the program, so all frames are of interest
         return traceback
     entry = entry.tb_next
     while entry is not None and entry.tb_frame.f_code.co_filename in RUNPY_FILES:

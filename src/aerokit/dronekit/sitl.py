@@ -1,4 +1,4 @@
-"""Replacement of the package dronekit-sitl 3.3 for programs that :mod:`aerokit.dronekit` runs: simulated vehicles.
+"""Simulated vehicles for DroneKit programs, with the interface of the package dronekit-sitl 3.3.
 
 Provides ``start_default``, ``SITL`` and ``version_list``. Downloads nothing; vehicles run in threads of this process.
 """
@@ -21,17 +21,20 @@ from aerokit.sim.server import open_simulator
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-# Maps vehicles of dronekit-sitl to kinds of the simulator.
+# Maps the vehicle names of dronekit-sitl to the simulator's names.
 KINDS = {"copter": "copter", "solo": "copter", "plane": "plane", "rover": "rover", "sub": "sub"}
 START_TIMEOUT_S = 30.0
 USUAL_ADDRESSES = ("tcpin:127.0.0.1:5760", "udpout:127.0.0.1:14550")
 
-_next_instance = 0  # number of the next SITL object created without a number
-_vehicle_for_program: ServedVehicle | None = None  # started by the runner before the program (--sim)
+_next_instance = 0  # instance number of the next SITL object that is created without one
+_vehicle_for_program: ServedVehicle | None = None  # the vehicle that --sim has started before the program
 
 
 class ServedVehicle:
-    """A simulated vehicle on addresses, in a separate thread, until :meth:`stop` or process exit."""
+    """A simulated vehicle that runs in a separate thread and is served on several addresses.
+
+    It runs until :meth:`stop` is called or the process exits.
+    """
 
     def __init__(
         self,
@@ -44,11 +47,11 @@ class ServedVehicle:
         self.kind: str = kind
         self.speedup: float = speedup
         self.addresses: tuple[str, ...] = ()
-        """Addresses in the simulator's spelling."""
+        """Addresses in the simulator's form, such as ``tcpin:127.0.0.1:5760``."""
         self._vehicle = simulated(kind, home=home)
         self._requested_addresses = tuple(addresses)
         self._error: Exception | None = None
-        self._startup_ended = threading.Event()  # set when the vehicle is served, or could not be
+        self._startup_ended = threading.Event()  # set when the vehicle is served, or when that has failed
         self._loop = asyncio.new_event_loop()
         self._stop_requested = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="aerokit simulated vehicle", daemon=True)
@@ -68,7 +71,7 @@ class ServedVehicle:
 
     def stop(self) -> None:
         if self._thread.is_alive():
-            with suppress(RuntimeError):  # the loop ends at this moment
+            with suppress(RuntimeError):  # the loop may have just ended
                 self._loop.call_soon_threadsafe(self._stop_requested.set)
             self._thread.join()
 
@@ -79,7 +82,7 @@ class ServedVehicle:
         try:
             self._loop.run_until_complete(self._serve())
         except Exception as error:
-            if self._startup_ended.is_set():
+            if self._startup_ended.is_set():  # otherwise __init__ raises the error
                 errprinter(f"the simulated vehicle failed: {error!r}")
             self._error = error
         finally:
@@ -95,7 +98,7 @@ class ServedVehicle:
 
 
 def serve_for_program(kind: str, home: tuple[float, float, float], speedup: float) -> ServedVehicle:
-    """Serve a vehicle on the usual addresses, until the program starts another vehicle.
+    """Serve a vehicle on DroneKit's usual addresses until the program starts another vehicle.
 
     Raises:
         InvalidArgument: the kind is unknown.
@@ -112,7 +115,7 @@ def serve_for_program(kind: str, home: tuple[float, float, float], speedup: floa
 
 
 class SITL:
-    """A simulated ArduPilot vehicle with the interface of dronekit-sitl. Ignores ``path`` and options for debuggers."""
+    """A simulated ArduPilot vehicle with the interface of dronekit-sitl. Ignores ``path`` and debugger options."""
 
     def __init__(self, path: str | None = None, instance: int | None = None, *_: Any, **__: Any) -> None:
         global _next_instance
@@ -124,9 +127,9 @@ class SITL:
         self._served: ServedVehicle | None = None
 
     def download(self, system: str, version: str, target: str | None = None, verbose: bool = False) -> None:
-        """Select the vehicle. Downloads nothing; ``version`` is ignored."""
+        """Select the kind of vehicle. Downloads nothing; ``version`` is ignored."""
         if system not in KINDS:
-            raise InvalidArgument(f"dronekit_sitl: system = {system!r} is not one of: {', '.join(KINDS)}")
+            raise InvalidArgument(f"dronekit_sitl: system = {system!r} is not allowed: one of {', '.join(KINDS)}")
         self._kind = KINDS[system]
 
     def launch(
@@ -142,7 +145,7 @@ class SITL:
         """Start the vehicle. Supports SITL's arguments ``--home``, ``--speedup``, ``--model`` and ``-I``.
 
         Raises:
-            ChildProcessError: the vehicle is running, and ``restart`` is not set.
+            ChildProcessError: the vehicle is already running, and ``restart`` is false.
             LinkOpenError: the port is in use.
         """
         global _vehicle_for_program
@@ -154,7 +157,8 @@ class SITL:
         if options.instance is not None:
             self.instance = options.instance
         kind, speedup, addresses = self._kind, speedup or options.speedup, [self._address()]
-        if _vehicle_for_program is not None:  # the new vehicle replaces it; by default with its kind and speed
+        # The new vehicle replaces that of --sim, whose kind and speed are the defaults.
+        if _vehicle_for_program is not None:
             kind = kind or _vehicle_for_program.kind
             speedup = speedup or _vehicle_for_program.speedup
             addresses += USUAL_ADDRESSES[1:]
@@ -191,9 +195,9 @@ class SITL:
 def start_default(lat: float | None = None, lon: float | None = None) -> SITL:
     """Start a copter near Canberra or at this position; InvalidArgument if only one coordinate is given."""
     if (lat is None) != (lon is None):
-        raise InvalidArgument("dronekit_sitl.start_default: give both lat and lon, or neither")
+        raise InvalidArgument("dronekit_sitl.start_default needs either both lat and lon or neither")
     sitl = SITL()
-    heading_deg = 353  # ignored, but SITL's --home has a fourth part
+    heading_deg = 353  # required by the format of SITL's --home, but ignored
     sitl.launch([] if lat is None else [f"--home={lat:f},{lon:f},{HOME[2]},{heading_deg}"])
     return sitl
 
@@ -207,7 +211,7 @@ def parse_home(text: str) -> tuple[float, float, float]:
     try:
         latitude, longitude, altitude = (float(part) for part in text.split(",")[:3])
     except ValueError:
-        raise InvalidArgument(f"home = {text!r} is not LAT,LON,ALT in degrees and metres") from None
+        raise InvalidArgument(f"home = {text!r} is not allowed: it must be LAT,LON,ALT in degrees and metres") from None
     return latitude, longitude, altitude
 
 

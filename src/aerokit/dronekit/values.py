@@ -1,7 +1,7 @@
 """Values of vehicle attributes, with DroneKit's names and texts.
 
-They are plain objects with writable attributes. Unknown values are None; numbers that a vehicle may not report are
-typed ``float | Any``, so that type checkers do not require a check for None. Locations compare by identity.
+Values are plain objects with writable attributes. Unknown numbers are None. They are typed ``float | Any``, so that
+type checkers do not require a check for None. Locations compare by identity.
 """
 
 from __future__ import annotations
@@ -9,16 +9,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
-# FIRMWARE_VERSION_TYPE: 255 for a release, otherwise 64 times the index of the release type plus its number.
+# The byte FIRMWARE_VERSION_TYPE is 255 for a release. Otherwise it is 64 times the index in RELEASE_TYPES, plus the
+# number of the pre-release (2 for rc2).
 STABLE = 255
 RELEASE_TYPES = ("dev", "alpha", "beta", "rc")
-# The values of MAV_AUTOPILOT and MAV_TYPE for which DroneKit has a name.
+# DroneKit's names for values of MAV_AUTOPILOT and MAV_TYPE. Other values have no name.
 AUTOPILOTS = {3: "APM:", 12: "PX4"}
 VEHICLES = {1: "Plane", 2: "Copter", 10: "Rover"}
 
 
 class _Value:
-    _text: str  # format string
+    _text: str  # format string, which gets the object as its argument
 
     def __str__(self) -> str:
         return self._text.format(self)
@@ -39,7 +40,7 @@ class Attitude(_Value):
 
 
 class _Place(_Value):
-    # Always None. DroneKit's locations have these attributes for old programs.
+    # DroneKit's locations have these attributes, which are always None, for old programs.
     local_frame: Any = None
     global_frame: Any = None
 
@@ -72,9 +73,9 @@ class LocationLocal(_Value):
         self.down = down
 
     def distance_home(self) -> float | None:
-        """Distance to the origin in metres, horizontal if ``down`` is None; None if ``north`` or ``east`` is None.
+        """Distance to the origin in metres; None if ``north`` or ``east`` is None.
 
-        The origin is at home, unless the origin or home was moved.
+        If ``down`` is None, the distance is horizontal. The origin is at home, unless the origin or home was moved.
         """
         if self.north is None or self.east is None:
             return None
@@ -100,7 +101,9 @@ class GPSInfo(_Value):
 
 
 class Battery(_Value):
-    """The main battery: ``voltage`` in volts, ``current`` in amperes or None, ``level`` in percent or None.
+    """The main battery: ``voltage`` in volts, ``current`` in amperes, ``level`` in percent.
+
+    An unknown current or level is None.
 
     The constructor takes the fields of SYS_STATUS: millivolts, hundredths of an ampere, and percent. A voltage of
     65535, which means unknown, becomes 65.535 V. A current or percentage of -1 is unknown.
@@ -119,7 +122,7 @@ class Battery(_Value):
 
 
 class Rangefinder(_Value):
-    """Rangefinder: ``distance`` in metres and ``voltage`` in volts, or None."""
+    """Rangefinder: ``distance`` in metres and ``voltage`` in volts; None if unknown."""
 
     _text = "Rangefinder: distance={0.distance}, voltage={0.voltage}"
 
@@ -129,7 +132,10 @@ class Rangefinder(_Value):
 
 
 class Wind(_Value):
-    """Wind: ``wind_direction`` (from) in degrees, ``wind_speed`` and ``wind_speed_z`` (up) in m/s."""
+    """Wind: the direction ``wind_direction`` from which it blows in degrees, and its speeds in m/s.
+
+    ``wind_speed`` is horizontal, ``wind_speed_z`` vertical and positive upwards.
+    """
 
     _text = "Wind: wind direction: {0.wind_direction}, wind speed: {0.wind_speed}, wind speed z: {0.wind_speed_z}"
 
@@ -140,7 +146,7 @@ class Wind(_Value):
 
 
 class _Named(_Value):
-    """A value that equals its name and is hashable."""
+    """Base class of a value that equals its name as a string and can be a dict key."""
 
     _name_attribute: str
 
@@ -154,7 +160,7 @@ class _Named(_Value):
 
 
 class VehicleMode(_Named):
-    """A flight mode by its ``name``: ``VehicleMode("GUIDED")``. It equals its name, and can be a dict key."""
+    """A flight mode, given by its ``name``: ``VehicleMode("GUIDED")``. It equals its name, and can be a dict key."""
 
     _text, _name_attribute = "VehicleMode:{0.name}", "name"
 
@@ -163,9 +169,9 @@ class VehicleMode(_Named):
 
 
 class SystemStatus(_Named):
-    """MAV_STATE by name: ``state`` is UNINIT, BOOT, CALIBRATING, STANDBY, ACTIVE, CRITICAL, EMERGENCY or POWEROFF.
+    """The vehicle's MAV_STATE. It equals the text of its ``state``, and can be a dict key.
 
-    It equals its state as a string, and can be a dict key.
+    ``state`` is UNINIT, BOOT, CALIBRATING, STANDBY, ACTIVE, CRITICAL, EMERGENCY or POWEROFF.
     """
 
     _text, _name_attribute = "SystemStatus:{0.state}", "state"
@@ -179,7 +185,7 @@ class Version(_Value):
 
     Args:
         raw_version: flight_sw_version of AUTOPILOT_VERSION, with one byte each for ``major``, ``minor``, ``patch`` and
-            ``release``; None if unknown; all four are then None.
+            ``release``. If it is None (unknown), these four are None.
         autopilot_type: MAV_AUTOPILOT of the heartbeat, or None.
         vehicle_type: MAV_TYPE of the heartbeat, or None.
     """
@@ -202,13 +208,16 @@ class Version(_Value):
         return bool(self.release == STABLE)
 
     def release_version(self) -> int | None:
-        """Return 23 for rc23; 0 for a release, None if the version is unknown."""
+        """Return the number of the pre-release (23 for rc23); 0 for a release, None if the version is unknown."""
         if self.release is None:
             return None
         return 0 if self.is_stable() else int(self.release % 64)
 
     def release_type(self) -> str | None:
-        """Return ``'dev'``, ``'alpha'``, ``'beta'`` or ``'rc'`` (also for releases); None if the version is unknown."""
+        """Return ``'dev'``, ``'alpha'``, ``'beta'`` or ``'rc'``; None if the version is unknown.
+
+        As in DroneKit, a release is of the type ``'rc'``.
+        """
         return None if self.release is None else RELEASE_TYPES[self.release >> 6]
 
     def __str__(self) -> str:

@@ -50,25 +50,25 @@ if TYPE_CHECKING:
 
 FIRST_VALUES = ("attitude", "location.global_relative_frame", "heading", "gps_0", "battery")
 
-# Seconds to wait for the first telemetry, because DroneKit programs read attributes right after connect(). Not every
-# vehicle reports every value, so waiting also ends if no further value arrives within the second time.
+# connect() waits this long for the first telemetry, because DroneKit programs read attributes right after it. Not every
+# vehicle reports every value, so connect() also returns if no further value arrives for NEXT_VALUE_TIMEOUT_S.
 FIRST_VALUES_TIMEOUT_S, NEXT_VALUE_TIMEOUT_S = 1.0, 0.4
 
 CONNECT_TIMEOUT_S = 30.0
 
 MAX_STREAM_RATE_HZ = 1000.0
 
-# Levels of the logger `autopilot` by MAV_SEVERITY.
+# Maps MAV_SEVERITY (the index) to levels of the logger `autopilot`.
 LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO, logging.INFO, logging.DEBUG)
 
 
 class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
-    """A vehicle: attributes to read and to listen to, orders, parameters, missions.
+    """A vehicle: its attributes and their listeners, orders, parameters and missions.
 
-    Created by :func:`connect`; ``connect(…, vehicle_class=…)`` uses a subclass, whose constructor passes its one
-    argument on and may add listeners and attributes. The vehicle can be used from any thread. Callbacks run in order on
-    a separate thread, and may use the vehicle, too. The vehicle is a context manager; :meth:`close` closes the
-    connection.
+    :func:`connect` creates it. ``connect(…, vehicle_class=…)`` creates a subclass, whose constructor must pass its one
+    argument to this class and may add listeners and attributes. The vehicle can be used from any thread. Callbacks run
+    in order on a separate thread, and may use the vehicle, too. The vehicle is a context manager; :meth:`close`
+    closes the connection.
     """
 
     def __init__(self, handler: MAVConnection) -> None:
@@ -80,18 +80,18 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         self._channels = Channels(self, 8)
         self._gimbal = Gimbal(self)
         self._parameters = Parameters(self)
-        self._dk.ready.mark("commands")
+        self._dk.ready.mark("commands")  # the empty sequence, which is valid until download() is called
 
     # --------------------------------------------------------------------------------- parts
 
     @property
     def channels(self) -> Channels:
-        """RC channels by number; ``.overrides`` sets overrides."""
+        """RC channels by number. Its attribute ``overrides`` overrides channels."""
         return self._channels
 
     @property
     def gimbal(self) -> Gimbal:
-        """The gimbal: its attitude, and orders to it."""
+        """The gimbal: its attitude, and orders to turn it."""
         return self._gimbal
 
     @property
@@ -106,10 +106,10 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
     @cached_property
     def _commands(self) -> CommandSequence:
-        # Imports pymavlink, which programs without missions do not need.
+        # Imported here, because it imports pymavlink, which programs without missions do not need.
         from aerokit.dronekit.commands import CommandSequence
 
-        # Two threads may get here at once; setdefault gives them the same object.
+        # Two threads may get here at the same time; setdefault returns the same object to both.
         commands: CommandSequence = self.__dict__.setdefault("_commands", CommandSequence(self))
         return commands
 
@@ -136,8 +136,8 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     def aio(self) -> AsyncVehicle:
         """The asynchronous vehicle (:class:`aerokit.Vehicle`), for coroutines on its loop.
 
-        Its state cells (``vehicle.aio.position.latest``) can be read from any thread; :meth:`run` runs coroutines.
-        Raises APIException before the vehicle is connected.
+        Its state values (``vehicle.aio.position.latest``) can be read from any thread. :meth:`run` runs a coroutine
+        function on its loop. Raises APIException before the vehicle is connected.
         """
         return self._dk.aio
 
@@ -181,19 +181,19 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return listener_decorator(self.add_message_listener, name)
 
     def notify_message_listeners(self, name: str, msg: Any) -> None:
-        """Call the listeners of a message as if it was received, and wait for them."""
+        """Call the listeners of a message as if the message was received, and wait until they return."""
         self._message_listeners.notify(name, msg, waits=True)
 
     @property
     def message_factory(self) -> MessageFactory:
-        """Creates pymavlink messages for :meth:`send_mavlink`: ``vehicle.message_factory.command_long_encode(…)``."""
+        """Creates pymavlink's messages for :meth:`send_mavlink`: ``vehicle.message_factory.command_long_encode(…)``."""
         return self._handler.master.mav
 
     def send_mavlink(self, message: Any) -> None:
         """Send a message made by :attr:`message_factory`, pymavlink or ``aerokit.messages`` once, without blocking.
 
         Sets ``target_system`` in the message to this vehicle; ``target_component`` stays. Raises InvalidArgument (a
-        ValueError) for a wrong field, and APIException while the link is down; nothing was sent then.
+        ValueError) for a wrong field, and APIException while the link is down; in both cases nothing was sent.
         """
         from aerokit.mavlink.pymavlink import from_pymavlink
 
@@ -208,14 +208,14 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
         Args:
             rate: Hz of the requested data streams; None requests none.
-            heartbeat_timeout: seconds to wait for the first heartbeat (0 or less: 30). In flight, orders and waits
-                raise APIException after a silence of this length (0 or less: never).
+            heartbeat_timeout: seconds to wait for the first heartbeat (0 or less: 30 s). Later, orders and waits raise
+                APIException after this many seconds without a heartbeat (0 or less: never).
 
         Raises:
             APIException: no vehicle was found in time; the text describes what was received instead.
         """
         with self._dk_initializing:
-            if self._dk.aio_or_none is not None:
+            if self._dk.aio_or_none is not None:  # already connected by an earlier call
                 self._dk_wait_until_booted(timeout=max(heartbeat_timeout or 0.0, 0.0) or CONNECT_TIMEOUT_S)
                 return
             self._dk.heartbeat_limit_s = max(heartbeat_timeout or 0.0, 0.0)
@@ -235,8 +235,8 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         """Wait up to two seconds for answers to recent orders, then close the link and end the threads.
 
         Idempotent; can be called from any thread, including callbacks. Releases overridden RC channels
-        (``connect(release_overrides=)``) and sends nothing else: a vehicle in the air continues what it does. Waiting
-        calls raise APIException.
+        (``connect(release_overrides=)``) and sends nothing else, so a vehicle in the air continues as before. Calls
+        that wait in other threads raise APIException.
         """
         self._handler.close()
 
@@ -255,13 +255,13 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return not mode_name(self._dk.aio, mode_code).endswith(f" {mode_code}")
 
     def _dk_begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
-        """Start receiving in the loop iteration in which the vehicle was found. Uses weak references only."""
+        """Start receiving, in the same loop iteration in which the vehicle was found. Uses weak references only."""
         core = self._dk
         core.begin(aio, tasks)
         self._handler.vehicle, self._handler.note_sent = self, aio.note_sent
         self._handler.calls.describe = self._dk_describe
         aio.telemetry.status_text.observe(weak_callback(self._dk_on_status_text), every_arrival=True)
-        # The first heartbeat, by which the vehicle was found, arrived before the handlers were attached.
+        # The heartbeat that revealed the vehicle arrived before the handlers were attached, so it is handled here.
         first_heartbeat = aio.connection.heartbeats.get((aio.system_id, aio.component_id))
         if first_heartbeat is not None:
             self._dk_on_heartbeat(first_heartbeat)
@@ -285,7 +285,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         deadline = next_value_deadline = now + FIRST_VALUES_TIMEOUT_S
         missing_before = names
         while (missing := names - ready.names) and now < min(deadline, next_value_deadline):
-            if missing < missing_before:  # another value has arrived, perhaps before this loop
+            if missing < missing_before:  # at least one more value has arrived (`<` means: a proper subset)
                 missing_before, next_value_deadline = missing, now + NEXT_VALUE_TIMEOUT_S
             ready.wait_for_change(names, min(deadline, next_value_deadline) - now)
             now = time.monotonic()
@@ -303,11 +303,12 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 async def _connected(
     connection: Connection, timeout: float, begin: Callable[..., None], rate: float | None
 ) -> AsyncIterator[AsyncVehicle]:
-    """Connect and request streams. Runs on the loop and does not refer to the classic vehicle."""
+    """Connect on the loop, and request streams. Does not refer to the classic vehicle."""
     async with connect_async(connection, timeout=timeout, rates={}) as aio:
         tasks = BackgroundTasks(connection.fail)
         try:
             begin(aio, tasks)
+            # DroneKit accepts a rate of 0 or less, but aio.streams() does not; 1 Hz is requested instead.
             with nullcontext() if rate is None else aio.streams(min(rate, MAX_STREAM_RATE_HZ) if rate > 0 else 1.0):
                 yield aio
         finally:
@@ -315,7 +316,7 @@ async def _connected(
 
 
 async def _request_capabilities(aio: AsyncVehicle) -> None:
-    # Old firmware needs this command; it is repeated until the version arrives.
+    # Old firmware sends its version only after this command, which is repeated until the version arrives.
     for _ in range(5):
         if aio.telemetry.version.is_known:
             return
@@ -324,7 +325,7 @@ async def _request_capabilities(aio: AsyncVehicle) -> None:
 
 
 def default_still_waiting_callback(atts: Iterable[str]) -> None:
-    """Log the missing attributes at level DEBUG of the logger ``dronekit``."""
+    """Log the names of missing attributes with the logger ``dronekit``, at level DEBUG."""
     logging.getLogger("dronekit").debug("Still waiting for data from vehicle: %s", ",".join(sorted(atts)))
 
 
@@ -360,22 +361,21 @@ def connect(
         vehicle_class: a subclass of :class:`Vehicle`.
         rate: Hz of the requested data streams; None requests none.
         baud: bits per second, for a serial port whose string has no baud rate.
-        heartbeat_timeout: seconds to wait for the first heartbeat (0: 30), and the silence in flight after which orders
-            and waits raise (0: never).
+        heartbeat_timeout: seconds to wait for the first heartbeat (0: 30 s). Later, orders and waits raise APIException
+            after this many seconds without a heartbeat (0: never).
         source_system: own system id, 1 to 255.
         source_component: own component id, 0 to 255.
         use_native: ignored.
-        release_overrides: release RC channels that are still overridden when the connection ends. False leaves them, as
-            DroneKit does, until the vehicle times out (ArduPilot: RC_OVERRIDE_TIME).
-        heartbeat: content of our HEARTBEAT, and the time for which it continues after the program last read an
-            attribute, gave an order, waited, or returned from a listener (60 s; :class:`aerokit.OwnHeartbeat`). None
-            sends none.
+        release_overrides: release RC channels that are still overridden when the connection ends. With False, overrides
+            stay, as in DroneKit, until the vehicle ends them (ArduPilot: after RC_OVERRIDE_TIME).
+        heartbeat: content of our HEARTBEAT; None: no HEARTBEAT. It stops when the program has done nothing for 60 s
+            (see :class:`aerokit.OwnHeartbeat`): no attribute read, no order, no wait, and no return from a listener.
 
     Raises:
         OSError: the link cannot be opened (ConnectionRefusedError, socket.gaierror, serial.SerialException …).
         ValueError: an argument is wrong; for an invalid connection string also an OSError.
         APIException: no vehicle was found in time; the text describes what was received instead.
-        TimeoutError: ``wait_ready`` was not satisfied in time. On any error everything is closed.
+        TimeoutError: a value for ``wait_ready`` did not arrive in time. On any error, the connection is closed.
     """
     from aerokit.dronekit.mavlink import MAVConnection
 
@@ -389,7 +389,7 @@ def connect(
             heartbeat=heartbeat,
         )
     except (OSError, ValueError, KeyboardInterrupt) as error:
-        raise error.with_traceback(None) from None  # internal frames do not help the user
+        raise error.with_traceback(None) from None  # frames of this package do not help the user
     handler.overrides.is_enabled = release_overrides
     try:
         vehicle = cast("VehicleT", Vehicle(handler)) if vehicle_class is None else vehicle_class(handler)
@@ -415,7 +415,7 @@ def connect(
 
 
 def _print_texts(handler: MAVConnection, status_printer: Callable[[str], object]) -> None:
-    # Texts go through the logger `autopilot`, as in DroneKit, so that the logger's level applies.
+    # As in DroneKit, the printer is a handler of the logger `autopilot`, so that the logger's level applies.
     logger, printer = logging.getLogger("autopilot"), ErrprinterHandler(status_printer)
     logger.addHandler(printer)
     handler.on_close(lambda: logger.removeHandler(printer))

@@ -40,13 +40,13 @@ class FleetAction:
 
     Args:
         context: context of the fleet.
-        name: appears in results, events and errors.
+        name: name of the action in results, events and errors.
         members: members that run the action; unavailable members are skipped.
-        execute: called with each available member.
+        execute: coroutine function that is called with each available member.
         timeout: seconds for each member; None: no limit.
         stagger_s: delay in seconds between the starts of consecutive members.
-        is_safe: the action ends a flight (hold, land, return), so a member's failure does not stop the other members.
-        holds_if_cancelled: on cancellation, members that have already finished hold, too.
+        is_safe: the action makes the flight safer (hold, land, return), so a member's failure does not stop the others.
+        holds_if_cancelled: if the action is cancelled, members that have already finished it hold, too.
     """
 
     def __init__(
@@ -75,17 +75,17 @@ class FleetAction:
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._orders: dict[str, PolicyOrder] = {}
-        # System id and name of the member to whose failure the policy reacted; None while the others continue.
+        # System id and name of the failed member for which the policy sent orders; None without such a failure.
         self._failed_first: tuple[int, str] | None = None
         self._order_errors: dict[str, str] = {}
         self._pending_orders = 0
         self._is_applying_policy = False
         self._finished = asyncio.Event()
-        # Error in the program's own function or policy function, which `run` raises at the end.
+        # An error that is not of aerokit, raised by a function of the program; `run` raises it at the end.
         self.program_error: Exception | None = None
 
     async def run(self) -> FleetResult:
-        """Execute the action with all members concurrently, and return when each has finished, failed or stopped."""
+        """Execute the action with all members concurrently, until every member has finished, failed or was stopped."""
         if not self._members:
             return self.result_so_far()
         tasks = BackgroundTasks(self._on_program_error)
@@ -111,7 +111,7 @@ class FleetAction:
 
     @property
     def orders(self) -> dict[str, str]:
-        """Orders of the policy by member name; empty if no member failed, or if the other members continue."""
+        """The policy's orders by member name. Empty if no member failed, or if the policy lets the others continue."""
         return dict(self._orders)
 
     @property
@@ -124,9 +124,10 @@ class FleetAction:
         )
 
     def result_so_far(self) -> FleetResult:
-        """Return the result of the members that have finished."""
+        """Return a result with the members that have finished so far."""
         names = [member.name for member in self._members]
-        outcomes = {name: self._outcomes[name] for name in names if name in self._outcomes}  # in the members' order
+        # In the order of the members, not in that of their ends.
+        outcomes = {name: self._outcomes[name] for name in names if name in self._outcomes}
         return FleetResult(self.name, outcomes, failed=self._failed, stopped=self._stopped, skipped=self._skipped)
 
     def on_member_unavailable(self, member: Member) -> None:
@@ -139,11 +140,12 @@ class FleetAction:
     # --------------------------------------------------------------------------------- one member
 
     async def _run_member(self, member: Member, delay_s: float) -> None:
+        """Execute the action with one member after a delay, and record its outcome."""
         task = asyncio.current_task()
         assert task is not None
         self._tasks[member.name] = task
         try:
-            if member.name in self._stopped:
+            if member.name in self._stopped:  # by the policy, before this task began
                 return
             if delay_s:
                 await anyio.sleep(delay_s)
@@ -154,7 +156,7 @@ class FleetAction:
             if member.name not in self._stopped:
                 self._fail(member, error)
         except asyncio.CancelledError:
-            # This class cancels members that have failed or were stopped; any other cancellation is the caller's.
+            # This class cancels the tasks of failed and stopped members. Other cancellations come from outside.
             if member.name not in self._stopped and member.name not in self._failed:
                 raise
         else:
@@ -177,9 +179,11 @@ class FleetAction:
             return
         self._failed[member.name] = self._outcomes[member.name] = error
         member.record_failure(self.name, error)
-        if self._is_safe or self._failed_first is not None or self._is_applying_policy or self._context.is_closed:
+        is_policy_applied = self._failed_first is not None or self._is_applying_policy
+        if self._is_safe or is_policy_applied or self._context.is_closed:
             return
-        # Refreshing the other members below may make them fail, too; only the first failure applies the policy.
+        # _apply_policy() refreshes the other members, which may call _fail() for them, too. Only the first failure
+        # applies the policy.
         self._is_applying_policy = True
         try:
             self._apply_policy(member, error)
@@ -189,6 +193,7 @@ class FleetAction:
     # ------------------------------------------------------------------------------ other members
 
     def _apply_policy(self, failed: Member, error: Exception) -> None:
+        """Ask the policy about a failure, send its orders, and cancel the running actions of the ordered members."""
         for member in self._members:
             member.refresh()
         others = [member for member in self._members if member.name not in self._failed]
@@ -197,7 +202,7 @@ class FleetAction:
         orders: dict[str, PolicyOrder]
         try:
             orders = self._context.rules.decide(failure)
-        except Exception as program_error:  # raised by the policy function; hold as the safe default
+        except Exception as program_error:  # the program's policy function raised it; the other members hold for safety
             self.program_error = self.program_error or program_error
             orders = dict.fromkeys(failure.others, "hold")
         if not orders:
@@ -214,7 +219,7 @@ class FleetAction:
                 skipped[member.name] = "it is disarmed" if is_disarmed else "this program does not fly it"
             else:
                 self._orders[member.name] = order
-            # A member that has finished and gets no order keeps its outcome.
+            # If a member has finished the action and gets no order, its outcome stays.
             if member.name in self._orders or member.name not in self._outcomes:
                 self._set_stopped(member, failed, self._orders.get(member.name))
         self._context.publish(
@@ -227,8 +232,8 @@ class FleetAction:
                     partial(self._send_order, member, self._orders[member.name]),
                     f"aerokit policy {member.name}",
                 )
-        # Cancelled after the policy's orders have begun: they supersede the orders of the running actions, and a
-        # cancelled action whose order is superseded sends no hold.
+        # The running actions are cancelled one loop iteration later, after the policy's orders have begun. These orders
+        # then have superseded those of the actions, so that the cancelled actions do not send a hold.
         asyncio.get_running_loop().call_soon(self._cancel, [member for member in available if member.name in orders])
         if not self._orders:
             self._publish_completed()
@@ -254,7 +259,7 @@ class FleetAction:
                 await member.vehicle.hold()
         except AerokitError as error:
             self._order_errors[member.name] = str(error)
-            member.refresh()
+            member.refresh()  # the order may have failed because of a lost link or a takeover
         finally:
             self._pending_orders -= 1
             if not self._pending_orders:
@@ -270,7 +275,7 @@ class FleetAction:
         )
 
     def _hold_finished_members(self) -> None:
-        # Members that are still executing the action hold because their own action is cancelled.
+        # The other members are still executing the action. They hold because its cancellation makes them hold.
         for member in self._members:
             if (
                 member.is_flown_by_program
@@ -289,7 +294,7 @@ class FleetAction:
 
 
 class FleetContext:
-    """State shared by the parts of one fleet. Lives as long as the ``async with aerokit.fleet(...)`` block."""
+    """State that the parts of one fleet share, as long as the ``async with aerokit.fleet(...)`` block runs."""
 
     def __init__(
         self,
@@ -308,7 +313,7 @@ class FleetContext:
         self.bus: Bus = Bus()
         self.background: BackgroundTasks = BackgroundTasks(on_error)
         self.actions: list[FleetAction] = []
-        self.missions: dict[str, Mission] = {}  # missions of the last upload, set once every member has accepted
+        self.missions: dict[str, Mission] = {}  # by member name; empty unless the last upload succeeded for all
         self.is_closed: bool = False
 
     def start(self) -> None:
@@ -325,7 +330,7 @@ class FleetContext:
         self.bus.publish(event)
 
     def hold(self, member: Member, task_name: str) -> None:
-        """Order a member to hold, in the background; a failure is recorded on the member."""
+        """Order a member to hold, in the background. If the order fails, the member's state becomes FAILED."""
 
         async def hold() -> None:
             try:
@@ -356,22 +361,22 @@ class FleetContext:
             action.on_member_unavailable(member)
 
 
-# Actions that continue for the other members when one member fails.
+# If one member fails in these actions, the other members continue, because the actions make the flight safer.
 FLIGHT_ENDING_ACTIONS = ("hold", "land", "return_to_launch", "disarm", "mission.pause")
 
-# Actions that need no hold when they are cancelled.
+# If these actions are cancelled, members do not hold, because the actions do not move them.
 ACTIONS_ON_GROUND = ("arm", "wait_ready", "upload")
 
 
 class SelectionBase:
-    """Members of a selection, and the execution of actions by them."""
+    """Base class of a selection: its members, and the execution of actions by all of them."""
 
     def __init__(self, context: FleetContext, names: tuple[str, ...] | None) -> None:
         self._context, self._names = context, names
 
     @property
     def members(self) -> Mapping[str, Member]:
-        """Maps names to members, in the order in which they were given or found."""
+        """Maps names to members, in the order in which the program gave them or their vehicles were found."""
         members = self._context.members
         return dict(members) if self._names is None else {name: members[name] for name in self._names}
 

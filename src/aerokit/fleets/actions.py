@@ -23,7 +23,7 @@ POLL_INTERVAL_S = 0.25
 
 @checks_arguments
 class Actions(SelectionBase):
-    """Arming, take-off, landing and modes of several members; ``do`` runs any other action."""
+    """Actions of several members: arming, take-off, landing, modes and, with ``do``, any other method of a vehicle."""
 
     async def do(
         self,
@@ -39,7 +39,7 @@ class Actions(SelectionBase):
             action: the name of a method of :class:`aerokit.Vehicle` (``"set_speed"``, ``"mission.resume"``), or a
                 coroutine function that is called with each :class:`Member`.
             *arguments: positional arguments of the method.
-            timeout: seconds for each member; None: the default of the action.
+            timeout: seconds for each member; None: no limit besides that of the method.
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
             **options: keyword arguments of the method.
 
@@ -48,7 +48,7 @@ class Actions(SelectionBase):
         """
         if isinstance(action, str):
             for member in self:
-                _method(member, action)  # an unknown name fails before any member has started
+                _method(member, action)  # an unknown name raises here, before any member has started
             name = method_name = action
 
             async def execute(member: Member) -> Any:
@@ -56,7 +56,7 @@ class Actions(SelectionBase):
 
         else:
             if arguments or options:
-                raise InvalidArgument("do: arguments and options are allowed only for an action given by name")
+                raise InvalidArgument("do: arguments and options are allowed only if action is the name of a method")
             execute = action  # type: ignore[assignment]
             name = getattr(action, "__name__", "action")
         return await self._run(name, execute, timeout=timeout, stagger_s=stagger_s)
@@ -70,7 +70,7 @@ class Actions(SelectionBase):
         return await self._run("wait_ready", lambda member: member.vehicle.wait_ready(timeout=timeout))
 
     async def arm(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:
-        """Arm: **propellers may start to turn**; see :meth:`aerokit.Vehicle.arm`.
+        """Arm all members: **propellers may start to turn**; see :meth:`aerokit.Vehicle.arm`.
 
         Args:
             timeout: seconds for each member.
@@ -79,7 +79,7 @@ class Actions(SelectionBase):
         return await self._run("arm", lambda member: member.vehicle.arm(timeout=timeout), stagger_s=stagger_s)
 
     async def disarm(self, *, timeout: float = 10.0) -> FleetResult:
-        """Disarm; see :meth:`aerokit.Vehicle.disarm`. Vehicles in the air refuse.
+        """Disarm all members; see :meth:`aerokit.Vehicle.disarm`. Vehicles in the air refuse.
 
         Args:
             timeout: seconds for each member.
@@ -92,7 +92,7 @@ class Actions(SelectionBase):
         """Take off and climb to ``altitude_m`` above home; see :meth:`aerokit.Vehicle.take_off`.
 
         Args:
-            altitude_m: metres above the home of each member, above 0, at most 10,000.
+            altitude_m: metres above the home of each member; more than 0 and at most 10,000.
             timeout: seconds for each member.
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
@@ -107,7 +107,7 @@ class Actions(SelectionBase):
         )
 
     async def land(self, *, timeout: float | None = 300.0, stagger_s: float | None = None) -> FleetResult:
-        """Land at the current position; see :meth:`aerokit.Vehicle.land`. A failure does not stop the other members.
+        """Land at the current position; see :meth:`aerokit.Vehicle.land`. A member's failure does not stop the others.
 
         Args:
             timeout: seconds for each member; None: no limit.
@@ -116,7 +116,7 @@ class Actions(SelectionBase):
         return await self._run("land", lambda member: member.vehicle.land(timeout=timeout), stagger_s=stagger_s)
 
     async def return_to_launch(self, *, timeout: float | None = 600.0, stagger_s: float | None = None) -> FleetResult:
-        """Return to launch; see :meth:`aerokit.Vehicle.return_to_launch`. A failure does not stop the other members.
+        """Return to launch; see :meth:`aerokit.Vehicle.return_to_launch`. A member's failure does not stop the others.
 
         Args:
             timeout: seconds for each member; None: no limit.
@@ -129,7 +129,7 @@ class Actions(SelectionBase):
         )
 
     async def hold(self) -> FleetResult:
-        """Stop and hold position; see :meth:`aerokit.Vehicle.hold`. A failure does not stop the other members."""
+        """Stop and hold position; see :meth:`aerokit.Vehicle.hold`. A member's failure does not stop the others."""
         return await self._run("hold", lambda member: member.vehicle.hold())
 
     async def set_mode(self, mode: str | int, *, timeout: float = 6.0) -> FleetResult:
@@ -142,7 +142,7 @@ class Actions(SelectionBase):
         Raises:
             InvalidArgument: a member has no such mode. Nothing was sent.
         """
-        for member in self:  # fail before any member has changed its mode
+        for member in self:  # an unknown mode raises here, before any member has changed its mode
             if member.is_available:
                 member.vehicle.autopilot.find_mode(mode, member.vehicle.telemetry.mode_names)
         return await self._run("set_mode", lambda member: member.vehicle.set_mode(mode, timeout=timeout))
@@ -155,16 +155,17 @@ class Actions(SelectionBase):
         """Wait until a condition is true for every member.
 
         Args:
-            condition: called with a member, four times a second and when its state changes.
+            condition: function of a member; it is called four times a second and when the member's state changes.
             timeout: seconds until the condition is true for all members.
             description: name of the barrier in errors.
 
         Raises:
-            FleetError: the condition did not become true for a member, which counts as failed in this action.
+            FleetError: the condition was not true for a member in time. The failure applies the fleet's policy.
         """
 
         async def wait_for_condition(member: Member) -> None:
             vehicle = member.vehicle
+            # The condition is checked again whenever one of these values changes.
             cells = (vehicle.mode, vehicle.armed, vehicle.position, vehicle.landed_state)
             with vehicle._session.streaming("position"), ChangeSignal(vehicle._session, *cells) as change_signal:
                 while not condition(member):
@@ -188,7 +189,7 @@ class Actions(SelectionBase):
 
         Args:
             altitude_m: metres above the home of each member.
-            tolerance_m: allowed difference in metres.
+            tolerance_m: allowed difference from ``altitude_m`` in metres.
             timeout: seconds until all members are at the altitude.
 
         Raises:
@@ -205,12 +206,12 @@ class Actions(SelectionBase):
 
 
 def _method(member: Member, name: str) -> Callable[..., Awaitable[Any]]:
-    """Return a public method of the vehicle or of a part of it (``"mission.resume"``)."""
+    """Return a public method of a member's vehicle or of a part of the vehicle (``"mission.resume"``)."""
     method: Any = None
     is_public = not any(part.startswith("_") for part in name.split("."))
     if is_public:
         with contextlib.suppress(AttributeError):
             method = attrgetter(name)(member.vehicle)
     if not callable(method):
-        raise InvalidArgument(f"action = {short_repr(name)} is not allowed: a method of Vehicle, such as 'land'")
+        raise InvalidArgument(f"action = {short_repr(name)} is not a method of Vehicle, such as 'land'")
     return method  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""``DistanceMonitor``: measures the distances between flying members, and orders them to hold if they are too close."""
+"""``DistanceMonitor``: reports flying members that are too close to each other, and orders them to hold."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 POSITION_MAX_AGE_S = 2.0
 POLL_INTERVAL_S = 0.25
 
-# A pair is reported again only after its distance has exceeded the minimum by this factor.
+# A pair is reported again only after its distance was larger than this factor times the minimum distance.
 RESET_FACTOR = 1.2
 
 
@@ -39,9 +39,9 @@ def position_of(member: Member, max_age_s: float = POSITION_MAX_AGE_S) -> Positi
 
 
 def altitude_amsl(member: Member, target: Position) -> float:
-    """Return the altitude above sea level of a target for this member, in metres.
+    """Return a target's altitude above sea level in metres, for this member.
 
-    If the target has no altitude, the member's present altitude is used.
+    A relative altitude counts from the member's home. Without an altitude, it is the member's present altitude.
 
     Raises:
         ValueUnknownError, StaleValueError: the position of the member or of its home is unknown.
@@ -60,7 +60,7 @@ def altitude_amsl(member: Member, target: Position) -> float:
 
 
 class LocalOrigin:
-    """Converts positions to metres north and east of an origin, and metres above sea level."""
+    """Converts positions to metres north and east of an origin and metres above sea level, and back."""
 
     def __init__(self, origin: Position) -> None:
         self._origin = origin
@@ -92,7 +92,8 @@ class LocalOrigin:
 class DistanceMonitor:
     """Compares the positions of flying members four times a second.
 
-    A pair is reported again only after its distance has exceeded the minimum by the factor ``RESET_FACTOR``.
+    A pair that is too close is reported once, and again only after its distance was larger than ``RESET_FACTOR`` times
+    the minimum.
     """
 
     def __init__(self, context: FleetContext, min_distance_m: float, *, holds: bool) -> None:
@@ -107,6 +108,7 @@ class DistanceMonitor:
     def check(self) -> None:
         points = to_local_points(self._flying_positions())
         near_pairs = pairs_within(points, RESET_FACTOR * self._min_distance_m)
+        # Pairs that are apart again can be reported again.
         self._reported &= {(first, second) for first, second, _ in near_pairs}
         for first, second, distance_m in near_pairs:
             if distance_m < self._min_distance_m and (first, second) not in self._reported:
@@ -114,7 +116,7 @@ class DistanceMonitor:
                 self._on_too_close(self._context.members[first], self._context.members[second], distance_m)
 
     def _flying_positions(self) -> dict[str, tuple[float, float, float]]:
-        """Return latitude, longitude and altitude of all members in the air, whoever controls them."""
+        """Return latitude, longitude and altitude of all members in the air, including those that a pilot controls."""
         positions: dict[str, tuple[float, float, float]] = {}
         for member in self._context.members.values():
             vehicle = member.vehicle
@@ -126,6 +128,7 @@ class DistanceMonitor:
         return positions
 
     def _on_too_close(self, first: Member, second: Member, distance_m: float) -> None:
+        """Order both members to hold, if this program flies them, and publish the event."""
         pair = (first, second)
         for member in pair:
             member.refresh()

@@ -27,7 +27,10 @@ __all__ = [
 
 
 class FleetEvent(Event):
-    """Base class. ``at`` is the time on the event loop's clock, ``system_id`` the system id of ``member``."""
+    """Base class of the events of a fleet.
+
+    ``at`` is the time on the event loop's clock, ``system_id`` is that of ``member``.
+    """
 
     member: str
 
@@ -42,7 +45,7 @@ class MemberEvent(FleetEvent):
 
 
 class StateUpdate(FleetEvent):
-    """A new ``value`` of one state of a vehicle. docs/states.md lists the names of states."""
+    """A vehicle's state has a new ``value``. docs/states.md lists the names of states."""
 
     state: str
     value: Any
@@ -80,8 +83,8 @@ class MemberFailed(FleetEvent):
 class PolicyApplied(FleetEvent):
     """``member`` failed in ``action``, and the policy sends ``orders`` to other members.
 
-    ``orders`` maps names to ``"hold"``, ``"land"`` or ``"return"``; ``skipped`` maps members without an order to the
-    reason.
+    ``orders`` maps names to ``"hold"``, ``"land"`` or ``"return"``. ``skipped`` maps the names of members that got no
+    order to the reason.
     """
 
     action: str
@@ -90,7 +93,10 @@ class PolicyApplied(FleetEvent):
 
 
 class PolicyCompleted(FleetEvent):
-    """The orders that followed the failure of ``member`` are done; ``errors`` maps members to their errors."""
+    """All orders that the policy sent after the failure of ``member`` have ended.
+
+    ``errors`` maps members whose order failed to the text of the error.
+    """
 
     action: str
     orders: dict[str, str]
@@ -98,7 +104,7 @@ class PolicyCompleted(FleetEvent):
 
 
 class FollowingStopped(FleetEvent):
-    """The followers of the leader ``member`` stopped following, but the program's block is still running.
+    """The followers stopped following the leader ``member`` before the end of the program's block.
 
     ``orders`` and ``skipped`` are as in :class:`PolicyApplied`.
     """
@@ -109,13 +115,13 @@ class FollowingStopped(FleetEvent):
 
 
 class PathsCompared(FleetEvent):
-    """The paths of several members were compared before flight. ``member`` is empty."""
+    """The paths of several members were compared before a flight. ``member`` is an empty string."""
 
     deconfliction: Deconfliction
 
 
 class TooClose(FleetEvent):
-    """``member`` and ``other`` are closer than the minimum distance; ``ordered`` are the members ordered to hold."""
+    """``member`` and ``other`` are closer than the minimum distance. ``ordered`` names the members ordered to hold."""
 
     other: str
     distance_m: float

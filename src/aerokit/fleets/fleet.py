@@ -30,9 +30,9 @@ class Selection(Actions, Missions, Formations, Shows):
     """Some members of a fleet: ``fleet.group("alpha")``, ``fleet["north/*"]``.
 
     Every action runs on all available members at once. A member is available unless it is lost, taken over or released.
-    The action returns a :class:`FleetResult` when all of these members are done. If a member fails, the fleet's policy
-    sends orders to the other members, and the action ends when these orders are executed. If the action is cancelled,
-    all members hold.
+    The action returns a :class:`FleetResult` when all these members have finished or failed. If a member fails, the
+    fleet's policy may send orders to the other members; then the action returns after these orders were executed. If
+    the action is cancelled, all members hold.
     """
 
     def __getitem__(self, pattern: str) -> Selection:
@@ -69,7 +69,7 @@ class Selection(Actions, Missions, Formations, Shows):
 
 @checks_arguments
 class Fleet(Selection):
-    """All members, as yielded by :func:`aerokit.fleet`. Usable inside its block only."""
+    """A fleet with all its members. :func:`aerokit.fleet` yields it, and it is usable in the block only."""
 
     def __init__(self, context: FleetContext) -> None:
         super().__init__(context, None)
@@ -78,7 +78,7 @@ class Fleet(Selection):
         return name in self._context.members
 
     def reclaim(self, name: str) -> None:
-        """Make members available again that were taken over or released.
+        """Make members available again after they were taken over or released.
 
         Sends nothing. The next action includes these members. **Ask the pilot first.**
 
@@ -96,7 +96,7 @@ class Fleet(Selection):
 
         Args:
             name: a member's name or a pattern.
-            reason: appears in ``Member.reason`` and in results.
+            reason: text for ``Member.reason`` and for results.
 
         Raises:
             InvalidArgument: no member matches.
@@ -115,7 +115,7 @@ class Fleet(Selection):
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.
-            ConnectionClosed, LinkLost: a link has ended; earlier links got the corrections.
+            ConnectionClosed, LinkLost: a link has ended. Links before it have already got the corrections.
         """
         messages, count = rtcm_messages(rtcm), 0
         for connection in dict.fromkeys(self._context.networks.values()):
@@ -136,7 +136,8 @@ class Fleet(Selection):
             *types: events of the fleet (``MemberLost``, ``PolicyCompleted`` …) and of vehicles (``ModeChanged`` …).
                 Events of vehicles arrive as :class:`MemberEvent` with the member's name. Without arguments: all events.
             capacity: maximum number of unread events.
-            overflow: what happens to an event that exceeds the capacity; the stream's ``missed`` counts dropped events.
+            overflow: what happens to an event when ``capacity`` is reached. The ``missed`` of the result counts dropped
+                events.
 
         Raises:
             InvalidArgument: a type is not an event.
@@ -146,7 +147,7 @@ class Fleet(Selection):
         def attach(sink: Sink) -> list[Detach]:
             detach: list[Detach] = []
             for event_type in event_types:
-                if event_type is MemberEvent:
+                if event_type is MemberEvent:  # all events of vehicles
                     detach += self._attach_member_events(Event, sink)
                 elif not issubclass(event_type, FleetEvent):
                     detach += self._attach_member_events(event_type, sink)
@@ -166,17 +167,17 @@ class Fleet(Selection):
         """Subscribe to states of all members; use it in a ``with`` block.
 
         Args:
-            *names: names of docs/states.md: ``"position"``, ``"batteries"`` …
-            every_arrival: also report values that arrive unchanged.
+            *names: names of states (docs/states.md), such as ``"position"`` and ``"batteries"``.
+            every_arrival: also report a value that arrives unchanged.
             capacity: maximum number of unread updates.
-            overflow: what happens to an update that exceeds the capacity; the stream's ``missed`` counts dropped
-                updates.
+            overflow: what happens to an update when ``capacity`` is reached. The ``missed`` of the result counts
+                dropped updates.
 
         Raises:
             InvalidArgument: a name is unknown, or none is given.
         """
         for member in self:
-            for name in names or ("",):  # without names, "" raises
+            for name in names or ("",):  # without names, the unknown name "" raises
                 if name not in member.vehicle.telemetry.cells:
                     raise InvalidArgument(f"names: {short_repr(name)} is not a state; docs/states.md lists them")
 

@@ -1,4 +1,4 @@
-"""Formations: positions relative to a leader, flown once (``form``) or kept while the leader moves (``following``)."""
+"""Formations: places around a leader, to which followers fly once (``form``) or all the time (``following``)."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ __all__ = ["Following", "Formation", "Formations", "Offset", "follow_velocity"]
 
 LEADER_MAX_AGE_S = 1.5
 
-# Speed per metre of distance to the member's place, in 1/s.
+# Speed of a follower towards its place in the formation, per metre of its distance from the place, in 1/s.
 FOLLOW_GAIN = 0.6
 
 
 class Offset(Snapshot):
-    """Offset from the leader in metres: north (or ahead), east (or right) and up."""
+    """Offset from the leader in metres: north, east and up; in the frame ``"heading"`` ahead, right and up."""
 
     north_m: float = 0.0
     east_m: float = 0.0
@@ -69,7 +69,10 @@ class Offset(Snapshot):
 
 
 class Formation(Snapshot):
-    """Maps member names to offsets. ``frame`` is ``"north"`` (north and east) or ``"heading"`` (ahead and right)."""
+    """Maps names of followers to their offsets from the leader.
+
+    With the frame ``"north"``, offsets are metres north and east; with ``"heading"``, ahead and right of the leader.
+    """
 
     offsets: Mapping[str, Offset]
     frame: Literal["north", "heading"] = "north"
@@ -81,16 +84,19 @@ class Formation(Snapshot):
 
     @classmethod
     def wedge(cls, names: Sequence[str], spacing_m: float, *, frame: Literal["north", "heading"] = "heading") -> Self:
-        """Make a V behind the leader, alternating left and right; each row is ``spacing_m`` farther back and out."""
+        """Make a V behind the leader, with members alternately on the left and right.
+
+        Each pair is ``spacing_m`` metres farther back, and as much farther out, than the pair before.
+        """
         offsets: dict[str, Offset] = {}
         for index, name in enumerate(names):
             row = index // 2 + 1
-            side = 1 if index % 2 else -1  # right or left
+            side = 1 if index % 2 else -1  # 1: right, -1: left
             offsets[name] = Offset(-spacing_m * row, spacing_m * row * side)
         return cls(offsets, frame)
 
     def offset_of(self, name: str, heading_deg: float | None) -> Offset:
-        """Return the offset of a member as metres north, east and up of the leader.
+        """Return the offset of a member in metres north, east and up of the leader.
 
         Raises:
             InvalidArgument: the leader's heading is needed and unknown.
@@ -103,7 +109,7 @@ class Formation(Snapshot):
         return offset.turned(heading_deg)
 
     def min_distance_m(self) -> float:
-        """Return the smallest distance between any two places, including the leader's."""
+        """Return the smallest distance between two places in metres; the leader's place counts, too."""
         places = [(offset.north_m, offset.east_m, offset.up_m) for offset in (Offset(), *self.offsets.values())]
         distances = (math.dist(first, second) for first, second in combinations(places, 2))
         return min(distances, default=math.inf)
@@ -114,7 +120,7 @@ class Formation(Snapshot):
             raise InvalidArgument(f"frame = {self.frame!r} is not allowed: 'north' or 'heading'")
         for name, offset in self.offsets.items():
             if not isinstance(offset, Offset):
-                raise InvalidArgument(f"offsets: {name} has {offset!r}: an Offset is needed")
+                raise InvalidArgument(f"offsets[{name!r}] = {offset!r} is not an Offset")
 
 
 def follow_velocity(
@@ -127,10 +133,10 @@ def follow_velocity(
     """Return the velocity to reach a moving target: the target's velocity plus ``gain`` times the distance vector.
 
     Args:
-        distance_vector: distance vector to the target in metres.
+        distance_vector: vector to the target in metres.
         target_velocity: velocity of the target in m/s.
-        gain: 1/s.
-        max_speed_m_s: limit of the resulting speed.
+        gain: speed per metre of distance, in 1/s.
+        max_speed_m_s: faster results are shortened to this speed.
     """
     velocity = [speed + gain * distance for speed, distance in zip(target_velocity, distance_vector, strict=True)]
     speed = math.hypot(*velocity)
@@ -140,11 +146,11 @@ def follow_velocity(
 
 @checks_arguments
 class Following:
-    """Keeps followers at their places while its ``async with`` block runs. Leaving the block makes them hold.
+    """Keeps followers at their places in a formation while its ``async with`` block runs. Then the followers hold.
 
-    Following stops early if the leader is lost or taken over, or if the fleet's policy stops it because a follower
-    failed. Then :class:`FollowingStopped` is published and ``wait_stopped`` returns. The block continues to run;
-    ``raise_if_stopped`` and leaving the block raise :class:`SetpointStreamStopped`.
+    Following stops early if the leader is lost or taken over, or if the fleet's policy stops all followers because one
+    of them failed. Then :class:`FollowingStopped` is published and ``wait_stopped`` returns. The program's block
+    continues to run; ``raise_if_stopped`` and the end of the block raise :class:`SetpointStreamStopped`.
     """
 
     def __init__(
@@ -165,12 +171,12 @@ class Following:
 
     @property
     def is_running(self) -> bool:
-        """True while the followers follow."""
+        """True until following has stopped."""
         return self._was_entered and not self._stopped.is_set()
 
     @property
     def reason(self) -> str:
-        """Reason for an early stop; empty if there was none."""
+        """The reason for which following has stopped early; an empty string if it has not."""
         return self._reason
 
     def error_m(self, name: str) -> float:
@@ -182,12 +188,12 @@ class Following:
             return math.inf
 
     async def wait_stopped(self) -> str:
-        """Wait for an early stop and return its reason; an empty string after the block has ended."""
+        """Wait until following stops. Return the reason of an early stop; an empty string after the block has ended."""
         await self._stopped.wait()
         return self._reason
 
     def raise_if_stopped(self) -> None:
-        """Raise if following has stopped early. Call it in the loops of the block.
+        """Raise SetpointStreamStopped if following has stopped early. Call it in the loops of the block.
 
         Raises:
             SetpointStreamStopped: following has stopped; the text has the reason.
@@ -198,7 +204,7 @@ class Following:
 
     async def __aenter__(self) -> Self:
         if self._was_entered:
-            raise BusyError("a Following can be entered only once; call following() again")
+            raise BusyError("a Following can be entered only once; call following() for another one")
         self._was_entered = True
         self._check_leader()
         self._action = FleetAction(self._context, "following", self._followers, self._fly_follower)
@@ -223,10 +229,10 @@ class Following:
                 while not self._stop_if_leader_lost():
                     stream.set(self._setpoint(member))
                     await anyio.sleep(self._period_s)
-                await asyncio.Event().wait()  # until cancelled, which makes the vehicle hold
+                await asyncio.Event().wait()  # waits to be cancelled, which makes the vehicle hold
         finally:
-            # Deferred until the action has recorded this follower's failure. The end of the action would be too late,
-            # because it also waits until the policy's orders, such as landing the others, are done.
+            # Called later, when the action has recorded this follower's failure. The end of the action would be too
+            # late, because the action also waits for the policy's orders, such as landing the other members.
             asyncio.get_running_loop().call_soon(self._stop_if_no_followers)
 
     def _stop_if_no_followers(self) -> None:
@@ -237,13 +243,13 @@ class Following:
             self._stop(reason or "no follower is left", self._action.orders, {**result.skipped, **failed})
 
     def _stop_if_leader_lost(self) -> bool:
-        """Stop if the leader is unavailable or its position is unknown; return True once following has stopped."""
+        """Stop following if the leader is unavailable or its position unknown. Return True if following has stopped."""
         if not self._stopped.is_set():
             try:
                 self._check_leader()
                 position_of(self._leader, LEADER_MAX_AGE_S)
             except (OperationRejected, ValueUnknownError) as error:
-                holding = self._action.active  # the end of their streams, below, makes them hold
+                holding = self._action.active  # these hold, because _tasks.cancel() below ends their streams
                 skipped = {
                     member.name: member.status if member.reason else "it does not follow"
                     for member in self._followers
@@ -254,7 +260,7 @@ class Following:
         return self._stopped.is_set()
 
     def _setpoint(self, member: Member) -> VelocitySetpoint:
-        velocity, leader_velocity = self._leader.vehicle.velocity.latest, (0.0, 0.0, 0.0)
+        velocity, leader_velocity = self._leader.vehicle.velocity.latest, (0.0, 0.0, 0.0)  # 0 while unknown
         if velocity is not None:
             leader_velocity = velocity.north_m_s, velocity.east_m_s, -velocity.down_m_s
         north, east, up = follow_velocity(
@@ -263,7 +269,10 @@ class Following:
         return VelocitySetpoint(north, east, -up)
 
     def _vector_to_place(self, member: Member) -> tuple[float, float, float]:
-        """Return metres north, east and up to the member's place, with both positions extrapolated to now."""
+        """Return the vector from a member to its place, in metres north, east and up.
+
+        The positions of the member and the leader are extrapolated to the present by their velocities.
+        """
         leader, vehicle = self._leader.vehicle, member.vehicle
         leader_position = position_of(self._leader, LEADER_MAX_AGE_S)
         position = position_of(member, LEADER_MAX_AGE_S)
@@ -282,7 +291,7 @@ class Following:
             points["leader"][i] - points["member"][i] + metres
             for i, metres in enumerate((offset.north_m, offset.east_m, offset.up_m))
         )
-        # Add the leader's way since its position was measured, and subtract the member's.
+        # Extrapolate both positions: the leader has moved on since its position was measured, and so has the member.
         for moving_vehicle, sign in ((leader, 1.0), (vehicle, -1.0)):
             velocity = moving_vehicle.velocity.latest
             if velocity is not None:
@@ -315,7 +324,7 @@ class Following:
 
 @checks_arguments
 class Formations(Travel):
-    """Positions relative to a leader."""
+    """Actions of a fleet that fly formations."""
 
     async def form(
         self,
@@ -328,10 +337,10 @@ class Formations(Travel):
         """Fly each follower to its place around the leader, which stays where it is; see :meth:`go_to`.
 
         Args:
-            formation: the places.
-            leader: name of the leading member; it has no offset in the formation.
-            speed_m_s: ground speed; None: unchanged.
-            timeout: seconds for each member and leg; None: no limit.
+            formation: the places of the followers.
+            leader: name of the leading member, which has no offset in the formation.
+            speed_m_s: ground speed in m/s; None: unchanged.
+            timeout: seconds for each member and each leg; None: no limit.
 
         Raises:
             InvalidArgument: a name is unknown, or two places are too close. Nothing was sent.
@@ -345,7 +354,7 @@ class Formations(Travel):
             offset = formation.offset_of(follower.name, heading)
             target = leader_position.offset(north_m=offset.north_m, east_m=offset.east_m, up_m=offset.up_m)
             if target.altitude_amsl_m is not None:
-                # Only above sea level: the homes of followers may be at other altitudes than the leader's home.
+                # Without the altitude above the leader's home, because the followers' homes may be at other altitudes.
                 target = Position(target.latitude_deg, target.longitude_deg, altitude_amsl_m=target.altitude_amsl_m)
             targets[follower.name] = target
         if speed_m_s is not None:
@@ -361,8 +370,8 @@ class Formations(Travel):
         follower fails, the fleet's policy decides about the other followers.
 
         Args:
-            formation: the places.
-            leader: name of the leading member; your program flies it, for example in the block.
+            formation: the places of the followers.
+            leader: name of the leading member. Your program flies it, for example in the block.
             rate_hz: set-points per second, 2 to 50.
             max_speed_m_s: maximum speed of the followers in m/s.
 
@@ -376,9 +385,12 @@ class Formations(Travel):
         return Following(self._context, member, followers, formation, rate_hz, max_speed_m_s)
 
     def _leader_and_followers(self, formation: Formation, leader: str) -> tuple[Member, list[Member]]:
+        """Check a formation and its leader; return the leader and the followers."""
         for name in (leader, *formation.offsets):
             if name not in self.members:
-                raise InvalidArgument(f"formation: {short_repr(name)} is not one of {', '.join(self.members)}")
+                raise InvalidArgument(
+                    f"formation: {short_repr(name)} is not a member; members: {', '.join(self.members)}"
+                )
         if leader in formation.offsets:
             raise InvalidArgument(f"formation: {leader!r} is the leader and cannot have an offset")
         min_m, closest_m = self._context.min_distance_m, formation.min_distance_m()

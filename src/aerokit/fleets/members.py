@@ -27,7 +27,7 @@ class MemberState(enum.Enum):
     ACTIVE = "active"
     """The member takes part in actions."""
     LOST = "lost"
-    """The member's heartbeats stopped or its link closed. The fleet sends it no orders until it is back."""
+    """The member's heartbeats stopped, or its link closed. The fleet sends it no orders until its heartbeats return."""
     TAKEN_OVER = "taken over"
     """A pilot, a failsafe or another program controls the member. The fleet sends it no orders until ``reclaim``."""
     FAILED = "failed"
@@ -41,11 +41,11 @@ class Member:
 
     def __init__(self, name: str, network: str, vehicle: Vehicle, *, group: str = "", role: str = "") -> None:
         self.name: str = name
-        """Unique name in the fleet: ``"north/7"``, or a name given by the program."""
+        """Name of the member, unique in the fleet: ``"north/7"``, or a name that the program gave."""
         self.network: str = network
-        """The name of its network."""
+        """Name of the network to which the vehicle belongs."""
         self.vehicle: Vehicle = vehicle
-        """The vehicle object, for anything that the fleet does not do."""
+        """The vehicle object, for calls that concern this member only."""
         self.group: str = group
         """The member's group, or an empty string."""
         self.role: str = role
@@ -53,11 +53,12 @@ class Member:
         self.state: MemberState = MemberState.ACTIVE
         """The member's state in the fleet."""
         self.reason: str = ""
-        """The cause of the state; empty while it is ACTIVE."""
+        """The reason for this state; empty in the state ACTIVE."""
         self._lost_at = 0.0
-        # The vehicle's newest order and its mode at the time of `reclaim`; no takeover while neither has changed.
+        # The vehicle's newest order and its mode at the time of `reclaim`. The member does not count as taken over as
+        # long as both are the same.
         self._control_when_reclaimed: tuple[object, object] | None = None
-        # MAV_STATE at the time of `reclaim`. A failsafe that was active then does not count as a takeover.
+        # MAV_STATE at the time of `reclaim`. If it was a failsafe, this failsafe does not count as a takeover.
         self._ignored_failsafe: int | None = None
         self._detach: list[Detach] = []
         self._publish: Callable[[FleetEvent], None] = lambda _: None
@@ -70,12 +71,15 @@ class Member:
 
     @property
     def is_flown_by_program(self) -> bool:
-        """True while this program's order flies the member. Only then do policies and the distance monitor stop it."""
+        """True while the member flies by an order of this program.
+
+        Failure policies and the distance monitor send orders to such members only.
+        """
         return self.is_available and self.vehicle.is_flown_by_program
 
     @property
     def status(self) -> str:
-        """State and reason as text, such as ``"lost: no heartbeat for 5.0 s"``."""
+        """The member's state and its reason as text, such as ``"lost: no heartbeat for 5.0 s"``."""
         return f"{self.state.value}: {self.reason}"
 
     def __repr__(self) -> str:
@@ -84,29 +88,29 @@ class Member:
     # ------------------------------------------------------------------- called by the fleet
 
     def start_monitoring(self, publish: Callable[[FleetEvent], None], on_unavailable: Callable[[Member], None]) -> None:
-        """Subscribe to the vehicle. ``on_unavailable`` is called when the member is lost or taken over."""
+        """Start updating the member's state. ``on_unavailable`` is called when the member is lost or taken over."""
         self._publish, self._on_unavailable = publish, on_unavailable
         vehicle, bus = self.vehicle, self.vehicle.connection.bus
         self._detach = [
             bus.attach_event(VehicleSilent, self._on_silent),
             bus.attach_event(VehicleRecovered, self._on_recovered),
             vehicle.mode.observe(self._refresh_soon),
-            # On every HEARTBEAT, because it reports the state too, which may change while mode and arming do not.
+            # Observes every HEARTBEAT, because its MAV_STATE may change while mode and arming stay the same.
             vehicle.armed.observe(self._refresh_soon, every_arrival=True),
             vehicle.connection.on_end(self._on_connection_end),
         ]
         if vehicle.is_silent:
             self._set_lost(vehicle.describe_link())
-        self.refresh()  # another program may have flown the vehicle before
+        self.refresh()  # another program or a pilot may already control the vehicle
 
     def stop_monitoring(self) -> None:
-        """Unsubscribe."""
+        """Stop updating the member's state."""
         for detach in self._detach:
             detach()
         self._detach = []
 
     def refresh(self) -> None:
-        """Update the state: the link may have closed, or a pilot may have taken over."""
+        """Update the state now, because the link may have closed or a pilot may have taken over."""
         if self._detach and not self.vehicle.connection.is_open:
             self._set_lost(f"its link is closed, {self.vehicle.describe_link()}")
         if self.is_available and self._detach and (reason := self._takeover_reason()):
@@ -121,12 +125,12 @@ class Member:
         self._publish(MemberFailed(*self._event_fields(), action, str(error)))
 
     def record_success(self) -> None:
-        """Set the state back to ACTIVE after FAILED."""
+        """Set the state to ACTIVE if it is FAILED."""
         if self.state is MemberState.FAILED:
             self._set_state(MemberState.ACTIVE, "")
 
     def reclaim(self) -> None:
-        """Make the member available again. The takeover or failsafe that is active now no longer counts."""
+        """Make the member available again. Its present takeover or failsafe then no longer makes it unavailable."""
         self._control_when_reclaimed = self._current_control()
         self._ignored_failsafe = self.vehicle.system_status.latest
         self.vehicle._arbiter.clear_failsafe()
@@ -144,16 +148,17 @@ class Member:
     # --------------------------------------------------------------------------------- private
 
     def _takeover_reason(self) -> str:
+        """Return why the member counts as taken over; an empty string if it does not."""
         vehicle = self.vehicle
-        if vehicle.is_confirmed_disarmed:  # on the ground, there is nothing to take over
+        if vehicle.is_confirmed_disarmed:  # a disarmed vehicle does not fly, so there is no control to take over
             return ""
         state = vehicle.system_status.latest
         if state not in FAILSAFE_STATES:
             self._ignored_failsafe = None
         elif state is not None and is_worse_failsafe(state, self._ignored_failsafe):
             return f"it is in a failsafe (MAV_STATE {MavState(state).name})"
-        uses_missions = "mission" in vars(vehicle)  # the attribute is created at its first use
-        if uses_missions and vehicle.mission.explains_mode:
+        uses_missions = "mission" in vars(vehicle)  # vehicle.mission is created at its first use
+        if uses_missions and vehicle.mission.explains_mode:  # the mode changed because the mission has ended
             return ""
         if self._current_control() == self._control_when_reclaimed:
             return ""
@@ -163,12 +168,12 @@ class Member:
         return "this program did not arm it" if vehicle.is_armed and has_no_order else ""
 
     def _current_control(self) -> tuple[object, object]:
-        """Return the newest order and the mode."""
+        """Return the vehicle's newest order and its mode."""
         return self.vehicle._arbiter.newest, self.vehicle.mode.latest
 
     def _refresh_soon(self, *_: object) -> None:
-        # Deferred until the whole HEARTBEAT is processed: after a landing it reports disarming together with a mode
-        # change, which is no takeover then.
+        # Called later, when the whole HEARTBEAT is processed. After a landing, one HEARTBEAT reports a mode change and
+        # disarming; the mode change of a disarmed vehicle is no takeover.
         asyncio.get_running_loop().call_soon(self.refresh)
 
     def _on_silent(self, event: VehicleSilent) -> None:
@@ -179,7 +184,8 @@ class Member:
         self._set_lost(str(error))
 
     def _on_recovered(self, event: VehicleRecovered) -> None:
-        if event.system_id == self.vehicle.system_id:  # its HEARTBEAT is still being processed
+        if event.system_id == self.vehicle.system_id:
+            # Called later, when the vehicle's HEARTBEAT is processed.
             asyncio.get_running_loop().call_soon(self._set_active_again)
 
     def _set_lost(self, reason: str) -> None:
@@ -207,5 +213,5 @@ class Member:
         self.state, self.reason = state, reason
 
     def _event_fields(self) -> tuple[float, int, str]:
-        """Return the first fields of a FleetEvent: time, system id and name."""
+        """Return the first fields of each FleetEvent: the time, and the member's system id and name."""
         return self.vehicle.connection.now(), self.vehicle.system_id, self.name

@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("aerokit")
 
 TooCloseAction = Literal["hold", "report"]
-"""Reaction to two members that come too close to each other in flight."""
+"""The fleet's reaction if two members come too close to each other in flight."""
 Source = str | Link | Connection | Vehicle
 
-DISCOVERY_S = 2.5  # long enough for two heartbeats at 1 Hz, in case one is lost
+DISCOVERY_S = 2.5  # long enough for two heartbeats at 1 Hz, because one may be lost
 WAIT_WARNING_S = 5.0
 
 
@@ -66,27 +66,28 @@ async def fleet(
     system 7 of network "north". Several networks can therefore use the same system ids.
 
     Args:
-        *sources: addresses, links or open connections, whose vehicles all become members; or vehicle objects. A mapping
-            gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
-        count: number of vehicles to wait for, in total; None: at least one on each network, plus those found in the
-            next 2.5 seconds.
-        system_ids: use these system ids only, on all networks or by network name; None: all that are found.
-        groups: group → names or patterns of its members (``"north/*"``). Other members have the group ``""``.
-        roles: role → names or patterns of its members.
-        on_error: policy for the other members when one fails in an action (docs/fleets.md).
-        on_error_by_group: group → policy when a member of this group fails.
+        *sources: addresses, links or open connections, all of whose vehicles become members, and vehicle objects. A
+            mapping gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
+        count: total number of vehicles to wait for; None: wait for one on each network, and 2.5 seconds for more.
+        system_ids: system ids to use, for all networks or mapped by network name; None: all that are found.
+        groups: maps groups to names or patterns of members (``"north/*"``). Other members have the group ``""``.
+        roles: maps roles to names or patterns of members.
+        on_error: policy for the other members when a member fails in an action (docs/fleets.md).
+        on_error_by_group: maps groups to the policy for a failure of one of their members, instead of ``on_error``.
         min_distance_m: minimum distance between any two members in metres. Paths are compared before flight, and the
             event ``TooClose`` reports violations in flight; None: no checks.
-        on_too_close: ``"hold"``: both members hold, if this program flies them; ``"report"``: event only.
+        on_too_close: ``"hold"``: members that are too close also hold, if this program flies them; ``"report"``: only
+            publish the event.
         timeout: seconds to wait for all members. After five seconds, a warning of the logger "aerokit" lists the
             missing members.
-        rates: message class → Hz, requested from each member instead of the default rates; ``{}`` requests nothing.
+        rates: maps message classes to rates in Hz that are requested from each member instead of the default rates;
+            ``{}`` requests nothing.
 
     Raises:
         InvalidArgument: an argument is not allowed, or two vehicles have the same name.
         BusyError: this program already has a vehicle object for one of ``system_ids`` on that connection.
         LinkOpenError: a link could not be opened.
-        LinkLost, ConnectionClosed: a link closed while waiting.
+        LinkLost, ConnectionClosed: a link closed while the fleet waited for members.
         ConnectFailed: some members were not found in time; the text lists the members found.
     """
     rules = PolicyRules(on_error, on_error_by_group or {})
@@ -136,17 +137,18 @@ async def fleet(
 
 
 def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[str, Source]:
+    """Return all sources by name. Sources outside of mappings are named by their number."""
     sources_by_name: dict[str, Source] = {}
     for number, source in enumerate(sources, 1):
         entries = source if isinstance(source, Mapping) else {str(number): source}
         for name, entry in entries.items():
             if not isinstance(name, str) or not name:
-                raise InvalidArgument(f"sources: {short_repr(name)} is not a name: a non-empty string is needed")
+                raise InvalidArgument(f"sources: name {short_repr(name)} is not allowed: it must be a non-empty string")
             if name in sources_by_name:
-                raise InvalidArgument(f"sources: two are named {name!r}")
+                raise InvalidArgument(f"sources: two sources are named {name!r}")
             sources_by_name[name] = entry
     if not sources_by_name:
-        raise InvalidArgument("sources: a fleet needs an address, a connection or a vehicle")
+        raise InvalidArgument("sources is empty: a fleet needs at least one address, connection or vehicle")
     return sources_by_name
 
 
@@ -160,7 +162,7 @@ def _members_of_vehicles(sources_by_name: Mapping[str, Source], networks: dict[s
             if network is None:
                 network = name
                 networks[name] = source.connection
-            is_named_by_program = not name.isdecimal()
+            is_named_by_program = not name.isdecimal()  # _named_sources() numbers the other sources
             member_name = name if is_named_by_program else f"{network}/{source.system_id}"
             members.append(Member(member_name, network, source))
     return members
@@ -169,6 +171,7 @@ def _members_of_vehicles(sources_by_name: Mapping[str, Source], networks: dict[s
 def _requested_ids(
     system_ids: Iterable[int] | Mapping[str, Iterable[int]] | None, networks: list[str]
 ) -> dict[str, list[int] | None]:
+    """Return the requested system ids of each network; None for a network: all that are found."""
     ids: dict[str, list[int] | None] = {name: None for name in networks}  # noqa: C420 - of a wider type
     by_network: dict[str, Iterable[int]] = {}
     if isinstance(system_ids, Mapping):
@@ -177,9 +180,7 @@ def _requested_ids(
         ids = {name: list(system_ids) for name in networks}
     for name, numbers in by_network.items():
         if name not in ids:
-            raise InvalidArgument(
-                f"system_ids: {short_repr(name)} is not a network; the networks are {', '.join(networks)}"
-            )
+            raise InvalidArgument(f"system_ids: {short_repr(name)} is not a network; networks: {', '.join(networks)}")
         ids[name] = list(numbers)
     for number in (number for numbers in ids.values() for number in numbers or ()):
         if not isinstance(number, int) or not 1 <= number <= 255:
@@ -191,7 +192,7 @@ def _check_names(members: list[Member]) -> None:
     seen: dict[str, Member] = {}
     for member in members:
         if seen.setdefault(member.name, member) is not member:
-            raise InvalidArgument(f"two vehicles are named {member.name!r}: name them in a mapping")
+            raise InvalidArgument(f"two vehicles are named {member.name!r}: pass a mapping with different names")
         for other in members:
             if other is not member and other.vehicle is member.vehicle:
                 raise InvalidArgument(f"{member.name!r} and {other.name!r} are the same vehicle")
@@ -202,7 +203,7 @@ def _assign(context: FleetContext, patterns_by_name: Mapping[str, Iterable[str]]
         for member in context.matching(*([patterns] if isinstance(patterns, str) else patterns)):
             previous = getattr(context.members[member], attribute)
             if previous:
-                raise InvalidArgument(f"{member} is in two {attribute}s: {previous!r} and {name!r}")
+                raise InvalidArgument(f"member {member} has two {attribute}s: {previous!r} and {name!r}")
             setattr(context.members[member], attribute, name)
 
 
@@ -220,20 +221,22 @@ async def find_systems(
     passed_count: int,
     timeout: float,
 ) -> dict[str, list[int]]:
-    """Return the system ids to connect to, by network: the requested ids, or all found without a vehicle object.
+    """Wait for vehicles; return the system ids to connect to, by network.
+
+    They are the requested ids or, without a request, all ids found that have no vehicle object yet.
 
     Args:
         networks: connections by name.
-        requested: system ids by network; None: all that are found.
-        count: total number to wait for, including ``passed_count``.
+        requested: system ids by network; None for a network: all that are found.
+        count: total number of vehicles to wait for, including ``passed_count``; None: at least one on each network.
         passed_count: number of vehicles that the program passed to ``fleet()``.
-        timeout: seconds.
+        timeout: seconds to wait.
 
     Raises:
-        ConnectFailed: not enough were found in time.
+        ConnectFailed: not enough vehicles were found in time.
     """
     searched = [name for name in networks if requested[name] is None]
-    # By network, an ordered set of system ids.
+    # Maps each network to its system ids. The inner dicts serve as ordered sets.
     found: dict[str, dict[int, None]] = {name: dict.fromkeys(requested[name] or ()) for name in networks}
     changed = anyio.Event()
 
@@ -287,7 +290,7 @@ async def find_systems(
 
 @contextmanager
 def warn_while_waiting(timeout: float, describe: Callable[[], str]) -> Iterator[None]:
-    """Log one warning if the block takes longer than five seconds."""
+    """Log one warning if the ``with`` block takes longer than five seconds; ``describe`` returns what is missing."""
 
     def warn() -> None:
         logger.warning("fleet: %s after %g s; waiting up to %g s in total", describe(), WAIT_WARNING_S, timeout)
@@ -300,7 +303,7 @@ def warn_while_waiting(timeout: float, describe: Callable[[], str]) -> Iterator[
 
 
 class _BlockFailed(Exception):
-    """Raised in each vehicle's own block when the fleet's block raises."""
+    """Raised in the ``async with`` block of each vehicle when the fleet's block has raised an exception."""
 
 
 class MemberConnections:
@@ -309,7 +312,7 @@ class MemberConnections:
     def __init__(self, timeout: float, rates: Mapping[type[Message], float] | None) -> None:
         self._timeout, self._rates = timeout, rates
         self._tasks = BackgroundTasks(self._on_error)
-        self._open: dict[int, tuple[str, Vehicle]] = {}  # by position in the list of systems
+        self._open: dict[int, tuple[str, Vehicle]] = {}  # by index in the list of systems
         self._error: Exception | None = None
         self._changed = asyncio.Event()
         self._close = asyncio.Event()
@@ -318,7 +321,10 @@ class MemberConnections:
         self._all_closed = asyncio.Event()
 
     async def open(self, systems: Sequence[tuple[str, Connection, int]]) -> list[tuple[str, Vehicle]]:
-        """Connect to all systems, given as network, connection and system id. The result is in the same order."""
+        """Connect to all systems, given as tuples of network, connection and system id.
+
+        Returns the network and the vehicle of each system, in the same order.
+        """
         for index, (network, connection, system_id) in enumerate(systems):
             self._running += 1
             self._tasks.start(partial(self._run, index, network, connection, system_id))
@@ -348,7 +354,7 @@ class MemberConnections:
         self._has_block_failed = error is not None
         self._close.set()
         is_every_vehicle_connected = len(self._open) == self._running
-        if self._running and is_every_vehicle_connected:  # otherwise cancelling the tasks is enough
+        if self._running and is_every_vehicle_connected:  # otherwise opening failed, and cancelling the tasks is enough
             await run_shielded(self._wait_until_all_closed())
         await self._tasks.aclose()
 

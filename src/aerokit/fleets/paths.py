@@ -1,6 +1,6 @@
-"""Timed paths, and the distance between two of them. Geometry without IO.
+"""Timed paths, and the distance between two paths. Geometry without IO.
 
-Points are metres north, east and up of a common origin; times are seconds since a common start.
+Points are in metres north, east and up of a common origin. Times are in seconds since a common start.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["Approach", "LocalPoint", "Path", "PathPoint", "horizontal_distance",
 
 LocalPoint = tuple[float, float, float]
 """Metres north, east and up."""
-TOLERANCE = 1e-9  # for rounding errors: a polygon's corner this far outside counts as inside
+TOLERANCE = 1e-9  # because of rounding errors, a corner that is at most this far outside a polygon counts as inside
 
 
 class PathPoint(Snapshot):
@@ -33,12 +33,12 @@ class PathPoint(Snapshot):
 
     @property
     def place(self) -> LocalPoint:
-        """The point without its time."""
+        """The point's position, without its time."""
         return self.north_m, self.east_m, self.up_m
 
     def _check(self) -> None:
         if not all(math.isfinite(value) for value in (self.t_s, *self.place)):
-            raise InvalidArgument(f"{self!r} is not allowed: finite numbers")
+            raise InvalidArgument(f"{self!r} is not allowed: all numbers must be finite")
 
 
 class Path(Snapshot):
@@ -58,7 +58,7 @@ class Path(Snapshot):
             InvalidArgument: the speed is not above 0.
         """
         if not speed_m_s > 0:
-            raise InvalidArgument(f"speed_m_s = {speed_m_s!r} is not allowed: above 0")
+            raise InvalidArgument(f"speed_m_s = {speed_m_s!r} is not allowed: it must be above 0")
         duration_s = math.dist(start, end) / speed_m_s
         return cls(name, (PathPoint(at_s, *start), PathPoint(at_s + duration_s, *end)))
 
@@ -73,7 +73,11 @@ class Path(Snapshot):
         return self.points[-1].t_s
 
     def legs(self, begin_s: float, end_s: float) -> list[tuple[PathPoint, PathPoint]]:
-        """Return pairs of consecutive points, including the rests from ``begin_s`` and until ``end_s``."""
+        """Return the pairs of consecutive points.
+
+        The vehicle rests at the first point from ``begin_s`` on, and at the last point until ``end_s``; these rests are
+        legs, too.
+        """
         first, last = self.points[0], self.points[-1]
         points = [
             first.replace(t_s=min(begin_s, first.t_s)),
@@ -88,7 +92,9 @@ class Path(Snapshot):
             raise InvalidArgument(f"points: the path of {self.name} has no points")
         for point, next_point in pairwise(self.points):
             if next_point.t_s < point.t_s:
-                raise InvalidArgument(f"points: the times of {self.name} decrease at {next_point.t_s:g} s")
+                raise InvalidArgument(
+                    f"points: times must not decrease; those of {self.name} decrease at {next_point.t_s:g} s"
+                )
 
 
 class Approach(Snapshot):
@@ -109,9 +115,9 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
     Args:
         path: the first path.
         other: the second path.
-        slack_s: compare points whose times differ by at most this many seconds. 0: both vehicles are exactly on time;
-            infinite: ignore times.
-        below_m: larger distances are not computed exactly; the result is then at least this distance.
+        slack_s: compare points whose times differ by at most this many seconds. With 0, both vehicles are exactly on
+            time; infinite: ignore times.
+        below_m: if the distance is larger than this, it need not be exact; the result is then at least this distance.
     """
     begin = min(path.begins_at_s, other.begins_at_s)
     end = max(path.ends_at_s, other.ends_at_s)
@@ -120,9 +126,10 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
     for leg in path.legs(begin, end):
         for other_leg in other_legs:
             if other_leg[0].t_s - slack_s > leg[1].t_s or other_leg[1].t_s + slack_s < leg[0].t_s:
-                continue
+                continue  # the vehicles never fly these legs at the same time
             if _lower_bound(leg, other_leg) >= min(best.distance_m, below_m):
-                if best.distance_m == math.inf:  # the first legs whose times match; they are at least `below_m` apart
+                # These legs are at least `below_m` apart, which is the result unless other legs are closer.
+                if best.distance_m == math.inf:
                     best = Approach(below_m, leg[0].t_s, other_leg[0].t_s)
                 continue
             approach = _closest(leg, other_leg, slack_s)
@@ -132,7 +139,7 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
 
 
 def horizontal_distance(line: tuple[LocalPoint, LocalPoint], other: tuple[LocalPoint, LocalPoint]) -> float:
-    """Return the distance in metres between two straight lines as seen from above, regardless of time."""
+    """Return the horizontal distance in metres between two straight lines, regardless of time and altitude."""
     approach = _closest(_flat_leg(*line), _flat_leg(*other), math.inf)
     assert approach is not None
     return approach.distance_m
@@ -143,7 +150,7 @@ def _flat_leg(start: LocalPoint, end: LocalPoint) -> Leg:
 
 
 def _lower_bound(leg: Leg, other: Leg) -> float:
-    """Return a lower bound of the distance of two legs: distance of the midpoints minus half of both lengths."""
+    """Return a lower bound of the distance of two legs: the distance of their midpoints minus half of their lengths."""
     lengths = math.dist(leg[0].place, leg[1].place) + math.dist(other[0].place, other[1].place)
     return math.dist(_midpoint(leg), _midpoint(other)) - lengths / 2
 
@@ -153,10 +160,12 @@ def _midpoint(leg: Leg) -> tuple[float, ...]:
 
 
 def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
-    """Return the closest approach of two legs at times at most ``slack_s`` apart; None if there are no such times.
+    """Return the closest approach of two legs, for pairs of times that differ by at most ``slack_s``.
+
+    None if there are no such times.
 
     With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The time condition
-    limits the unit square of (s, t) to a strip. The minimum is inside this polygon or on its border.
+    cuts a strip out of the unit square of (s, t). The minimum is inside the resulting polygon or on its border.
     """
     start, other_start = leg[0].place, other[0].place
     vector = [leg[1].place[i] - start[i] for i in range(3)]
@@ -170,15 +179,17 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
     def difference(s: float, t: float) -> list[float]:
         return [start_difference[i] + s * vector[i] - t * other_vector[i] for i in range(3)]
 
+    # If the closest points of the whole legs satisfy the time condition, they are the result. Otherwise the minimum is
+    # on the border of the polygon.
     inside = _closest_inside(start_difference, vector, other_vector)
     if inside is not None and abs(time_difference(*inside)) <= slack_s:
-        corners = [inside]
+        corners = [inside]  # a polygon that is a single point
     else:
         corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
         if slack_s < math.inf:
             corners = _clip(corners, lambda s, t: time_difference(s, t) - slack_s)
             corners = _clip(corners, lambda s, t: -time_difference(s, t) - slack_s)
-    best: tuple[float, float, float] | None = None  # distance, s and t
+    best: tuple[float, float, float] | None = None  # the smallest distance so far, with its s and t
     for index, corner in enumerate(corners):
         previous = corners[index - 1]
         s, t = _closest_on_edge(corner, previous, difference(*corner), difference(*previous))
@@ -194,13 +205,13 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
 def _closest_inside(
     start_difference: Sequence[float], vector: Sequence[float], other_vector: Sequence[float]
 ) -> tuple[float, float] | None:
-    """Return s and t of the closest points of two lines; None if one is outside of its leg, or the lines are parallel.
+    """Return s and t of the closest points of two lines; None if a point is outside of its leg, or they are parallel.
 
-    They solve the two equations by which the derivatives of the squared distance with respect to s and t are 0.
+    At the closest points, the derivatives of the squared distance with respect to s and t are 0.
     """
     aa, bb, ab = _dot(vector, vector), _dot(other_vector, other_vector), _dot(vector, other_vector)
     determinant = aa * bb - ab * ab
-    if determinant <= TOLERANCE * max(aa * bb, TOLERANCE):
+    if determinant <= TOLERANCE * max(aa * bb, TOLERANCE):  # the lines are parallel, or a leg has no length
         return None
     da, db = _dot(start_difference, vector), _dot(start_difference, other_vector)
     s, t = (ab * db - bb * da) / determinant, (aa * db - ab * da) / determinant
@@ -228,7 +239,10 @@ def _closest_on_edge(
     difference: Sequence[float],
     other_difference: Sequence[float],
 ) -> tuple[float, float]:
-    """Return s and t where the distance is smallest on an edge, given the difference vectors at both its corners."""
+    """Return s and t where the distance is smallest on an edge of the polygon.
+
+    ``difference`` and ``other_difference`` are the difference vectors at the corners of the edge.
+    """
     step = [q - p for p, q in zip(difference, other_difference, strict=True)]
     length = _dot(step, step)
     fraction = 0.0 if length == 0 else min(1.0, max(0.0, -_dot(difference, step) / length))
@@ -245,4 +259,4 @@ def _dot(vector: Sequence[float], other: Sequence[float]) -> float:
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    _Outside = Callable[[float, float], float]  # of s and t: positive outside
+    _Outside = Callable[[float, float], float]  # a function of s and t that is positive outside of the border

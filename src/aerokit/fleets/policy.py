@@ -1,4 +1,4 @@
-"""Failure policies: orders to the other members when one member fails. Without IO."""
+"""Failure policies: which orders the other members get when a member fails. Without IO."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ PolicyOrder = Literal["hold", "land", "return"]
 
 
 class MemberFailure(Snapshot):
-    """Failure of ``member`` (of ``group``) in ``action``.
+    """The failure of a ``member``, which belongs to ``group``, in ``action``.
 
-    ``others``: the members that the policy may send orders to.
+    ``others`` are the members to which the policy may send orders.
     """
 
     member: str
@@ -40,7 +40,7 @@ class MemberFailure(Snapshot):
 
 
 PolicyDecision = PolicyName | Mapping[str, PolicyOrder] | None
-"""Result of a policy function: a built-in policy, or a mapping of names to orders, or None to continue."""
+"""Result of a policy function: a built-in policy, a mapping of members to orders, or None (the others continue)."""
 
 Policy = PolicyName | Callable[[MemberFailure], PolicyDecision]
 """A built-in policy, or a function. The function is called on the event loop and must not block."""
@@ -61,16 +61,17 @@ class PolicyRules:
         for name, value in arguments.items():
             if not callable(value) and value not in get_args(PolicyName):
                 raise InvalidArgument(
-                    f"{name} = {short_repr(value)} is not allowed: one of"
+                    f"{name} = {short_repr(value)} is not allowed: it must be"
                     f" {', '.join(get_args(PolicyName))}, or a function"
                 )
         self._policy, self._by_group = policy, dict(by_group)
 
     def decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
-        """Return the orders for ``failure.others``; members without an order continue.
+        """Return the orders for the members in ``failure.others``. Members without an order continue.
 
         Raises:
-            InvalidArgument: the policy function returned something else, or a name that is not in ``others``.
+            InvalidArgument: the policy function did not return a PolicyDecision, or named a member that is not in
+                ``others``.
         """
         policy = self._by_group.get(failure.group, self._policy)
         decision = policy(failure) if callable(policy) else policy
@@ -97,7 +98,7 @@ class PolicyRules:
 
 
 class FleetResult(Mapping[str, Any]):
-    """Result of a fleet action: maps each member's name to its return value, or to the exception that it raised."""
+    """Result of a fleet action: maps each member's name to the action's return value or exception."""
 
     def __init__(
         self,
@@ -115,20 +116,20 @@ class FleetResult(Mapping[str, Any]):
         self.stopped: dict[str, Exception] = dict(stopped)
         """Members that the policy stopped because another member failed."""
         self.skipped: dict[str, str] = dict(skipped)
-        """Members that were not ordered, with the reason (lost, taken over); they are not in the mapping."""
+        """Unavailable members, which got no order, with the reason. The mapping does not contain them."""
         self._outcomes = dict(outcomes)
 
     @property
     def is_complete(self) -> bool:
-        """True if no member failed or was stopped."""
+        """True if no member failed and none was stopped."""
         return not self.failed and not self.stopped
 
     def raise_for_errors(self) -> None:
-        """Raise FleetError if a member failed or was stopped; ``FleetError.errors`` has all errors."""
+        """Raise FleetError if a member failed or was stopped; its ``errors`` has the errors of all these members."""
         errors = {**self.failed, **self.stopped}
         if errors:
             done = len(self._outcomes) - len(errors)
-            raise FleetError(f"{self.action}: {done} of {len(self._outcomes)} succeeded", errors=errors)
+            raise FleetError(f"{self.action}: {done} of {len(self._outcomes)} members succeeded", errors=errors)
 
     def __getitem__(self, name: str) -> Any:
         return self._outcomes[name]

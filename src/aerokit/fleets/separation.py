@@ -1,4 +1,4 @@
-"""Path conflicts, and their separation by altitude or time. Without IO."""
+"""Finds conflicts between paths, and separates the paths by altitude or time. Without IO."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ class Route(Snapshot):
 
 
 class Conflict(Snapshot):
-    """Two paths that come too close; ``at_s`` is the time on the first path, or None if times are ignored."""
+    """Two paths that come too close to each other.
+
+    ``at_s`` is the time on the first path at which they are closest; None if times are ignored.
+    """
 
     name: str
     other: str
@@ -48,11 +51,11 @@ class Deconfliction(Snapshot):
     ``decision`` is one of
 
     - ``"clear"``: no conflicts;
-    - ``"layers"``: all climb to ``heights_m``, cross there, and descend after all have crossed;
+    - ``"layers"``: all vehicles climb to ``heights_m``, cross there, and descend after all have crossed;
     - ``"corridors"``: each vehicle starts after its delay in ``delays_s``;
     - ``"refused"``: the conflicts cannot be resolved.
 
-    ``conflicts`` has the conflicts of the original paths. Heights are metres above sea level.
+    ``conflicts`` has the conflicts of the direct paths, without separation. Heights are in metres above sea level.
     """
 
     decision: Literal["clear", "layers", "corridors", "refused"]
@@ -90,13 +93,13 @@ def separate_by_altitude(
 ) -> Deconfliction:
     """Separate conflicting routes by altitude.
 
-    All climb, then cross, then descend. No vehicle begins the next phase before all have finished the previous one,
-    so only movements of the same phase have to be separated.
+    All vehicles climb to layers, then cross, then descend. A phase begins only after all vehicles have finished the
+    phase before, so only movements of the same phase have to be separated.
 
     Args:
         routes: routes of the moving vehicles.
-        stationary: positions of the other vehicles, on the ground or in the air.
-        min_distance_m: minimum distance in metres, also between layers.
+        stationary: positions of the vehicles that do not move, on the ground or in the air.
+        min_distance_m: minimum distance in metres, which is also the distance between layers.
         max_altitude_m: highest layer in metres above sea level.
     """
     conflicts = _conflicts(routes, stationary, min_distance_m)
@@ -107,6 +110,7 @@ def separate_by_altitude(
         return Deconfliction("refused", reason, min_distance_m, conflicts)
     lowest_m = max(max(route.start[2], route.target[2]) for route in routes)
     layers: dict[str, int] = {}
+    # Each route gets the lowest layer that no crossing route uses and no stationary vehicle blocks.
     for route in routes:
         used_layers = {
             layers[earlier.name]
@@ -140,11 +144,11 @@ def separate_by_time(
 
     Args:
         routes: routes of the moving vehicles.
-        stationary: positions of the other vehicles.
+        stationary: positions of the vehicles that do not move.
         min_distance_m: minimum distance in metres.
         speed_m_s: ground speed of all moving vehicles.
         slack_s: how early or late one vehicle may be relative to another, in seconds.
-        max_delay_s: maximum delay of a start in seconds.
+        max_delay_s: maximum delay of a vehicle's start in seconds.
     """
     conflicts = _conflicts(routes, stationary, min_distance_m)
     if not conflicts:
@@ -152,21 +156,24 @@ def separate_by_time(
     resting_paths = _resting_paths(stationary)
     order, refusal = list(routes), ""
     for _ in routes:
-        delays, blocked, blocker = _delays(order, resting_paths, min_distance_m, speed_m_s, slack_s, max_delay_s)
-        if blocked is None:
-            delays = {route.name: delays[route.name] for route in routes}  # in the order of `routes`
+        delays, blocked_route, blocker = _delays(order, resting_paths, min_distance_m, speed_m_s, slack_s, max_delay_s)
+        if blocked_route is None:
+            delays = {route.name: delays[route.name] for route in routes}  # back in the order of `routes`
             max_s = max(delays.values())
             reason = f"{_describe_pairs(conflicts)} come too close; starts are delayed by up to {max_s:g} s"
             return Deconfliction("corridors", reason, min_distance_m, conflicts, {}, delays)
-        refusal = f"{blocked.name} would have to wait for {blocker} longer than {max_delay_s:g} s"
-        order = [blocked, *(route for route in order if route is not blocked)]  # retry with the blocked route first
+        refusal = f"{blocked_route.name} would have to wait for {blocker} longer than {max_delay_s:g} s"
+        # Routes wait only for those before them in the order, so the next try begins with the blocked route.
+        order = [blocked_route, *(route for route in order if route is not blocked_route)]
     return Deconfliction("refused", refusal, min_distance_m, conflicts)
 
 
 def _conflicts(
     routes: Sequence[Route], stationary: Mapping[str, LocalPoint], min_distance_m: float
 ) -> tuple[Conflict, ...]:
+    """Return the conflicts of routes with each other and with stationary vehicles, regardless of time."""
     _check_distance(min_distance_m)
+    # Times are ignored here, so the paths can have any speed.
     paths = [Path.straight(route.name, route.start, route.target, 1.0) for route in routes]
     conflicts = list(find_conflicts(paths, min_distance_m))
     for path in paths:
@@ -189,7 +196,10 @@ def _delays(
     slack_s: float,
     max_delay_s: float,
 ) -> tuple[dict[str, float], Route | None, str]:
-    """Return the delay of each route. If a delay exceeds the maximum, also return its route and the blocker's name."""
+    """Return the delay of each route in seconds.
+
+    If a delay would exceed the maximum, also return its route, and the name of the vehicle that blocks this route.
+    """
     delayed_paths: list[Path] = []
     delays: dict[str, float] = {}
     for route in order:
@@ -208,11 +218,11 @@ def _delays(
 
 
 def _vertical_conflict(routes: Sequence[Route], stationary: Mapping[str, LocalPoint], min_distance_m: float) -> str:
-    """Return the reason why the vehicles cannot climb and descend vertically; empty if they can."""
+    """Return why the vehicles cannot climb and descend vertically; an empty string if they can."""
     for end in ("start", "target"):
         points: dict[str, LocalPoint] = {route.name: getattr(route, end) for route in routes}
         for name, point in points.items():
-            # A stationary vehicle well below an end point is not on the vertical path above it.
+            # The vertical path leads upwards from the point, so stationary vehicles well below the point do not matter.
             lowest_m = point[2] - min_distance_m
             obstacles = {other: place for other, place in stationary.items() if place[2] > lowest_m}
             for other, other_point in {**points, **obstacles}.items():
@@ -252,19 +262,20 @@ def _describe_pairs(conflicts: Sequence[Conflict]) -> str:
 
 def _check_distance(min_distance_m: float) -> None:
     if not 0 < min_distance_m < math.inf:
-        raise InvalidArgument(f"min_distance_m = {min_distance_m!r} is not allowed: above 0 metres")
+        raise InvalidArgument(f"min_distance_m = {min_distance_m!r} is not allowed: it must be above 0 metres")
 
 
 METRES_PER_DEGREE = 111_319.5
 
-# Steps to half of the 26 neighbours of a cube, so that each pair of neighbouring cubes is compared once.
+# The steps to 13 of the 26 neighbours of a cube. With half of them, each pair of neighbouring cubes is compared once.
 NEIGHBOURS = tuple(step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0))
 
 
 def pairs_within(points: Mapping[str, LocalPoint], max_distance_m: float) -> list[tuple[str, str, float]]:
-    """Return all pairs that are closer than ``max_distance_m``, as two names and the distance in metres.
+    """Return all pairs of points that are closer than ``max_distance_m``, as two names and the distance in metres.
 
-    Space is divided into cubes of that size, and only vehicles in the same or neighbouring cubes are compared.
+    Divides space into cubes with edges of ``max_distance_m``, and compares only points in the same or neighbouring
+    cubes.
     """
     cubes: dict[tuple[int, int, int], list[str]] = {}
     for name, (north, east, up) in points.items():

@@ -1,8 +1,8 @@
-"""``Show``: timed trajectories of several vehicles, and their files. Without IO to vehicles.
+"""``Show``: timed trajectories of several vehicles, and files that contain them. Without communication.
 
-Two file formats, both with seconds, and metres north, east and up of the show's origin:
+There are two file formats. Both have times in seconds, and points in metres north, east and up of the show's origin:
 
-- CSV: the header ``name,t_s,north_m,east_m,up_m``, then one line for each point; names may be in any order;
+- CSV: the header ``name,t_s,north_m,east_m,up_m``, then one line for each point, names in any order;
 - JSON: ``{"format": "aerokit show", "version": 1, "tracks": {"name": [[t_s, north_m, east_m, up_m], …], …}}``.
 """
 
@@ -36,7 +36,7 @@ FORMAT, VERSION = "aerokit show", 1
 
 
 class Show(Snapshot):
-    """Trajectories by name. All times are seconds since the common start."""
+    """A show: trajectories by name. All times are in seconds since the common start."""
 
     tracks: Mapping[str, Path]
 
@@ -55,21 +55,21 @@ class Show(Snapshot):
 
         Args:
             min_distance_m: minimum distance in metres.
-            slack_s: maximum time offset between two vehicles in seconds.
+            slack_s: how early or late one vehicle may be relative to another, in seconds.
         """
         return find_conflicts(list(self.tracks.values()), min_distance_m, slack_s=slack_s)
 
     def renamed(self, names: Mapping[str, str]) -> Self:
-        """Return the show with other names; ``names`` maps names in the show to names of fleet members.
+        """Return the show with other track names. ``names`` maps the names in the show to names of fleet members.
 
         Raises:
-            InvalidArgument: a name is missing, or two tracks get the same name.
+            InvalidArgument: ``names`` lacks a track, or gives two tracks the same name.
         """
         missing = [name for name in self.tracks if name not in names]
         if missing:
-            raise InvalidArgument(f"names: no member for {missing}")
+            raise InvalidArgument(f"names has no member for the tracks {missing}")
         if len(set(names.values())) < len(self.tracks):
-            raise InvalidArgument("names: one member for two tracks")
+            raise InvalidArgument("names has the same member for two tracks")
         return type(self)({names[name]: track.replace(name=names[name]) for name, track in self.tracks.items()})
 
     @classmethod
@@ -77,7 +77,7 @@ class Show(Snapshot):
         """Make a show from points ``(t_s, north_m, east_m, up_m)`` for each name.
 
         Raises:
-            InvalidArgument: a point is not four numbers, or times decrease.
+            InvalidArgument: a point is not four numbers, or the times of a track decrease.
         """
         parsed: dict[str, Path] = {}
         for name, points in tracks.items():
@@ -89,7 +89,7 @@ class Show(Snapshot):
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a CSV or JSON file; the content decides which.
+        """Read a CSV or JSON file. The format is detected from the content.
 
         Raises:
             FileFormatError: the file is damaged, or neither CSV nor JSON; the text names the line or the track.
@@ -103,14 +103,14 @@ class Show(Snapshot):
 
     @classmethod
     def from_csv(cls, text: str) -> Self:
-        """Parse CSV text in the format above.
+        """Parse a show in CSV, in the format that the module describes.
 
         Raises:
-            InvalidArgument: the text is not in this format; the error names the line.
+            InvalidArgument: the text is not in this format. The error names the line.
         """
         rows = csv.reader(io.StringIO(text))
         if [cell.strip() for cell in next(rows, [])] != COLUMNS:
-            raise InvalidArgument(f"line 1 is not {','.join(COLUMNS)}")
+            raise InvalidArgument(f"line 1 must be {','.join(COLUMNS)}")
         points: dict[str, list[PathPoint]] = {}
         for row in rows:
             if not row:
@@ -125,18 +125,18 @@ class Show(Snapshot):
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Parse JSON text in the format above.
+        """Parse a show in JSON, in the format that the module describes.
 
         Raises:
-            InvalidArgument: the text is not in this format; the error names the track.
+            InvalidArgument: the text is not in this format. The error names the track.
         """
         try:
             data = json.loads(text)
         except (ValueError, RecursionError) as error:
-            raise InvalidArgument(f"not JSON: {error}") from None
+            raise InvalidArgument(f"the text is not JSON: {error}") from None
         tracks = data.get("tracks") if isinstance(data, dict) else None
         if not isinstance(tracks, dict) or (data.get("format"), data.get("version")) != (FORMAT, VERSION):
-            raise InvalidArgument(f"not {FORMAT!r} of version {VERSION}")
+            raise InvalidArgument(f"the JSON text is not {FORMAT!r} of version {VERSION}")
         return cls.from_points(tracks)
 
     def to_csv(self) -> str:
@@ -158,19 +158,19 @@ class Show(Snapshot):
         write_atomically(path, self.to_json() if str(path).lower().endswith(".json") else self.to_csv())
 
     def _check(self) -> None:
-        object.__setattr__(self, "tracks", dict(self.tracks))
+        object.__setattr__(self, "tracks", dict(self.tracks))  # a copy; this object is immutable otherwise
         if not self.tracks:
             raise InvalidArgument("tracks is empty: a show needs at least one track")
         for name, track in self.tracks.items():
             if not isinstance(track, Path) or track.begins_at_s < 0:
-                raise InvalidArgument(f"tracks: {name!r} needs a Path that begins at 0 s or later")
+                raise InvalidArgument(f"tracks[{name!r}] must be a Path that begins at 0 s or later")
             for start, end in pairwise(track.points):
                 if not _speed_between(start, end) < math.inf:
-                    raise InvalidArgument(f"tracks: {name!r} has two positions at {end.t_s:g} s")
+                    raise InvalidArgument(f"tracks[{name!r}] has two positions at {end.t_s:g} s")
 
 
 def state_at(path: Path, at_s: float) -> tuple[LocalPoint, LocalPoint]:
-    """Return position and velocity on a path at a time, as metres and m/s north, east and up."""
+    """Return the position (metres north, east, up) and the velocity (m/s) on a path at a time."""
     points = path.points
     next_index = bisect_right(points, at_s, key=_time_of)
     if next_index == 0:

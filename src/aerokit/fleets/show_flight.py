@@ -45,10 +45,10 @@ __all__ = [
     "track_deviation",
 ]
 
-# Correction speed per metre of deviation from the track, in 1/s.
+# Speed of the correction towards the track, per metre of deviation, in 1/s.
 TRACK_GAIN = 0.8
 
-# Speed limit while catching up: the track's speed times the factor, but at least CATCH_UP_M_S; plus CATCH_UP_M_S.
+# Speed limit: CATCH_UP_FACTOR times the track's speed or CATCH_UP_M_S (the larger), plus CATCH_UP_M_S.
 CATCH_UP_FACTOR, CATCH_UP_M_S = 1.5, 1.0
 
 CONFLICT_SLACK_S = 0.5
@@ -61,15 +61,15 @@ POSITION_MAX_AGE_S = 2.0
 TIMESYNC_INTERVAL_S = 0.1
 TIMESYNC_TIMEOUT_S = 2.0
 
-# If `time_boot_ms`, converted to our time by TIMESYNC, differs by more than this from the time of arrival, the vehicle
-# uses another clock for `time_boot_ms` than for TIMESYNC.
+# `time_boot_ms` is converted to our time with the result of TIMESYNC. If the result differs by more than this from the
+# time of arrival, the vehicle uses different clocks for `time_boot_ms` and TIMESYNC.
 MAX_CLOCK_ERROR_S = 1.0
 
 
 class ClockOffset(Snapshot):
-    """A vehicle's clock minus the event loop's clock.
+    """The offset of a vehicle's clock: its time minus that of the event loop's clock.
 
-    Accurate to half of ``round_trip_s``, the shortest of ``answers`` round trips.
+    The offset is accurate to half of ``round_trip_s``, which is the shortest round trip of ``answers`` requests.
     """
 
     offset_s: float
@@ -82,7 +82,7 @@ class ClockOffset(Snapshot):
 
 
 async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
-    """Measure a vehicle's clock with several TIMESYNC requests; the answer with the shortest round trip counts.
+    """Measure the offset of a vehicle's clock with TIMESYNC requests; the one with the shortest round trip counts.
 
     Raises:
         OperationTimeout: no request was answered.
@@ -90,7 +90,7 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
     """
     connection = vehicle.connection
     sent_at_by_timestamp: dict[int, float] = {}
-    measurements: list[tuple[float, float]] = []  # round trip and offset in seconds
+    measurements: list[tuple[float, float]] = []  # pairs of round trip and offset, in seconds
 
     def on_timesync(message: Timesync) -> None:
         frame = message.received_frame
@@ -105,7 +105,7 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
     try:
         for _ in range(requests):
             now = connection.now()
-            timestamp = int(now * 1e9) | 1  # odd, unlike the timestamps of the link's own requests
+            timestamp = int(now * 1e9) | 1  # an odd number, which the link's own TIMESYNC requests never use
             sent_at_by_timestamp[timestamp] = now
             connection.send(Timesync(0, timestamp), to=vehicle.system_id)
             await anyio.sleep(TIMESYNC_INTERVAL_S)
@@ -116,14 +116,14 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
     finally:
         detach()
     if not measurements:
-        raise OperationTimeout(f"TIMESYNC was not answered; {vehicle.describe_link()}")
-    round_trip_s, offset_s = min(measurements)  # the shortest round trip is the most accurate
+        raise OperationTimeout(f"the vehicle did not answer TIMESYNC; {vehicle.describe_link()}")
+    round_trip_s, offset_s = min(measurements)  # the measurement with the shortest round trip is the most accurate
     return ClockOffset(offset_s, round_trip_s, len(measurements))
 
 
 # ------------------------------------------------------------------------------------------ report
 
-# Minimum speed to compute a lag. On slower legs, a lag cannot be distinguished from a position error.
+# The lag is computed from faster legs only. On slower legs, a lag cannot be distinguished from a position error.
 MIN_LAG_SPEED_M_S = 0.3
 
 RELATIVE_ERROR_SAMPLES = 60
@@ -142,10 +142,10 @@ class TrackDeviation(Snapshot):
 
 
 class ShowReport(Snapshot):
-    """Result of a show. Times are from the vehicles' own clocks, converted with ``clocks``.
+    """Result of a show. Positions have times of the vehicles' own clocks, which ``clocks`` relate to each other.
 
     ``lag_spread_s`` is the difference between the largest and the smallest lag. ``max_relative_error_m`` is the largest
-    error of the vector between any two members. Both are None if unknown.
+    deviation between two members: of the vector from one to the other. Both are None if unknown.
     """
 
     result: FleetResult
@@ -156,12 +156,12 @@ class ShowReport(Snapshot):
 
 
 def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> TrackDeviation:
-    """Compare a path with measured positions, each with its time in seconds of the show.
+    """Compare a path with measured positions. Times of ``samples`` are in seconds since the start of the show.
 
-    The lag is the time shift of the path that fits the samples best (least squares along the track).
+    The lag is the delay of the path with which it fits the samples best (least squares along the track).
     """
     errors: list[float] = []
-    # A lag causes an error of lag × velocity. The best fit is sum(error · velocity) / sum(velocity²).
+    # A lag causes an error vector of lag × velocity. The lag that fits best is sum(error · velocity) / sum(velocity²).
     error_times_velocity = velocity_squared = 0.0
     for at_s, point in samples:
         planned, velocity = state_at(path, at_s)
@@ -180,9 +180,9 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
 def max_relative_error(
     paths: Mapping[str, Path], samples: Mapping[str, Sequence[tuple[float, LocalPoint]]], duration_s: float
 ) -> float | None:
-    """Return the largest error of the vector between two vehicles, in metres; None for fewer than two vehicles.
+    """Return the largest error of the vector from one vehicle to another in metres; None for fewer than two vehicles.
 
-    Evaluated at 60 times of the show, with positions interpolated between samples.
+    It is computed at 61 times of the show, with positions that are interpolated between samples.
     """
     largest_m: float | None = None
     for number in range(RELATIVE_ERROR_SAMPLES + 1):
@@ -200,6 +200,7 @@ def max_relative_error(
 
 
 def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> LocalPoint | None:
+    """Return the position at a time, interpolated between samples; None outside of their times."""
     for (start_s, start), (end_s, end) in pairwise(samples):
         if start_s <= at_s <= end_s:
             fraction = 0.0 if end_s == start_s else (at_s - start_s) / (end_s - start_s)
@@ -215,10 +216,9 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
 
 
 class TrackRecorder:
-    """Records each GLOBAL_POSITION_INT during its block, as seconds of the show and metres from the show's origin.
+    """Records the positions of a vehicle (GLOBAL_POSITION_INT) in its ``with`` block: seconds of the show, and metres.
 
-    The time is the vehicle's own (``time_boot_ms``), converted by means of its measured clock. If that is implausible,
-    the time is the time of arrival.
+    Times are from the vehicle's clock (``time_boot_ms``), or those of arrival if the measured offset does not fit it.
     """
 
     def __init__(
@@ -229,7 +229,7 @@ class TrackRecorder:
         self._latitude, self._longitude = position.latitude_deg, position.longitude_deg
         metres_per_degree = _metres_per_degree(origin, self._latitude, self._longitude)
         self._metres_per_latitude_degree, self._metres_per_longitude_degree = metres_per_degree
-        self.samples: list[tuple[float, LocalPoint]] = []  # times count from the start of the show
+        self.samples: list[tuple[float, LocalPoint]] = []  # seconds since the start of the show, and position
         self._latest: tuple[float, LocalPoint, LocalPoint] | None = None  # time, position and velocity
         self._detach: Detach | None = None
 
@@ -277,24 +277,24 @@ class TrackRecorder:
 
 
 def _metres_per_degree(origin: LocalOrigin, latitude: float, longitude: float) -> tuple[float, float]:
-    """Return metres per degree of latitude and of longitude. Accurate within some hundred metres."""
+    """Return the metres per degree of latitude and per degree of longitude, for places within some hundred metres."""
     step = 1e-3
     north = origin.to_local(Position(min(latitude + step, 90.0), longitude), 0.0)[0] / step
     east = origin.to_local(Position(latitude, longitude + step), 0.0)[1] / step
-    return north or METRES_PER_DEGREE, east  # at the pole, the step north is 0
+    return north or METRES_PER_DEGREE, east  # at the north pole, a step north has no length
 
 
 @checks_arguments
 class Shows(Travel):
-    """Trajectories on a common clock."""
+    """Actions of a fleet that fly shows."""
 
     def show_start_positions(self, show: Show, origin: Position) -> dict[str, Position]:
         """Return the position of each member at the start of a show.
 
         Args:
             show: the trajectories.
-            origin: origin of the show's metres; without an altitude above sea level it is at the altitude of the first
-                member's home.
+            origin: the place from which the show's metres count. If it has no altitude above sea level, it is at the
+                altitude of the first member's home.
 
         Raises:
             InvalidArgument: a track has no member.
@@ -314,18 +314,18 @@ class Shows(Travel):
     ) -> ShowReport:
         """Fly a show: all members fly to their first points, start at the same instant, and hold at the end.
 
-        The members have to be in the air. Their clocks are measured with TIMESYNC, so that delayed telemetry does not
-        count as deviation. If a member fails, the fleet's policy decides about the other members, as in any action.
+        The members have to be in the air. Their clocks are measured with TIMESYNC, so that the report does not count
+        the delay of telemetry as a deviation. If a member fails, the fleet's policy decides about the others.
 
         Args:
-            show: tracks by member's name; :meth:`Show.renamed` assigns tracks to members.
-            origin: origin of the show's metres; without an altitude above sea level it is at the altitude of the first
-                member's home.
+            show: tracks with the names of members; :meth:`Show.renamed` assigns tracks to members.
+            origin: the place from which the show's metres count. If it has no altitude above sea level, it is at the
+                altitude of the first member's home.
             rate_hz: set-points per second for each member, 2 to 50.
             start_in_s: seconds from the arrival of the last member at its first point to the start.
-            lead_s: seconds by which velocities are sent ahead of the track, to compensate for the vehicles' reaction
+            lead_s: how many seconds before their time velocities are sent, to compensate for the vehicles' reaction
                 time (``lag_s`` in the report); None: 0.
-            speed_m_s: ground speed to the first points; None: unchanged.
+            speed_m_s: ground speed to the first points in m/s; None: unchanged.
 
         Raises:
             InvalidArgument: a track has no member, or an argument is out of range. Nothing was sent.
@@ -366,13 +366,13 @@ class Shows(Travel):
     # --------------------------------------------------------------------------------------- private
 
     def _local_origin(self, show: Show, origin: Position) -> tuple[LocalOrigin, float]:
-        """Return the origin and its altitude above sea level."""
+        """Return the origin of the show's metres, and its altitude above sea level."""
         for name in show.tracks:
             if name not in self.members:
-                raise InvalidArgument(f"show: {short_repr(name)} is not one of {', '.join(self.members)}")
+                raise InvalidArgument(f"show: {short_repr(name)} is not a member; members: {', '.join(self.members)}")
         if origin.altitude_amsl_m is not None:
             return LocalOrigin(origin), origin.altitude_amsl_m
-        first_member = self.members[next(iter(show.tracks))]
+        first_member = self.members[next(iter(show.tracks))]  # its home defines the altitude
         above_home = origin.replace(altitude_relative_m=origin.altitude_relative_m or 0.0)
         return LocalOrigin(origin), altitude_amsl(first_member, above_home)
 
@@ -409,14 +409,14 @@ async def _fly_track(
         async with vehicle.guided.velocity(rate_hz=rate_hz) as stream:
             while (at_s := vehicle.connection.now() - begin_at) < path.ends_at_s:
                 if at_s < 0 and not recorder.has_position:
-                    stream.set(VelocitySetpoint())  # stay until the first position arrives
+                    stream.set(VelocitySetpoint())  # a velocity of 0, until the first position arrives
                 else:
                     stream.set(_setpoint(path, at_s, lead_s, recorder.extrapolated_position()))
                 await anyio.sleep(period_s)
 
 
 def _setpoint(path: Path, at_s: float, lead_s: float, position: LocalPoint) -> VelocitySetpoint:
-    """Return the path's velocity ``lead_s`` later, plus a correction towards the path's position at this time."""
+    """Return the velocity of the path at ``at_s + lead_s``, plus a correction towards its position at ``at_s``."""
     planned, _ = state_at(path, at_s)
     _, velocity = state_at(path, at_s + lead_s)
     speed = math.hypot(*velocity)

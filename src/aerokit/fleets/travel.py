@@ -1,4 +1,4 @@
-"""``Travel`` and ``Missions``: flights to targets and missions, on paths that are compared before the flight."""
+"""``Travel`` and ``Missions``: flights to targets and flights of missions, whose paths are compared before."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from aerokit.position import Home, Position, travel_target
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
 SeparationMethod = Literal["layers", "corridors", "refuse"]
-"""How crossing paths are separated: by altitude, by time, or not at all."""
+"""Method to separate crossing paths: by altitude (layers), by time (corridors), or not at all (refuse)."""
 
 
 @checks_arguments
 class Travel(SelectionBase):
-    """Targets for each member, on paths that do not conflict."""
+    """Flights of several members to targets, on paths that do not conflict."""
 
     async def go_to(
         self,
@@ -48,14 +48,14 @@ class Travel(SelectionBase):
     ) -> FleetResult:
         """Fly each member to its own target; see :meth:`aerokit.Vehicle.go_to`.
 
-        A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude: members
-        change to different altitudes (layers), cross, and change to the altitude of their targets, in separate legs.
+        A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude. Members
+        then fly three legs: they climb to different altitudes (layers), cross, and descend to their targets.
 
         Args:
-            targets: mapping of member names to targets; members without a target stay where they are. Or a function
-                that returns a member's target.
-            speed_m_s: ground speed; None: unchanged.
-            max_distance_m: reject targets farther than this from the vehicle.
+            targets: mapping of member names to targets, or a function that returns a member's target. Members that a
+                mapping omits stay where they are.
+            speed_m_s: ground speed in m/s; None: unchanged.
+            max_distance_m: reject targets that are farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
             separation: result of :meth:`plan_separation` for these targets.
@@ -63,13 +63,14 @@ class Travel(SelectionBase):
         Raises:
             InvalidArgument: a name is unknown, or a target is too far away. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
-            OperationRejected: paths come too close and cannot be separated: nothing was sent. Or a member became
-                unavailable after a leg: the other members stay in their layers.
+            OperationRejected: paths come too close and cannot be separated, and nothing was sent; or a member became
+                unavailable after a leg, and the other members stay in their layers.
         """
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
         positions = self._resolve_targets(targets)
-        # A function gives targets to available members only; all are named, so that the result lists the others too.
+        # A function of targets is called for available members only. All members are named, so that the result also
+        # lists the others as skipped.
         names = tuple(self.members) if callable(targets) else tuple(positions)
         for name, target in positions.items():
             self.members[name].vehicle._position.check_reach(f"targets[{name!r}]", [target], max_distance_m)
@@ -96,24 +97,24 @@ class Travel(SelectionBase):
     ) -> Deconfliction:
         """Compare the straight paths to these targets and plan their separation. Nothing is sent.
 
-        Members without a target count at their current position. Publishes :class:`PathsCompared`.
+        Members without a target count as obstacles at their current positions. Publishes :class:`PathsCompared`.
 
         Args:
             targets: as for :meth:`go_to`.
             min_distance_m: minimum distance between any two members in metres; None: that of the fleet.
             by: ``"layers"`` separates crossing paths by altitude, ``"corridors"`` by time, which needs ``speed_m_s``.
                 ``"refuse"`` refuses crossing paths.
-            speed_m_s: ground speed of all members.
+            speed_m_s: ground speed of all members in m/s, for corridors.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
             slack_s: for corridors: how early or late a member may be relative to another, in seconds.
 
         Raises:
-            InvalidArgument: a name is unknown, or an argument is missing.
+            InvalidArgument: a name is unknown, or a required argument is missing.
             ValueUnknownError: the position of a member is unknown.
         """
         min_m = self._context.min_distance_m if min_distance_m is None else min_distance_m
         if min_m is None:
-            raise InvalidArgument("min_distance_m is required: this fleet was created without one")
+            raise InvalidArgument("min_distance_m is required, because this fleet was created without it")
         routes, stationary = self._routes(self._resolve_targets(targets))
         if by == "corridors":
             if speed_m_s is None:
@@ -141,6 +142,7 @@ class Travel(SelectionBase):
         names: tuple[str, ...] = (),
         max_distance_m: float = MAX_DISTANCE_M,
     ) -> FleetResult:
+        """Fly members to their targets, directly or with the planned separation."""
         if separation is None and self._context.min_distance_m is not None:
             separation = self.plan_separation(targets, speed_m_s=speed_m_s)
         if separation is None or separation.decision == "clear":
@@ -155,13 +157,16 @@ class Travel(SelectionBase):
     def _resolve_targets(
         self, targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home]
     ) -> dict[str, Position]:
+        """Return the targets by member name. A function of targets is called for available members only."""
         for member in self:
             member.refresh()
         if callable(targets):
             return {member.name: _target_from_function(targets, member) for member in self if member.is_available}
         for name in targets:
             if name not in self.members:
-                raise InvalidArgument(f"targets: {short_repr(name)} is not one of {', '.join(self.members)}")
+                raise InvalidArgument(
+                    f"targets: {short_repr(name)} is not a member; members: {', '.join(self.members)}"
+                )
         return {name: travel_target(target) for name, target in targets.items()}
 
     def _routes(self, targets: Mapping[str, Position]) -> tuple[list[Route], dict[str, LocalPoint]]:
@@ -215,7 +220,7 @@ class Travel(SelectionBase):
         heights_m: Mapping[str, float],
         max_distance_m: float,
     ) -> FleetResult:
-        """Fly up, across and down. All members finish one leg before the next begins."""
+        """Fly up to the layers, across, and down. A leg begins when all members have finished the leg before."""
         starts = {name: position_of(self._context.members[name], math.inf) for name in heights_m}
         legs: tuple[dict[str, Position], ...] = (
             {name: _at_altitude(starts[name], height) for name, height in heights_m.items()},
@@ -225,7 +230,7 @@ class Travel(SelectionBase):
         result: FleetResult | None = None
         for leg in legs:
             missing = [name for name in leg if not self.members[name].is_available]
-            if missing:  # a missing member may be in the path of any other member
+            if missing:  # an unavailable member may be in the way of the others, so the flight ends
                 raise OperationRejected(
                     f"{action}: {', '.join(missing)} became unavailable between two legs; the others stay in their"
                     " layers"
@@ -250,7 +255,7 @@ def _at_altitude(position: Position, altitude_amsl_m: float) -> Position:
 
 @checks_arguments
 class Missions(SelectionBase):
-    """Missions, one for each member."""
+    """Uploads and flights of missions, one for each member."""
 
     async def upload(
         self,
@@ -262,14 +267,14 @@ class Missions(SelectionBase):
     ) -> FleetResult:
         """Upload a mission to each member and verify it; see ``vehicle.mission.upload``.
 
-        :meth:`start_missions` starts them only after all uploads succeeded. A fleet with a ``min_distance_m`` compares
-        the missions first.
+        :meth:`start_missions` starts the missions, but only if all uploads succeeded. A fleet with a
+        ``min_distance_m`` compares the missions first.
 
         Args:
-            missions: member's name → mission.
-            max_concurrent: maximum number of simultaneous transfers on each network, from 1.
+            missions: maps names of members to missions.
+            max_concurrent: maximum number of simultaneous transfers on each network, at least 1.
             max_distance_m: reject missions with a position farther than this from the vehicle.
-            timeout: seconds for each member; None: no limit while data arrives.
+            timeout: seconds for each member; None: no limit as long as data arrives.
 
         Raises:
             InvalidArgument: a name is unknown, or a mission is invalid. Nothing was sent.
@@ -277,7 +282,7 @@ class Missions(SelectionBase):
             FleetError: an upload failed; ``start_missions`` will start no mission.
         """
         if max_concurrent < 1:
-            raise InvalidArgument(f"max_concurrent = {max_concurrent!r} is not allowed: at least 1")
+            raise InvalidArgument(f"max_concurrent = {max_concurrent!r} is not allowed: it must be at least 1")
         members = self._require_available(missions)
         for name, mission in missions.items():
             mission.check(home_is_item_0=members[name].vehicle.autopilot.home_is_item_0)
@@ -304,7 +309,7 @@ class Missions(SelectionBase):
         return result
 
     async def start_missions(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:
-        """Start the uploaded missions of all members, or of none; see ``vehicle.mission.start``.
+        """Start the uploaded missions if all members can start; see ``vehicle.mission.start``.
 
         Args:
             timeout: seconds until each member reports its mission mode.
@@ -320,7 +325,7 @@ class Missions(SelectionBase):
         members = self._require_available(dict.fromkeys(names))
         disarmed = [name for name in names if not members[name].vehicle.is_armed]
         if disarmed:
-            raise OperationRejected(f"start_missions: not armed: {', '.join(disarmed)}; nothing was sent")
+            raise OperationRejected(f"start_missions: members not armed: {', '.join(disarmed)}; nothing was sent")
         return await self._run(
             "mission.start",
             lambda member: member.vehicle.mission.start(timeout=timeout),
@@ -349,20 +354,21 @@ class Missions(SelectionBase):
         Ignores items without a position, terrain altitudes and jumps.
 
         Args:
-            missions: member's name → mission.
+            missions: maps names of members to missions.
             min_distance_m: minimum distance between any two paths in metres; None: that of the fleet.
 
         Raises:
-            InvalidArgument: a name is unknown, or an argument is missing.
+            InvalidArgument: a name is unknown, or a required argument is missing.
             ValueUnknownError: the position of a member is unknown.
         """
         min_m = self._context.min_distance_m if min_distance_m is None else min_distance_m
         if min_m is None:
-            raise InvalidArgument("min_distance_m is required: this fleet was created without one")
+            raise InvalidArgument("min_distance_m is required, because this fleet was created without it")
         members = self._require_available(missions)
         paths: list[Path | None] = []
         if members:
             first_member = next(iter(members.values()))
+            # A position of any age will do, because it is only the origin of the coordinates.
             origin = LocalOrigin(position_of(first_member, math.inf))
             paths = [_mission_path(origin, members[name], mission) for name, mission in missions.items()]
         conflicts = find_conflicts([path for path in paths if path is not None], min_m)
@@ -375,11 +381,13 @@ class Missions(SelectionBase):
         return deconfliction
 
     def _require_available(self, missions: Mapping[str, Any]) -> dict[str, Member]:
-        """Return the members of these missions; raise if a name is unknown or a member unavailable."""
+        """Return the members with these names; raise if a name is unknown or a member is unavailable."""
         members: dict[str, Member] = {}
         for name in missions:
             if name not in self.members:
-                raise InvalidArgument(f"missions: {short_repr(name)} is not one of {', '.join(self.members)}")
+                raise InvalidArgument(
+                    f"missions: {short_repr(name)} is not a member; members: {', '.join(self.members)}"
+                )
             member = members[name] = self.members[name]
             member.refresh()
             if not member.is_available:
@@ -388,7 +396,7 @@ class Missions(SelectionBase):
 
 
 def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path | None:
-    """Return the path of a mission; None if no item has a position. Its points have no times."""
+    """Return the path of a mission, whose points have no times; None if no item has a position."""
     points = [
         PathPoint(0.0, *origin.to_local(position, altitude_amsl(member, position)))
         for position in (item.position for item in mission)

@@ -50,21 +50,21 @@ __all__ = [
 
 
 class Following(BlockTwin["AsyncFollowing"]):
-    """Keeps followers at their places while its ``async with`` block runs. Leaving the block makes them hold.
+    """Keeps followers at their places in a formation while its ``async with`` block runs. Then the followers hold.
 
-    Following stops early if the leader is lost or taken over, or if the fleet's policy stops it because a follower
-    failed. Then :class:`FollowingStopped` is published and ``wait_stopped`` returns. The block continues to run;
-    ``raise_if_stopped`` and leaving the block raise :class:`SetpointStreamStopped`.
+    Following stops early if the leader is lost or taken over, or if the fleet's policy stops all followers because one
+    of them failed. Then :class:`FollowingStopped` is published and ``wait_stopped`` returns. The program's block
+    continues to run; ``raise_if_stopped`` and the end of the block raise :class:`SetpointStreamStopped`.
     """
 
     @property
     def is_running(self) -> bool:
-        """True while the followers follow."""
+        """True until following has stopped."""
         return self.aio.is_running
 
     @property
     def reason(self) -> str:
-        """Reason for an early stop; empty if there was none."""
+        """The reason for which following has stopped early; an empty string if it has not."""
         return self.aio.reason
 
     def error_m(self, name: str) -> float:
@@ -72,11 +72,11 @@ class Following(BlockTwin["AsyncFollowing"]):
         return self.aio.error_m(name)
 
     def wait_stopped(self) -> str:
-        """Wait for an early stop and return its reason; an empty string after the block has ended."""
+        """Wait until following stops. Return the reason of an early stop; an empty string after the block has ended."""
         return self._loop.run(self.aio.wait_stopped)
 
     def raise_if_stopped(self) -> None:
-        """Raise if following has stopped early. Call it in the loops of the block.
+        """Raise SetpointStreamStopped if following has stopped early. Call it in the loops of the block.
 
         Raises:
             SetpointStreamStopped: following has stopped; the text has the reason.
@@ -88,14 +88,14 @@ class Selection(SelectionTwin["AsyncSelection"]):
     """Some members of a fleet: ``fleet.group("alpha")``, ``fleet["north/*"]``.
 
     Every action runs on all available members at once. A member is available unless it is lost, taken over or released.
-    The action returns a :class:`FleetResult` when all of these members are done. If a member fails, the fleet's policy
-    sends orders to the other members, and the action ends when these orders are executed. If the action is cancelled,
-    all members hold.
+    The action returns a :class:`FleetResult` when all these members have finished or failed. If a member fails, the
+    fleet's policy may send orders to the other members; then the action returns after these orders were executed. If
+    the action is cancelled, all members hold.
     """
 
     @property
     def members(self) -> Mapping[str, Member]:
-        """Maps names to members, in the order in which they were given or found."""
+        """Maps names to members, in the order in which the program gave them or their vehicles were found."""
         return self.aio.members
 
     def go_to(
@@ -110,14 +110,14 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> FleetResult:
         """Fly each member to its own target; see :meth:`aerokit.Vehicle.go_to`.
 
-        A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude: members
-        change to different altitudes (layers), cross, and change to the altitude of their targets, in separate legs.
+        A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude. Members
+        then fly three legs: they climb to different altitudes (layers), cross, and descend to their targets.
 
         Args:
-            targets: mapping of member names to targets; members without a target stay where they are. Or a function
-                that returns a member's target.
-            speed_m_s: ground speed; None: unchanged.
-            max_distance_m: reject targets farther than this from the vehicle.
+            targets: mapping of member names to targets, or a function that returns a member's target. Members that a
+                mapping omits stay where they are.
+            speed_m_s: ground speed in m/s; None: unchanged.
+            max_distance_m: reject targets that are farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
             separation: result of :meth:`plan_separation` for these targets.
@@ -125,8 +125,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Raises:
             InvalidArgument: a name is unknown, or a target is too far away. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
-            OperationRejected: paths come too close and cannot be separated: nothing was sent. Or a member became
-                unavailable after a leg: the other members stay in their layers.
+            OperationRejected: paths come too close and cannot be separated, and nothing was sent; or a member became
+                unavailable after a leg, and the other members stay in their layers.
         """
         return self._loop.run(
             self.aio.go_to,
@@ -150,19 +150,19 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> Deconfliction:
         """Compare the straight paths to these targets and plan their separation. Nothing is sent.
 
-        Members without a target count at their current position. Publishes :class:`PathsCompared`.
+        Members without a target count as obstacles at their current positions. Publishes :class:`PathsCompared`.
 
         Args:
             targets: as for :meth:`go_to`.
             min_distance_m: minimum distance between any two members in metres; None: that of the fleet.
             by: ``"layers"`` separates crossing paths by altitude, ``"corridors"`` by time, which needs ``speed_m_s``.
                 ``"refuse"`` refuses crossing paths.
-            speed_m_s: ground speed of all members.
+            speed_m_s: ground speed of all members in m/s, for corridors.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
             slack_s: for corridors: how early or late a member may be relative to another, in seconds.
 
         Raises:
-            InvalidArgument: a name is unknown, or an argument is missing.
+            InvalidArgument: a name is unknown, or a required argument is missing.
             ValueUnknownError: the position of a member is unknown.
         """
         return self._loop.call(
@@ -180,8 +180,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             show: the trajectories.
-            origin: origin of the show's metres; without an altitude above sea level it is at the altitude of the first
-                member's home.
+            origin: the place from which the show's metres count. If it has no altitude above sea level, it is at the
+                altitude of the first member's home.
 
         Raises:
             InvalidArgument: a track has no member.
@@ -201,18 +201,18 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> ShowReport:
         """Fly a show: all members fly to their first points, start at the same instant, and hold at the end.
 
-        The members have to be in the air. Their clocks are measured with TIMESYNC, so that delayed telemetry does not
-        count as deviation. If a member fails, the fleet's policy decides about the other members, as in any action.
+        The members have to be in the air. Their clocks are measured with TIMESYNC, so that the report does not count
+        the delay of telemetry as a deviation. If a member fails, the fleet's policy decides about the others.
 
         Args:
-            show: tracks by member's name; :meth:`Show.renamed` assigns tracks to members.
-            origin: origin of the show's metres; without an altitude above sea level it is at the altitude of the first
-                member's home.
+            show: tracks with the names of members; :meth:`Show.renamed` assigns tracks to members.
+            origin: the place from which the show's metres count. If it has no altitude above sea level, it is at the
+                altitude of the first member's home.
             rate_hz: set-points per second for each member, 2 to 50.
             start_in_s: seconds from the arrival of the last member at its first point to the start.
-            lead_s: seconds by which velocities are sent ahead of the track, to compensate for the vehicles' reaction
+            lead_s: how many seconds before their time velocities are sent, to compensate for the vehicles' reaction
                 time (``lag_s`` in the report); None: 0.
-            speed_m_s: ground speed to the first points; None: unchanged.
+            speed_m_s: ground speed to the first points in m/s; None: unchanged.
 
         Raises:
             InvalidArgument: a track has no member, or an argument is out of range. Nothing was sent.
@@ -241,10 +241,10 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """Fly each follower to its place around the leader, which stays where it is; see :meth:`go_to`.
 
         Args:
-            formation: the places.
-            leader: name of the leading member; it has no offset in the formation.
-            speed_m_s: ground speed; None: unchanged.
-            timeout: seconds for each member and leg; None: no limit.
+            formation: the places of the followers.
+            leader: name of the leading member, which has no offset in the formation.
+            speed_m_s: ground speed in m/s; None: unchanged.
+            timeout: seconds for each member and each leg; None: no limit.
 
         Raises:
             InvalidArgument: a name is unknown, or two places are too close. Nothing was sent.
@@ -267,8 +267,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
         follower fails, the fleet's policy decides about the other followers.
 
         Args:
-            formation: the places.
-            leader: name of the leading member; your program flies it, for example in the block.
+            formation: the places of the followers.
+            leader: name of the leading member. Your program flies it, for example in the block.
             rate_hz: set-points per second, 2 to 50.
             max_speed_m_s: maximum speed of the followers in m/s.
 
@@ -291,14 +291,14 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> FleetResult:
         """Upload a mission to each member and verify it; see ``vehicle.mission.upload``.
 
-        :meth:`start_missions` starts them only after all uploads succeeded. A fleet with a ``min_distance_m`` compares
-        the missions first.
+        :meth:`start_missions` starts the missions, but only if all uploads succeeded. A fleet with a
+        ``min_distance_m`` compares the missions first.
 
         Args:
-            missions: member's name → mission.
-            max_concurrent: maximum number of simultaneous transfers on each network, from 1.
+            missions: maps names of members to missions.
+            max_concurrent: maximum number of simultaneous transfers on each network, at least 1.
             max_distance_m: reject missions with a position farther than this from the vehicle.
-            timeout: seconds for each member; None: no limit while data arrives.
+            timeout: seconds for each member; None: no limit as long as data arrives.
 
         Raises:
             InvalidArgument: a name is unknown, or a mission is invalid. Nothing was sent.
@@ -314,7 +314,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         )
 
     def start_missions(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:
-        """Start the uploaded missions of all members, or of none; see ``vehicle.mission.start``.
+        """Start the uploaded missions if all members can start; see ``vehicle.mission.start``.
 
         Args:
             timeout: seconds until each member reports its mission mode.
@@ -345,11 +345,11 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Ignores items without a position, terrain altitudes and jumps.
 
         Args:
-            missions: member's name → mission.
+            missions: maps names of members to missions.
             min_distance_m: minimum distance between any two paths in metres; None: that of the fleet.
 
         Raises:
-            InvalidArgument: a name is unknown, or an argument is missing.
+            InvalidArgument: a name is unknown, or a required argument is missing.
             ValueUnknownError: the position of a member is unknown.
         """
         return self._loop.call(self.aio.compare_missions, missions, min_distance_m=min_distance_m)
@@ -368,7 +368,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             action: the name of a method of :class:`aerokit.Vehicle` (``"set_speed"``, ``"mission.resume"``), or a
                 coroutine function that is called with each :class:`Member`.
             *arguments: positional arguments of the method.
-            timeout: seconds for each member; None: the default of the action.
+            timeout: seconds for each member; None: no limit besides that of the method.
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
             **options: keyword arguments of the method.
 
@@ -386,7 +386,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return self._loop.run(self.aio.wait_ready, timeout=timeout)
 
     def arm(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:
-        """Arm: **propellers may start to turn**; see :meth:`aerokit.Vehicle.arm`.
+        """Arm all members: **propellers may start to turn**; see :meth:`aerokit.Vehicle.arm`.
 
         Args:
             timeout: seconds for each member.
@@ -395,7 +395,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return self._loop.run(self.aio.arm, timeout=timeout, stagger_s=stagger_s)
 
     def disarm(self, *, timeout: float = 10.0) -> FleetResult:
-        """Disarm; see :meth:`aerokit.Vehicle.disarm`. Vehicles in the air refuse.
+        """Disarm all members; see :meth:`aerokit.Vehicle.disarm`. Vehicles in the air refuse.
 
         Args:
             timeout: seconds for each member.
@@ -406,7 +406,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """Take off and climb to ``altitude_m`` above home; see :meth:`aerokit.Vehicle.take_off`.
 
         Args:
-            altitude_m: metres above the home of each member, above 0, at most 10,000.
+            altitude_m: metres above the home of each member; more than 0 and at most 10,000.
             timeout: seconds for each member.
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
@@ -416,7 +416,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, stagger_s=stagger_s)
 
     def land(self, *, timeout: float | None = 300.0, stagger_s: float | None = None) -> FleetResult:
-        """Land at the current position; see :meth:`aerokit.Vehicle.land`. A failure does not stop the other members.
+        """Land at the current position; see :meth:`aerokit.Vehicle.land`. A member's failure does not stop the others.
 
         Args:
             timeout: seconds for each member; None: no limit.
@@ -425,7 +425,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return self._loop.run(self.aio.land, timeout=timeout, stagger_s=stagger_s)
 
     def return_to_launch(self, *, timeout: float | None = 600.0, stagger_s: float | None = None) -> FleetResult:
-        """Return to launch; see :meth:`aerokit.Vehicle.return_to_launch`. A failure does not stop the other members.
+        """Return to launch; see :meth:`aerokit.Vehicle.return_to_launch`. A member's failure does not stop the others.
 
         Args:
             timeout: seconds for each member; None: no limit.
@@ -434,7 +434,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return self._loop.run(self.aio.return_to_launch, timeout=timeout, stagger_s=stagger_s)
 
     def hold(self) -> FleetResult:
-        """Stop and hold position; see :meth:`aerokit.Vehicle.hold`. A failure does not stop the other members."""
+        """Stop and hold position; see :meth:`aerokit.Vehicle.hold`. A member's failure does not stop the others."""
         return self._loop.run(self.aio.hold)
 
     def set_mode(self, mode: str | int, *, timeout: float = 6.0) -> FleetResult:
@@ -459,12 +459,12 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """Wait until a condition is true for every member.
 
         Args:
-            condition: called with a member, four times a second and when its state changes.
+            condition: function of a member; it is called four times a second and when the member's state changes.
             timeout: seconds until the condition is true for all members.
             description: name of the barrier in errors.
 
         Raises:
-            FleetError: the condition did not become true for a member, which counts as failed in this action.
+            FleetError: the condition was not true for a member in time. The failure applies the fleet's policy.
         """
         return self._loop.run(self.aio.barrier, condition, timeout=timeout, description=description)
 
@@ -473,7 +473,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             altitude_m: metres above the home of each member.
-            tolerance_m: allowed difference in metres.
+            tolerance_m: allowed difference from ``altitude_m`` in metres.
             timeout: seconds until all members are at the altitude.
 
         Raises:
@@ -502,10 +502,10 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
 
 class Fleet(FleetTwin, Selection):
-    """All members, as yielded by :func:`aerokit.fleet`. Usable inside its block only."""
+    """A fleet with all its members. :func:`aerokit.fleet` yields it, and it is usable in the block only."""
 
     def reclaim(self, name: str) -> None:
-        """Make members available again that were taken over or released.
+        """Make members available again after they were taken over or released.
 
         Sends nothing. The next action includes these members. **Ask the pilot first.**
 
@@ -522,7 +522,7 @@ class Fleet(FleetTwin, Selection):
 
         Args:
             name: a member's name or a pattern.
-            reason: appears in ``Member.reason`` and in results.
+            reason: text for ``Member.reason`` and for results.
 
         Raises:
             InvalidArgument: no member matches.
@@ -540,7 +540,7 @@ class Fleet(FleetTwin, Selection):
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.
-            ConnectionClosed, LinkLost: a link has ended; earlier links got the corrections.
+            ConnectionClosed, LinkLost: a link has ended. Links before it have already got the corrections.
         """
         return self._loop.call(self.aio.send_corrections, rtcm)
 
@@ -556,7 +556,8 @@ class Fleet(FleetTwin, Selection):
             *types: events of the fleet (``MemberLost``, ``PolicyCompleted`` …) and of vehicles (``ModeChanged`` …).
                 Events of vehicles arrive as :class:`MemberEvent` with the member's name. Without arguments: all events.
             capacity: maximum number of unread events.
-            overflow: what happens to an event that exceeds the capacity; the stream's ``missed`` counts dropped events.
+            overflow: what happens to an event when ``capacity`` is reached. The ``missed`` of the result counts dropped
+                events.
 
         Raises:
             InvalidArgument: a type is not an event.
@@ -573,11 +574,11 @@ class Fleet(FleetTwin, Selection):
         """Subscribe to states of all members; use it in a ``with`` block.
 
         Args:
-            *names: names of docs/states.md: ``"position"``, ``"batteries"`` …
-            every_arrival: also report values that arrive unchanged.
+            *names: names of states (docs/states.md), such as ``"position"`` and ``"batteries"``.
+            every_arrival: also report a value that arrives unchanged.
             capacity: maximum number of unread updates.
-            overflow: what happens to an update that exceeds the capacity; the stream's ``missed`` counts dropped
-                updates.
+            overflow: what happens to an update when ``capacity`` is reached. The ``missed`` of the result counts
+                dropped updates.
 
         Raises:
             InvalidArgument: a name is unknown, or none is given.
@@ -608,27 +609,28 @@ def fleet(
     system 7 of network "north". Several networks can therefore use the same system ids.
 
     Args:
-        *sources: addresses, links or open connections, whose vehicles all become members; or vehicle objects. A mapping
-            gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
-        count: number of vehicles to wait for, in total; None: at least one on each network, plus those found in the
-            next 2.5 seconds.
-        system_ids: use these system ids only, on all networks or by network name; None: all that are found.
-        groups: group → names or patterns of its members (``"north/*"``). Other members have the group ``""``.
-        roles: role → names or patterns of its members.
-        on_error: policy for the other members when one fails in an action (docs/fleets.md).
-        on_error_by_group: group → policy when a member of this group fails.
+        *sources: addresses, links or open connections, all of whose vehicles become members, and vehicle objects. A
+            mapping gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
+        count: total number of vehicles to wait for; None: wait for one on each network, and 2.5 seconds for more.
+        system_ids: system ids to use, for all networks or mapped by network name; None: all that are found.
+        groups: maps groups to names or patterns of members (``"north/*"``). Other members have the group ``""``.
+        roles: maps roles to names or patterns of members.
+        on_error: policy for the other members when a member fails in an action (docs/fleets.md).
+        on_error_by_group: maps groups to the policy for a failure of one of their members, instead of ``on_error``.
         min_distance_m: minimum distance between any two members in metres. Paths are compared before flight, and the
             event ``TooClose`` reports violations in flight; None: no checks.
-        on_too_close: ``"hold"``: both members hold, if this program flies them; ``"report"``: event only.
+        on_too_close: ``"hold"``: members that are too close also hold, if this program flies them; ``"report"``: only
+            publish the event.
         timeout: seconds to wait for all members. After five seconds, a warning of the logger "aerokit" lists the
             missing members.
-        rates: message class → Hz, requested from each member instead of the default rates; ``{}`` requests nothing.
+        rates: maps message classes to rates in Hz that are requested from each member instead of the default rates;
+            ``{}`` requests nothing.
 
     Raises:
         InvalidArgument: an argument is not allowed, or two vehicles have the same name.
         BusyError: this program already has a vehicle object for one of ``system_ids`` on that connection.
         LinkOpenError: a link could not be opened.
-        LinkLost, ConnectionClosed: a link closed while waiting.
+        LinkLost, ConnectionClosed: a link closed while the fleet waited for members.
         ConnectFailed: some members were not found in time; the text lists the members found.
     """
     return opened_fleet(

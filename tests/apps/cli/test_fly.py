@@ -87,7 +87,7 @@ def test_fly_without_terminal_and_yes_sends_nothing(
 ) -> None:
     monkeypatch.setattr(fly, "is_interactive", lambda: False)
     assert main(["fly", "m.waypoints", "--connect", "tcp:127.0.0.1:1"]) == 2
-    assert "--yes is not given; nothing was sent" in capsys.readouterr().err
+    assert "--yes omits the question; nothing was sent" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("answer", "code"), [(True, 0), (False, 1)])

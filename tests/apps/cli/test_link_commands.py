@@ -240,7 +240,10 @@ def test_record_without_frames_fails(capsys: pytest.CaptureFixture[str]) -> None
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["udpin:127.0.0.1:0"], "argument FILE: 'udpin:127.0.0.1:0' is an address; the recording comes after it"),
+        (
+            ["udpin:127.0.0.1:0"],
+            "'udpin:127.0.0.1:0' is an address; the recording must follow the address",
+        ),
         (["a.tlog", "--seconds", "1", "b.tlog"], "aerokit record: error: unrecognized arguments: b.tlog"),
         (
             ["--secnds", "3"],

@@ -1,4 +1,4 @@
-"""Argument types for argparse: each raises ArgumentTypeError, which becomes exit code 2."""
+"""Argument types for argparse. They raise ArgumentTypeError, which leads to exit code 2."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 DEFAULT_SIM_ADDRESS = "tcpin:127.0.0.1:{5760+10n}"
-"""Default address template of ``aerokit sim``, with the ports of SITL instances: 5760, 5770, 5780 …"""
+"""Default address template of ``aerokit sim``. Its ports are those of SITL instances: 5760, 5770, 5780 …"""
 _TEMPLATE_FIELD = re.compile(r"\{(?:(\d{1,5})\+)?(\d{0,3})(n|id)\}")
 
 
 def is_address_template(address: str) -> bool:
-    """Return True if the address has placeholders, so that each vehicle gets a separate link."""
+    """Return True if the address has placeholders. Each vehicle then gets its own link."""
     return _TEMPLATE_FIELD.search(address) is not None
 
 
 def expand_address(address: str, number: int, system_id: int) -> str:
     """Fill in the placeholders of an address template for one vehicle.
 
-    ``{n}`` is the number of the vehicle, from 0; ``{id}`` its system id. ``{5760+10n}`` is an expression with such a
-    value.
+    ``{n}`` is the number of the vehicle, from 0, and ``{id}`` is its system id. ``{5760+10n}`` computes a port from
+    such a value.
     """
 
     def value(match: re.Match[str]) -> str:
@@ -126,7 +126,7 @@ def wind(text: str) -> tuple[float, ...]:
     are_gusts_positive = min(values[2:], default=0) >= 0
     is_in_range = all(abs(value) <= 50 for value in values) and are_gusts_positive
     if len(values) not in (2, 3) or not is_in_range:
-        raise ArgumentTypeError(f"{text!r} is not NORTH,EAST or NORTH,EAST,GUSTS in m/s, up to 50")
+        raise ArgumentTypeError(f"{text!r} is not NORTH,EAST or NORTH,EAST,GUSTS with numbers in m/s up to 50")
     return values
 
 
@@ -159,7 +159,7 @@ def assignment(text: str) -> tuple[str, int | float]:
     """Parse ``NAME=VALUE`` for a parameter; whole numbers may be hexadecimal (0x1F)."""
     name, equals, value = text.partition("=")
     if not equals:
-        raise ArgumentTypeError(f"{text!r} has no value: write NAME=VALUE without spaces")
+        raise ArgumentTypeError(f"{text!r} has no value; expected NAME=VALUE, without spaces")
     try:
         number = parse_number(value)
     except ValueError:
@@ -201,14 +201,14 @@ def writable_file(text: str) -> str:
 def log_file(text: str) -> str:
     """Parse the path of a recording to write."""
     if is_address(text):
-        raise ArgumentTypeError(f"{text!r} is an address; the recording comes after it: ADDRESS flight.tlog")
+        raise ArgumentTypeError(f"{text!r} is an address; the recording must follow the address: ADDRESS flight.tlog")
     if not text.lower().endswith(".tlog"):
         raise ArgumentTypeError(f"{text!r} does not end in .tlog")
     return writable_file(text)
 
 
 def directory(text: str) -> Path:
-    """Parse the path of a directory, which the command creates if it does not exist."""
+    """Parse the path of a directory. If it does not exist, the command will create it."""
     path = Path(text)
     for directory_path in (path, *path.parents):
         if directory_path.exists() and not directory_path.is_dir():

@@ -1,4 +1,4 @@
-"""``aerokit bridge``: the vehicles on a link in Foxglove, or as JSON over zenoh or MQTT."""
+"""``aerokit bridge``: shows the vehicles on a link in Foxglove, or publishes them as JSON over zenoh or MQTT."""
 
 from __future__ import annotations
 
@@ -99,9 +99,9 @@ def _add_common(action: argparse.ArgumentParser, rate_hz: float, what: str) -> N
 
 
 def _network(text: str) -> str:
-    # Check this before a link is opened, because the two addresses are easily swapped.
+    # Checked before a link is opened, because users easily swap the two addresses.
     if parse_address(address(text)).kind not in ("zenoh", "zenohin"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a zenoh address, zenoh://FLEET/NAME")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a zenoh address; expected zenoh://FLEET/NAME")
     return text
 
 
@@ -184,7 +184,7 @@ async def _publish(options: argparse.Namespace) -> int:
 
 
 async def _wait_until_ended(connection: Connection, stop: asyncio.Event) -> None:
-    """Wait until ``stop`` is set or the connection ends; raise what ended the connection."""
+    """Wait until ``stop`` is set or the connection ends. Raise the error that ended the connection."""
     ended: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
     connection.on_end(ended.set_result)
     stopped = asyncio.ensure_future(stop.wait())

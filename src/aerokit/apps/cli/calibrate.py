@@ -28,8 +28,8 @@ _BAR_WIDTH = 30
 _CANCEL_TIMEOUT_S = 20.0
 
 _GROUND = "    ~~~~~~~~~~~~~~~~~~~~~~~~~~~~"
-# Pictures of a vehicle with its nose to the right, seen from its right side. Poses with a side down are seen from
-# behind.
+# The pictures show a vehicle from its right side, with its nose to the right. In the poses with a side down, they show
+# it from behind.
 _FROM_BEHIND = (CalibrationPose.LEFT, CalibrationPose.RIGHT)
 PICTURES: dict[CalibrationPose, str] = {
     CalibrationPose.LEVEL: r"""
@@ -93,7 +93,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 async def _run(options: argparse.Namespace) -> int:
     if options.sensor == "escs" and not options.propellers_removed:
-        raise InvalidArgument("escs: the motors get full throttle: remove the propellers and add --propellers-removed")
+        raise InvalidArgument("escs: the motors get full throttle; remove the propellers and add --propellers-removed")
     async with connect_to(
         options,
         options.address,
@@ -113,7 +113,7 @@ def _calibration(vehicle: Vehicle, sensor: str) -> Calibration:
 
 
 async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
-    """Show the steps until the end. Ctrl-C cancels the calibration on the vehicle."""
+    """Show the steps of a calibration until it ends. Ctrl-C cancels the calibration on the vehicle."""
     scope, display = anyio.CancelScope(), Display(options)
     with on_interrupt(scope.cancel):
         with scope:
@@ -121,7 +121,7 @@ async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
                 display.show(step)
                 if step.needs_confirmation and not await press_enter():
                     scope.cancel()
-                    await anyio.lowlevel.checkpoint()  # the cancellation takes effect here, before the next step
+                    await anyio.lowlevel.checkpoint()  # a cancellation takes effect here, before the next step
             return DONE
         return await _cancel(options, calibration)
 
@@ -138,7 +138,7 @@ async def _cancel(options: argparse.Namespace, calibration: Calibration) -> int:
 
 
 class Display:
-    """Prints pictures of poses, instructions and progress; at most 80 columns and 24 lines at a time."""
+    """Prints the pictures of poses, the instructions and the progress, in at most 80 columns and 24 lines at a time."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self._options = options
@@ -152,7 +152,7 @@ class Display:
         del record["result"]
         shown_pose, shown_instruction = self._shown
         self._shown = step.pose, step.instruction
-        text = None  # only the progress has changed
+        text = None  # unless the pose changes, the step only reports progress
         if step.pose is not shown_pose:
             text = "\n".join(lines_of(step))
         elif step.instruction != shown_instruction:

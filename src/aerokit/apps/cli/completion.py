@@ -1,4 +1,4 @@
-"""``aerokit completion``: shell completion by argcomplete, and the values that it offers."""
+"""``aerokit completion``: shell completion by argcomplete, and the values that are offered for arguments."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ async def run_completion(options: argparse.Namespace) -> int:
 
 
 def offer(action: argparse.Action, values: Callable[[], Iterable[str]]) -> None:
-    """Set the completion values of an argument; argcomplete filters them by the typed characters."""
+    """Set the values that the shell offers for an argument. argcomplete filters them by the typed characters."""
     setattr(action, "completer", lambda **_: list(values()))  # noqa: B010 - not an attribute of argparse.Action
 
 
@@ -62,7 +62,7 @@ def kinds() -> tuple[str, ...]:
 
 
 def parameter_names(autopilot: str | None = None) -> list[str]:
-    """Return the sorted parameter names of simulated vehicles of "ArduPilot" or "PX4"; of both by default."""
+    """Return the sorted parameter names of the simulated vehicles of "ArduPilot" or "PX4", by default of both."""
     paths = _PARAMETER_TABLES.get(autopilot or "") or [path for group in _PARAMETER_TABLES.values() for path in group]
     names = set()
     for path in paths:

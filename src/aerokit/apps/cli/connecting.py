@@ -28,18 +28,18 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link
     from aerokit.vehicle.vehicle import Vehicle
 
-# Long enough to receive the heartbeats of all vehicles, which come once a second.
+# How long to listen for other vehicles: long enough for their heartbeats, which they send once a second.
 _OTHER_VEHICLES_TIMEOUT_S = 1.5
 SIGNING_KEY_VARIABLE = "AEROKIT_SIGNING_KEY"
-"""Environment variable with the signing key: a passphrase, or 64 hexadecimal digits."""
+"""Name of the environment variable that contains the signing key: a passphrase, or 64 hexadecimal digits."""
 ADDRESS_VARIABLE = "AEROKIT_ADDRESS"
-"""Environment variable with the default address."""
+"""Name of the environment variable that contains the default address."""
 _DEFAULT_ADDRESS = "udpin:0.0.0.0:14550"
 _CONNECT_TIMEOUT_S = 30.0
 
 
 async def _check_only_vehicle(vehicle: Vehicle, options: argparse.Namespace) -> None:
-    """Unless ``--system-id`` is given, check that no other vehicle is on the link.
+    """Check that no other vehicle is on the link, unless ``--system-id`` is given.
 
     Raises:
         InvalidArgument: there are several vehicles.
@@ -68,7 +68,7 @@ def add_signing_key(command: argparse._ActionsContainer, text: str) -> None:
 
 
 def key_file(path: str) -> SigningKey:
-    """Read the signing key from the file at this path."""
+    """Read a signing key from the file at this path, for argparse."""
     from aerokit.mavlink.signing import SigningKey
 
     try:
@@ -92,7 +92,7 @@ def signing_of(options: argparse.Namespace) -> Signing | None:
 
 
 def default_address() -> str:
-    """Return the address in the environment, else the port on which ground stations listen."""
+    """Return the address from the environment or, by default, the UDP port on which ground stations listen."""
     return os.environ.get(ADDRESS_VARIABLE, "").strip() or _DEFAULT_ADDRESS
 
 
@@ -104,7 +104,7 @@ def add_address(
     Args:
         command: the parser or group.
         name: name of the argument; with leading dashes, name of the option.
-        what: text before the examples in the help.
+        what: text of the help before the examples.
         default: description of the default in the help; None if the usual default address is used.
     """
     keywords: dict[str, Any] = {} if name.startswith("-") else {"nargs": "?"}
@@ -158,7 +158,7 @@ def add_action(
     *,
     connects: bool = True,
 ) -> argparse.ArgumentParser:
-    """Add ``aerokit COMMAND name``. ``connects``: the action connects to a vehicle."""
+    """Add the action ``name`` to a command; with ``connects``, also the options for a connection to a vehicle."""
     parents = [_vehicle_parser()] if connects else []
     summary = text[0].lower() + text[1:].partition(". ")[0].rstrip(".")
     action = actions.add_parser(name, help=summary, description=text, parents=parents)
@@ -168,7 +168,7 @@ def add_action(
 
 
 def confirm_blocking(question: str) -> bool:
-    """Ask a yes/no question before connecting. The answer is no if stdin is not a terminal."""
+    """Ask a yes/no question before a connection is opened. The answer is no if stdin is not a terminal."""
     return sys.stdin.isatty() and input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
 
@@ -184,7 +184,7 @@ def command_action(
         name: the name of the action in the ``done`` record; may contain names of options in braces.
         text: the line that is printed without ``--json``; may also contain names of options in braces.
         action: called with the target and the options.
-        target: function that opens the target; None connects to the vehicle.
+        target: function that opens the target of the action; None: connect to the vehicle.
     """
 
     async def run(options: argparse.Namespace) -> int:
@@ -200,8 +200,8 @@ def command_action(
 async def connected(options: argparse.Namespace, *, changes: bool = False) -> AsyncIterator[Vehicle]:
     """Connect to the vehicle that the options name, without requesting message rates.
 
-    With ``changes``, which is for actions that change something, the vehicle must be the only one on the link, or
-    chosen by ``--system-id``.
+    Actions that change something on the vehicle set ``changes``. The vehicle must then be the only one on the link, or
+    be chosen by ``--system-id``.
     """
     async with connect_to(
         options,
@@ -220,7 +220,7 @@ async def connect_to(
 ) -> AsyncIterator[Vehicle]:
     """Connect to the vehicle on a link, with a countdown. ``connecting`` is passed to :func:`aerokit.connect`.
 
-    ``changes``: see :func:`connected`.
+    ``changes`` is as in :func:`connected`.
     """
     from aerokit.vehicle.connect import connect
 
@@ -242,7 +242,7 @@ async def connect_to(
 
 
 def add_link(command: argparse.ArgumentParser, *, default: str | None = None) -> None:
-    """Add the address with ``--baud``, ``--signing-key`` and ``--json``; ``default`` as in :func:`add_address`."""
+    """Add the address with ``--baud``, ``--signing-key`` and ``--json``; ``default`` is as in :func:`add_address`."""
     add_address(command, default=default)
     add_signing_key(command, f"signing key of the vehicles (${SIGNING_KEY_VARIABLE})")
     add_json(command)
@@ -256,7 +256,7 @@ def add_seconds(command: argparse.ArgumentParser, text: str, default: float | No
 async def opened(options: argparse.Namespace, *, reconnect: bool = False) -> AsyncIterator[Connection]:
     """Open a connection to the address. Only heartbeats are sent.
 
-    ``reconnect``: reopen a lost link, if the address is a string.
+    With ``reconnect``, a lost link is reopened, if it was given as an address.
     """
     from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
 
@@ -292,7 +292,7 @@ async def await_vehicle(connection: Connection, options: argparse.Namespace, pat
 
 
 def _simulator_hint(connection: Connection) -> str:
-    """Return the command that starts a simulated vehicle for this link, if it listens and received nothing."""
+    """Return a hint on how to start a simulated vehicle for a link that listens and received nothing, else ""."""
     place = connection.link.address.replace("0.0.0.0", "127.0.0.1")
     if not place.startswith("udpin:127.0.0.1:") or any(peer.bytes for peer in connection.statistics()):
         return ""
@@ -302,7 +302,7 @@ def _simulator_hint(connection: Connection) -> str:
 async def await_end(connection: Connection, seconds: float | None, work: asyncio.Task[None] | None = None) -> bool:
     """Wait for Ctrl-C or for ``seconds``. Return True after Ctrl-C.
 
-    Raises the error that ended the connection. The end of the background task ``work`` also ends the wait.
+    If the connection ends, raises its error. The wait also ends when the background task ``work`` ends.
     """
     ended = asyncio.Event()
     interrupted = False

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.apps.cli.supervised_flight import Purpose
     from aerokit.vehicle.vehicle import Vehicle
 
-# Name of each corner, and its offset north and east from the start in multiples of the side.
+# The corners of the square: name, and offset north and east of the start in multiples of the side.
 _CORNERS = (("north-west", 1, 0), ("north-east", 1, 1), ("south-east", 0, 1), ("south-west", 0, 0))
 _READY_TIMEOUT_S = 120.0
 _DEFAULT_LOG = "demo.tlog"
@@ -68,7 +68,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 async def run_demo(options: argparse.Namespace) -> int:
     """Fly the demonstration. Return 0 when the vehicle is back on the ground."""
     if options.connect is not None and options.faults:
-        raise InvalidArgument("--fault is for the simulated vehicle, not for one on --connect")
+        raise InvalidArgument("--fault works with the simulated vehicle only: remove --connect, or remove --fault")
     interrupts = InterruptStack()
     with on_interrupt(interrupts.interrupt):
         code = await interrupts.run(lambda: _connect_and_fly(options, interrupts))
@@ -96,7 +96,7 @@ async def _connect_and_fly(options: argparse.Namespace, interrupts: InterruptSta
 
 @asynccontextmanager
 async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
-    """Yield the address of the vehicle. Without ``--connect``, simulate a vehicle until the block ends."""
+    """Yield the address of the vehicle. Without ``--connect``, simulate a vehicle while the block lasts."""
     if options.connect is not None:
         yield options.connect
         return
@@ -119,14 +119,14 @@ class _SquareFlight(SupervisedFlight):
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack) -> None:
         super().__init__(vehicle, report, interrupts, "land")
-        self._was_overruled = False  # True if a mode change by another party ended the flight along the square
+        self._was_overruled = False  # True if another party's mode change has ended the flight along the square
 
     async def fly_square(self, altitude_m: float, side_m: float) -> int:
-        """Fly the square, land in any case, and return the exit code."""
+        """Fly the square and return the exit code. Lands in any case."""
         self._altitude_m, self._side_m = altitude_m, side_m
         try:
             return await self.fly()
-        except AerokitError:  # already printed
+        except AerokitError:  # the error is already printed
             return FAILED
 
     async def _fly(self) -> int:
@@ -153,12 +153,12 @@ class _SquareFlight(SupervisedFlight):
         self._print(f"ready, home is {home.latitude_deg:.6f}, {home.longitude_deg:.6f}; arming")
         await self._arm()
         self._print(f"armed; taking off to {altitude_m:g} m")
-        self._has_started = True  # from here on, a mode change by another party ends this program's control
+        self._has_started = True  # from now on, a mode change by another party ends this program's control
         await vehicle.take_off(altitude_m)
         self._print("at altitude; flying the square")
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # The modes for hold and land may come from this program, unless another party has changed the mode.
+        # The modes for hold and land are this program's, too, unless another party has changed the mode.
         return ("take_off", "setpoint") if self._was_overruled else ("take_off", "setpoint", "hold", "land")
 
     async def _after_failure(self, error: Exception) -> int:

@@ -111,14 +111,14 @@ async def _photo(options: argparse.Namespace) -> int:
 
 
 async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -> bool:
-    """Print a picture, and download it with ``--to``. Return False if taking or downloading it failed."""
+    """Print a picture's data and, with ``--to``, download it. Return False if taking or downloading it failed."""
     position, folder = capture.place, options.to
     place = "position unknown" if position is None else f"{position.latitude_deg:.7f} {position.longitude_deg:.7f}"
     text = f"{capture.index:>5}  {place}  {_printable_text(capture.file_url)}".rstrip()
     record = {name: value for name, value in capture.to_dict().items() if name != "received_at"}
     emit(options, "picture", record, text)
     if folder is None or not capture.success:
-        return capture.success is not False  # None: the camera has not reported whether it succeeded
+        return capture.success is not False  # None counts as success: the camera has not reported the result
     name = _file_name(capture)
     if name is None:
         not_fetched = {"index": capture.index, "file": None, "bytes": None}
@@ -132,19 +132,22 @@ async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -
 
 
 def _printable_text(text: str) -> str:
-    """Replace control characters, which a terminal would execute."""
+    """Replace the control characters of a text, because a terminal would execute them."""
     return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
 
 
 def _file_name(capture: Capture) -> str | None:
-    """Return ``INDEX-NAME``, made from the last part of the address; None if that is no portable file name."""
+    """Return the file name ``INDEX-NAME`` for a picture, with the last part of its address as NAME.
+
+    None if this is not a portable file name.
+    """
     name = unquote(capture.file_url.rpartition("/")[2]) or "capture.jpg"
     is_portable = name.isprintable() and not set(name) & set('/\\:*?"<>|') and name.strip(" .") == name
     return f"{capture.index:05}-{name}" if is_portable and len(name) <= _MAX_FILE_NAME else None
 
 
 def _write_new(folder: Path, name: str, content: bytes) -> Path:
-    """Write to a new file; append a number to the name if the file exists."""
+    """Write data to a new file. If a file with this name exists, a number is appended to the name."""
     stem, dot, ending = name.rpartition(".")
     number, target = 1, folder / name
     while True:
@@ -225,7 +228,7 @@ def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
 @asynccontextmanager
 async def _gimbal(options: argparse.Namespace, *, changes: bool = True) -> AsyncIterator[Gimbal]:
     async with connected(options, changes=changes) as vehicle:
-        await vehicle.gimbals.discover()  # until then, commands go to the autopilot
+        await vehicle.gimbals.discover()  # until gimbals are found, commands go to the autopilot
         yield vehicle.gimbal if options.gimbal is None else vehicle.gimbals.get(options.gimbal)
 
 

@@ -41,15 +41,15 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "video": ("av", "numpy"),
     "zenoh": ("zenoh",),
 }
-"""Modules of each extra. A test compares them with pyproject.toml."""
+"""Maps extras to their modules. A test compares them with pyproject.toml."""
 
-# Number of each port, its usual purpose, and True for UDP.
+# Network ports: number, usual purpose, and True for UDP (False: TCP).
 _COMMON_PORTS = (
     (14550, "the port of ground stations such as QGroundControl and MAVProxy", True),
     (14540, "PX4's simulator sends to it", True),
     (5760, "ArduPilot's simulator listens on it", False),
 )
-# This is long enough to receive two heartbeats.
+# How long to listen at each baud rate: long enough for two heartbeats.
 BAUD_RATE_TIMEOUT_S = 2.5
 
 
@@ -79,9 +79,9 @@ def check_installation() -> Iterator[Finding]:
 
 
 def check_serial_port(device: str, description: str = "") -> Finding:
-    """Check the permissions of a serial port, and whether another program uses it.
+    """Check the permissions of a serial port, and whether another program uses the port.
 
-    The port is not opened, because that toggles DTR, which resets some boards.
+    The port is not opened, because opening it toggles DTR, which resets some boards.
     """
     name = f"{device} ({description})" if description and description != "n/a" else device
     if os.name == "posix" and os.path.exists(device) and not os.access(device, os.R_OK | os.W_OK):
@@ -97,10 +97,10 @@ def check_serial_port(device: str, description: str = "") -> Finding:
 
 
 def _programs_using(device: str) -> list[str]:
-    """Return the names of other programs that have the port open. Linux shows programs of other users only to root."""
+    """Return the names of other programs that have opened the port. Only root can see programs of other users."""
     programs: list[str] = []
     if sys.platform != "linux" or os.path.realpath(device).startswith("/dev/pts/"):
-        return programs  # the creator of a pseudo-terminal keeps it open, but does not use it in this sense
+        return programs  # a pseudo-terminal is always open in the program that created it
     for process in glob("/proc/[0-9]*"):
         process_id = int(process.rpartition("/")[2])
         if process_id == os.getpid():
@@ -128,7 +128,7 @@ def _permission_advice(device: str) -> str:
 
 
 def check_network_port(port: int, meaning: str, *, udp: bool) -> Finding:
-    """Check whether a program on this computer uses a port."""
+    """Check whether a program on this computer uses a network port."""
     name = f"{'UDP' if udp else 'TCP'} port {port}"
     error = port_bind_error("0.0.0.0" if udp else "127.0.0.1", port, udp=udp)
     if error is None:
@@ -184,7 +184,7 @@ def _check_computer(report: Callable[[Finding], None]) -> None:
 
 
 async def _check_link(options: argparse.Namespace, report: Callable[[Finding], None]) -> bool:
-    """Return True if anything was received."""
+    """Check the link and print the findings. Return True if anything was received."""
     from aerokit.apps.cli.doctor_link import LinkExamination
 
     parsed = parse_address(options.address) if isinstance(options.address, str) else None
@@ -211,7 +211,7 @@ async def _check_link(options: argparse.Namespace, report: Callable[[Finding], N
 async def _find_baud_rate(
     options: argparse.Namespace, device: str, baud: int, report: Callable[[Finding], None]
 ) -> int:
-    """Return the rate at which MAVLink is received; ``baud`` if there is none."""
+    """Return the baud rate at which MAVLink is received; ``baud`` if it is received at none."""
     from aerokit.apps.cli.doctor_link import BAUD_RATES, listen_at
 
     port = check_serial_port(device)
@@ -222,14 +222,14 @@ async def _find_baud_rate(
         async with waiting(options, f"{device} at {rate}", BAUD_RATE_TIMEOUT_S, "MAVLink"):
             try:
                 probe = await listen_at(device, rate, BAUD_RATE_TIMEOUT_S)
-            except AerokitError:  # reported when the link is opened
+            except AerokitError:  # reported later, when the link is opened
                 return baud
         if probe.is_mavlink:
             report(_baud_finding(device, rate, baud))
             return rate
         probes.append(probe)
         if probe.bytes == 0:
-            break  # no signal at all, so other rates receive nothing either
+            break  # nothing was received, so the other rates would receive nothing either
     rates = ", ".join(f"{probe.baud}: {probe.bytes} bytes" for probe in probes)
     report(Finding("note", "baud rate", f"no MAVLink on {device} at any rate tried ({rates})"))
     return baud

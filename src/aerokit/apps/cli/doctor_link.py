@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
 
 BAUD_RATES = (57600, 115200, 921600, 460800, 230400, 500000, 38400, 19200, 9600)
-"""Rates to try, the most common first."""
-# One frame with a valid checksum may be noise.
+"""Baud rates to try, the most common first."""
+# Fewer valid frames may be noise.
 _MIN_FRAMES = 2
 _MARKS: dict[str, str] = {"ok": "ok  ", "note": "note", "problem": "BAD "}
 _MAX_LOSS = 0.02
-# Default ids of programs that use aerokit. The command doctor uses another system id.
+# The default system and component id of programs that use aerokit. `aerokit doctor` itself has another system id.
 _PROGRAM_IDS = (255, 190)
-# With fewer frames, the loss is not meaningful.
+# The loss is reported only if at least this many frames were received.
 _MIN_FRAMES_FOR_LOSS = 20
 _SERIAL_LOSS_ADVICE = (
     "check antennas and distance, whether the baud rate is too low for the traffic, and RTS/CTS flow control"
@@ -58,7 +58,7 @@ class BaudRateProbe:
 
     @property
     def is_mavlink(self) -> bool:
-        """Return True after enough valid frames."""
+        """Return True if enough valid frames were received."""
         return self.frames >= _MIN_FRAMES
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
@@ -73,7 +73,7 @@ class BaudRateProbe:
         self._ended.set()
 
     async def wait(self, seconds: float) -> None:
-        """Wait until MAVLink is detected, the port is lost, or the time is over."""
+        """Wait until MAVLink is detected, the port is lost, or the time has passed."""
         with anyio.move_on_after(seconds):
             await self._ended.wait()
 
@@ -99,11 +99,11 @@ async def listen_at(device: str, baud: int, seconds: float) -> BaudRateProbe:
 
 
 Level = Literal["ok", "note", "problem"]
-"""Severity of a finding; only a "problem" makes the command fail."""
+"""Severity of a finding. Only a "problem" makes the command fail."""
 
 
 class Finding(Snapshot):
-    """One result of a check: its subject, what was found, and what to do (may be empty)."""
+    """One result of a check: its subject, what was found, and what to do, which may be empty."""
 
     level: Level
     subject: str
@@ -119,12 +119,13 @@ def emit_finding(options: argparse.Namespace, finding: Finding) -> None:
 
 
 class LinkExamination:
-    """Collects all frames that a connection receives, and derives findings."""
+    """Collects all frames that a connection receives, and derives findings from them."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._own_ids = (connection.source_system, connection.source_component)
-        # All by system and component id. A source with several types or autopilots stands for several senders.
+        # The keys are system and component ids. If they have several vehicle types or autopilots, several senders use
+        # the same ids.
         self._versions: dict[tuple[int, int], set[int]] = {}
         self._signed: Counter[tuple[int, int]] = Counter()
         self._frames: Counter[tuple[int, int]] = Counter()
@@ -136,7 +137,7 @@ class LinkExamination:
 
     def _on_frame(self, frame: Frame, peer: Peer) -> None:
         if self._connection.bus.dialect.get(frame.message_id) is None:
-            return  # without a definition the checksum cannot be verified, so the frame may be noise
+            return  # the checksum of an unknown message cannot be verified, so the frame may be noise
         source = frame.system_id, frame.component_id
         self._frames[source] += 1
         self._versions.setdefault(source, set()).add(frame.version)

@@ -152,7 +152,7 @@ def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequenc
     if options.all:
         return entries
     if not options.ids:
-        return entries[-1:]  # the newest
+        return entries[-1:]  # the newest log, which is the last one
     by_id = {entry.id: entry for entry in entries}
     for log_id in options.ids:
         if log_id not in by_id:

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
     from aerokit.logs.report import Report
 
-# The noun for `Conversion.written`; an .mcap also gets a message for each state that an entry changes.
+# Maps suffixes to the noun for `Conversion.written`; others are rows. An .mcap has more messages than the log has
+# entries, because each changed state is a message, too.
 _WRITTEN_NOUNS = {".mcap": "message", ".gpx": "point", ".kml": "point"}
 _REQUIRED_MODULES = {".mcap": "mcap", ".parquet": "pyarrow", ".gpx": "gpxpy", ".kml": "simplekml"}
 
@@ -108,7 +109,7 @@ async def _report(options: argparse.Namespace) -> int:
 
     target = options.output or options.log.with_suffix(".html")
     for log in logs:
-        check_log_name(log)  # checked first, because the default target is derived from this name
+        check_log_name(log)  # before the target, whose default is derived from the name of the log
     check_not_existing(target, options)
     with progress_bar(options.log.name, "B") as on_progress:
         report = write_report(

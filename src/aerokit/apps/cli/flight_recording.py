@@ -1,4 +1,4 @@
-"""Complete recordings of flights: with the parameters, and with what follows a failure in the air."""
+"""Makes recordings of flights complete: they contain the parameters, and the rest of the flight after a failure."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from aerokit.apps.cli.terminal import InterruptStack
     from aerokit.vehicle.vehicle import Vehicle
 
-# A radio may need longer for all parameters. The flight then begins without the rest.
+# After this time, the flight begins without the remaining parameters. Over a slow radio, all may take longer.
 _PARAMETERS_TIMEOUT_S = 10.0
 MAX_SILENCE_S = 10.0
-"""Seconds without a heartbeat after which nothing more is expected to be recorded."""
+"""A recording ends after this many seconds without a heartbeat, because no more data is expected."""
 _POLL_INTERVAL_S = 0.2
 _MAX_STILL_S = 20.0
 _MAX_DRIFT_M = 1.0
@@ -28,7 +28,7 @@ _MAX_HEIGHT_M = 3.0
 async def record_parameters(vehicle: Vehicle, print_line: Callable[[str], None]) -> None:
     """Request all parameters, so that a report on the recording can explain failsafes. Gives up after 10 s.
 
-    MAVFTP would be faster, but a recording of it has no PARAM_VALUE messages, which reports read.
+    They are not read by MAVFTP, which is faster, because reports need the PARAM_VALUE messages of each parameter.
     """
     try:
         table = await vehicle.parameters.download(method="list", timeout=_PARAMETERS_TIMEOUT_S)
@@ -39,9 +39,9 @@ async def record_parameters(vehicle: Vehicle, print_line: Callable[[str], None])
 
 
 async def record_to_end(vehicle: Vehicle, interrupts: InterruptStack, print_line: Callable[[str], None]) -> None:
-    """While the vehicle is armed, stay connected until it has disarmed, is silent for 10 s, or Ctrl-C.
+    """Stay connected to an armed vehicle until it is disarmed or silent for 10 s, or until Ctrl-C.
 
-    A vehicle that has crashed may stay armed: near the ground, the recording also ends after 20 s without motion.
+    A crashed vehicle may stay armed. Near the ground, the recording therefore also ends after 20 s without motion.
     """
     if not vehicle.is_armed or not vehicle.connection.is_open:
         return
@@ -56,7 +56,7 @@ async def record_to_end(vehicle: Vehicle, interrupts: InterruptStack, print_line
 
     async def wait() -> int:
         while vehicle.is_armed and vehicle.connection.is_open and vehicle.heartbeat_age < MAX_SILENCE_S:
-            if still.is_so():
+            if still.has_lasted():
                 break
             await anyio.sleep(_POLL_INTERVAL_S)
         return DONE
@@ -66,13 +66,13 @@ async def record_to_end(vehicle: Vehicle, interrupts: InterruptStack, print_line
 
 
 class _StillNearGround:
-    """Detects a vehicle that has not moved for 20 s, at the height of its home or a little above."""
+    """Detects that a vehicle has not moved for 20 s at the height of its home or a little above."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
         self._place, self._since = vehicle.position.latest, vehicle.connection.now()
 
-    def is_so(self) -> bool:
+    def has_lasted(self) -> bool:
         here, now = self._vehicle.position.latest, self._vehicle.connection.now()
         if here is None:
             return False

@@ -53,7 +53,7 @@ class PlanFlight(SupervisedFlight):
         super().__init__(vehicle, report, interrupts, options.on_interrupt)
         self._plan, self._options, self._report = plan, options, report
         self.sent: str = _NOTHING_SENT
-        """Description of what was sent before arming, for the message after Ctrl-C."""
+        """Words for what was sent to the vehicle before arming, for the message after Ctrl-C."""
 
     async def _fly(self) -> int:
         vehicle = self._vehicle
@@ -72,7 +72,7 @@ class PlanFlight(SupervisedFlight):
         if not await self._is_confirmed():
             self._print("not confirmed; nothing was started")
             return FAILED
-        self._check_disarmed()  # check again, because the user may have taken long to answer
+        self._check_disarmed()  # once more, because much may have happened before the user answered
         if self._needs_confirmation and await self._download_mission() != confirmed_mission:
             raise OperationRejected(
                 "the mission on the vehicle changed after the question was asked; nothing was started"
@@ -95,7 +95,7 @@ class PlanFlight(SupervisedFlight):
         return tuple((await self._vehicle.mission.download(idle_timeout_s=self._options.patience)).items)
 
     def _check_vehicle(self) -> None:
-        """Raise unless the vehicle is disarmed and can fly the mission, and ``--on-interrupt`` is possible."""
+        """Raise an error if the vehicle is armed or cannot fly the mission, or if it cannot do ``--on-interrupt``."""
         vehicle, interrupt_action = self._vehicle, self._options.on_interrupt
         self._check_disarmed()
         possible = [action for action in INTERRUPT_ACTIONS if action == "nothing" or self._has_mode_for(action)]
@@ -164,7 +164,7 @@ class PlanFlight(SupervisedFlight):
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
         # Modes for landing and returning are not included, because a failsafe may have set them. The mode for holding
-        # is this program's only before the start: a cancelled start of the mission ends in it.
+        # is included only before the start, because a cancelled start of the mission ends in it.
         return ("mission",) if self._has_started else ("mission", "hold")
 
 
@@ -204,14 +204,14 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_fly(options: argparse.Namespace) -> int:
-    """Fly a plan. Return 0 when the mission was flown to its end."""
+    """Fly a plan. Return 0 if the mission was flown to its end."""
     plan = read_plan(options.file)
     _check_arguments(options, plan)
     for part in PARTS:
         items = getattr(plan, part).to_items()
         if items:
             emit_items(options, part, items, "in the file")
-    # `_connect_and_fly` adds its flight to `flights`, so that the flight's state is known after an interrupt.
+    # `_connect_and_fly` appends its flight to `flights`, so that its state is known here after an interrupt.
     interrupts, flights = InterruptStack(), list[PlanFlight]()
     with on_interrupt(interrupts.interrupt):
         code = await interrupts.run(lambda: _connect_and_fly(options, plan, interrupts, flights))
@@ -225,15 +225,15 @@ async def run_fly(options: argparse.Namespace) -> int:
 
 def _check_arguments(options: argparse.Namespace, plan: Plan) -> None:
     if not plan.mission.items:
-        raise InvalidArgument(f"{options.file} has no mission items; nothing to fly")
+        raise InvalidArgument(f"{options.file} has no mission items, so there is nothing to fly")
     if options.sim and options.connect is not None:
-        raise InvalidArgument("--sim and --connect exclude each other")
+        raise InvalidArgument("--sim and --connect cannot be used together")
     for given, name in ((options.vehicle is not None, "--vehicle"), (bool(options.faults), "--fault")):
         if given and not options.sim:
             raise InvalidArgument(f"{name} needs --sim")
     if not (options.sim or options.yes or is_interactive()):
         raise InvalidArgument(
-            "cannot ask for confirmation: stdin is not a terminal, and --yes is not given; nothing was sent"
+            "cannot ask for confirmation, because stdin is not a terminal; --yes omits the question; nothing was sent"
         )
 
 
@@ -257,7 +257,7 @@ async def _connect_and_fly(
             flights.append(PlanFlight(vehicle, plan, report, interrupts, options))
             try:
                 code = await flights[-1].fly()
-                # Nobody would land a simulated vehicle whose mission ended in the air.
+                # A simulated vehicle is not followed: if its mission ended in the air, no pilot would land it.
                 is_followed = code == DONE and not options.sim
                 if is_followed and options.record is not None and flights[-1].armed_by_us:
                     await record_to_end(vehicle, interrupts, report.print_line)
@@ -273,7 +273,7 @@ async def _connect_and_fly(
 
 
 async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: AsyncExitStack) -> Link:
-    """Start a simulated vehicle of the plan's type at the start of the mission."""
+    """Start a simulated vehicle of the plan's vehicle type, at the place where the mission starts."""
     from aerokit.apps.cli.sim import faults_begin, simulated_vehicle
     from aerokit.sim import simulated_link
     from aerokit.sim.kinds import scale_timeouts

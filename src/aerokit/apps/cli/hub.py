@@ -62,13 +62,13 @@ def _add_filter(command: argparse.ArgumentParser, option: str, read: Callable[[s
 
 
 def _named_address(text: str) -> tuple[str, str]:
-    """Parse ``[NAME=]ADDRESS`` into name and address."""
+    """Parse ``[NAME=]ADDRESS`` into the name of an endpoint and its address."""
     match = _NAMED_ADDRESS.fullmatch(text)
     return (match[1], address(match[2])) if match else (text, address(text))
 
 
 def _messages(text: str) -> tuple[str, tuple[str, ...]]:
-    """Parse ``MESSAGE,…[@NAME]`` into the endpoint ("" for all) and message patterns."""
+    """Parse ``MESSAGE,…[@NAME]`` into the name of the endpoint ("" for all) and patterns of message names."""
     names, at, endpoint = text.partition("@")
     patterns = tuple(name.strip() for name in names.split(",") if name.strip())
     if not patterns:
@@ -79,7 +79,7 @@ def _messages(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _rate(text: str) -> tuple[str, dict[str, float]]:
-    """Parse ``MESSAGE=HZ,…[@NAME]`` into the endpoint ("" for all) and rates."""
+    """Parse ``MESSAGE=HZ,…[@NAME]`` into the name of the endpoint ("" for all) and the rates of messages."""
     endpoint, parts = _messages(text)
     rates = {}
     for part in parts:
@@ -87,7 +87,7 @@ def _rate(text: str) -> tuple[str, dict[str, float]]:
         try:
             rates[name] = float(hz)
         except ValueError:
-            raise argparse.ArgumentTypeError(f"{part!r} is not a rate; expected ATTITUDE=5") from None
+            raise argparse.ArgumentTypeError(f"{part!r} is not a rate; expected ATTITUDE=5 (in Hz)") from None
     return endpoint, rates
 
 
@@ -116,6 +116,7 @@ async def _hub(options: argparse.Namespace) -> int:
                     if not stop.is_set():
                         _emit_statistics(options, hub)
             _emit_statistics(options, hub)
+    # Without --seconds, Ctrl-C is the normal end of the command.
     return INTERRUPTED if stop.is_set() and options.seconds is not None else DONE
 
 
@@ -152,7 +153,7 @@ def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
 
 
 def _patterns_for(name: str, filters: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[str, ...]:
-    """Return the patterns of the filters for this endpoint, or for all ("")."""
+    """Return the patterns of the filters that apply to this endpoint; a filter with the name "" applies to all."""
     return tuple(pattern for endpoint, patterns in filters if endpoint in ("", name) for pattern in patterns)
 
 

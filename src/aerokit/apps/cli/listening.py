@@ -45,13 +45,13 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.transport.link import Peer
 
-# If the terminal is too slow to print more events, the oldest are dropped and counted.
+# If more events wait because the terminal prints slowly, the oldest are dropped and counted.
 _MAX_WAITING_EVENTS = 1000
 _SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "INFO", "DEBUG")
-# After this time the command continues to wait, but the countdown ends.
+# The countdown ends after this time; the command continues to wait without it.
 _COUNTDOWN_S = 30.0
 EXIT_TIMEOUT_S = 3.0
-"""Seconds from a signal to the end of the process, in case Textual does not exit and keeps the port open."""
+"""Seconds after a signal at which the process is ended by force, in case Textual does not exit."""
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -67,7 +67,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_record(options: argparse.Namespace) -> int:
-    """Record until Ctrl-C or for ``--seconds``; a lost link is reopened."""
+    """Record a link until Ctrl-C, or for ``--seconds``. A lost link is reopened."""
     with new_recording(options.file):
         return await _record_link(options)
 
@@ -87,7 +87,7 @@ async def _record_link(options: argparse.Namespace) -> int:
         emit(options, "recording", {"address": connection.link.address, "file": options.file}, text)
         try:
             is_interrupted = await _record(connection, options)
-        except AerokitError as connection_error:  # raised below, after the counts are reported
+        except AerokitError as connection_error:  # raised again below, after the report of the counts
             error, is_interrupted = connection_error, False
         seconds = connection.now() - started_at
     _emit_counts(options, counts, seconds)
@@ -95,6 +95,7 @@ async def _record_link(options: argparse.Namespace) -> int:
         raise error
     if not counts:
         return FAILED
+    # Without --seconds, Ctrl-C is the normal end of the command.
     return INTERRUPTED if is_interrupted and options.seconds is not None else DONE
 
 
@@ -115,7 +116,8 @@ def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], 
         message = STANDARD.get(message_id)
         messages[str(message_id) if message is None else message.NAME] += count
     systems = sorted({system_id for system_id, _ in counts})
-    size = os.path.getsize(options.file) if counts else 0  # without a frame, an earlier recording keeps its name
+    # Without a frame no file was created, and a file with this name is an earlier recording.
+    size = os.path.getsize(options.file) if counts else 0
     record = {
         "file": options.file,
         "seconds": seconds,
@@ -140,12 +142,12 @@ def add_events_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_events(options: argparse.Namespace) -> int:
-    """Print events until Ctrl-C or for ``--seconds``; a lost link is reopened."""
+    """Print events until Ctrl-C, or for ``--seconds``. A lost link is reopened."""
     from aerokit.vehicle.connect import vehicles_on
 
     async with AsyncExitStack() as stack:
         connection = await stack.enter_async_context(opened(options, reconnect=True))
-        # Subscribe before the vehicles connect, so that their first events are printed, too.
+        # Subscribes before the vehicles are connected, so that their first events are printed, too.
         printing = asyncio.create_task(_print_all(connection, options))
         stack.push_async_callback(_cancel, printing)
         await stack.enter_async_context(vehicles_on(connection, rates={}))
@@ -160,7 +162,7 @@ async def _print_all(connection: Connection, options: argparse.Namespace) -> Non
         missed = 0
         async with waiting(options, connection.link.address, _COUNTDOWN_S):
             event = await events.get()
-        with suppress(AerokitError):  # the connection has ended; await_end raises the error
+        with suppress(AerokitError):  # raised when the connection ends; await_end raises it again
             while True:
                 if options.all or not isinstance(event, LinkReport):
                     _emit_event(event, unix_time_at_0 + event.at, options)
@@ -214,7 +216,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
     from aerokit.apps.monitor.app import run_monitor as run
 
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise InvalidArgument("aerokit monitor needs a terminal: stdin or stdout is redirected")
+        raise InvalidArgument("aerokit monitor needs a terminal, but stdin or stdout is redirected")
     with ExitStack() as stack:
 
         def exit_soon(signal_number: int) -> None:
@@ -238,7 +240,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _kept_is_printed(path: str | None) -> Iterator[None]:
-    """After the block, print where an earlier recording is now, because Textual hides the log meanwhile."""
+    """After the block, print the new name of an earlier recording. In the block, Textual hides log messages."""
     if path is None or not os.path.isfile(path):
         yield
         return
@@ -250,9 +252,9 @@ def _kept_is_printed(path: str | None) -> Iterator[None]:
 
 
 def _detach_terminal() -> None:
-    """Redirect the output to the null device.
+    """Redirect stdout and stderr to the null device.
 
-    Textual's output thread ends when it writes to a terminal that was closed. Later writes would block the event loop.
+    Textual's output thread ends when it writes to a closed terminal. Later writes would then block the event loop.
     """
     with open(os.devnull, "w") as null_device:
         for stream in (1, 2):  # stdout and stderr

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 ARGCOMPLETE_VARIABLE = "_ARGCOMPLETE"
-"""Environment variable that the shell sets when it asks argcomplete for completions."""
-# `aerokit run PROGRAM ARGUMENTS…` is not parsed here: the arguments belong to the program.
+"""Name of the environment variable that the shell sets when it asks argcomplete for completions."""
+# `aerokit run PROGRAM ARGUMENTS…` is not parsed by argparse here, because the arguments belong to the program.
 RUN = "run"
 
 
@@ -39,9 +39,9 @@ RUN = "run"
 class CliCommand:
     """A subcommand, ``aerokit NAME``. Its module is imported only when the command is called.
 
-    ``location`` is ``"module:function"`` in `aerokit.apps.cli`; the function is ``add_arguments`` by default.
-    That function adds the arguments to a parser, and sets ``run`` to a coroutine function that takes the parsed options
-    and returns the exit code. The first sentence of ``description`` appears in the list of commands.
+    ``location`` is ``"module"`` or ``"module:function"`` in `aerokit.apps.cli`. The function, by default
+    ``add_arguments``, adds the command's arguments to a parser, and sets ``run`` to a coroutine function that takes the
+    parsed options and returns the exit code. The first sentence of ``description`` appears in the list of commands.
     """
 
     name: str
@@ -54,7 +54,7 @@ class CliCommand:
         return self.description[0].lower() + self.description[1:].partition(". ")[0].rstrip(".")
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Import the module and let it add its arguments."""
+        """Import the command's module and add the command's arguments to the parser."""
         module, _, function = self.location.partition(":")
         getattr(import_module(f"aerokit.apps.cli.{module}"), function or "add_arguments")(parser)
 
@@ -156,7 +156,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "parameters, files, devices": ("params", "calibrate", "files", "logs", "camera", "gimbal"),
     "connect programs": ("hub", "bridge"),
 }
-"""Commands by task, for the help."""
+"""All commands, grouped by task for the help."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -164,13 +164,13 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        # argparse recognises "-35" as a number, but takes "-35.36,149.16,584" for an option.
+        # Also matches coordinates: argparse would take "-35.36,149.16,584" for an option, but "-35" for a number.
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def parse_known_args(  # type: ignore[override]  # typeshed has overloads for other namespaces
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> tuple[Any, list[str]]:
-        """Report unrecognized arguments in the subparser, which has the right usage message."""
+        """Parse arguments. Unrecognized arguments are reported here, by the subparser, which prints the right usage."""
         if args is not None and not isinstance(self, _TopParser):
             if self._subparsers is None:
                 self._check_option_names(args)
@@ -182,8 +182,8 @@ class Parser(argparse.ArgumentParser):
         return namespace, unknown
 
     def _check_option_names(self, args: Sequence[str]) -> None:
-        # Unknown options are checked first. Otherwise argparse takes the value after an unknown option for a positional
-        # argument. misplaced_address() reports --connect, with the right command line.
+        # Unknown options are reported first, because argparse takes the value after an unknown option for a positional
+        # argument. For --connect, misplaced_address() reports the right command line.
         options = list(args[: args.index("--")] if "--" in args else args)
         names = [option.partition("=")[0] for option in options if option.startswith("--")]
         for name in names:
@@ -197,6 +197,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and the message, and exit with code 2."""
+        # argparse's message about an unknown choice gets a suggestion.
         match = re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message)
         if match is not None:
             choice, choices = match.groups()
@@ -210,12 +211,12 @@ class Parser(argparse.ArgumentParser):
         super().error(message)
 
 
-# Actions of the library for which there is no command.
+# Names of actions that users may try as commands. The library has them, but the command line does not.
 _ARMING_WORDS = ("arm", "disarm", "takeoff", "take_off", "take-off", "land", "goto", "go_to", "rtl")
 
 
 class _TopParser(Parser):
-    """The parser of ``aerokit`` itself, whose help lists the commands by task."""
+    """The parser of ``aerokit`` itself. Its help lists the commands by task."""
 
     def format_help(self) -> str:
         *options, subparsers = self._actions
@@ -238,7 +239,7 @@ class _TopParser(Parser):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, as listed in `aerokit.apps.cli.output`.
 
-    ``aerokit run PROGRAM`` returns or raises what the program does.
+    ``aerokit run PROGRAM`` returns the exit code of the program, or raises its exception.
     """
     if (problem := _installation_problem()) is not None:
         print(f"aerokit: {problem}", file=sys.stderr)
@@ -258,7 +259,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with plain_warnings():
             code: int = asyncio.run(options.run(options))
     except BrokenPipeError:
-        # Without this, the interpreter would report another BrokenPipeError when it flushes stdout at exit.
+        # Otherwise the interpreter reports another BrokenPipeError when it flushes stdout at exit.
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         return FAILED
     except KeyboardInterrupt:
@@ -285,7 +286,7 @@ def make_parser(only: str | None = None) -> argparse.ArgumentParser:
     """Make the parser for the command line.
 
     Args:
-        only: the one command that gets its arguments; importing all command modules is slow. None: all
+        only: the only command whose arguments are added, because importing all modules is slow. None: all
             commands.
     """
     from aerokit import __version__
@@ -302,7 +303,7 @@ def make_parser(only: str | None = None) -> argparse.ArgumentParser:
         if only in (command.name, None):
             command.add_arguments(subparser)
     run = subparsers.add_parser(RUN, help="run a DroneKit program unchanged", add_help=False)
-    run.add_argument("program", nargs=argparse.REMAINDER)  # for completion of file names
+    run.add_argument("program", nargs=argparse.REMAINDER)  # only for the completion of file names
     return parser
 
 

@@ -1,4 +1,4 @@
-"""Recognises an address or a file given in place of another argument, before anything is opened."""
+"""Recognises an address or a file that was given in place of another argument, before anything is opened."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _COMMANDS_BY_SUFFIX = {
 
 
 def is_address(word: str) -> bool:
-    """Return True for an address of a link that is unlikely to be anything else."""
+    """Return True if a word is certainly the address of a link and not another argument."""
     return _ADDRESS_PATTERN.fullmatch(word) is not None
 
 
@@ -37,7 +37,7 @@ def misplaced_file(word: str) -> str | None:
     path = Path(word)
     suffix = path.suffix.lower()
     advice = _COMMANDS_BY_SUFFIX.get(suffix)
-    is_other_file = path.is_file() and suffix != ".tlog"  # a recording is an address: it is replayed
+    is_other_file = path.is_file() and suffix != ".tlog"  # a recording can be an address: it is replayed
     if advice is None and not is_other_file:
         return None
     text = f"{word!r} is a file; an address is expected, such as udpin:0.0.0.0:14550"
@@ -51,6 +51,7 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
     if parser._subparsers is not None:
         return _address_before_action(parser, words) if words and is_address(words[0]) else None
     has_connect = "--connect" in parser._option_string_actions
+    # Some commands take the address as a positional argument, without --connect.
     if not has_connect and any("address" in action.dest or action.dest == "endpoints" for action in parser._actions):
         is_connected = any(word.partition("=")[0] == "--connect" for word in words)
         line = shlex.join([*command, *(word.removeprefix("--connect=") for word in words if word != "--connect")])
@@ -72,7 +73,7 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
 
 
 def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) -> str:
-    """Return the error text for ``aerokit params udpin:… list``."""
+    """Return the error text if an address is before the action, as in ``aerokit params udpin:… list``."""
     address, action, *arguments = [*words, "ACTION"] if len(words) == 1 else words
     actions = next(item.choices for item in parser._actions if isinstance(item, argparse._SubParsersAction))
     action_parser = actions.get(action) or next(iter(actions.values()))

@@ -34,13 +34,13 @@ def read_plan(path: str) -> Plan:
     Raises:
         OSError: the file cannot be read.
         FileFormatError: the file has neither format; the text names the position of the error.
-        InvalidArgument: an item cannot be sent.
+        InvalidArgument: an item cannot be sent to a vehicle.
     """
     return parse_plan_text(read_text(path), Path(path).name)
 
 
 def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
-    """Return True if the first navigation command is a take-off; a delay may precede it, as in AP_Mission."""
+    """Return True if the first navigation command is a take-off. Like in AP_Mission, a delay may precede it."""
     for item in items:
         if item.command < MavCmd.NAV_LAST and item.command != MavCmd.NAV_DELAY:
             return item.command in _TAKE_OFFS
@@ -48,7 +48,7 @@ def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
 
 
 def plan_warnings(plan: Plan) -> list[str]:
-    """Return texts about parts of a plan that can be sent, but that a vehicle will probably refuse."""
+    """Return warnings about parts of a plan that a vehicle will probably refuse, although they can be sent."""
     from aerokit.autopilots.ardupilot import COPTERS
 
     standard_commands = frozenset(MavCmd)
@@ -70,7 +70,7 @@ def emit_part(options: argparse.Namespace, part: str, items: int, state: str, te
 
 
 def emit_items(options: argparse.Namespace, part: str, items: Sequence[MissionItem], state: str) -> None:
-    """Print a part of a plan, item by item. NaN, which MAVLink uses for "not set", is printed as "–"."""
+    """Print the items of a part of a plan. NaN, which means "not set" in MAVLink, is printed as "–"."""
     emit_part(options, part, len(items), state, f"{part}: {len(items)} items")
     for index, item in enumerate(items):
         position = item.position
@@ -96,7 +96,7 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
         count = len(content.to_items())
         if count == 0:
             continue
-        with progress_bar(part, None) as on_progress:  # only a percentage: of items or, over MAVFTP, of bytes
+        with progress_bar(part, None) as on_progress:  # a percentage, because the unit is items or, over MAVFTP, bytes
             try:
                 await getattr(vehicle, part).upload(
                     content,
@@ -227,7 +227,7 @@ async def _check(options: argparse.Namespace) -> int:
     plan = read_plan(options.file)
     for part in PARTS:
         items = getattr(plan, part).to_items()
-        if items or options.json:  # "fence: 0 items" would look as if the upload cleared the fence
+        if items or options.json:  # because "fence: 0 items" would look as if the upload cleared the fence
             emit_items(options, part, items, "in the file")
     if not any(getattr(plan, part).to_items() for part in PARTS) and not options.json:
         print(f"{options.file} has no items")

@@ -42,9 +42,9 @@ def emit(options: argparse.Namespace, kind: str, record: Mapping[str, object], t
 
     Args:
         options: the parsed options of the command.
-        kind: the record type, written first: ``{"type": "parameter", …}``.
-        record: fields, as listed in docs/command-line.md; converted by `aerokit._internal.formatting.to_jsonable`.
-        text: what to print without ``--json``; None prints nothing.
+        kind: type of the record, which is its first field: ``{"type": "parameter", …}``.
+        record: the other fields (docs/command-line.md), in types that `aerokit._internal.formatting.to_jsonable` takes.
+        text: text to print without ``--json``; None: print nothing.
     """
     if options.json:
         assert "type" not in record, record
@@ -65,12 +65,12 @@ def _print(text: str) -> None:
 
 
 def emit_done(options: argparse.Namespace, action: str, text: str) -> None:
-    """Print the ``done`` record of an action that has no other result; without ``--json`` print only ``text``."""
+    """Print the ``done`` record of an action that has no other result. Without ``--json``, print ``text`` instead."""
     emit(options, "done", {"action": action}, text)
 
 
 def emit_error(error: BaseException, code: int, *, as_json: bool) -> None:
-    """Print an error to stderr, and with ``--json`` also as the last object on stdout."""
+    """Print an error to stderr and, with ``--json``, also as the last object on stdout."""
     text = _text(error)
     if as_json:
         record = {"type": "error", "error": type(error).__name__, "message": text, "exit_code": code}
@@ -84,7 +84,7 @@ def _text(error: BaseException) -> str:
     return plain_text(error) or type(error).__name__
 
 
-# Maps names of calls with which error texts of the library begin to the words that a command prints instead.
+# Error texts of the library begin with the name of a call. Maps these names to the words that a command prints instead.
 _PLAIN_NAMES = {
     "arm": "arming",
     "disarm": "disarming",
@@ -98,14 +98,14 @@ _PLAIN_NAMES = {
     "mission.resume": "continuing the mission",
     "mission.wait_finished": "flying the mission",
 }
-# ArduPilot announces each mission item in texts that repeat what the commands print, and that explain no failure.
+# ArduPilot's texts about mission items. They only repeat what the commands print, and do not explain failures.
 MISSION_TEXT: re.Pattern[str] = re.compile(r"(?:Mission: \d+ |Reached command #\d+)[^\n]*")
 _MISSION_REASON = re.compile(rf"\n  - {MISSION_TEXT.pattern}")
 _CALL = re.compile(rf"({'|'.join(map(re.escape, _PLAIN_NAMES))})(?:\(([^()]*)\))?(?=: )")
 
 
 def plain_text(error: BaseException) -> str:
-    """Return the text of an error. The name of the call that raised it is replaced, because users do not know the call.
+    """Return the text of an error, in which the name of the call that raised it is replaced by words for users.
 
     ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``. Reasons
     that only announce a mission item are left out.
@@ -121,7 +121,7 @@ def plain_text(error: BaseException) -> str:
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Within the block, print warnings of this library without code and without advice on code."""
+    """Within the block, warnings of this library are printed without advice on code, which does not help users."""
     import logging
     import warnings
 
@@ -144,18 +144,18 @@ def plain_warnings() -> Iterator[None]:
 
 
 def _rewrite_for_commands(record: logging.LogRecord) -> bool:
-    """Replace warnings about a program's code: about a blocked event loop, and about the block of a vehicle."""
+    """Rewrite warnings about a program's code: about a blocked event loop, and about a vehicle's ``async with``."""
     if str(record.msg).startswith("the async with block of vehicle %d was left: "):
         record.msg = "disconnected from vehicle %d: %s"
     if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):
         record.msg = "this computer was busy for %.1f s: no messages or heartbeats were processed"
-        record.args = record.args[:1]  # the new text has one placeholder
+        record.args = record.args[:1]  # because the new text has only one placeholder
     return True
 
 
 DONE, FAILED, WRONG_ARGUMENTS, NO_VEHICLE, TIMED_OUT, REFUSED, UNREADABLE, NOT_INSTALLED = range(8)
 INTERRUPTED = 130
-# Minimum SequenceMatcher.ratio() of two names; it allows one wrong letter in a name of four.
+# Two names count as similar from this SequenceMatcher.ratio() on. Names of four letters may have one wrong letter.
 _MIN_SIMILARITY = 0.75
 
 _MEANINGS = {
@@ -172,10 +172,10 @@ _MEANINGS = {
 
 
 class NotInstalled(AerokitError):
-    """A command needs an optional dependency. The message names the extra to install."""
+    """A command needs a package that is not installed. The text names the extra to install."""
 
 
-# Maps error classes to exit codes. The first matching class counts.
+# Maps error classes to exit codes. The first class that matches an error counts.
 _CODES: tuple[tuple[type[BaseException], int], ...] = (
     (KeyboardInterrupt, INTERRUPTED),
     (NotInstalled, NOT_INSTALLED),
@@ -202,7 +202,7 @@ def import_extra(module: str, extra: str) -> Any:
     """Import a module that an extra provides.
 
     Raises:
-        NotInstalled: a package is missing; the text has the command that installs it.
+        NotInstalled: a package is missing. The text has the command that installs it.
     """
     try:
         return import_module(module)
@@ -213,7 +213,7 @@ def import_extra(module: str, extra: str) -> Any:
 
 
 def _requirement(extra: str) -> str:
-    """Return the argument of pip that adds an extra to this installation, wherever it was installed from."""
+    """Return the argument for pip that adds an extra to this installation, from the source of the installation."""
     from importlib.metadata import PackageNotFoundError, distribution
 
     try:
@@ -227,7 +227,7 @@ def _requirement(extra: str) -> str:
 
 
 def near_names(name: str, known: Iterable[str], count: int = 1) -> list[str]:
-    """Return known names that begin with ``name`` or are similar to it, the most similar first."""
+    """Return the known names that begin with ``name`` or are similar to it, the most similar first."""
     from difflib import SequenceMatcher
 
     plain_name, ratios = name.strip("-").upper(), dict[str, float]()
@@ -235,7 +235,7 @@ def near_names(name: str, known: Iterable[str], count: int = 1) -> list[str]:
         plain_known_name = known_name.strip("-").upper()
         is_beginning = len(plain_name) >= 3 and plain_known_name.startswith(plain_name)
         matcher = SequenceMatcher(None, plain_name, plain_known_name)
-        # The quick ratios are upper bounds that save most of the calculation.
+        # These ratios are upper bounds of ratio(). For most names, they make the slow ratio() unnecessary.
         may_be_near = matcher.real_quick_ratio() >= _MIN_SIMILARITY and matcher.quick_ratio() >= _MIN_SIMILARITY
         if is_beginning or may_be_near:
             ratios[known_name] = 1.0 if is_beginning else matcher.ratio()
@@ -265,10 +265,10 @@ def check_not_existing(file: str | Path, options: argparse.Namespace) -> None:
 
 @contextmanager
 def new_recording(path: str | None) -> Iterator[None]:
-    """Check that a recording can be written, and delete it after the block if it is new and empty.
+    """Check that a recording can be written. After the block, delete it if it is new and empty.
 
-    The connection creates the file, and keeps an existing one under a numbered name
-    (`aerokit.connection.frame_observers.keep_existing`). ``path`` None: do nothing.
+    The connection creates the file. It renames an existing file to a numbered name
+    (`aerokit.connection.frame_observers.keep_existing`). If ``path`` is None, nothing is done.
 
     Raises:
         PermissionError: the folder is not writable.

@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
-# Maximum time for reading the names of the vehicle's parameters for a suggestion.
+# How long to read the names of the vehicle's parameters, if only a suggestion needs them.
 _NAMES_TIMEOUT_S = 10.0
-# Minimum length of a name that is suggested because the given name begins with it.
+# If the given name begins with a known name of at least this length, the known name is suggested.
 _MIN_BEGINNING = 5
 _FORMATS = ("missionplanner", "mavproxy", "qgroundcontrol")
 
@@ -79,8 +79,8 @@ def _add_writing(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
 
 
 def connected(options: argparse.Namespace, *, changes: bool = False) -> AbstractAsyncContextManager[Vehicle]:
-    """Connect as in :func:`aerokit.apps.cli.connecting.connected`."""
-    # Importing this while connected would block the event loop.
+    """Connect like :func:`aerokit.apps.cli.connecting.connected`, after importing the parameters' module."""
+    # Imported before connecting, because the import would block the event loop.
     import aerokit.vehicle.parameters.parameters  # noqa: F401
 
     return connecting.connected(options, changes=changes)
@@ -142,7 +142,7 @@ async def _diff(options: argparse.Namespace) -> int:
 async def _set(options: argparse.Namespace) -> int:
     metadata = load_metadata_option(options)
     if not options.force:
-        check_allowed(metadata, dict(options.values))  # before the vehicle is connected
+        check_allowed(metadata, dict(options.values))  # with a file of metadata, already before connecting
     async with connected(options, changes=True) as vehicle:
         if metadata is None:
             metadata = await metadata_for_check(vehicle, None, options)
@@ -166,7 +166,7 @@ async def _load(options: argparse.Namespace) -> int:
         _check_file(file_values, await _download(vehicle, options), vehicle)
         metadata = await metadata_for_check(vehicle, file_metadata, options)
         if metadata is not None:
-            # Only changes are checked, because a backup may have unusual values that the vehicle has already.
+            # Only changes are checked, because a backup may contain unusual values that the vehicle already has.
             differences = await vehicle.parameters.diff(file_values, idle_timeout_s=options.patience)
             new_values = {change.name: change.after for change in differences if change.after is not None}
             check_allowed(metadata, new_values)
@@ -186,16 +186,16 @@ async def _load(options: argparse.Namespace) -> int:
 
 
 def _check_file(wanted: ParameterFile, table: ParameterTable, vehicle: Vehicle) -> None:
-    """Check all values of a file with the types of the vehicle.
+    """Check that all values of a file fit the types of the vehicle's parameters.
 
     Raises:
         InvalidArgument: a value does not have the type of its parameter. The text names all such values, and the names
             that the vehicle does not have, with their lines.
     """
-    is_upper = vehicle.autopilot.name == "ArduPilot"
+    names_are_upper_case = vehicle.autopilot.name == "ArduPilot"
     invalid, unknown = [], []
     for name, value in wanted.items():
-        place, found = wanted.places[name], resolve_known(name.upper() if is_upper else name, table)
+        place, found = wanted.places[name], resolve_known(name.upper() if names_are_upper_case else name, table)
         if found is None:
             unknown.append(f"{place}: the vehicle has no parameter {name}{suggestion(name, table, 3)}")
             continue
@@ -222,26 +222,28 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
 
 
 async def _names_for_hints(vehicle: Vehicle, results: Iterable[ParameterWrite]) -> Collection[str]:
-    """Return the names of the vehicle's parameters if a result needs a suggestion."""
+    """Return the names of the vehicle's parameters if a result needs suggestions, otherwise nothing."""
     is_needed = any("has no parameter" in str(result.error) for result in results)
     return await _known_names(vehicle) if is_needed else ()
 
 
 async def _known_names(vehicle: Vehicle) -> Collection[str]:
-    """Return the names of the vehicle's parameters; none if reading them takes too long."""
+    """Return the names of the vehicle's parameters; no names if reading them takes too long."""
     with anyio.move_on_after(_NAMES_TIMEOUT_S), suppress(AerokitError):
         return await vehicle.parameters.download()
     return ()
 
 
 def _with_hint(name: str, error: Exception, known: Collection[str]) -> str:
-    """Return the text of an error; if the vehicle lacks the name, with similar names that it has, or the command that
-    lists them.
+    """Return the text of an error, with a hint if the vehicle does not have the parameter.
+
+    The hint is similar names or, if there are none, the command that lists the names.
     """
     text = str(error)
+    # The texts with "replaced by" and "its name on" already contain the right name.
     if "has no parameter" not in text or "replaced by" in text or "its name on" in text:
         return text
-    bare = text.partition(" (did you mean")[0]  # the error knows only the parameters that were read before
+    bare = text.partition(" (did you mean")[0]  # the error suggests only parameters that were already read
     beginnings = [other for other in known if len(other) >= _MIN_BEGINNING and name.upper().startswith(other)]
     names = dict.fromkeys([*beginnings, *near_names(name, known, 3)])
     hint = " or ".join(map(repr, list(names)[:3]))
@@ -261,7 +263,7 @@ def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter
 def _emit_results(
     options: argparse.Namespace, results: Iterable[ParameterWrite], known: Collection[str], metadata: Metadata | None
 ) -> int:
-    """Print a line for each result, and return the exit code. ``known`` are the vehicle's names, for suggestions.
+    """Print a line for each result, and return the exit code. ``known`` are names for suggestions.
 
     The exit code is that of the first error, as for ``get``. Without an error, it is FAILED if a value differs from the
     requested value by more than rounding.
@@ -296,5 +298,5 @@ def _value_or_missing(value: float | None) -> str:
 
 
 def _text(value: float | None) -> str:
-    """Format integers whole, and floats with the precision of 32 bits."""
+    """Format a value: an integer exactly, and a float with the precision of 32 bits."""
     return str(value) if isinstance(value, int) else f"{value:.9g}"

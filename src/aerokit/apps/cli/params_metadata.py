@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from aerokit.parameters import Metadata, Parameter
     from aerokit.vehicle.vehicle import Vehicle
 
-# ArduPilot uses a new system id at once (GCS_Common.cpp, update_send), PX4 and old ArduPilots after a reboot.
+# Parameters with the system id. ArduPilot uses a new id at once (GCS_Common.cpp, update_send); PX4 and old versions of
+# ArduPilot use it after a reboot.
 _SYSTEM_ID_NAMES = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
-# Maximum time for reading the metadata from the vehicle. Reading takes longer over a slow radio and is then given up.
+# How long to read the metadata from the vehicle. Over a slow radio reading may take longer; it is then given up.
 _READ_TIMEOUT_S = 10.0
 
 
@@ -46,7 +47,7 @@ def add_metadata(command: argparse.ArgumentParser, *, checks: bool = False) -> N
 
 
 def load_metadata_option(options: argparse.Namespace) -> Metadata | None:
-    """Read the file given as ``--metadata``, if any."""
+    """Read the file that ``--metadata`` names; None without the option."""
     if options.metadata is None:
         return None
     from aerokit.parameters import load_metadata
@@ -57,7 +58,7 @@ def load_metadata_option(options: argparse.Namespace) -> Metadata | None:
 async def metadata_for_check(
     vehicle: Vehicle, from_file: Metadata | None, options: argparse.Namespace
 ) -> Metadata | None:
-    """Return the metadata for checking values: that of the file, else that of the vehicle. None with --force."""
+    """Return the metadata to check values with, from the file or else from the vehicle; None with ``--force``."""
     if options.force:
         return None
     if from_file is not None or vehicle.autopilot.name != "PX4":  # ArduPilot has no component metadata
@@ -73,7 +74,7 @@ async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
         try:
             content = await vehicle.component(vehicle.component_id).metadata("parameter")
             return parse_metadata(json.dumps(content).encode(), "the vehicle's metadata")
-        except (NotSupported, CommandRejected, FileError):  # the vehicle has no metadata
+        except (NotSupported, CommandRejected, FileError):  # the vehicle does not provide metadata
             return None
         except AerokitError as error:
             problem = str(error)
@@ -83,12 +84,12 @@ async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
 
 
 def check_allowed(metadata: Metadata | None, values: Mapping[str, float]) -> None:
-    """Raise InvalidArgument with all values that the metadata does not allow. Unknown names are accepted."""
+    """Raise InvalidArgument if the metadata does not allow a value; the text lists all such values."""
     check_values(metadata, values, "--force")
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
-    """Return a note on the steps until the new value takes effect, e.g. a reboot; empty if none is known."""
+    """Return a note on what is needed until a new value takes effect, such as a reboot; empty if nothing is known."""
     if name.upper() in _SYSTEM_ID_NAMES:
         return f"the system id changes at the next reboot at the latest; then connect with --system-id {value:g}"
     entry = None if metadata is None else metadata_entry(metadata, name)[0]
@@ -96,8 +97,8 @@ def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
 
 
 def metadata_facts(metadata: Metadata | None, parameter: Parameter) -> dict[str, object]:
-    """Return unit, range and meaning of a parameter, for its record; null if unknown."""
-    # Only under exactly this name, because metadata under another name may have another unit.
+    """Return the unit, range and meaning of a parameter as fields for its record; None if unknown."""
+    # Does not look under the parameter's other names, whose metadata may have another unit.
     entry = None if metadata is None else metadata.get(parameter.name)
     if entry is None:
         return {"unit": None, "minimum": None, "maximum": None, "meaning": None}
@@ -107,7 +108,7 @@ def metadata_facts(metadata: Metadata | None, parameter: Parameter) -> dict[str,
 
 
 def metadata_text(facts: Mapping[str, Any]) -> str:
-    """Return unit, range and meaning in a few words; empty if unknown."""
+    """Return the unit, range and meaning of a parameter in a few words; empty if unknown."""
     low, high = facts["minimum"], facts["maximum"]
     has_range = low is not None or high is not None
     parts = (facts["unit"], facts["meaning"], f"range {_bound(low)} to {_bound(high)}" if has_range else "")

@@ -152,9 +152,9 @@ async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> in
     with on_interrupt(stop):
         try:
             await server.serve()
-        except SystemExit:  # uvicorn exits when it cannot listen
+        except SystemExit:  # uvicorn exits if it cannot listen
             raise LinkOpenError(
-                f"cannot listen on {options.host} port {options.port}: it may be in use; choose another with --port"
+                f"cannot listen on {options.host}, port {options.port}: it may be in use; choose another with --port"
             ) from None
     if not server.started:
         return FAILED
@@ -166,7 +166,7 @@ def _server_class(uvicorn: Any) -> Any:
     class Server(uvicorn.Server):  # type: ignore[misc]
         @contextmanager
         def capture_signals(self) -> Iterator[None]:
-            yield  # the command handles signals
+            yield  # uvicorn's signal handlers are not installed, because the command handles signals
 
         async def startup(self, sockets: Any = None) -> None:
             await super().startup(sockets=sockets)

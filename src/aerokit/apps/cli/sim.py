@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from aerokit.sim import AttachableComponent
     from aerokit.testing.track import Track
 
-# Scheme of a simulator's address, and the scheme with which a client connects to it.
+# Maps schemes of a simulator's address to the schemes with which a client connects.
 _CLIENT_SCHEMES = {
     "tcpin": "tcp",
     "udpout": "udpin",
@@ -64,10 +64,10 @@ _SERIAL_END = "the other end of the serial line"
 def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
     """Create a vehicle of a kind of `aerokit.sim.kinds`. ``options`` are arguments of its class.
 
-    ``boot_text`` is ignored by kinds that do not have it.
+    Kinds without ``boot_text`` ignore this option.
 
     Raises:
-        InvalidArgument: the kind has no such option or parameter.
+        InvalidArgument: this kind does not have one of the options or parameters.
     """
     from aerokit.sim.kinds import kind_class, simulated
 
@@ -91,10 +91,10 @@ def simulated_fleet(
     components: Callable[[], Iterable[AttachableComponent]] = tuple,
     **options: Any,
 ) -> list[SimulatedVehicle]:
-    """Create ``count`` vehicles in a row eastwards from ``home`` (`aerokit.sim.HOME`), with consecutive system ids
-    and seeds. ``components`` makes the components of one vehicle.
+    """Create ``count`` vehicles with consecutive system ids and seeds, in a row eastwards from ``home``.
 
-    If ``name`` is a .tlog file, return the single vehicle of that recording; other options do not apply.
+    The default home is `aerokit.sim.HOME`. ``components`` makes the components of one vehicle. If ``name`` is a .tlog
+    file, the result is the single vehicle of that recording; other options do not apply.
     """
     from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame
 
@@ -128,7 +128,7 @@ def _recorded(path: str, count: int) -> SimulatedVehicle:
 
 
 def _accepted_options(vehicle_class: type) -> set[str]:
-    """Return the arguments of a constructor, including those it passes to base classes by ``**kwargs``."""
+    """Return the names of a class's constructor arguments, including those passed to base classes by ``**kwargs``."""
     names: set[str] = set()
     for cls in vehicle_class.__mro__:
         if "__init__" not in vars(cls):
@@ -181,7 +181,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     _add_conditions(command)
 
 
-# Option → maximum number, function that makes the device with a number from 0, and its description.
+# Maps options to the maximum number of devices, the function that makes a device from its number (from 0), and a
+# description.
 _DEVICES: dict[str, tuple[int, Callable[[int], AttachableComponent], str]] = {
     "camera": (6, lambda number: SimulatedCamera(100 + number), "camera (component 100 to 105)"),
     "gimbal": (
@@ -212,7 +213,7 @@ def _devices(options: argparse.Namespace) -> list[AttachableComponent]:
     for name, (max_count, make_device, _) in _DEVICES.items():
         count = getattr(options, name)
         if count > max_count:
-            raise InvalidArgument(f"--{name} is given {count} times; a vehicle has {max_count} at most")
+            raise InvalidArgument(f"--{name} is given {count} times, but a vehicle has at most {max_count}")
         components += [make_device(number) for number in range(count)]
     return components
 
@@ -280,7 +281,7 @@ async def run_sim(options: argparse.Namespace) -> int:
 
 @asynccontextmanager
 async def faults_begin(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> AsyncIterator[None]:
-    """Within the block, begin the faults of ``--fault`` at their times."""
+    """Within the block, each fault of ``--fault`` begins at its time."""
     injecting = asyncio.create_task(_inject(vehicles, options))
     try:
         yield

@@ -31,16 +31,16 @@ if TYPE_CHECKING:
 _UNKNOWN = "unknown"
 _NO_KEY = "; it signs its frames, and without its key (--signing-key FILE) it may ignore this computer"
 _FIX_NAMES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed", "static", "PPP")
-# States that are requested once if the vehicle does not stream them, and the messages that carry them.
+# States that are requested once if the vehicle does not stream them, with the messages that contain them.
 _REQUESTED = (
     ("sensors", SysStatus),
     ("gps", GpsRawInt),
     ("batteries", BatteryStatus),
     ("position", GlobalPositionInt),
 )
-# Time to restore the rates of the changed streams before the connection is closed.
+# How long to wait before the connection is closed, until the rates of changed streams are restored.
 _RELEASE_TIME_S = 0.5
-# Time to wait for a requested message after the vehicle has accepted the request.
+# How long to wait for a requested message after the vehicle has accepted the request.
 _MESSAGE_TIMEOUT_S = 0.3
 
 
@@ -81,7 +81,7 @@ def _vehicle_lines(vehicle: Vehicle, found: Readiness) -> list[str]:
 
 def _readiness(vehicle: Vehicle, found: Readiness) -> list[str]:
     lines = readiness_lines(vehicle, found)
-    if lines and vehicle.armed.latest:  # arming checks do not apply
+    if lines and vehicle.armed.latest:  # the checks before arming do not matter in flight
         return _aligned("missing", [*found.against_arming, *found.against_flight])
     if lines:
         return _aligned("arming", [text.replace("arm() changes to", "aerokit changes to") for text in lines])
@@ -171,7 +171,7 @@ def _battery(battery: Battery) -> str:
 
 
 def _aligned(label: str, texts: Sequence[str]) -> list[str]:
-    """Return lines with the label before the first text, and spaces before the others."""
+    """Return one line for each text. The label is before the first text, and spaces are before the others."""
     return [f"  {label if index == 0 else '':8} {text}" for index, text in enumerate(texts)]
 
 
@@ -204,7 +204,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_status(options: argparse.Namespace) -> int:
-    """Listen, request what is missing, and print the status. Return 1 if a vehicle cannot arm."""
+    """Listen, request missing data, and print the status of all systems. Return 1 if a vehicle cannot arm."""
     from aerokit.vehicle.connect import vehicles_on
 
     async with opened(options) as connection, vehicles_on(connection, rates={}) as vehicles:
@@ -215,7 +215,7 @@ async def run_status(options: argparse.Namespace) -> int:
             raise
         started_at = connection.now()
         await anyio.sleep(options.seconds)
-        vehicles_found = dict(vehicles)  # more may be found while reasons are requested
+        vehicles_found = dict(vehicles)  # a copy, because more vehicles may be found while reasons are requested
         reasons = await asyncio.gather(*map(_readiness_of, vehicles_found.values()))
         _emit_link(connection, options, connection.now() - started_at)
         for vehicle, found in zip(vehicles_found.values(), reasons, strict=True):
@@ -267,7 +267,7 @@ def _emit_link(connection: Connection, options: argparse.Namespace, seconds: flo
 
 
 def _emit_components(connection: Connection, options: argparse.Namespace, vehicles: dict[int, Vehicle]) -> None:
-    """Print the other components of vehicles, and ground stations."""
+    """Print the other components of the vehicles, and the ground stations."""
     for source, heartbeat in sorted(connection.heartbeats.items()):
         system_id, component_id = source
         if system_id in vehicles and vehicles[system_id].component_id == component_id:

@@ -45,36 +45,36 @@ INTERRUPT_ACTIONS: dict[str, str] = {
     "hold": "holding here",
     "nothing": "no command is sent",
 }
-"""Maps the choices of ``--on-interrupt`` to the texts that are printed."""
+"""Maps choices of ``--on-interrupt`` to the texts that are printed when they are performed."""
 _AUTO_DISARM_TIMEOUT_S = 30.0
 _WARNING_SEVERITY = 4
-# A status line is printed after this time without output.
+# If nothing was printed for this time, a status line is printed.
 _STATUS_INTERVAL_S = 5.0
 
 
 class SupervisedFlight(ABC):
     """Arms and flies a vehicle, and brings it to a safe state after a failure or Ctrl-C.
 
-    Never commands a vehicle that was armed before, or whose mode another party has changed.
+    Never commands a vehicle that was already armed before, or whose mode another party has changed.
     """
 
-    _prints_reasons = True  # False if the command prints the error with its reasons when it ends
+    _prints_reasons = True  # False if the command prints the error, with its reasons, at its end
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack, on_interrupt: str) -> None:
         self._vehicle, self._print, self._interrupts = vehicle, report.print_line, interrupts
         self._on_interrupt = on_interrupt
         self.armed_by_us: bool = False
         """True once this program has sent an arm command."""
-        self._may_arm_late = False  # True if an arm command was sent and its result is unknown
+        self._may_arm_late = False  # True if an arm command was sent whose result is unknown
         self._modes_armed_in: set[str] = set()
         self._has_started = False  # True once a command of this program has changed the mode after arming
 
     async def fly(self) -> int:
-        """Fly to the end, and return the exit code. On failure, make the vehicle safe and re-raise the error."""
+        """Perform the flight and return the exit code. After an error, make the vehicle safe and re-raise the error."""
         try:
             code = await self._interrupts.run(self._fly)
         except Exception as error:
-            # After any error, a vehicle that this program has armed must not stay armed on the ground.
+            # After any error, if this program has armed the vehicle, it must not stay armed on the ground.
             text = plain_text(error)
             if not self._prints_reasons:
                 text = text.partition("\n")[0].removesuffix("; still missing:")
@@ -95,7 +95,7 @@ class SupervisedFlight(ABC):
 
     @abstractmethod
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        """Return the purposes of the modes in which only this program controls the vehicle."""
+        """Return the purposes of modes that show that this program still has control."""
 
     def _check_disarmed(self) -> None:
         now = self._vehicle.describe_now()
@@ -122,7 +122,7 @@ class SupervisedFlight(ABC):
                 await self._vehicle.armed.wait_until(lambda armed: not armed, timeout=_AUTO_DISARM_TIMEOUT_S)
 
     async def _make_safe(self, action: Callable[[], Awaitable[int]]) -> None:
-        """Run the action. A second Ctrl-C or an error ends it, without further commands."""
+        """Run an action that makes the vehicle safe. Another Ctrl-C or an error ends it without further commands."""
         try:
             if await self._interrupts.run(action) is None:
                 self._print(f"interrupted again; no further commands: vehicle {self._vehicle.describe_now()}")
@@ -131,7 +131,7 @@ class SupervisedFlight(ABC):
             self._print(f"no further commands: vehicle {self._vehicle.describe_now()}")
 
     async def _after_failure(self, error: Exception) -> int:
-        """Disarm on the ground if this program armed it. In the air, leave control to mission, pilot or failsafe."""
+        """Disarm on the ground, if this program armed the vehicle. In the air, leave control to pilot or failsafe."""
         vehicle = self._vehicle
         if vehicle.is_confirmed_disarmed:
             await self._watch_late_arming()
@@ -142,7 +142,7 @@ class SupervisedFlight(ABC):
         return DONE
 
     async def _after_interrupt(self) -> int:
-        """Disarm on the ground. In the air, perform ``--on-interrupt`` if this program has control."""
+        """Disarm a vehicle on the ground. In the air, perform ``--on-interrupt`` if this program still has control."""
         vehicle, action = self._vehicle, self._on_interrupt
         if vehicle.is_confirmed_disarmed:
             await self._watch_late_arming()
@@ -152,7 +152,7 @@ class SupervisedFlight(ABC):
         if self._is_armed_on_ground and action != "nothing":
             try:
                 await self._disarm()
-            except CommandRejected as error:  # the vehicle has taken off since it last reported its landed state
+            except CommandRejected as error:  # the vehicle may have taken off after it reported its landed state
                 self._print(f"disarming failed: {plain_text(error)}")
             if vehicle.is_confirmed_disarmed or not self._check_control():
                 return DONE
@@ -211,7 +211,7 @@ class SupervisedFlight(ABC):
 class FlightReport:
     """Prints the progress of a flight and the vehicle's texts, and measures the track.
 
-    ``speedup`` is that of the simulation, 1.0 for a real vehicle. Durations are in simulated time.
+    ``speedup`` is the speed of the simulation, 1.0 for a real vehicle. Durations are in simulated time.
     """
 
     def __init__(self, vehicle: Vehicle, options: argparse.Namespace, speedup: float) -> None:
@@ -222,13 +222,13 @@ class FlightReport:
         self._highest_m = self._fastest_m_s = self._flown_m = 0.0
         self._previous_position: Position | None = None
         self.prints_status: bool = True
-        """True if status lines are printed when there is no other output. Set it to False during a question."""
+        """True if status lines are printed when there is no other output. Set it to False during questions."""
 
     def print_line(self, text: str) -> None:
-        """Print a line with time and altitude. A closed pipe or a full disk does not end the flight."""
+        """Print a line with time and altitude. If printing fails, as after a closed pipe, the flight continues."""
         position = None if self._vehicle.heartbeat_age > SILENT_AFTER_S else self._vehicle.position.latest
         altitude = None if position is None else position.altitude_relative_m
-        height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"  # + 0.0 turns -0.0 into 0.0
+        height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"  # + 0.0 converts -0.0 to 0.0
         self._last_line_at = self._vehicle.connection.now()
         seconds = self._speedup * (self._last_line_at - self._started_at)
         record = {"seconds": seconds, "altitude_relative_m": altitude, "text": text.strip()}
@@ -257,7 +257,7 @@ class FlightReport:
         vehicle = self._vehicle
         received, lost = vehicle.connection.counts(vehicle.system_id)
         seconds = self._speedup * (vehicle.connection.now() - self._started_at)
-        self._on_armed(None, False)  # adds the time since the last arming, if the vehicle is still armed
+        self._on_armed(None, False)  # if the vehicle is still armed, adds the time since arming
         version = vehicle.version.latest
         batteries = vehicle.batteries.latest or ()
         record = {

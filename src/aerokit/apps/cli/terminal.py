@@ -1,7 +1,6 @@
 """Terminal interaction that does not block the event loop: questions, Ctrl-C, countdowns and progress bars.
 
-The loop must keep running during a question: a vehicle starts a failsafe when the ground station's heartbeat
-stops.
+The loop must run during a question, because a vehicle starts a failsafe when the ground station's heartbeats stop.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
 
     from aerokit.protocols.exchange import OnProgress, TransferProgress
 
-# The countdown begins after this time, because a vehicle usually answers sooner.
+# The countdown is shown only after this time, because a vehicle usually answers sooner.
 COUNTDOWN_DELAY_S = 1.0
 CLEAR_LINE = "\r\x1b[K"
 
@@ -33,12 +32,12 @@ def is_interactive() -> bool:
 
 
 async def confirm(question: str) -> bool:
-    """Ask a yes/no question. Return True for "y" or "yes", False for any other input and at the end of the input."""
+    """Ask a yes/no question. Return True for "y" or "yes", and False for other input or at the end of the input."""
     _discard_typed_input()
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
     try:
         answer = await _read_line()
-    except asyncio.CancelledError:  # Ctrl-C: what follows begins on a new line
+    except asyncio.CancelledError:  # by Ctrl-C; ends the line of the question
         print(file=sys.stderr, flush=True)
         raise
     return answer.strip().lower() in ("y", "yes")
@@ -52,12 +51,12 @@ async def press_enter() -> bool:
 
 
 def _discard_typed_input() -> None:
-    """Discard earlier typed input, which cannot be an answer to a question that was not shown yet."""
+    """Discard input that was typed earlier, because it cannot be the answer to a question that is asked only now."""
     try:
         import termios
-    except ImportError:  # Windows
+    except ImportError:  # on Windows
         return
-    with suppress(termios.error, OSError, ValueError):  # no terminal
+    with suppress(termios.error, OSError, ValueError):  # stdin is not a terminal
         termios.tcflush(sys.stdin, termios.TCIFLUSH)
 
 
@@ -75,7 +74,7 @@ async def _read_line() -> str:
 
     try:
         loop.add_reader(sys.stdin, read)
-    except NotImplementedError:  # Windows
+    except NotImplementedError:  # on Windows
         threading.Thread(target=read, daemon=True).start()
         return await line
     try:
@@ -86,7 +85,7 @@ async def _read_line() -> str:
 
 def _signals() -> tuple[signal.Signals, ...]:
     hang_up: signal.Signals | None = getattr(signal, "SIGHUP", None)  # not on Windows
-    if hang_up is None or signal.getsignal(hang_up) is signal.SIG_IGN:  # ignored under nohup
+    if hang_up is None or signal.getsignal(hang_up) is signal.SIG_IGN:  # nohup sets SIG_IGN
         return signal.SIGINT, signal.SIGTERM
     return signal.SIGINT, signal.SIGTERM, hang_up
 
@@ -95,9 +94,9 @@ def _signals() -> tuple[signal.Signals, ...]:
 def on_interrupt(
     callback: Callable[[], None], at_once: Callable[[int], object] = lambda number: None
 ) -> Iterator[None]:
-    """Within the block, replace the effect of SIGINT, SIGTERM and SIGHUP by a call of ``callback`` on the running loop.
+    """Within the block, SIGINT, SIGTERM and SIGHUP only call ``callback`` on the running loop.
 
-    ``at_once(number)`` is called first, in the signal handler, and so even while the loop is blocked.
+    Before that, ``at_once(number)`` is called in the signal handler, so it is called even if the loop is blocked.
     """
     loop = asyncio.get_running_loop()
     signals = _signals()
@@ -121,7 +120,7 @@ def on_interrupt(
 
 
 class InterruptStack:
-    """A stack of running functions. Each interrupt cancels the innermost one only."""
+    """A stack of running functions. An interrupt cancels only the innermost function."""
 
     def __init__(self) -> None:
         self._scopes: list[anyio.CancelScope] = []
@@ -190,7 +189,7 @@ def progress_bar(what: str, unit: str | None) -> Iterator[OnProgress]:
         unit_scale=is_bytes,
         unit_divisor=1024 if is_bytes else 1000,
         file=sys.stderr,
-        disable=None,  # hides the bar when stderr is not a terminal
+        disable=None,  # tqdm then hides the bar if stderr is not a terminal
         leave=False,
         dynamic_ncols=True,
     ) as bar:
@@ -200,6 +199,6 @@ def progress_bar(what: str, unit: str | None) -> Iterator[OnProgress]:
                 bar.total = progress.total
             bar.update(progress.done - bar.n)
             if progress.done == progress.total:
-                bar.refresh()  # regardless of tqdm's minimum update interval
+                bar.refresh()  # at once, regardless of tqdm's minimum interval
 
         yield show

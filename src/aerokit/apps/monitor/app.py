@@ -38,16 +38,19 @@ __all__ = ["ConfirmScreen", "Monitor", "run_monitor"]
 
 REFRESH_INTERVAL_S = 0.5
 WIDE_SIZE = 120, 30
-"""Minimum columns and rows of a terminal that shows values of secondary importance."""
+"""Minimum columns and rows of a terminal in which less important values are displayed, too."""
 ANSI_THEMES = ("ansi-dark", "textual-ansi", "textual-dark")
-"""Themes that use the colours of the terminal; their name depends on the version of Textual."""
+"""Names of the theme that uses the terminal's colours. The name depends on the version of Textual."""
 TRACK_STYLES = ("green", "magenta", "red", "blue", "cyan", "yellow")
 KEY_COMMANDS = {"hold": "HOLD", "land": "LAND", "return_to_launch": "RETURN TO LAUNCH"}
-"""Maps the vehicle methods that keys call to their names in the confirmation."""
+"""Maps methods of a vehicle that keys call to the names of the commands in the confirmation."""
 
 
 class ConfirmScreen(ModalScreen[bool]):
-    """A yes/no question. Returns True for "y" or the button Yes; Enter alone is No."""
+    """A yes/no question. Returns True for the key "y" or the button Yes.
+
+    Enter presses the focused button, which is No at first.
+    """
 
     BINDINGS: ClassVar[list[BindingType]] = [
         ("y", "answer(True)", "Yes"),
@@ -69,7 +72,7 @@ class ConfirmScreen(ModalScreen[bool]):
         """The question."""
 
     def compose(self) -> ComposeResult:
-        """Yield the question and two buttons; No is first and focused."""
+        """Yield the question and two buttons, first No, then Yes."""
         with Vertical():
             yield Label(self.text, markup=False)
             with Horizontal():
@@ -81,16 +84,16 @@ class ConfirmScreen(ModalScreen[bool]):
         self.query_one("#no").focus()
 
     def on_button_pressed(self, event: Button.Pressed) -> None:
-        """Return the answer of a button."""
+        """Close the screen with the answer of the pressed button."""
         self.dismiss(event.button.id == "yes")
 
     def action_answer(self, yes: bool) -> None:
-        """Return the answer of a key."""
+        """Close the screen with the answer of the pressed key."""
         self.dismiss(yes)
 
 
 class Panel(Widget):
-    """A widget that shows a text or table. New content causes a new layout only if its height differs."""
+    """A widget that shows a text or a table. New content changes the layout only if its height differs."""
 
     def __init__(self, name: str) -> None:
         super().__init__(id=name)
@@ -124,7 +127,7 @@ class Monitor(App[None]):
 
     def __init__(self, model: MonitorModel, commands: BackgroundTasks, name: str) -> None:
         super().__init__(ansi_color=True)
-        self.theme = next(name for name in ANSI_THEMES if name in self.available_themes)
+        self.theme = next(theme for theme in ANSI_THEMES if theme in self.available_themes)
         self._model, self._commands, self._name = model, commands, name
         self._began_at = model.connection.now()
         self._listed_ids: list[int] = []
@@ -132,7 +135,7 @@ class Monitor(App[None]):
         self._is_wide = False
 
     def compose(self) -> ComposeResult:
-        """Yield the vehicle list, state and map, texts and rates."""
+        """Yield the widgets: list of vehicles, state, map, texts and rates."""
         yield Panel("title")
         yield OptionList(id="vehicles")
         with Container(id="panels"):
@@ -144,7 +147,7 @@ class Monitor(App[None]):
         yield Footer()
 
     def on_mount(self) -> None:
-        """Set titles, and start periodic updates."""
+        """Set the titles of the panels, and start periodic updates."""
         for name, title in (("state", "state"), ("map", "map"), ("texts", "texts and events")):
             self.query_one(f"#{name}").border_title = title
         self.query_one("#rates_box").border_title = "messages per second"
@@ -154,7 +157,7 @@ class Monitor(App[None]):
         self.set_interval(REFRESH_INTERVAL_S, self.update_view)
 
     def on_resize(self, event: Resize) -> None:
-        """Adapt the layout to the width: on wide terminals, rates are below the state, and texts below the map."""
+        """Adapt the layout to the terminal: if it is wide, rates are below the state, and texts below the map."""
         is_wide = event.size.width >= WIDE_SIZE[0] and event.size.height >= WIDE_SIZE[1]
         if is_wide == self._is_wide:
             return
@@ -174,7 +177,7 @@ class Monitor(App[None]):
         return None if index is None else self._model.vehicles[self._listed_ids[index]]
 
     def update_view(self) -> None:
-        """Update the widgets whose content has changed in the model."""
+        """Update the model, and the widgets whose content has changed."""
         self._model.update()
         base = self.screen_stack[0]
         self._update_list(base.query_one("#vehicles", OptionList))
@@ -191,7 +194,7 @@ class Monitor(App[None]):
             texts.border_subtitle = self._model.slow_streams
 
     def _has_changed(self, name: str, content: object) -> bool:
-        """Return True if the content differs from that of the last call. Drawing only then saves processor time."""
+        """Return True if the content differs from that of the last call. Drawing only then saves CPU time."""
         if self._shown.get(name) == content:
             return False
         self._shown[name] = content
@@ -264,9 +267,10 @@ class Monitor(App[None]):
         return size.width, size.height
 
     def _show_map(self, widget: Panel) -> None:
+        """Draw the map again if its size, a marker or a track has changed."""
         model, size = self._model, widget.content_size
         homes = []
-        for vehicle in model.vehicles.values():
+        for vehicle in model.vehicles.values():  # a home is shown only together with a track
             home = vehicle.home.latest
             if home is not None and model.tracks.get(vehicle.system_id):
                 homes.append(model.metres(home.latitude_deg, home.longitude_deg))
@@ -306,14 +310,14 @@ class Monitor(App[None]):
         rates = [(_rate_text(hz), name) for name, hz in self._model.rates(vehicle.system_id) if hz]
         if not rates:
             return Text(UNKNOWN, "dim")
-        # Sorted by the shown numbers, so that rates that look the same stay in the order of the names.
+        # Sorts by the displayed numbers, not by the exact rates, so that equal numbers stay in the order of the names.
         rates.sort(key=lambda rate: (-float(rate[0]), rate[1]))
         lines = "\n".join(f"{text:>5} {name}" for text, name in rates)
         return Text(lines, no_wrap=True, overflow="ellipsis")
 
 
 def _rate_text(hz: float) -> str:
-    """Format a rate; spaces in place of missing decimals align the numbers."""
+    """Format a rate in Hz. Spaces replace missing decimals, so that the decimal points are aligned."""
     return f"{number(hz, 0)}  " if hz >= 3 else number(hz, 1)
 
 
@@ -335,10 +339,10 @@ async def run_monitor(
     """Show the vehicles on a link until the user quits.
 
     Args:
-        address: address of the link; a lost link is reopened.
+        address: address of the link, or an open link. The link of an address is reopened after a loss.
         baud: baud rate of a serial port whose address does not give it.
         signing: as in :func:`aerokit.open_connection`.
-        record: a .tlog file for everything that is sent and received.
+        record: path of a .tlog file that records all sent and received messages.
         on_start: called with the application before it runs.
 
     Returns:
@@ -346,7 +350,7 @@ async def run_monitor(
 
     Raises:
         LinkOpenError: the link cannot be opened.
-        AerokitError: the error that ended the connection.
+        AerokitError: the connection ended with this error.
     """
     async with (
         open_connection(

@@ -1,7 +1,7 @@
-"""Text of a vehicle's state for the terminal. Old values are dimmed and show their age; unknown values are "—".
+"""Texts of a vehicle's state for the terminal. Old values are dim and show their age; unknown values are "—".
 
-Colours are readable on light and dark terminals. A style with a background colour also sets the foreground colour;
-the other colours have enough contrast to both white and black.
+All colours are readable on light and dark terminals. A style with a background colour also sets the foreground colour.
+Other colours have enough contrast to both white and black.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed")
 DANGER, WARNING = "bold white on red", "black on yellow"
 LINK_STYLES = {LinkState.CONNECTED: "", LinkState.SILENT: WARNING, LinkState.LOST: DANGER}
 ARROWS = "↑↗→↘↓↙←↖"
-"""Arrows by heading, clockwise from north."""
-# Bits of the dots of a Braille character (U+2800), by row and column.
+"""Arrows for the eight directions, clockwise from north."""
+# The bits of a Braille character (U+2800 plus bits) that show its dots, by row and column.
 _BRAILLE_BITS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
 _MIN_SPAN_M = 20.0
-# Columns between labels and values, and of " (and 10 more)".
+# Number of columns between labels and values, and number of columns of the text " (and 10 more)".
 _LABEL_PADDING, _MORE_WIDTH = 2, 14
 
 
 def number(value: float | None, digits: int = 1, unit: str = "", sign: str = "-") -> str:
-    """Format a number, without a sign if it rounds to 0. ``sign`` is as in format specifications."""
+    """Format a number. ``sign`` is as in Python's format specification; a number that rounds to 0 has no sign."""
     if value is None:
         return UNKNOWN
-    rounded = round(value, digits) + 0.0  # -0.0 + 0.0 is 0.0
+    rounded = round(value, digits) + 0.0  # converts -0.0 to 0.0
     return f"{rounded:{sign if rounded else '-'}.{digits}f}{unit}"
 
 
@@ -50,7 +50,7 @@ def age(seconds: float) -> str:
 
 
 class VehicleText:
-    """Texts of one vehicle. While the vehicle is silent, values are dimmed, and one line shows the time of silence."""
+    """Texts of one vehicle. While no heartbeats arrive, values are dim, and one line shows for how long."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
@@ -62,22 +62,23 @@ class VehicleText:
         if not cell.is_known:
             return Text(UNKNOWN, "dim")
         text = printable(show(cell.value))
-        age_s = cell.age - self._silent_s  # while the vehicle is silent: the age when the silence began
+        # While the vehicle is silent, this is the age that the value had when the silence began.
+        age_s = cell.age - self._silent_s
         if age_s > MAX_AGE_S:
             return Text(f"{text} ({age(age_s)} old)", "dim italic")
         return Text(text, "dim" if self._silent_s else style)
 
     def rows(self, *, more: bool = False, size: tuple[int, int] = (0, 0)) -> list[tuple[str, Text]]:
-        """Return labels and values. ``more`` includes values of secondary importance.
+        """Return the lines of the state panel as labels and values. With ``more``, less important values are included.
 
-        ``size`` is the space, in columns and lines: where it has room, all missing reasons are listed.
+        ``size`` is the number of columns and lines of the panel. Free lines list further reasons that prevent a flight.
         """
         rows = self._main_rows() + (self._more_rows() if more else [])
         if not self._silent_s:
             columns, lines = size
             width = columns - max(len(label) for label, _ in rows) - _LABEL_PADDING
             unused_lines = lines - len(rows)
-            rows[1] = ("missing", self._missing(1 + unused_lines, width))
+            rows[1] = ("missing", self._missing(1 + unused_lines, width))  # replaces the row with one reason only
         return rows
 
     def _main_rows(self) -> list[tuple[str, Text]]:
@@ -109,7 +110,7 @@ class VehicleText:
         ]
 
     def row(self, *, is_selected: bool, more: bool) -> Text:
-        """Return the line of the list of vehicles."""
+        """Return this vehicle's line in the list of vehicles."""
         vehicle, cell = self._vehicle, self.cell
         text = Text("▸" if is_selected else " ", no_wrap=True, overflow="ellipsis")
         text.append(f"{vehicle.system_id:>3} ", "bold")
@@ -135,7 +136,7 @@ class VehicleText:
         return text.append_text(self.silence(is_short=True))
 
     def silence(self, *, is_short: bool = False) -> Text:
-        """Return the state of the link and the time of silence; empty while the vehicle is not silent."""
+        """Return the state of the link and how long the vehicle has been silent; empty if it is not silent."""
         if self._link_state is None or not self._silent_s:
             return Text()
         note = "" if is_short else "; values are from before"
@@ -169,7 +170,7 @@ class VehicleText:
         return text.append_text(self.cell(quality, lambda report: _milliseconds(report.round_trip_s)))
 
     def _missing(self, max_lines: int = 1, width: int = 0) -> Text:
-        """Return the reasons that prevent a flight: the first, and as many more as have room."""
+        """Return the first reason that prevents a flight, then as many others as fit into ``max_lines``."""
         found = readiness(self._vehicle)
         missing = list(found.against_arming or found.against_flight)
         if not missing:
@@ -186,7 +187,7 @@ class VehicleText:
 
 
 def cell_of_constant(cell: StateCell[Any]) -> Text:
-    """Return the text of a value that does not age."""
+    """Return the text of a value that does not become old, such as a version."""
     return Text(printable(str(cell.value))) if cell.is_known else Text(UNKNOWN, "dim")
 
 
@@ -249,7 +250,7 @@ class Canvas:
         self._columns, self._rows = max(columns, 2), max(rows - 1, 2)
         norths, easts = zip(*(list(points) or [(0.0, 0.0)]), strict=True)
         self._middle = (max(norths) + min(norths)) / 2, (max(easts) + min(easts)) / 2
-        # A character has two columns and four rows of dots.
+        # Each Braille character has two columns and four rows of dots.
         width_dots, height_dots = 2 * (self._columns - 1), 4 * (self._rows - 1)
         self._metres_per_dot: float = max(
             (max(easts) - min(easts)) / width_dots,
@@ -263,7 +264,7 @@ class Canvas:
     def line(self, points: Sequence[tuple[float, float]], style: str) -> None:
         """Draw a line through the points."""
         dots = [self._dot_at(point) for point in points]
-        for (x, y), (end_x, end_y) in zip(dots, dots[1:] or dots, strict=False):  # a single point is a line, too
+        for (x, y), (end_x, end_y) in zip(dots, dots[1:] or dots, strict=False):  # a single point: line to itself
             steps = max(abs(end_x - x), abs(end_y - y), 1)
             for step in range(steps + 1):
                 dot_x, dot_y = x + round((end_x - x) * step / steps), y + round((end_y - y) * step / steps)
@@ -272,13 +273,13 @@ class Canvas:
                 self._styles[cell] = style
 
     def mark(self, point: tuple[float, float], text: str, style: str) -> None:
-        """Write characters at a point, over dots and earlier marks."""
+        """Write characters at a point. They replace dots and earlier marks."""
         dot_x, dot_y = self._dot_at(point)
         for offset, character in enumerate(text):
             self._marks[dot_y // 4, dot_x // 2 + offset] = character, style
 
     def _scale(self) -> str:
-        """Return a bar of 1, 2 or 5 times a power of ten metres, at most a third of the map wide."""
+        """Return the scale bar. Its length is 1, 2 or 5 times a power of ten metres, and at most a third of the map."""
         column_m = 2 * self._metres_per_dot
         max_m = max(self._columns / 3, 3) * column_m
         power = 10.0 ** math.floor(math.log10(max_m))

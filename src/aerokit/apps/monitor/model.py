@@ -1,4 +1,4 @@
-"""``MonitorModel``: data of the terminal monitor: texts and events, message rates, tracks."""
+"""``MonitorModel``: the data of the terminal monitor, which are texts, events, message rates and tracks."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ MAX_LINES = 500
 MAX_TRACK_POINTS = 3000
 MIN_POINT_DISTANCE_M = 0.5
 MAX_MESSAGE_TYPES = 2000
-"""Maximum number of counted message types. It limits memory, because a sender can use any number of ids."""
+"""Maximum number of message types that are counted. It limits memory, because a sender can use many ids."""
 RATE_WINDOW_S = 5.0
 SEVERITY_STYLES = (DANGER, DANGER, DANGER, "bold red", "bold magenta", "bold", "", "dim")
-"""Text styles by MAV_SEVERITY, from 0 (emergency)."""
+"""Text styles; the index is the MAV_SEVERITY, from 0 (emergency) to 7 (debug)."""
 
 
 class MonitorModel:
-    """Collects data from a connection. Call ``update()`` a few times a second."""
+    """Collects the data from a connection. ``update()`` must be called a few times a second."""
 
     def __init__(self, connection: Connection, vehicles: Mapping[int, Vehicle]) -> None:
         self.connection: Connection = connection
@@ -50,7 +50,7 @@ class MonitorModel:
         self.reference: tuple[float, float] | None = None
         """Latitude and longitude of the first known position, in degrees."""
         self._counts: Counter[tuple[int, int]] = Counter()
-        # Copies of the counts with their times, one for each second of the window.
+        # Copies of the counts, one for each second of RATE_WINDOW_S, with the time of each copy.
         self._count_samples: deque[tuple[float, Counter[tuple[int, int]]]] = deque([(connection.now(), Counter())])
         self._detach: list[Detach] = [
             connection.observe_frames(self._count_frame),
@@ -62,10 +62,11 @@ class MonitorModel:
             detach()
 
     def update(self) -> None:
-        """Sample the positions and the message counts."""
+        """Store samples of the vehicles' positions and, once a second, of the message counts."""
         now = self.connection.now()
         if now - self._count_samples[-1][0] >= 1.0:
             self._count_samples.append((now, self._counts.copy()))
+            # The oldest sample stays until the next one is old enough to be the start of the window.
             while now - self._count_samples[1][0] >= RATE_WINDOW_S:
                 self._count_samples.popleft()
         for system_id, vehicle in self.vehicles.items():
@@ -76,7 +77,7 @@ class MonitorModel:
                     track.append(point)
 
     def rates(self, system_id: int) -> list[tuple[str, float]]:
-        """Return message names of a system, and their rates in Hz over the last five seconds, the highest first."""
+        """Return names and rates in Hz of a system's messages in the last five seconds, the highest rate first."""
         begin_s, counts_at_begin = self._count_samples[0]
         end_s, counts_at_end = self._count_samples[-1]
         if end_s <= begin_s:
@@ -91,13 +92,13 @@ class MonitorModel:
         return sorted(rates, key=lambda rate: (-rate[1], rate[0]))
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-        """Convert to metres north and east of ``reference``; the first position becomes the reference."""
+        """Convert a position to metres north and east of ``reference``. The first position becomes the reference."""
         if self.reference is None:
             self.reference = latitude_deg, longitude_deg
         return geo.north_east_m(*self.reference, latitude_deg, longitude_deg)
 
     def add_line(self, system_id: int, text: str, style: str = "") -> None:
-        """Add a line with the current time."""
+        """Add a line that begins with the current time."""
         line = Text(f"{self._time()} ", "dim")
         line.append(f"{system_id} " if system_id else "link ", "bold")
         line.append(printable(text).replace("\n", " "), style)

@@ -31,15 +31,18 @@ PORTS: dict[str, int] = {"mqtt": 1883, "mqtts": 8883}
 """Maps a scheme to its default port."""
 CONNECT_TIMEOUT_S = 5.0
 MAX_WAITING = 32_768
-"""Maximum number of names with an unsent value, enough for all states of 255 vehicles."""
+"""Maximum number of unsent values; enough for all states of 255 vehicles."""
 KEEPALIVE_S = 5
 """MQTT keep-alive in seconds. The connection is lost if the broker does not answer a ping within this time."""
-# Interval of calls to paho's loop_misc(), which sends pings and detects missing answers.
+# Interval in seconds at which paho's loop_misc() is called, which sends pings and detects missing answers.
 _POLL_INTERVAL_S = 1.0
 
 
 class BrokerAddress(Snapshot):
-    """Address of a broker, and the fleet and name to publish under. ``str`` and ``repr`` omit user and password."""
+    """Address of a broker, and the names of fleet and vehicle under which to publish.
+
+    ``str`` and ``repr`` omit user and password.
+    """
 
     scheme: str
     """``"mqtt"``, or ``"mqtts"`` for TLS."""
@@ -57,7 +60,7 @@ class BrokerAddress(Snapshot):
 
 
 def parse_broker(text: str, *schemes: str) -> BrokerAddress:
-    """Parse an address with one of these schemes, by default any.
+    """Parse an address with one of these schemes, by default ``mqtt`` or ``mqtts``.
 
     Raises:
         InvalidArgument: the address is invalid. The text omits the address if it may contain a password.
@@ -74,7 +77,7 @@ def parse_broker(text: str, *schemes: str) -> BrokerAddress:
     scheme = text.partition("://")[0].strip().lower() if "://" in text else "…"
     if scheme not in allowed:
         if "@" in text:
-            scheme = "…"  # it may be a part of the password
+            scheme = "…"  # not shown, because it may be a part of a password
         fail(f"the scheme is not {' or '.join(f'{name}://' for name in allowed)}")
     try:
         parts = urlsplit(text.strip())
@@ -98,7 +101,7 @@ class MqttLink(BaseLink):
     """One connection to an MQTT 3.1.1 broker. It publishes with QoS 0.
 
     The ``peer`` of :meth:`write` is the name of a state. While the broker accepts no data, the newest value of each
-    name is kept. These values are discarded when the connection ends.
+    state is buffered. These values are discarded when the connection ends.
     """
 
     def __init__(self, broker: BrokerAddress) -> None:
@@ -107,12 +110,12 @@ class MqttLink(BaseLink):
         self._unsent: dict[str, bytes] = {}
         self._client: Any = None
         self._timer: asyncio.TimerHandle | None = None
-        self._connect_result: asyncio.Future[str] | None = None  # the reason of a failure; empty: connected
-        self._is_accepted = False  # by the broker
+        self._connect_result: asyncio.Future[str] | None = None  # why connecting failed; an empty string: connected
+        self._is_accepted = False  # True when the broker has accepted the connection
         self._alive_topic = broker.key_space.root + "/alive"
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """Send a value, or keep it until the broker accepts data."""
+        """Send a value, or buffer it until the broker accepts data."""
         name = str(peer)
         if self._receiver is None or (name not in self._unsent and len(self._unsent) >= MAX_WAITING):
             self._drop(1)
@@ -136,7 +139,7 @@ class MqttLink(BaseLink):
             client.username_pw_set(broker.user, broker.password)
         self._connect_result = loop.create_future()
 
-        def connect() -> Any:  # runs on a thread, because name resolution, connection and TLS handshake block
+        def connect() -> Any:  # runs on a thread, because resolving the name, connecting and the TLS handshake block
             if broker.scheme == "mqtts":
                 client.tls_set_context(ssl.create_default_context())
             client.connect(broker.host, broker.port, KEEPALIVE_S)
@@ -153,7 +156,7 @@ class MqttLink(BaseLink):
         client.on_socket_close = self._on_socket_close
         loop.add_reader(sock, self._read, client, sock)
         self._poll(client)
-        # Not by wait_for, which can swallow a cancellation before Python 3.12.
+        # Does not use asyncio.wait_for, which before Python 3.12 could lose a cancellation.
         await asyncio.wait((self._connect_result,), timeout=CONNECT_TIMEOUT_S)
         if self._connect_result.done():
             refusal = self._connect_result.result()
@@ -184,7 +187,7 @@ class MqttLink(BaseLink):
     def _read(self, client: Any, sock: Any) -> None:
         try:
             client.loop_read()
-            # Data that TLS has decrypted already does not make the socket readable again.
+            # TLS may have more decrypted data, for which the loop does not report the socket as readable.
             while client.socket() is sock and isinstance(sock, ssl.SSLSocket) and sock.pending():
                 client.loop_read()
         except Exception as error:  # paho 2.1 raises arbitrary errors for malformed packets
@@ -208,7 +211,8 @@ class MqttLink(BaseLink):
         loop = asyncio.get_running_loop()
         loop.remove_reader(sock)
         loop.remove_writer(sock)
-        if client is self._client:  # the connection was lost; unsent data must not arrive when the network is back
+        # After a loss, data that the kernel has not sent must not arrive when the network is back.
+        if client is self._client:
             discard_on_close(sock)
 
     def _finish_connecting(self, text: str) -> None:
@@ -216,11 +220,13 @@ class MqttLink(BaseLink):
             self._connect_result.set_result(text)
 
     def _release(self) -> None:
+        """Close the connection, and publish "offline" if that is possible without waiting."""
         client, self._client = self._client, None
         self._unsent.clear()
         if self._timer is not None:
             self._timer.cancel()
         if client is not None and client.socket() is not None:
+            # Without a DISCONNECT, the broker itself publishes "offline" (will_set).
             if client.is_connected() and not client.want_write():
                 client.publish(self._alive_topic, b"offline", retain=True)
                 client.disconnect()
@@ -229,7 +235,7 @@ class MqttLink(BaseLink):
 
 
 def _close_socket(client: Any) -> None:
-    """Close the socket if it is open, without DISCONNECT."""
+    """Close the socket if it is open, without sending DISCONNECT."""
     sock = client.socket()
     if sock is not None:
         if client.on_socket_close is not None:
@@ -240,7 +246,7 @@ def _close_socket(client: Any) -> None:
 
 
 class _NullReceiver:
-    # `ReconnectingLink` logs that the connection is lost or restored.
+    # These methods do nothing: `ReconnectingLink` already logs that the connection is lost or restored.
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         pass
 
@@ -265,13 +271,13 @@ async def mqtt_publisher(address: str) -> AsyncIterator[Publisher]:
     """Connect to an MQTT broker while the block lasts.
 
     States are published to the topics ``aerokit/FLEET/NAME/state/…``, with QoS 0, not retained.
-    ``aerokit/FLEET/NAME/alive`` is retained: "online" within the block, "offline" after the block or once the broker
-    has lost the connection. A lost connection is reopened; values published meanwhile are dropped. The event loop must
-    support ``add_reader``; on Windows, only ``asyncio.SelectorEventLoop`` has it.
+    ``aerokit/FLEET/NAME/alive`` is retained. It is "online" within the block, and "offline" after the block or after
+    the broker has lost the connection. A lost connection is reopened; values published meanwhile are dropped. The event
+    loop must support ``add_reader``; on Windows, only ``asyncio.SelectorEventLoop`` does.
 
     Args:
-        address: ``"mqtt://10.0.0.5:1883/fleet/alpha"``, ``"mqtt://user:password@…"``; ``mqtts`` for TLS (port
-            8883).
+        address: ``"mqtt://10.0.0.5:1883/fleet/alpha"`` or ``"mqtt://user:password@…"``; with ``mqtts`` instead of
+            ``mqtt`` for TLS (port 8883).
 
     Returns:
         A publisher for :func:`publishing`.

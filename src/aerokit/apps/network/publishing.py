@@ -35,7 +35,7 @@ PUBLISHERS: dict[str, Callable[[str], AbstractAsyncContextManager[Publisher]]] =
 }
 """Maps the scheme of an address to the function that opens its publisher."""
 VERSION = 1
-"""Version of the message format; incremented only for incompatible changes."""
+"""Version of the message format. Only incompatible changes increment it."""
 MAX_RATE_HZ = 50.0
 REPEAT_INTERVAL_S = 2.0
 """Interval in seconds at which an unchanged state is published again, for new subscribers."""
@@ -43,7 +43,7 @@ _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=Fa
 
 
 def publisher_for(address: str) -> AbstractAsyncContextManager[Publisher]:
-    """Return the unopened publisher for an address; other schemes fail like an invalid zenoh address."""
+    """Return the publisher for an address, to be opened by ``async with``. Unknown schemes are left to zenoh's."""
     scheme = address.partition(":")[0].strip().lower()
     return PUBLISHERS.get(scheme, zenoh_publisher)(address)
 
@@ -57,7 +57,7 @@ class Publishing:
     Args:
         vehicle: a connected vehicle.
         publisher: the network to publish to.
-        states: names of states; empty: all.
+        states: names of the states to publish; empty: all.
     """
 
     published: int
@@ -67,15 +67,18 @@ class Publishing:
         """Number of messages published so far."""
         self._vehicle, self._publisher, self._states = vehicle, publisher, states
         self._has_logged_error = False
-        self._sent: dict[str, tuple[float, object]] = {}  # maps a state to the time and value of its last message
+        self._sent: dict[str, tuple[float, object]] = {}  # maps states to time and value of their last message
 
     def publish(self, now: float) -> None:
-        """Publish states that have changed, or were last published `REPEAT_INTERVAL_S` ago; ``now`` in seconds."""
+        """Publish all states that have changed or were last published `REPEAT_INTERVAL_S` ago.
+
+        ``now`` is the present time in seconds, on any clock.
+        """
         for name, cell in self._vehicle.telemetry.cells.items():
             if cell.is_known and (not self._states or name in self._states):
                 self._publish(name, to_jsonable(cell.latest), cell.age, now)
         is_link_wanted = not self._states or "link" in self._states
-        # The link's statistics change with every frame, so they are published only at the repeat interval.
+        # The statistics of the link change with every frame. They are therefore published every REPEAT_INTERVAL_S only.
         if is_link_wanted and self._is_repeat_due("link", now):
             self._publish("link", overview(self._vehicle)["link"], 0.0, now)
 
@@ -83,6 +86,7 @@ class Publishing:
         return now - self._sent.get(name, (-math.inf, None))[0] >= REPEAT_INTERVAL_S
 
     def _publish(self, name: str, value: object, age_s: float, now: float) -> None:
+        """Publish a state, unless its value is unchanged and a repetition is not due."""
         if name in self._sent and self._sent[name][1] == value and not self._is_repeat_due(name, now):
             return
         self._sent[name] = (now, value)
@@ -97,7 +101,7 @@ class Publishing:
         }
         try:
             self._publisher.put(f"{system_id}/{name}", _JSON.encode(message).encode())
-        except Exception:  # an error in a background task would close the connection during a flight
+        except Exception:  # it would end this background task and close the connection, perhaps during a flight
             if not self._has_logged_error:
                 self._has_logged_error = True
                 logger.exception("publisher %r raised an error; publishing continues", self._publisher)
@@ -110,7 +114,7 @@ class Publishing:
 async def publishing(
     vehicle: Vehicle, to: str | Publisher, *, rate_hz: float = 5.0, states: Iterable[str] = ()
 ) -> AsyncIterator[Publishing]:
-    """Publish the state of a vehicle on a network while the block lasts, as JSON, one message for each state.
+    """Publish the state of a vehicle on a network as JSON while the block lasts, with one message for each state.
 
     A changed state is published at most ``rate_hz`` times a second, an unchanged state every two seconds.
     docs/state.schema.json has the schema of the messages. Nothing is requested from the vehicle, and subscribers cannot
@@ -121,7 +125,7 @@ async def publishing(
         to: ``"zenoh://fleet/alpha"`` for the keys ``aerokit/fleet/alpha/state/SYSTEM_ID/STATE``,
             ``"mqtt://host/fleet/alpha"`` for topics of the same names, or a `Publisher`.
         rate_hz: maximum rate of each state, above 0, at most 50.
-        states: names of docs/states.md, or ``"link"``; empty: all.
+        states: names of states to publish (docs/states.md), or ``"link"``; empty: all.
 
     Raises:
         InvalidArgument: an argument is invalid, or there is no such state.
@@ -129,7 +133,7 @@ async def publishing(
         ConnectionClosed, LinkLost: the vehicle's connection has ended.
     """
     if not 0 < rate_hz <= MAX_RATE_HZ:
-        raise InvalidArgument(f"rate_hz = {rate_hz} is not allowed: above 0, at most {MAX_RATE_HZ:g}")
+        raise InvalidArgument(f"rate_hz = {rate_hz} is not allowed: it must be above 0 and at most {MAX_RATE_HZ:g}")
     state_names = frozenset(states)
     unknown = sorted(state_names - vehicle.telemetry.cells.keys() - {"link"})
     if unknown:

@@ -1,4 +1,4 @@
-"""The JSON schema of published states, generated from their types: ``python -m aerokit.apps.network.schema``."""
+"""Generates the JSON schema of published states from their types: ``python -m aerokit.apps.network.schema``."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ ENUMS: dict[str, type[Enum]] = {
     "Odometry.child_frame": enums.MavFrame,
     "Aircraft.emitter": enums.AdsbEmitterType,
 }
-"""Fields whose integers are published as names of a MAVLink enum, if the number has a name."""
+"""Maps states and fields to MAVLink enums. Their integers are published as names of the enum where it has one."""
 
 
 def document() -> dict[str, Any]:
-    """Return the schema (draft 2020-12): ``oneOf`` the messages, distinguished by ``state``."""
+    """Return the schema (draft 2020-12), which is ``oneOf`` all messages. Their ``state`` distinguishes them."""
     definitions: dict[str, dict[str, Any]] = {"Message": _MESSAGE}
     cell_types = typing.get_type_hints(States)
     states = {}
@@ -118,14 +118,17 @@ def _schema_of(value_type: Any, definitions: dict[str, dict[str, Any]]) -> dict[
     if isinstance(value_type, type) and issubclass(value_type, Snapshot):
         name = value_type.__name__
         if name not in definitions:
-            definitions[name] = {}  # placeholder for recursive types
+            definitions[name] = {}  # set first, because the type may refer to itself
             definitions[name] = _snapshot_schema(value_type, definitions)
         return {"$ref": f"#/$defs/{name}"}
     return dict(_PLAIN_SCHEMAS[value_type])
 
 
 def _enum_schema(name: str) -> dict[str, Any] | None:
-    """Return the schema of an integer with names. Values are a name, a list of names (flags), or else the number."""
+    """Return the schema of an integer that is published as a name, as a list of names (flags), or else as the number.
+
+    None if ``name`` is not in ``ENUMS``.
+    """
     enum = ENUMS.get(name)
     if enum is None:
         return None
@@ -135,6 +138,7 @@ def _enum_schema(name: str) -> dict[str, Any] | None:
 
 
 def _snapshot_schema(value_type: type[Snapshot], definitions: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return the schema of a class of values, whose fields may be inherited."""
     annotations: dict[str, Any] = {}
     for base in reversed(value_type.__mro__):
         if issubclass(base, Snapshot) and base is not Snapshot:

@@ -36,7 +36,7 @@ class _ZenohPublisher(Publisher):
         self._session = session
 
     def put(self, name: str, data: bytes) -> None:
-        with contextlib.suppress(Exception):  # zenoh's own error: the session has ended
+        with contextlib.suppress(Exception):  # after the end of the session, zenoh raises its own error
             self._session.put(
                 self._key_space.state(name), data, encoding="application/json", congestion_control=self._drop
             )
@@ -47,7 +47,7 @@ class _ZenohPublisher(Publisher):
 async def zenoh_publisher(address: str) -> AsyncIterator[Publisher]:
     """Open a session on a zenoh network while the block lasts.
 
-    Data is dropped if a queue is full, or if there is no network.
+    Data is dropped while zenoh's queue is full or the network is unreachable.
 
     Args:
         address: ``"zenoh://fleet/alpha"``, with the options of :doc:`addresses </addresses>`.
@@ -62,7 +62,7 @@ async def zenoh_publisher(address: str) -> AsyncIterator[Publisher]:
     parsed = parse_address(address)
     if parsed.kind not in ("zenoh", "zenohin"):
         raise InvalidArgument(
-            f"address = {address!r} is not allowed: expected a zenoh address like zenoh://fleet/alpha"
+            f"address = {address!r} is not allowed: it must be a zenoh address, such as zenoh://fleet/alpha"
         )
     fleet, _, name = parsed.path.partition("/")
     publisher = _ZenohPublisher(KeySpace(fleet, name))
@@ -104,10 +104,10 @@ async def discover(
     """
     check_name("fleet", fleet)
     keys: set[str] = set()
-    subscribers: list[Any] = []  # zenoh ends a subscription when its subscriber is garbage collected
+    subscribers: list[Any] = []  # a reference, because zenoh ends a subscription whose subscriber is garbage collected
 
     def prepare(zenoh: Any, session: Any) -> None:
-        def on_sample(sample: Any) -> None:  # on a zenoh thread; set.add and set.discard are atomic
+        def on_sample(sample: Any) -> None:  # runs on a zenoh thread; set.add and set.discard are atomic
             key = str(sample.key_expr)
             if sample.kind == zenoh.SampleKind.PUT:
                 keys.add(key)
@@ -126,4 +126,4 @@ async def discover(
         subscribers.clear()
         close_session(session, closed.set)
     await closed.wait()
-    return sorted({key.split("/")[2] for key in keys})  # aerokit/FLEET/NAME/…
+    return sorted({key.split("/")[2] for key in keys})  # keys are aerokit/FLEET/NAME/…

@@ -73,7 +73,7 @@ _FAILURES = {
     "504": "timed out",
 }
 
-# Headers of orders: name, True if required, type and description.
+# The request headers of orders: name, whether it is required, type and description.
 _HEADERS = (
     (
         "Idempotency-Key",
@@ -121,7 +121,7 @@ _ORDER: dict[str, Any] = {
     },
 }
 _METADATA = ("short_description", "description", "unit", "minimum", "maximum", "reboot_required", "read_only")
-# Names of the bits in states, for the page.
+# Names of the bits of states, which the page displays.
 _BITS = {
     state: {str(int(bit)): str(bit.name) for bit in flags}
     for state, flags in {
@@ -131,12 +131,12 @@ _BITS = {
         "ESTIMATOR_STATUS": EstimatorStatusFlags,
     }.items()
 }
-# Even with wait=false, wait this long, so that the answer has the reason if the order is refused locally.
+# With wait=false, the answer waits this long, so that it contains the reason if the library refuses the order.
 _REFUSAL_TIMEOUT_S = 0.2
 
 
 def document(operations: Iterable[Operation], root_path: str = "") -> dict[str, Any]:
-    """Return the OpenAPI document; ``root_path`` is the path where the application is mounted."""
+    """Return the OpenAPI document. ``root_path`` is the path at which the application is mounted."""
     paths: dict[str, Any] = {}
     for operation in operations:
         paths.setdefault(operation.path, {})[operation.method.lower()] = _operation(operation)
@@ -166,6 +166,7 @@ def _operation(operation: Operation) -> dict[str, Any]:
         },
     }
     if not operation.is_open:
+        # In OpenAPI, {} means that a request without a token may be allowed, too.
         description["security"] = [{"token": []}] if is_order else [{"token": []}, {}]
     if is_order:
         description["responses"]["202"] = {"description": "running (wait=false)", "content": _json(answer)}
@@ -200,7 +201,7 @@ def _parameters(operation: Operation) -> Iterable[dict[str, Any]]:
 def _failures(operation: Operation) -> dict[str, Any]:
     if operation.is_open:
         return {}
-    impossible = set() if operation.order or operation.body else {"413", "415"}  # only with a body
+    impossible = set() if operation.order or operation.body else {"413", "415"}  # these statuses concern request bodies
     problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"description": text, "content": problem}
@@ -254,8 +255,8 @@ Handler = Callable[["Request"], Awaitable[Response]]
 class Operation:
     """One HTTP method of one path.
 
-    ``name`` is the operationId, ``order`` is the order that the operation gives. An operation without an order may have
-    ``body``: an order with the same request body.
+    ``name`` is the operationId. ``order`` is the type of the order that the operation gives. An operation without an
+    order may have a ``body``, which is the order type whose request body it accepts.
     """
 
     method: str
@@ -282,7 +283,7 @@ class HttpApi:
         self._served, self._orders, self._access, self._settings = served, orders, access, settings
         self._metadata = metadata
         self._locks: dict[Vehicle, asyncio.Lock] = {}
-        # Downloaded missions, fences and rally points, with the times of the downloads.
+        # Downloaded missions, fences and rally points, with the time of each download.
         self._plans: dict[tuple[Vehicle, str], tuple[Mission | Fence | RallyPoints, float]] = {}
         served.listen(self._on_message)
 
@@ -318,7 +319,7 @@ class HttpApi:
         )
 
     def endpoint(self, operation: Operation) -> Handler:
-        """Return the Starlette endpoint of an operation, with the check of the token."""
+        """Return a Starlette endpoint that checks the token and then performs an operation."""
 
         async def answer(request: Request) -> Response:
             try:
@@ -372,11 +373,12 @@ class HttpApi:
         return json_response({"items": _items(rally), "age_s": age_s})
 
     async def _plan(self, request: Request, kind: str) -> tuple[Any, float]:
-        """Return the mission, fence or rally points, and their age in seconds."""
+        """Return the mission, fence or rally points of a vehicle, and their age in seconds."""
         vehicle, is_refresh = self._vehicle_of(request), self._is_refresh(request)
         async with self._lock(vehicle):
             plan, read_at = self._plans.get((vehicle, kind), (None, 0.0))
-            # The vehicle reports how many items its mission has; MAVLink does not report other changes.
+            # If the vehicle reports another number of mission items, its mission has changed. MAVLink does not report
+            # other changes.
             count = vehicle.mission.count.latest if kind == "mission" else None
             if plan is None or is_refresh or count not in (None, len(plan.to_items())):
                 plan = await getattr(vehicle, kind).download()
@@ -385,14 +387,14 @@ class HttpApi:
         return plan, to_jsonable(vehicle.connection.now() - read_at)
 
     def _on_message(self, message: dict[str, Any]) -> None:
-        # Even an upload that failed half-way may have changed the plans.
+        # Stored plans are dropped even if the upload failed, because it may have changed some of them.
         if message["type"] == "order" and message["order"] == "mission/upload":
             for vehicle, kind in tuple(self._plans):
                 if vehicle.system_id == message["system_id"]:
                     del self._plans[vehicle, kind]
 
     async def _check_plan(self, request: Request) -> Response:
-        self._access.check(request.headers, needs_token=True)  # checked first, because large plans take time to parse
+        self._access.check(request.headers, needs_token=True)  # before parsing, which takes long for large plans
         arguments = await read_body(request, UPLOAD.max_body_size)
         UPLOAD.check(arguments)
         _, _, plan = parse_plan_body(arguments)
@@ -457,14 +459,14 @@ class HttpApi:
         return vehicle.parameters.metadata or self._metadata
 
     def _is_refresh(self, request: Request) -> bool:
-        # A refresh uses the vehicle's link, and therefore needs the token, like an order.
+        # A refresh needs the token, like an order, because it uses the vehicle's link.
         is_refresh = query_flag(request, "refresh", default=False)
         if is_refresh:
             self._access.check(request.headers, needs_token=True)
         return is_refresh
 
     def _lock(self, vehicle: Vehicle) -> asyncio.Lock:
-        # One transfer at a time; concurrent requests share its result.
+        # Requests wait for a running transfer, and then share its result.
         return self._locks.setdefault(vehicle, asyncio.Lock())
 
 
@@ -488,7 +490,7 @@ def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any
 
 
 async def _wait_until_ended(record: OrderRecord, timeout_s: float | None) -> None:
-    # Not by asyncio.wait_for, which can swallow a cancellation before Python 3.12.
+    # Does not use asyncio.wait_for, which before Python 3.12 could lose a cancellation.
     waiting = asyncio.ensure_future(record.ended.wait())
     try:
         await asyncio.wait((waiting,), timeout=timeout_s)

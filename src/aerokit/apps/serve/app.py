@@ -35,7 +35,7 @@ MEDIA_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript
 
 
 class ServeApp:
-    """The ASGI application. Use ``async with app:``, or call ``await app.aclose()`` at the end."""
+    """The ASGI application. Use it in ``async with app:``, or call ``await app.aclose()`` at the end."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class ServeApp:
         metadata: Metadata | None = None,
     ) -> None:
         self.token = token
-        """Token that orders require. Reading requires it too, unless ``open_reading`` is set."""
+        """Token that orders require. Reading also requires it, unless ``open_reading`` is set."""
         self._access = access
         self._served, self._orders = served, OrderRunner(served)
         api = HttpApi(served, self._orders, access, settings, metadata)
@@ -78,7 +78,7 @@ class ServeApp:
         return self._access.has_token(Headers(raw=headers))
 
     async def aclose(self) -> None:
-        """Close the application. Running orders are cancelled, so their vehicles hold."""
+        """Close the application. Running orders are cancelled, so that their vehicles hold."""
         await self._orders.aclose()
         await self._served.aclose()
 
@@ -103,8 +103,8 @@ def make_app(
     """Make an ASGI application that serves vehicles, to be mounted or run with uvicorn in the running loop.
 
     Args:
-        source: a connection (its vehicles are served as they appear), one vehicle, or a mapping from system id to
-            vehicle. The caller closes them, after the application.
+        source: a connection (its vehicles are served when they appear), one vehicle, or a mapping of system ids to
+            vehicles. The caller must close them, after the application.
         token: 16 to 256 characters of A-Z, a-z, 0-9, - . _ ~; None: a random token, in ``app.token``.
         read_only: reject all orders.
         open_reading: allow reading without the token; orders always need it.
@@ -131,7 +131,7 @@ def make_app(
 
 
 def _static_routes() -> list[Route]:
-    # Files are read once at the start, so that no request can reach other files.
+    # Files are read only here, at the start, so that no request can reach other files.
     routes = []
     for path in sorted(STATIC.iterdir()):
         if path.suffix in MEDIA_TYPES:

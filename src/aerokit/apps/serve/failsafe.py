@@ -16,8 +16,9 @@ _RETURN, _SMART, _HOLD, _TERMINATE = (
     "holds",
     "stops its motors",
 )
-# For each firmware, the parameters that determine the action, the most important first. If the value of a parameter is
-# not listed, the next parameter decides. Sources: Parameters.cpp of ArduPilot's firmwares, navigator parameters of PX4.
+# Maps firmwares to the parameters that determine the action, the most important parameter first, and to the actions of
+# their values. If a value is not listed, the next parameter decides. Sources: Parameters.cpp of ArduPilot's firmwares,
+# navigator parameters of PX4.
 _ACTIONS: Mapping[str, Mapping[str, Mapping[float, str]]] = {
     "ArduCopter": {
         "FS_GCS_ENABLE": {
@@ -60,9 +61,10 @@ _ACTIONS: Mapping[str, Mapping[str, Mapping[float, str]]] = {
 
 
 def ground_station_failsafe(vehicle: Vehicle) -> dict[str, Any]:
-    """Return ``action`` (a clause, None while unknown), ``because`` (the parameter) and ``unread`` (parameter names).
+    """Return the vehicle's action after the loss of the ground station, according to its parameters.
 
-    The function uses parameters that have been read, and requests nothing.
+    ``action`` is a clause, or None while the action is unknown. ``because`` is the parameter that decides, with its
+    value. ``unread`` lists parameters that would be needed but were not read. Requests nothing.
     """
     for name, actions in _ACTIONS.get(vehicle.autopilot.firmware, {}).items():
         parameter = vehicle.parameters.known(name)

@@ -28,21 +28,21 @@ _TOKEN_CHARACTERS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvw
 MAX_ANONYMOUS_CONNECTIONS = 64
 """Maximum number of connections that have not sent the token.
 
-Above this number, the server closes the oldest connection of the address with the most connections.
+If there are more, the server closes the oldest connection of the address that has the most connections.
 """
 REQUEST_TIMEOUT_S = 10.0
 """Seconds from the first byte of a request, or from the start of the connection, to the end of its headers."""
 
 
 def check_token(token: str) -> str:
-    """Return the token; raise InvalidArgument if it is too short, or not valid in a header.
+    """Return the token; raise InvalidArgument if its length or one of its characters is not allowed.
 
     The error text does not contain the token.
     """
     if not (MIN_TOKEN_LENGTH <= len(token) <= 256 and set(token) <= _TOKEN_CHARACTERS):
         raise InvalidArgument(
-            f"a token must have {MIN_TOKEN_LENGTH} to 256 characters of A-Z, a-z, 0-9 and - . _ ~; this one has"
-            f" {len(token)}{'' if set(token) <= _TOKEN_CHARACTERS else ', some of them invalid'}"
+            f"a token must have {MIN_TOKEN_LENGTH} to 256 characters of A-Z, a-z, 0-9 and - . _ ~; this token has"
+            f" {len(token)}{'' if set(token) <= _TOKEN_CHARACTERS else ', some of which are not allowed'}"
         )
     return token
 
@@ -89,11 +89,11 @@ def content_policy(tiles: str | None) -> str:
         url = urlsplit(tiles)
         is_url = url.scheme in ("http", "https") and url.hostname and "@" not in url.netloc
         lacks_placeholder = any(f"{{{axis}}}" not in tiles for axis in "xyz")
-        # These characters could end the entry in the policy and begin another.
+        # These characters could end the entry of the policy and begin another entry.
         has_separator = set(tiles) & set(" \t\n\"';,<>\\")
         if not is_url or lacks_placeholder or has_separator:
             raise InvalidArgument(
-                f"tiles = {tiles!r} is not a tile URL like https://tiles.example/{{z}}/{{x}}/{{y}}.png"
+                f"tiles = {tiles!r} is not a tile URL, such as https://tiles.example/{{z}}/{{x}}/{{y}}.png"
             )
         image_sources += f" {url.scheme}://{url.netloc}"
     return (
@@ -135,7 +135,7 @@ class SecurityMiddleware:
             self._check(Headers(scope=scope))
         except HttpProblem as problem:
             if scope["type"] == "websocket":
-                await receive()  # websocket.connect, which ASGI expects to be received before the answer
+                await receive()  # websocket.connect, which ASGI requires to be received before an answer
                 await send({"type": "websocket.close", "code": 1008})
             else:
                 await problem_response(problem)(scope, receive, send_with_headers)
@@ -145,11 +145,11 @@ class SecurityMiddleware:
     def _check(self, headers: Headers) -> None:
         host = headers.get("host", "")
         if not self._is_own_host(host):
-            raise HttpProblem(421, "WrongHost", f"Host {host[:100]!r} is not allowed; add it with --allow-host")
+            raise HttpProblem(421, "WrongHost", f"host name {host[:100]!r} is not allowed; --allow-host allows it")
         origins = headers.getlist("origin")
         if any(urlsplit(origin).netloc.lower() != host.lower() for origin in origins):
             raise HttpProblem(403, "WrongOrigin", "requests from pages of other sites are not allowed")
-        # A link on another site may open the page, but its scripts and images may request nothing.
+        # Links on other sites may open the page, but scripts and images of other sites must not request anything.
         if headers.get("sec-fetch-site", "none") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
             raise HttpProblem(403, "WrongOrigin", "requests from pages of other sites are not allowed")
 
@@ -170,7 +170,7 @@ RawHeaders = list[tuple[bytes, bytes]]
 def http_protocol(has_token: Callable[[RawHeaders], bool]) -> type[H11Protocol]:
     """Return the ``http`` class for `uvicorn.Config`, which limits anonymous connections.
 
-    Connections whose requests contain the token are never closed, so that anonymous clients cannot exclude the owner.
+    Connections with the token in a request are never closed, so that anonymous clients cannot exclude the owner.
     """
     anonymous: dict[_HttpConnection, None] = {}
 
@@ -209,13 +209,13 @@ class _HttpConnection(H11Protocol):
     def handle_events(self) -> None:
         previous_scope = self.scope
         super().handle_events()
-        if self.scope is not previous_scope:  # the headers of a new request are complete
+        if self.scope is not previous_scope:  # a new request has begun, and its headers are complete
             self._stop_timer()
             if self._has_token():
                 self._anonymous.pop(self, None)
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        self._remove_from_anonymous()  # the application limits WebSockets itself
+        self._remove_from_anonymous()  # not counted here, because the application itself limits WebSockets
         super().handle_websocket_upgrade(event)
 
     def _start_timer(self) -> None:
@@ -239,7 +239,7 @@ class _HttpConnection(H11Protocol):
 def _oldest_of_busiest_host(connections: Iterable[_HttpConnection]) -> _HttpConnection:
     connections = list(connections)
     counts = Counter(_host(connection) for connection in connections)
-    # max() returns the first of several maxima, which is the oldest.
+    # Among equal counts, max() returns the first connection, which is the oldest.
     return max(connections, key=lambda connection: counts[_host(connection)])
 
 

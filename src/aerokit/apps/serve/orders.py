@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("aerokit")
 
 MAX_RUNNING = 16
-"""Maximum number of running orders for each vehicle. Orders with ``is_safe`` are accepted beyond it."""
+"""Maximum number of running orders for each vehicle. Orders with ``is_safe`` are accepted nevertheless."""
 MAX_RESULTS = 500
 """Maximum number of orders whose results are stored."""
 MAX_USED_KEYS = 100_000
-"""Maximum number of older keys that are stored to detect their reuse."""
+"""Maximum number of keys of older orders that are stored to detect reuse."""
 STATE_MAX_AGE_S = 5.0
 """Maximum age in seconds of the state on which a client bases an order."""
 _LANDED_STATE_MAX_AGE_S = 3.0
@@ -51,7 +51,7 @@ _KEY = re.compile(r"[A-Za-z0-9._~-]{8,64}")
 
 @dataclass(frozen=True)
 class OrderArgument:
-    """One field of an order's body: its JSON type and description."""
+    """One argument of an order: a field of the request body, with its JSON type and description."""
 
     type: str | tuple[str, ...]
     text: str
@@ -62,8 +62,8 @@ class OrderArgument:
 class OrderType:
     """One type of order: its arguments, and the function that runs it.
 
-    ``is_safe`` marks an order that brings the vehicle to rest; it is sent even to a silent vehicle. ``parse`` converts
-    the arguments to a pair: the arguments that are recorded, and those that ``run`` receives.
+    ``is_safe`` marks an order that brings the vehicle to rest. Such orders are sent even to a silent vehicle. ``parse``
+    converts the arguments to two dicts: the arguments to record, and the arguments for ``run``.
     """
 
     name: str
@@ -78,16 +78,18 @@ class OrderType:
     max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Check the names of arguments; raise InvalidArgument. The library checks the values."""
+        """Check the names of the arguments; raise InvalidArgument for wrong names. The library checks the values."""
         for name in values:
             if name not in self.arguments:
                 names = ", ".join(self.arguments) or "none"
                 raise InvalidArgument(f"{self.name}: unknown argument {name[:40]!r}; arguments: {names}")
         for name, argument in self.arguments.items():
             value = values.get(name)
-            # Only bools are checked here: they are ints in Python, but True is not a mode number.
+            # Checks only bools, which Python accepts as ints: True is not the number of a mode.
             if value is not None and isinstance(value, bool) != (argument.type == "boolean"):
-                raise InvalidArgument(f"{self.name}: {name} = {value!r:.40} is not of type {argument.type}")
+                raise InvalidArgument(
+                    f"{self.name}: {name} = {value!r:.40} is not allowed: its type must be {argument.type}"
+                )
             if argument.is_required and value is None:
                 raise InvalidArgument(f"{self.name}: argument {name} is missing ({argument.text})")
 
@@ -101,7 +103,7 @@ async def _go_to(vehicle: Vehicle, values: dict[str, Any]) -> None:
     is_below_home = isinstance(altitude_m, (int, float)) and altitude_m < 0
     if is_below_home and vehicle.autopilot.vehicle_type != MavType.SUBMARINE:
         raise InvalidArgument(
-            f"go_to: altitude_relative_m = {altitude_m:g} is below home; allowed is 0 or more, except for submarines"
+            f"go_to: altitude_relative_m = {altitude_m:g} is not allowed: it must be 0 or more, except for submarines"
             " (altitude_amsl_m is not limited); nothing was sent"
         )
     position = {name: values.pop(name) for name in tuple(values) if name in _POSITION}
@@ -109,12 +111,12 @@ async def _go_to(vehicle: Vehicle, values: dict[str, Any]) -> None:
 
 
 async def _resume(vehicle: Vehicle, values: dict[str, Any]) -> None:
-    # ArduCopter, on the ground after a finished mission, takes off and flies from the first item.
+    # After a finished mission, an ArduCopter on the ground would take off and fly from the first item.
     landed = vehicle.landed_state
     is_on_ground = landed.latest == MavLandedState.ON_GROUND and landed.age <= _LANDED_STATE_MAX_AGE_S
     if vehicle.is_armed and is_on_ground and vehicle.autopilot.vehicle_type not in SURFACE_TYPES:
         raise OperationRejected(
-            "mission/resume: the vehicle is on the ground, where it would take off: order mission/start;"
+            "mission/resume: the vehicle is on the ground and would take off; use mission/start to take off;"
             " nothing was sent"
         )
     await vehicle.mission.resume()
@@ -126,14 +128,14 @@ async def _set_parameter(vehicle: Vehicle, values: dict[str, Any], metadata: Met
 
 
 def parameter_order(metadata: Metadata | None) -> OrderType:
-    """Return the order that sets a parameter; its result has a note if the metadata could not check the value."""
+    """Return the order type that sets a parameter. Its result has a note if the value's range was not checked."""
     return replace(SET_PARAMETER, run=partial(_set_parameter, metadata=metadata))
 
 
 def check_parameter(metadata: Metadata | None, values: Mapping[str, Any]) -> None:
-    """Raise InvalidArgument for a value that the metadata does not allow, unless ``force`` is set."""
+    """Raise InvalidArgument if the metadata does not allow the value, unless ``force`` is set."""
     value = values["value"]
-    # The library rejects values of other types, and those that MAVLink cannot represent.
+    # The library itself rejects values of other types, and values that MAVLink cannot represent.
     if isinstance(value, (int, float)) and abs(value) <= sys.float_info.max and not values.get("force"):
         check_values(metadata, {values["name"]: value}, '"force": true')
 
@@ -149,11 +151,11 @@ async def _upload(vehicle: Vehicle, values: dict[str, Any]) -> None:
 
 
 def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
-    """Return name, text and plan of a request body: an object of a .plan file, or the text of either format.
+    """Return the name, text and plan of a request body, which has a .plan as JSON object, or a text in either format.
 
     Raises:
         FileFormatError: the body has neither format; the text names the position of the error.
-        InvalidArgument: an item cannot be sent.
+        InvalidArgument: an item of the plan cannot be sent to a vehicle.
     """
     content, name = values["plan"], values.get("name")
     name = name[:100] if isinstance(name, str) else "plan"
@@ -250,7 +252,7 @@ _RECORD_FIELDS = (
 
 @dataclass(eq=False)
 class OrderRecord:
-    """One order and its result."""
+    """One order to a vehicle, and its result."""
 
     key: str
     system_id: int
@@ -265,16 +267,16 @@ class OrderRecord:
     ended: asyncio.Event = field(default_factory=asyncio.Event)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields that the API shows."""
+        """Return the fields of the order that the API shows."""
         return {name: getattr(self, name) for name in _RECORD_FIELDS}
 
     def is_same(self, system_id: int, order: str, arguments: Mapping[str, Any]) -> bool:
-        """Return True if a request repeats this order."""
+        """Return True if a request with these values repeats this order."""
         return (self.system_id, self.order, self.arguments) == (system_id, order, arguments)
 
 
 class OrderRunner:
-    """Runs each order once, in a task of the server, so that a disconnecting client does not affect the order."""
+    """Runs each order once, in a task of the server, so that an order continues when its client disconnects."""
 
     def __init__(self, served: ServedVehicles) -> None:
         self._served = served
@@ -288,7 +290,7 @@ class OrderRunner:
         """Start an order, or return the earlier order with this key. ``order_type.check`` has checked the arguments.
 
         Raises:
-            HttpProblem: the key is missing, or was used for another order; the client has seen an old state.
+            HttpProblem: the key is missing or was used for another order, or the client has only seen an old state.
             FileFormatError, InvalidArgument: the arguments cannot be parsed.
             BusyError: too many orders are running.
             HeartbeatTimeout: the vehicle is silent.
@@ -326,13 +328,13 @@ class OrderRunner:
         return self._records[key]
 
     async def aclose(self) -> None:
-        """Cancel running orders; the vehicle holds, as after any cancelled action."""
+        """Cancel running orders. Their vehicles hold, as after every cancelled action."""
         await self._background.aclose()
 
     def _check(
         self, vehicle: Vehicle, order_type: OrderType, arguments: Mapping[str, Any], seen_at_s: float | None
     ) -> None:
-        """Raise unless the order may be sent now."""
+        """Raise the error that applies if the order must not be sent now."""
         vehicle.connection.raise_if_ended()
         now = asyncio.get_running_loop().time()
         if seen_at_s is not None and not 0 <= now - seen_at_s <= STATE_MAX_AGE_S:
@@ -349,7 +351,7 @@ class OrderRunner:
                 "disarm: force is allowed only after the server has seen the vehicle hit the ground and stay there;"
                 " nothing was sent",
             )
-        if order_type.is_safe:
+        if order_type.is_safe:  # may be sent to a silent vehicle, and in any number
             return
         if vehicle.link_state.latest is not LinkState.CONNECTED:
             raise HeartbeatTimeout(

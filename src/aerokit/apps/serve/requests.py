@@ -1,4 +1,4 @@
-"""Reading of requests, with bounded sizes and checked values, and responses as JSON."""
+"""Reads requests, with limited sizes and checked values, and makes JSON responses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from aerokit.errors import (
 if TYPE_CHECKING:
     from starlette.requests import Request
 
-# Maps error classes to HTTP statuses. The first matching class counts.
+# Maps error classes to HTTP statuses. The first class that matches an error counts.
 _STATUS: tuple[tuple[type[Exception], int], ...] = (
     (InvalidArgument, 400),
     (FileFormatError, 400),
@@ -41,12 +41,12 @@ _STATUS: tuple[tuple[type[Exception], int], ...] = (
 )
 MAX_BODY_SIZE = 16_384
 MAX_PLAN_SIZE = 1_000_000
-"""Limit for a body with a mission."""
+"""Maximum size in bytes of a request body with a plan."""
 BODY_TIMEOUT_S = 10.0
 
 
 class HttpProblem(Exception):
-    """A request failed. The response is a problem object; ``kind`` identifies the problem for programs."""
+    """A request failed. The response is a problem object, in which ``kind`` identifies the problem for programs."""
 
     def __init__(self, status: int, kind: str, text: str, headers: dict[str, str] | None = None) -> None:
         super().__init__(text)
@@ -56,15 +56,16 @@ class HttpProblem(Exception):
 
 
 def problem_of(error: Exception) -> dict[str, Any]:
-    """Return the problem object (RFC 9457) of an error, with ``error``, ``detail``, and ``reasons`` given by the
-    vehicle.
+    """Return the problem object (RFC 9457) of an error.
+
+    It has ``error``, ``detail`` and, if the vehicle has given reasons, ``reasons``.
     """
     if isinstance(error, HttpProblem):
         status, kind = error.status, error.kind
     else:
         kind = type(error).__name__
         status = next((status for error_class, status in _STATUS if isinstance(error, error_class)), 500)
-    is_public = isinstance(error, (AerokitError, HttpProblem))  # other texts may reveal internals
+    is_public = isinstance(error, (AerokitError, HttpProblem))  # the texts of other errors may reveal internals
     problem: dict[str, Any] = {
         "type": "about:blank",
         "title": kind,
@@ -95,29 +96,30 @@ def json_response(
 
 
 async def read_body(request: Request, max_size: int = MAX_BODY_SIZE) -> dict[str, Any]:
-    """Read the JSON object in the body; an empty body is an empty object.
+    """Read the JSON object in the request body. An empty body counts as an empty object.
 
     Raises:
-        HttpProblem: 400 not a JSON object, 408 timed out, 413 too large, 415 not declared as JSON.
+        HttpProblem: the body is not a JSON object (400), did not arrive in time (408), is too large (413) or is not
+            declared as JSON (415).
     """
     try:
         data = await asyncio.wait_for(_read_bytes(request, max_size), BODY_TIMEOUT_S)
     except asyncio.TimeoutError:
         raise HttpProblem(
-            408, "BodyTimeout", f"the body was not received within {BODY_TIMEOUT_S:g} s; nothing was sent"
+            408, "BodyTimeout", f"the request body did not arrive within {BODY_TIMEOUT_S:g} s; nothing was sent"
         ) from None
     if not data:
         return {}
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-        raise HttpProblem(415, "NotJson", "the body must have Content-Type: application/json; nothing was sent")
+        raise HttpProblem(415, "NotJson", "the header Content-Type must be application/json; nothing was sent")
     try:
         body = json.loads(data, parse_constant=_refuse_constant, object_pairs_hook=_object_without_duplicates)
-        # Rejects infinity (1e999) and lone surrogates, which could not be sent to other clients.
+        # Raises for infinity (1e999) and lone surrogates, because they could not be sent to other clients.
         json.dumps(body, ensure_ascii=False, allow_nan=False).encode()
     except (ValueError, RecursionError) as error:
-        raise HttpProblem(400, "NotJson", f"the body is not valid JSON: {error}; nothing was sent") from None
+        raise HttpProblem(400, "NotJson", f"the request body is not valid JSON: {error}; nothing was sent") from None
     if not isinstance(body, dict):
-        raise HttpProblem(400, "NotJson", "the body is not a JSON object; nothing was sent")
+        raise HttpProblem(400, "NotJson", "the request body is not a JSON object; nothing was sent")
     return body
 
 
@@ -126,7 +128,7 @@ async def _read_bytes(request: Request, max_size: int) -> bytes:
     async for part in request.stream():
         data += part
         if len(data) > max_size:
-            raise HttpProblem(413, "TooLarge", f"the body is larger than {max_size} bytes; nothing was sent")
+            raise HttpProblem(413, "TooLarge", f"the request body is larger than {max_size} bytes; nothing was sent")
     return bytes(data)
 
 
@@ -137,7 +139,7 @@ def _refuse_constant(constant: str) -> NoReturn:
 def _object_without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) < len(pairs):
-        raise ValueError("an object has a duplicate name")
+        raise ValueError("an object contains the same name twice")
     return result
 
 
@@ -149,7 +151,7 @@ def query_flag(request: Request, name: str, *, default: bool) -> bool:
 
 
 def seen_at(request: Request) -> float | None:
-    """Return the header Aerokit-Seen-At, the ``at_s`` of the state that the client has seen; None if missing."""
+    """Return the header Aerokit-Seen-At, the ``at_s`` of the state that the client has seen; None without it."""
     text = request.headers.get("aerokit-seen-at")
     if text is None:
         return None
@@ -166,5 +168,5 @@ def system_id_of(request: Request) -> int:
     """Return the system id in the path; raise HttpProblem 404 if it is invalid."""
     text = request.path_params["system_id"]
     if not (text.isascii() and text.isdigit() and len(text) <= 3 and 1 <= int(text) <= 255):
-        raise HttpProblem(404, "UnknownVehicle", "a system id is a number from 1 to 255; nothing was sent")
+        raise HttpProblem(404, "UnknownVehicle", "the system id must be a number from 1 to 255; nothing was sent")
     return int(text)

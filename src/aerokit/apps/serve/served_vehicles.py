@@ -1,4 +1,4 @@
-"""``ServedVehicles``: the vehicles that are served, with their recent events and texts."""
+"""``ServedVehicles``: the vehicles that are served, with their recent events, texts and tracks."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ MAX_EVENTS = 500
 MAX_TEXTS = 200
 """Maximum number of stored texts for each vehicle."""
 SNAPSHOT_MAX_AGE_S = 0.05
-"""Requests within this time share one snapshot."""
+"""Requests for a snapshot get the previous one if it is not older than this many seconds."""
 MAX_TRACK_POINTS = 2000
-"""Maximum number of stored track points for each vehicle. A full track is thinned to every second point, so that it
-still covers the whole flight."""
+"""Maximum number of stored track points for each vehicle. If a track is full, every second point is removed, so that
+the track still covers the whole flight."""
 TRACK_INTERVAL_S = 0.2
 MIN_TRACK_STEP_M = 0.5
 TRACK_GAP_S = 3.0
@@ -45,7 +45,7 @@ PREARM_TEXT_MAX_AGE_S = 35.0
 """Maximum age in seconds of a text about a failed arming check. ArduPilot repeats these texts every 30 s."""
 _CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
 MIN_CHECK_INTERVAL_S = 5.0
-"""Minimum seconds between two requests to run the arming checks, for a vehicle whose readiness alternates."""
+"""Minimum seconds between two requests for arming checks, because the failing sensors of a vehicle may alternate."""
 
 
 class ServedVehicles:
@@ -61,8 +61,8 @@ class ServedVehicles:
     def __init__(self, source: Connection | Vehicle | Mapping[int, Vehicle]) -> None:
         self.events: deque[dict[str, Any]] = deque(maxlen=MAX_EVENTS)
         self._texts: dict[int, deque[dict[str, Any]]] = {}
-        self._tracks: dict[int, list[tuple[Position, bool]]] = {}  # True: the first after a gap
-        # The failing sensors for which the arming checks were requested last, and the time of that request.
+        self._tracks: dict[int, list[tuple[Position, bool]]] = {}  # True marks the first position after a gap
+        # For each vehicle, the failing sensors at the last request for arming checks, and the time of this request.
         self._requested_for: dict[Vehicle, tuple[str, ...]] = {}
         self._requested_at: dict[Vehicle, float] = {}
         self._watches: dict[Vehicle, FlightWatch] = {}
@@ -70,7 +70,7 @@ class ServedVehicles:
         self._attached: dict[Connection, list[Detach]] = {}
         self._message_count = 0
         self._snapshot: tuple[float, str] | None = None
-        # The end of a connection is not an error here, because the states of its vehicles show it.
+        # Errors of background tasks, such as the end of a connection, are ignored: the vehicles' states show the end.
         self._background = BackgroundTasks(lambda error: None)
         self._vehicles: Mapping[int, Vehicle] = {}
         if isinstance(source, Connection):
@@ -111,12 +111,12 @@ class ServedVehicles:
         return list(self._texts.get(system_id, ()))
 
     def track(self, system_id: int) -> list[tuple[float, float, bool]]:
-        """Return a track, the oldest position first: latitude, longitude, and True after a gap."""
+        """Return a vehicle's track, the oldest position first: latitude, longitude, and True after a gap."""
         points = self._tracks.get(system_id, ())
         return [(position.latitude_deg, position.longitude_deg, is_after_gap) for position, is_after_gap in points]
 
     def snapshot(self) -> str:
-        """Return the current state of all vehicles, as a JSON ``state`` message of the stream."""
+        """Return the current state of all vehicles as JSON, which is the message ``state`` of the stream."""
         now = asyncio.get_running_loop().time()
         if self._snapshot is None or now - self._snapshot[0] > SNAPSHOT_MAX_AGE_S:
             vehicles = [self._state_of(vehicle) for vehicle in self.vehicles.values()]
@@ -125,12 +125,12 @@ class ServedVehicles:
         return self._snapshot[1]
 
     def listen(self, listener: Listener) -> Callable[[], None]:
-        """Call ``listener`` with each published message, until the returned function is called."""
+        """Call ``listener`` with each published message. Return a function that ends this."""
         self._listeners.append(listener)
         return lambda: self._listeners.remove(listener)
 
     def publish(self, message: dict[str, Any]) -> None:
-        """Number a message, and pass it to all listeners."""
+        """Add a number to a message, and pass it to all listeners."""
         self._message_count += 1
         numbered = {**message, "number": self._message_count}
         if message["type"] == "event":
@@ -183,7 +183,7 @@ class ServedVehicles:
         self.publish({"type": "event", "event": type(event).__name__, "time_unix_s": unix_s, **to_jsonable(event)})
 
     async def _record_tracks(self) -> None:
-        silent: set[int] = set()  # system ids whose next position comes after a gap
+        silent: set[int] = set()  # system ids of vehicles whose next position is the first after a gap
         while True:
             for system_id, vehicle in tuple(self._vehicles.items()):
                 self._watch(vehicle)
@@ -235,7 +235,7 @@ class ServedVehicles:
         missing = vehicle.missing_for_flight()
         if not missing or vehicle.link_state.latest is not LinkState.CONNECTED:
             return missing
-        # Texts from before the newest check may describe problems that are solved.
+        # Texts that are older than the last request for checks may describe problems that are already solved.
         age_s = min(vehicle.connection.now() - self._requested_at.get(vehicle, -math.inf), PREARM_TEXT_MAX_AGE_S)
         oldest_unix_s = vehicle.connection.unix_time() - age_s
         recent = [entry["text"] for entry in self.texts(vehicle.system_id) if entry["time_unix_s"] >= oldest_unix_s]
@@ -244,7 +244,7 @@ class ServedVehicles:
 
 
 def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
-    """Return the failing sensors of a disarmed vehicle whose arming checks do not pass, else None."""
+    """Return the failing sensors of a vehicle. None if it is armed, or if its arming checks pass."""
     sensors = vehicle.sensors.latest
     is_disarmed = vehicle.armed.latest is False
     if vehicle.link_state.latest is not LinkState.CONNECTED or not is_disarmed or sensors is None:
@@ -253,21 +253,24 @@ def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
 
 
 def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
-    """Return why ``arm`` would be refused, from the state received so far; empty if no reason is known.
+    """Return the known reasons why the order ``arm`` would be refused; empty if none is known. Sends nothing.
 
-    ``missing`` are the conditions missing for flight. ArduPilot arms without most of them, in modes without position.
+    ``missing`` are the missing conditions for flight. In modes without a position, ArduPilot arms without most of them.
     """
     autopilot, unarmable = vehicle.autopilot, _unarmable_mode(vehicle)
     if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False:
         return []
-    if unarmable is not None and unarmable["arms_in"] is None:
+    if unarmable is not None and unarmable["arms_in"] is None:  # `arm` cannot change to a mode that allows arming
         unless = f" unless {unarmable['unless']} allows it" if unarmable["unless"] else ""
         return [f"{autopilot.firmware} cannot arm in {unarmable['mode']}{unless}", *missing]
     sensors, estimator = vehicle.sensors.latest, vehicle.estimator.latest
     if missing and sensors is not None and sensors.prearm_checks_pass is False:
+        # The general reason is omitted if there are specific reasons.
         return [reason for reason in missing if len(missing) == 1 or reason != _CHECKS_FAIL]
     mode = vehicle.mode.latest
-    arms_in = unarmable["arms_in"] if unarmable is not None else None if mode is None else mode.name
+    arms_in = None if mode is None else mode.name
+    if unarmable is not None:  # `arm` would change the mode before
+        arms_in = unarmable["arms_in"]
     needs_position = bool(autopilot.modes_without_position) and arms_in not in (None, *autopilot.modes_without_position)
     if needs_position and estimator is not None and estimator.missing:
         change = "" if unarmable is None else ", to which Arm would change the mode"
@@ -281,13 +284,17 @@ def _unread(vehicle: Vehicle, parameter: str | None) -> list[str]:
 
 
 def _is_flying_mission(vehicle: Vehicle) -> bool:
-    """Return True while the vehicle is armed in its mission mode, the condition of ``mission.pause``."""
+    """Return True if the vehicle is armed and in its mission mode, which ``mission.pause`` requires."""
     mode = vehicle.autopilot.mode_for("mission", is_vtol=vehicle.telemetry.is_vtol)
     return mode is not None and vehicle.telemetry.is_in(mode) and not vehicle.telemetry.is_confirmed_disarmed
 
 
 def _unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
-    """Return the current mode if ``arm`` would leave it, the mode to arm in, and the parameter that permits arming."""
+    """Return data about the current mode if the vehicle cannot arm in it; None if it can.
+
+    ``arms_in`` is the mode to which ``arm`` would change, or None. ``unless`` is the parameter that permits arming in
+    the current mode.
+    """
     autopilot, mode = vehicle.autopilot, vehicle.mode.latest
     if mode is None or mode.name not in autopilot.unarmable_modes.union(autopilot.armable_by_option):
         return None
@@ -296,5 +303,5 @@ def _unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
 
 
 async def _run_checks(vehicle: Vehicle) -> None:
-    with contextlib.suppress(AerokitError):  # the state shows a vehicle that does not answer
+    with contextlib.suppress(AerokitError):  # if the vehicle does not answer, its state shows that
         await vehicle.why_not_armable()

@@ -23,15 +23,18 @@ if TYPE_CHECKING:
 
 MAX_SOCKETS = 32
 MAX_ANONYMOUS_SOCKETS = 16
-"""Maximum number of sockets without the token, if reading is open."""
+"""Maximum number of WebSockets without the token, if reading without a token is allowed."""
 MAX_QUEUED_MESSAGES = 256
-"""Maximum number of queued messages for one client. When the queue is full, the oldest is dropped and counted."""
+"""Maximum number of queued messages for each client. If a queue is full, its oldest message is dropped and counted."""
 SEND_TIMEOUT_S = 10.0
 DEFAULT_RATE_HZ, MAX_RATE_HZ, MIN_RATE_HZ = 5.0, 20.0, 0.1
 
 
 class StateStream:
-    """The endpoint ``/api/stream``. Clients must not send. Clients that do not read for 10 seconds are disconnected."""
+    """The WebSocket endpoint ``/api/stream``.
+
+    Clients must not send anything. Clients that do not read for 10 seconds are disconnected.
+    """
 
     def __init__(self, served: ServedVehicles, orders: OrderRunner, access: AccessControl) -> None:
         self._served, self._orders, self._access = served, orders, access
@@ -57,12 +60,12 @@ class StateStream:
     def _admit(self, socket: WebSocket) -> float:
         self._access.check(socket.headers)
         if self._open >= MAX_SOCKETS:
-            raise HttpProblem(503, "TooManySockets", f"the maximum of {MAX_SOCKETS} clients is connected")
+            raise HttpProblem(503, "TooManySockets", f"the maximum number of clients ({MAX_SOCKETS}) is connected")
         if self._anonymous >= MAX_ANONYMOUS_SOCKETS and not self._access.has_token(socket.headers):
             raise HttpProblem(
                 503,
                 "TooManySockets",
-                f"the maximum of {MAX_ANONYMOUS_SOCKETS} clients without the token is connected",
+                f"the maximum number of clients without the token ({MAX_ANONYMOUS_SOCKETS}) is connected",
             )
         text = socket.query_params.get("rate_hz", str(DEFAULT_RATE_HZ))
         try:
@@ -84,17 +87,17 @@ class StateStream:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         if receiving.done() and not receiving.cancelled() and receiving.exception() is None:
-            code = 1008  # policy violation: the client sent a message
+            code = 1008  # "policy violation": the client has sent a message
         elif sending.done() and not sending.cancelled() and isinstance(sending.exception(), TimeoutError):
-            code = 1013  # try again later: the client does not read
+            code = 1013  # "try again later": the client does not read
         else:
             return
-        with suppress(Exception):  # the client may be gone
+        with suppress(Exception):  # the client may have disconnected
             await asyncio.wait_for(socket.close(code), 1.0)
 
     async def _send_messages(self, socket: WebSocket, period_s: float) -> None:
         loop, queue, changed = asyncio.get_running_loop(), deque[dict[str, Any]](), asyncio.Event()
-        missed = 0  # messages that were dropped since the last sent message
+        missed = 0  # number of messages that were dropped since the last message was sent
 
         def enqueue(message: dict[str, Any]) -> None:
             nonlocal missed
@@ -113,7 +116,7 @@ class StateStream:
                     await _send(socket, self._served.snapshot())
                     next_snapshot_at = loop.time() + period_s
                 while queue:
-                    message = dict(queue.popleft())  # a copy, because all clients share the message
+                    message = dict(queue.popleft())  # a copy, because all clients get the same object
                     if missed:
                         message["missed"], missed = missed, 0
                     await _send(socket, json.dumps(message, ensure_ascii=False))
@@ -136,7 +139,7 @@ class StateStream:
 
 
 async def _send(socket: WebSocket, text: str) -> None:
-    with anyio.fail_after(SEND_TIMEOUT_S):  # before Python 3.12, wait_for can swallow a cancellation
+    with anyio.fail_after(SEND_TIMEOUT_S):  # not wait_for, which before Python 3.12 could lose a cancellation
         await socket.send_text(text)
 
 

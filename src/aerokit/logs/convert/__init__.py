@@ -59,11 +59,11 @@ class Conversion(Snapshot):
     """The result of a conversion."""
 
     target: Path
-    """The file or folder."""
+    """The written file or folder."""
     entries: int
-    """Number of records read from the log: messages or rows."""
+    """Number of records that were read from the log: its messages or rows."""
     written: int
-    """Number of messages, rows or points written.
+    """Number of messages, rows or points that were written.
 
     In an ``.mcap``, each record becomes one message, plus one message for each state that the record changes. A flight
     table or track has rows or points for positions only.
@@ -75,7 +75,7 @@ class Conversion(Snapshot):
     ends_at: float
     """UTC of the last record, in seconds since 1970."""
     notes: tuple[str, ...]
-    """Problems with the log, and data that is missing for that reason."""
+    """Problems of the log, and data that is missing because of them."""
 
 
 def convert(
@@ -88,19 +88,19 @@ def convert(
 ) -> Conversion:
     """Convert a flight log. If the log is damaged, only its readable part is converted.
 
-    The target appears only when it is complete. The function blocks and needs no event loop.
+    The target gets its name only when it is complete. The function blocks; it needs no event loop.
 
     Args:
         log: a ``.tlog`` of a ground station, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
         target: a file, ``.mcap``, ``.csv``, ``.parquet``, ``.gpx`` or ``.kml``; without a suffix, a folder with
             one table for each message type.
         tables: format of the tables in a folder: ``"csv"`` or ``"parquet"``.
-        force: replace existing files; other files in a folder are kept.
-        on_progress: called from time to time with the bytes that were read.
+        force: replace existing files. Other files in a target folder stay.
+        on_progress: called from time to time with the number of bytes read so far.
 
     Raises:
         InvalidArgument: the format is unknown, or the target exists.
-        FileFormatError: the file is not a log, or nothing can be read.
+        FileFormatError: the file is not a flight log, or nothing in it can be read.
         OSError: a file cannot be read or written.
         ModuleNotFoundError: a package of the extra ``convert`` is not installed.
     """
@@ -117,7 +117,7 @@ def convert(
         existing, new = ("file", "folder") if is_folder else ("folder", "file")
         raise InvalidArgument(f"{target_path} is a {existing} and cannot be replaced by a {new}")
     on_bytes = _progress_callback(source, on_progress)
-    # The temporary folder is in the target's directory, so that the result can be renamed.
+    # The temporary folder is in the target's directory, because renaming works only within one file system.
     with tempfile.TemporaryDirectory(dir=target_path.parent, prefix=f".{target_path.name}.") as folder:
         incomplete = Path(folder) / target_path.name
         if is_folder:
@@ -141,7 +141,7 @@ def _writer_for(target: Path, tables: str) -> Callable[[Path, LogReader], _Write
 
 
 def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], object]) -> tuple[int, float, float, int]:
-    """Return the number of records, the times of the first and the last, and the number of written messages."""
+    """Write all records of a log. Return their number, the first and the last time, and the writer's count."""
     entries, begins_at, ends_at = 0, 0.0, 0.0
     try:
         for entry in log.entries(on_bytes):
@@ -165,11 +165,11 @@ def _progress_callback(source: Path, on_progress: OnProgress | None) -> Callable
 
 
 def _move(complete: Path, target: Path) -> int:
-    """Flush the files to disk, and give them their final names. Return their total size."""
+    """Flush the complete files to disk and move them to their final names. Return their total size."""
     files = sorted(complete.iterdir()) if complete.is_dir() else [complete]
     for file in files:
         with file.open("rb") as opened:
-            os.fsync(opened.fileno())  # without fsync, a power failure could leave an empty file
+            os.fsync(opened.fileno())  # otherwise a power failure could leave an empty file under the final name
     size = sum(file.stat().st_size for file in files)
     if not complete.is_dir():
         complete.replace(target)

@@ -1,4 +1,4 @@
-"""MCAP for Foxglove: the topics of ``aerokit bridge foxglove``, and the records of the log."""
+"""Writes MCAP files for Foxglove, with the topics of ``aerokit bridge foxglove`` and the records of the log."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _POSE_STATES = frozenset(("position", "attitude"))
 
 
 class McapWriter:
-    """Writes a log as ``.mcap``, with one message for each record of a topic."""
+    """Writes a log as ``.mcap``, with one message for each record."""
 
     def __init__(self, path: Path, log: LogReader) -> None:
         self._log = log
@@ -71,6 +71,7 @@ class McapWriter:
             if state == "status_text":
                 fields = topics.log_entry(unix_s, system_id, value)
                 self._put_foxglove(unix_s, system_id, "log", fields, topics.LOG)
+        # The pose combines the position and the attitude, so a change of either makes a new pose.
         changed_pose_states = {state for state, _ in record.states} & _POSE_STATES
         position, attitude = latest.get("position"), latest.get("attitude")
         if not changed_pose_states or position is None:
@@ -93,7 +94,7 @@ class McapWriter:
         self._put(unix_s, name, fields, lambda: Topic(name, schema))
 
     def _put(self, unix_s: float, name: str, fields: Mapping[str, Any], make_topic: Callable[[], Topic]) -> None:
-        """Add a message to a topic, which is made for its first message."""
+        """Add a message to a topic. The topic is registered with its first message."""
         channel = self._channels.get(name)
         if channel is None:
             channel = self._channels[name] = self._register(make_topic())

@@ -1,4 +1,4 @@
-"""Tables in CSV or Parquet: one table of the flight, or a folder with a table for each message type."""
+"""Writes tables in CSV or Parquet: one table of the flight, or a folder with a table for each message type."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ FLIGHT = (
     TableColumn("mode", "mode.name", "str"),
     TableColumn("armed", "armed", "bool"),
 )
-"""Columns of the flight table after time and system id. Each row has the newest values at one position."""
+"""Columns of the flight table after the time and the system id. A row has the newest values at one position."""
 
 
-# Places in a text where spreadsheets recognise a formula (owasp.org/www-community/attacks/CSV_Injection). These are the
-# beginning, even after white space, and the places after separators of other locales, even in quotes.
+# Matches the places in a text where spreadsheets recognise a formula (owasp.org/www-community/attacks/CSV_Injection):
+# the beginning, also after white space, and the places after other locales' separators, also in quotes.
 _FORMULA = re.compile(r"(^|[;\t])(?=[\s\0]*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n\0])")
 
 
@@ -64,13 +64,13 @@ _NUMBER_TYPES = (float, int)
 def _csv_cell(value: Any) -> Any:
     if isinstance(value, str):
         return _FORMULA.sub(r"\1'", value)
-    return "" if value != value else value  # NaN becomes an empty cell
+    return "" if value != value else value  # a value that is not equal to itself is NaN, which becomes an empty cell
 
 
 class CsvTable:
     """A CSV file: UTF-8, comma-separated, with a header; unknown values are empty.
 
-    An apostrophe keeps spreadsheets from executing a text as a formula; numbers stay as they are.
+    Texts that spreadsheets would execute as formulas get an apostrophe. Numbers stay as they are.
     """
 
     SUFFIX = ".csv"
@@ -84,8 +84,8 @@ class CsvTable:
         self._writer.writerow([_csv_cell(column.name) for column in columns])
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
-        """Add a row; the time is ISO 8601 in UTC with microseconds."""
-        # Most values are numbers; calling _csv_cell for them would take longer. `value == value` is False for NaN.
+        """Add a row, whose time is written as ISO 8601 in UTC with microseconds."""
+        # Most values are numbers, for which a call of _csv_cell would be slow. `value == value` is False for NaN.
         cells = [value if type(value) in _NUMBER_TYPES and value == value else _csv_cell(value) for value in values]
         self._writer.writerow([_iso_time(unix_s), *cells])
         if len(self._lines) >= _LINES_PER_FLUSH:
@@ -104,7 +104,7 @@ class CsvTable:
 
 
 class ParquetTable:
-    """A Parquet file; times are UTC timestamps, unknown values are null."""
+    """A Parquet file, in which times are UTC timestamps and unknown values are null."""
 
     SUFFIX = ".parquet"
 
@@ -148,7 +148,7 @@ Table = CsvTable | ParquetTable
 
 
 class FlightTableWriter:
-    """Writes one table, with a row for each position of each vehicle. A row includes the newest other values."""
+    """Writes one table, with a row for each position of each vehicle. The row also has the newest other values."""
 
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
         self._table = kind(path, (*_SENDER_COLUMNS[:2], *FLIGHT))
@@ -179,12 +179,12 @@ class FlightTableWriter:
 
 
 class MessageTablesWriter:
-    """Writes a folder with a table for each message type, with all fields as logged."""
+    """Writes a folder of tables, one for each message type, with all its fields as they were logged."""
 
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
         self._path, self._log, self._kind = path, log, kind
         log.needs_states = False
-        # By record type: the table, and the function that makes its rows.
+        # Maps record types to their table and the function that makes its rows.
         self._tables: dict[str, tuple[Table, Callable[[LogRecord], list[Any]]]] = {}
         self.written: int = 0
 
@@ -196,7 +196,7 @@ class MessageTablesWriter:
 
     def _open_table(self, record: LogRecord) -> tuple[Table, Callable[[LogRecord], list[Any]]]:
         columns = self._log.columns(record)
-        # The log is untrusted input, and the name becomes a file name.
+        # The name becomes a file name, but the log is untrusted input, so other characters are replaced.
         name = re.sub(r"[^\w-]", "_", record.table) + self._kind.SUFFIX
         if (self._path / name).exists():
             name = f"{len(self._tables)}_{name}"
@@ -216,7 +216,7 @@ class MessageTablesWriter:
 def _iso_time(unix_s: float) -> str:
     fraction, second = math.modf(unix_s)
     microseconds = round(fraction * 1e6)
-    if not 0 <= microseconds < 1_000_000:  # before 1970, or rounded up to a full second
+    if not 0 <= microseconds < 1_000_000:  # rare cases: before 1970, or rounded up to a full second
         return datetime.fromtimestamp(unix_s, timezone.utc).isoformat(timespec="microseconds")
     return f"{_iso_second(second)}.{microseconds:06}+00:00"
 
@@ -227,12 +227,12 @@ def _iso_second(unix_s: float) -> str:
 
 
 def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[LogRecord], list[Any]]:
-    """Return a function that makes table rows from records of this type."""
+    """Return a function that converts records of the same type as ``record`` to table rows."""
     if record.message is None:
         names = [column.field for column in columns]
         return lambda record: [_cell(record.fields.get(name)) for name in names]
     parts = [column.field.partition(".") for column in columns]
-    # attrgetter returns a tuple only for several names, and a message may have a single field.
+    # With NAME there are at least two names, because attrgetter returns a tuple only for several names.
     get_fields = attrgetter("NAME", *(name for name, _, _ in parts))
     array_elements = [(position, int(index)) for position, (_, _, index) in enumerate(parts) if index]
     texts = [position for position, column in enumerate(columns) if column.kind == "str"]
@@ -249,7 +249,7 @@ def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[L
 
 
 def _cell(value: Any) -> Any:
-    """Convert a value for a table: bytes to hexadecimal digits, lists to text."""
+    """Convert a value for a table: bytes become hexadecimal digits, and a list becomes a text."""
     if isinstance(value, bytes):
         return value.hex()
     is_array = hasattr(value, "typecode")
@@ -261,7 +261,10 @@ def _first(values: Sequence[Any]) -> Any:
 
 
 def _value_getter(path: str) -> Callable[[dict[str, Any]], Any]:
-    """Return a function that reads a path such as ``batteries.0.voltage_v`` from states; None for unknown values."""
+    """Return a function that gets the value at a path such as ``batteries.0.voltage_v`` from states.
+
+    It returns None for unknown values.
+    """
     state, *steps = path.split(".")
 
     def get_value(latest: dict[str, Any]) -> Any:

@@ -1,7 +1,7 @@
-"""Foxglove topics of a vehicle: names, JSON schemas and messages, for the live bridge and for files.
+"""The Foxglove topics of a vehicle: their names, JSON schemas and messages, for the live bridge and for files.
 
-Schemas named ``foxglove.…`` are known to Foxglove's panels (https://docs.foxglove.dev/docs/sdk/schemas). Other schemas
-contain the fields of aerokit's values. Everything is JSON.
+Foxglove's panels know the schemas named ``foxglove.…`` (https://docs.foxglove.dev/docs/sdk/schemas). Other schemas
+contain the fields of aerokit's values. All messages are JSON.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=Fa
 _NUMBER, _TEXT = {"type": "number"}, {"type": "string"}
 _JSON_TYPES = {"float": "number", "int": "number", "str": "string", "bool": "boolean"}
 _FATAL, _ERROR, _WARNING, _INFO, _DEBUG = 5, 4, 3, 2, 1
-# MAV_SEVERITY → foxglove.LogLevel.
+# Maps MAV_SEVERITY (the index) to foxglove.LogLevel.
 _FOXGLOVE_LEVELS = (_FATAL, _FATAL, _FATAL, _ERROR, _WARNING, _INFO, _INFO, _DEBUG)
 
 
@@ -103,7 +103,10 @@ class MapFrame:
         self._origin: tuple[float, float, float] | None = None
 
     def east_north_up_m(self, position: Position) -> tuple[float, float, float]:
-        """Convert a position. The first position becomes the origin, at the altitude of home if that is known."""
+        """Convert a position to metres east, north and up of the origin.
+
+        The first position becomes the origin; its altitude is that of home, if known.
+        """
         altitude, relative = position.altitude_amsl_m, position.altitude_relative_m
         if self._origin is None:
             self._origin = (
@@ -117,7 +120,10 @@ class MapFrame:
 
 
 def height_above(origin_m: float, altitude_amsl_m: float | None, relative_m: float | None) -> float:
-    """Return the height above the origin in metres, from the altitude above sea level if known, else above home."""
+    """Return the height above the origin in metres.
+
+    It is derived from the altitude above sea level or, if that is unknown, from the altitude above home.
+    """
     return (relative_m or 0.0) if altitude_amsl_m is None else altitude_amsl_m - origin_m
 
 
@@ -131,7 +137,7 @@ def frame_of(system_id: int) -> str:
 
 
 def state_topic(system_id: int, name: str, value: object) -> Topic:
-    """Return the topic of a state, ``/vehicle/1/attitude``, with the schema of its first value."""
+    """Return the topic of a state, such as ``/vehicle/1/attitude``, with the schema of this value."""
     schema = _schema_of(value)
     if schema.get("type") != "object":
         schema = {"type": "object", "properties": {"value": schema}}
@@ -139,7 +145,7 @@ def state_topic(system_id: int, name: str, value: object) -> Topic:
 
 
 def raw_topic(system_id: int, component_id: int, message: type[Message]) -> Topic:
-    """Return the topic of a raw MAVLink message, ``/mavlink/1/1/GPS_RAW_INT``; the schema has the units."""
+    """Return the topic of a MAVLink message, such as ``/mavlink/1/1/GPS_RAW_INT``. Its schema has the units."""
     properties: dict[str, Any] = {}
     for field in message.FIELDS:
         if field.name in SECRET_FIELDS:
@@ -164,7 +170,7 @@ def _is_byte_array(field: Any) -> bool:
 
 
 def nanoseconds(unix_s: float) -> int:
-    """Convert to nanoseconds since 1970, rounded to microseconds."""
+    """Convert seconds to nanoseconds, rounded to microseconds."""
     return round(unix_s * 1e6) * 1000
 
 
@@ -173,7 +179,7 @@ def encoded(fields: Mapping[str, Any]) -> bytes:
 
 
 def state_fields(value: object) -> dict[str, Any]:
-    """Return the message of a state: its fields, or ``{"value": …}`` for a number, text or list."""
+    """Return the message of a state: its fields or, for a number, text or list, ``{"value": …}``."""
     if isinstance(value, Snapshot):
         return {name: _plain(getattr(value, name)) for name in value.__match_args__}
     converted = to_jsonable(value)
@@ -186,8 +192,9 @@ def raw_fields(message: Message) -> dict[str, Any]:
 
 
 def _plain(value: object) -> Any:
-    """Like `aerokit._internal.formatting.to_jsonable`, but three times as fast for common types: logs have millions of
-    values.
+    """Convert a value like `aerokit._internal.formatting.to_jsonable`.
+
+    For common types this is three times as fast, which matters because logs have millions of values.
     """
     kind = type(value)
     if kind is int or kind is str or value is None:
@@ -204,7 +211,7 @@ def location_fix(
     heading_deg: float | None = None,
     velocity: Velocity | None = None,
 ) -> dict[str, Any]:
-    """Return a ``foxglove.LocationFix``; the altitude is above mean sea level, 0 if unknown."""
+    """Return a ``foxglove.LocationFix``. The altitude is above mean sea level; 0 if it is unknown."""
     fix: dict[str, Any] = {
         "timestamp": _time(unix_s),
         "frame_id": frame_of(system_id),
@@ -269,8 +276,8 @@ def _vector(x: float, y: float, z: float) -> dict[str, float]:
 def _rotation(attitude: Attitude | None) -> dict[str, float]:
     """Return the rotation of a body frame (forward, left, up) in the map frame (east, north, up) as a quaternion.
 
-    MAVLink uses forward, right, down in north, east, down. Both changes of axes are rotations by 180°, so that the
-    result only exchanges and adds components of MAVLink's quaternion.
+    MAVLink's quaternion relates the axes forward, right, down to the axes north, east, down. Both changes of axes are
+    rotations by 180°, so each component of the result is a sum or difference of two of MAVLink's components.
     """
     w, x, y, z = 1.0, 0.0, 0.0, 0.0
     if attitude is not None and all(map(math.isfinite, (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))):
@@ -280,7 +287,7 @@ def _rotation(attitude: Attitude | None) -> dict[str, float]:
 
 
 def _schema_of(value: object) -> dict[str, Any]:
-    """Return the JSON schema of a converted value. If a field is None, its annotation determines the type."""
+    """Return the JSON schema of a value after its conversion to JSON. A field that is None gets the annotated type."""
     if isinstance(value, Snapshot):
         annotations = _annotations(type(value))
         fields = value.to_dict()
@@ -309,6 +316,6 @@ def _annotations(value_class: type) -> dict[str, str]:
 
 
 def _schema_of_annotation(annotation: str) -> dict[str, Any]:
-    """Return the schema of an annotation like ``"float | None"``."""
+    """Return the JSON schema of a type annotation, such as ``"float | None"``."""
     json_type = _JSON_TYPES.get(annotation.partition(" | ")[0])
     return {} if json_type is None else {"type": json_type}

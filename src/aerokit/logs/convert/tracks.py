@@ -49,7 +49,7 @@ class _Track:
 
 
 class _TrackWriter:
-    """Base of writers that collect positions and missions, and write the file at the end."""
+    """Base class of writers that collect positions and missions, and write the whole file at the end."""
 
     def __init__(self, path: Path, log: LogReader) -> None:
         self._path, self._log = path, log
@@ -66,7 +66,7 @@ class _TrackWriter:
             self._add_item(record)
 
     def discard(self) -> None:
-        pass  # the file is opened in `close`
+        pass  # nothing to discard, because only `close` opens the file
 
     def close(self) -> None:
         if not self.written:
@@ -85,7 +85,7 @@ class _TrackWriter:
             return
         scale = 1e7 if item.NAME == "MISSION_ITEM_INT" else 1.0
         latitude, longitude = item.x / scale, item.y / scale
-        # 0, 0 means the current position; NaN and invalid coordinates are skipped too.
+        # Skips items without valid coordinates: 0, 0 means the current position, and NaN fails both comparisons.
         is_valid = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
         if is_valid and math.isfinite(item.z):
             self._tracks[system_id].waypoints[item.seq] = Waypoint(
@@ -140,8 +140,8 @@ class KmlWriter(_TrackWriter):
         file = kml.Kml(name=self._log.path.name)
         for system_id, track in self._tracks.items():
             folder = file.newfolder(name=f"vehicle {system_id}")
-            # Use altitudes above sea level if all of them are known. Otherwise use altitudes above home, which come
-            # closest to KML's "relativeToGround".
+            # Altitudes above sea level are used if all are known. Otherwise altitudes above home are used as KML's
+            # "relativeToGround", which is the closest to them.
             is_absolute = all(position.altitude_amsl_m is not None for _, position in track.points)
             mode = kml.AltitudeMode.absolute if is_absolute else kml.AltitudeMode.relativetoground
             line = folder.newgxtrack(name="track", altitudemode=mode)

@@ -52,13 +52,13 @@ LOG_READERS: dict[str, Callable[[FlightLog, int | None, Callable[[int], object]]
     ".ulg": read_ulog_flight,
 }
 """Maps the suffix of a log to the function that reads it."""
-# Below this height above home, the vehicle may be on the ground. Slower sinking is noise.
+# A vehicle below this height above home may be on the ground. Sinking more slowly than this is noise.
 _FLYING_HEIGHT_M, _SINKING_M_S = 1.0, 0.3
-_SAME_ALTITUDE_M = 5.0  # a smaller difference means that both altitudes are the same value
+_SAME_ALTITUDE_M = 5.0  # both logged altitudes count as the same value if they differ by less than this
 
 
 def check_log_name(path: Path) -> None:
-    """Raise FileFormatError if the suffix is not that of a flight log."""
+    """Raise FileFormatError if the name of the file does not have the suffix of a flight log."""
     if path.suffix.lower() not in LOG_READERS:
         raise FileFormatError(f"{path} is not a flight log; supported suffixes: {', '.join(LOG_READERS)}")
 
@@ -73,10 +73,10 @@ def read_flight(
     Args:
         log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
         system_id: system id of the vehicle, if a ``.tlog`` contains several vehicles; None: the first vehicle.
-        on_progress: called from time to time with the bytes that were read.
+        on_progress: called from time to time with the number of bytes read so far.
 
     Raises:
-        FileFormatError: the file is not a flight log, or nothing can be read.
+        FileFormatError: the file is not a flight log, or nothing in it can be read.
         OSError: the file cannot be read.
         ModuleNotFoundError: pyulog, of the extra ``report``, is not installed (``.ulg``).
     """
@@ -98,11 +98,11 @@ def read_flight(
 
 
 def _complete(flight: FlightLog) -> None:
-    """Close open spans, and derive home, heights and failsafe evidence."""
+    """Complete the flight after reading: close open time spans, and derive home, heights and failsafe evidence."""
     is_armed_at_end = bool(flight.armed) and math.isinf(flight.armed[-1][1])
     if is_armed_at_end:
         flight.armed[-1] = (flight.armed[-1][0], flight.duration_s)
-    if flight.home is None and len(flight.track):
+    if flight.home is None and len(flight.track):  # use the position at the first arming, or else the first position
         first_armed_row = max(flight.track.index_at(flight.armed[0][0]), 0) if flight.armed else 0
         columns = ("latitude_deg", "longitude_deg", "altitude_amsl_m")
         position = (flight.track[name][first_armed_row] for name in columns)
@@ -115,10 +115,10 @@ def _complete(flight: FlightLog) -> None:
 
 
 def _armed_at_end(flight: FlightLog) -> str:
-    """Describe the end of a log of a vehicle that is still armed, and what is therefore unknown."""
+    """Return a note that the log ends while the vehicle is armed, and on what is unknown for that reason."""
     note = "the log ends while the vehicle is armed"
     height_m = flight.track.at("altitude_relative_m", flight.duration_s, not_older_s=math.inf)
-    if height_m < _FLYING_HEIGHT_M:
+    if height_m < _FLYING_HEIGHT_M:  # False if the height is unknown (NaN)
         return note
     where = "" if math.isnan(height_m) else f", {height_m:.1f} m above home"
     sink_m_s = flight.velocity.at("down_m_s", flight.duration_s, not_older_s=math.inf)
@@ -134,7 +134,7 @@ def _armed_at_end(flight: FlightLog) -> str:
 def _complete_altitudes(flight: FlightLog) -> None:
     """Derive heights above home from altitudes above sea level.
 
-    While ArduPilot does not know home or the altitude above sea level, it logs the same value as both altitudes.
+    While ArduPilot does not know one of the two altitudes, it logs the other one for both.
     """
     home_amsl_m = flight.home.altitude_amsl_m if flight.home is not None else None
     if home_amsl_m is None:
@@ -145,8 +145,10 @@ def _complete_altitudes(flight: FlightLog) -> None:
             amsl_m = amsl[row]
             if math.isnan(relative_m):
                 relative[row] = amsl_m - home_amsl_m
+            # If home is near sea level, both altitudes are nearly the same anyway.
             elif abs(home_amsl_m) > _SAME_ALTITUDE_M and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
-                # The value is above sea level if that puts the vehicle closer to home, otherwise above home.
+                # The value is the altitude above sea level if it is closer to that of home than to 0; otherwise it is
+                # the altitude above home.
                 if abs(amsl_m - home_amsl_m) < abs(amsl_m):
                     relative[row] = amsl_m - home_amsl_m
                 else:

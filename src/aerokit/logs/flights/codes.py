@@ -65,7 +65,8 @@ MODE_REASONS: Mapping[int | None, tuple[str, str | None, bool | None]] = {
     54: ("automatic landing", None, True),
     55: ("fence re-enabled", None, True),
 }
-"""Maps a number to description, kind of failsafe (or None), and True if the autopilot changed the mode itself."""
+"""Maps a reason's number to its description, the kind of failsafe (or None), and whether the autopilot itself changed
+the mode."""
 
 ERRORS: Mapping[int, tuple[str, str]] = {
     1: ("general", "main loop"),
@@ -97,9 +98,9 @@ ERRORS: Mapping[int, tuple[str, str]] = {
     30: ("general", "internal error"),
     31: ("estimator", "dead reckoning"),
 }
-"""Maps a subsystem to the kind of failsafe and a description."""
+"""Maps the number of a subsystem to the kind of failsafe and a description of the error."""
 
-# Subsystem and error code → details.
+# Maps pairs of subsystem and error code to details of the error.
 _ERROR_DETAILS: Mapping[tuple[int, int], str] = {
     (2, 2): "late frames",
     (11, 2): "glitch",
@@ -109,7 +110,8 @@ _ERROR_DETAILS: Mapping[tuple[int, int], str] = {
     (18, 2): "glitch",
 }
 
-# Subsystems whose error code is the number of the refused mode, the number of the new estimator, and fence bits.
+# Subsystems with special error codes: the number of the refused mode, the number of the new estimator, and bits of
+# AC_FENCE_TYPE.
 _MODE_CHANGE, _ESTIMATOR_SWITCH, _FENCE = 10, 24, 9
 # Bits of AC_FENCE_TYPE.
 _FENCE_TYPES = {
@@ -126,7 +128,7 @@ _CONTROL_CHARACTERS = re.compile(
 
 
 def error_text(subsystem: int, code: int, text: str) -> str:
-    """Return the description of an ERR message."""
+    """Return a description of ArduPilot's log message ERR."""
     if subsystem == _MODE_CHANGE:
         return f"mode {code} was refused"
     if subsystem == _ESTIMATOR_SWITCH:

@@ -1,4 +1,4 @@
-"""Detection of failsafes in a flight by texts, modes, errors and flags, and the values before each failsafe."""
+"""Detects failsafes of a flight from texts, modes, errors and flags, and collects the values before each of them."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ if TYPE_CHECKING:
 
     from aerokit.logs.flights.flight import FlightLog, LoggedText, ModeChange, TimeSeries
 
-# Evidence of the same kind within this time belongs to one failsafe.
+# Pieces of evidence of the same kind belong to one failsafe if they are at most this time apart.
 _SAME_KIND_GAP_S = 8.0
-# Evidence of the kind "general" belongs to the failsafe of specific evidence if they are at most this time apart.
+# Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart.
 _GENERAL_GAP_S = 3.0
 _REACTION_TIMEOUT_S = 12.0
 # Values measured at most this time before a failsafe are shown with it.
 _BEFORE_S = 10.0
-# A change this soon after a failsafe is the autopilot's, even if the log does not contain its cause.
+# A mode change within this time after a failsafe is attributed to the autopilot, even if the log has no cause.
 _AUTOPILOT_REACTION_S = 3.0
-# Kinds of crashes and failures for which autopilots disarm.
+# The kinds of failsafes (crashes and failures) at which autopilots disarm.
 CRASH_KINDS: frozenset[str] = frozenset(("crash", "thrust", "motor", "termination"))
 
 
 class Failsafe(Snapshot):
-    """A failsafe, or a problem without a known reaction."""
+    """A failsafe, or a problem to which no reaction is known."""
 
     time_s: float
     kind: str
-    """A key of `KINDS`."""
+    """The kind of failsafe, a key of `KINDS`."""
     acted: bool
-    """True if the autopilot changed the mode, disarmed, or reported an action."""
+    """True if the autopilot reacted: it changed the mode, disarmed, or reported an action."""
     evidence: tuple[FailsafeEvidence, ...]
     reaction: str
     """Description of the autopilot's reaction."""
     context: tuple[str, ...]
-    """Descriptions of values before the failsafe, and of configured limits."""
+    """Descriptions of the values before the failsafe and of the configured limits."""
 
     @property
     def title(self) -> str:
@@ -110,7 +110,7 @@ _ACTION_PATTERN = re.compile(
 )
 
 _PX4_PREFIXES = ("BAT_", "COM_", "FD_", "GF_", "NAV_")
-# Parameters that define when a failsafe triggers, and its action.
+# Maps kinds of failsafes to the parameters that define when the failsafe triggers, and its action.
 _LIMIT_PARAMETERS: dict[str, tuple[str, ...]] = {
     "battery": (
         *("BATT_LOW_VOLT", "BATT_CRT_VOLT", "BATT_LOW_MAH", "BATT_CRT_MAH", "BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"),
@@ -132,7 +132,7 @@ _LIMIT_PARAMETERS: dict[str, tuple[str, ...]] = {
 
 
 def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
-    """Return the failsafe evidence in texts."""
+    """Return the evidence of failsafes that the vehicle's texts contain."""
     evidence = []
     for text in texts:
         if _NO_EVIDENCE_PATTERN.search(text.text) is None:
@@ -144,7 +144,7 @@ def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
 
 
 def failsafes(flight: FlightLog) -> list[Failsafe]:
-    """Return the failsafes and problems while the vehicle was armed, the oldest first."""
+    """Return the failsafes and problems that began while the vehicle was armed, the oldest first."""
     groups: list[list[FailsafeEvidence]] = []
     recent_groups: list[list[FailsafeEvidence]] = []
     for evidence in flight.failsafe_evidence:
@@ -187,10 +187,10 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_o
 
 
 def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence]) -> tuple[str, bool]:
-    """Return a description of the reaction, and True if the autopilot caused it.
+    """Return a description of the reaction to a failsafe, and True if the reaction is the autopilot's.
 
-    The reaction is the first mode change that was not commanded, or disarming. If the log does not contain the cause of
-    a change, an immediate change is attributed to the autopilot. The pilot may have made a later change.
+    The reaction is disarming, or the first mode change that was not commanded. If the log does not contain the cause of
+    the change, an immediate change is attributed to the autopilot; a later change may be the pilot's.
     """
     last_s = group[-1].time_s
     for change in flight.modes:
@@ -216,7 +216,7 @@ def _mode_change_text(change: ModeChange, previous_mode: str, time_s: float) -> 
 
 
 def _location(flight: FlightLog, time_s: float) -> list[str]:
-    """Return height, distance and mode as one text, in a list that is empty if all are unknown."""
+    """Return a list with one text about height, distance and mode; an empty list if all three are unknown."""
     facts = []
     height = flight.track.at("altitude_relative_m", time_s)
     if not math.isnan(height):
@@ -224,7 +224,7 @@ def _location(flight: FlightLog, time_s: float) -> list[str]:
     distance = distance_from_home_m(flight, time_s)
     if distance is not None:
         facts.append(f"{distance:.0f} m from home")
-    mode = flight.mode_at(time_s - 0.5)
+    mode = flight.mode_at(time_s - 0.5)  # before the failsafe changed the mode
     if mode:
         facts.append(f"in {mode}")
     return [", ".join(facts)] if facts else []
@@ -379,7 +379,7 @@ def _missing_parameters(flight: FlightLog, kind: str) -> list[str]:
 
 
 def configured_by(flight: FlightLog, kind: str) -> list[str]:
-    """Return the names of the autopilot's parameters that configure this kind of failsafe; empty if none are known."""
+    """Return the names of the autopilot's parameters for this kind of failsafe; empty if none are known."""
     is_px4 = {"PX4": True, "ArduPilot": False}.get(flight.autopilot)
     return [name for name in _LIMIT_PARAMETERS.get(kind, ()) if is_px4 in (None, name.startswith(_PX4_PREFIXES))]
 

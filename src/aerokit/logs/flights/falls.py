@@ -1,4 +1,4 @@
-"""Detection of falls and hard landings in a flight, from heights, sink rates and the autopilot's texts."""
+"""Detects the falls and hard landings of a flight from heights, sink rates and the autopilot's texts."""
 
 from __future__ import annotations
 
@@ -13,36 +13,37 @@ if TYPE_CHECKING:
 
     from aerokit.logs.flights.flight import FlightLog
 
-# Autopilots land at 0.5 to 2 m/s, and descend at 1.5 m/s by default (ArduPilot WP_SPD_DN, PX4 MPC_Z_VEL_MAX_DN).
+# Slower descents do not count, and a descent ends below _STOPPED_M_S. Autopilots land at 0.5 to 2 m/s, and descend at
+# 1.5 m/s by default (ArduPilot WP_SPD_DN, PX4 MPC_Z_VEL_MAX_DN).
 _MIN_SINK_M_S, _STOPPED_M_S = 3.0, 1.0
 _MIN_HEIGHT_M = 2.0
-# Free fall reaches this speed after two metres.
+# With a higher sink rate, an impact is a fall, not a hard landing. Free fall reaches this speed after two metres.
 _FALL_SINK_M_S = 6.0
-# The ground stops a vehicle within this time. Motors need longer.
+# An impact on the ground stops a vehicle within this time. Motors need longer to stop a fast descent.
 _IMPACT_S = 0.6
 _SAME_HEIGHT_M = 1.5
 _DISARM_TIMEOUT_S = 30.0
-_NEAR_HOME_HEIGHT_M = 3.0  # higher up, an armed vehicle that keeps its height may hover
+_NEAR_HOME_HEIGHT_M = 3.0  # above this height, an armed vehicle that keeps its height may be hovering
 
 
 class Fall(Snapshot):
-    """A descent that ended on the ground at more than 3 m/s; see docs/report.md."""
+    """A fall or a hard landing: a descent that ended on the ground at more than 3 m/s; see docs/report.md."""
 
     time_s: float
     """Time of the impact, or of the last entry if the log ends before it."""
     begins_s: float
     """Start of the descent."""
     height_m: float
-    """Height lost."""
+    """Height that the vehicle lost."""
     sink_m_s: float
-    """Sink rate at the end."""
+    """Sink rate at the end of the descent."""
     is_hard_landing: bool
-    """True below 6 m/s sink rate, unless the vehicle was disarmed in the air or the autopilot reported a crash.
+    """True for a hard landing: the sink rate was below 6 m/s, and there are no ``reasons``.
     """
     has_impact: bool
-    """False if the log ends in the descent."""
+    """False if the log ends during the descent."""
     reasons: tuple[str, ...]
-    """Disarming in the air, and texts that report a crash, a motor failure or a termination."""
+    """Evidence of a fall: disarming in the air, and texts that report a crash, a motor failure or a termination."""
 
     @property
     def title(self) -> str:
@@ -50,7 +51,7 @@ class Fall(Snapshot):
 
 
 def falls(flight: FlightLog) -> list[Fall]:
-    """Return the falls and hard landings of a flight, the oldest first; none without heights and sink rates.
+    """Return the falls and hard landings of a flight, the oldest first. The log must have heights and sink rates.
 
     A descent counts if the vehicle sank at more than 3 m/s, was stopped within 0.6 s, and one of these is true:
 
@@ -58,7 +59,7 @@ def falls(flight: FlightLog) -> list[Fall]:
     - The vehicle stayed armed and less than 3 m above home for 30 s.
     - The autopilot reported a crash.
 
-    A descent near the ground also counts if the log ends in it.
+    A descent near the ground also counts if the log ends before its end.
     """
     if not flight.armed:
         return []
@@ -66,9 +67,9 @@ def falls(flight: FlightLog) -> list[Fall]:
 
 
 def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
-    """Yield start, end and last sink rate of each fast descent, and True if it was stopped."""
+    """Yield the start, end and last sink rate of each fast descent, and whether the descent was stopped."""
     begin_s = previous_s = last_fast_s = -math.inf
-    sink_m_s = 0.0  # highest sink rate just before the end
+    sink_m_s = 0.0  # the highest sink rate shortly before the end of the descent
     for time_s, down_m_s in zip(flight.velocity.times, flight.velocity["down_m_s"], strict=True):
         if math.isnan(down_m_s):
             continue
@@ -76,7 +77,7 @@ def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
             is_recent = time_s - last_fast_s <= _IMPACT_S
             last_fast_s, sink_m_s = time_s, max(down_m_s, sink_m_s if is_recent else 0.0)
         elif down_m_s < _STOPPED_M_S:
-            max_stop_s = max(_IMPACT_S, 1.5 * (time_s - previous_s))  # longer if values are rare
+            max_stop_s = max(_IMPACT_S, 1.5 * (time_s - previous_s))  # longer if the log has few values
             if last_fast_s > begin_s and time_s - last_fast_s <= max_stop_s:
                 yield begin_s, time_s, sink_m_s, True
             begin_s, sink_m_s = time_s, 0.0
@@ -86,13 +87,14 @@ def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
 
 
 def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_impact: bool) -> Fall | None:
+    """Return the fall or hard landing that a descent is; None if the vehicle may have continued to fly."""
     begin_height_m = flight.track.at("altitude_relative_m", begin_s)
     end_height_m = flight.track.at("altitude_relative_m", end_s)
     lost_height_m = begin_height_m - end_height_m
-    if not lost_height_m >= _MIN_HEIGHT_M:  # also true if a height is NaN
+    if not lost_height_m >= _MIN_HEIGHT_M:  # `not >=` is also true if a height is NaN
         return None
     reasons = _reasons(flight, begin_s, end_s)
-    # If the log ends in the descent: the vehicle would be on the ground within two seconds.
+    # If the log ends during the descent, the vehicle must be so low that it would hit the ground within two seconds.
     is_on_ground = _stays_at_height(flight, end_s, end_height_m) if has_impact else end_height_m < 2 * sink_m_s
     if not (is_on_ground or reasons):
         return None
@@ -101,19 +103,19 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
-    """Return True if the vehicle stays at this height until it is disarmed, or stays armed near home's height."""
+    """Return True if the vehicle keeps this height until it is disarmed, or stays armed near the height of home."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
     is_armed = until_s < disarmed_s or disarmed_s >= flight.duration_s
     if is_armed and height_m > _NEAR_HOME_HEIGHT_M:
-        return False  # it may hover
+        return False  # the vehicle may be hovering
     heights = flight.track.between("altitude_relative_m", time_s + _IMPACT_S, until_s)
     return all(abs(height - height_m) <= _SAME_HEIGHT_M for height in heights)
 
 
 def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
     """Return the log's evidence of a fall: disarming in the air, and texts."""
-    # Only disarming that may have caused the descent counts; at its end, the impact disarms.
+    # Disarming counts only if it may have caused the descent. At the end of the descent, the impact disarms.
     reasons = [
         "disarmed in the air"
         for armed_s, disarmed_s in flight.armed
@@ -121,4 +123,4 @@ def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
     ]
     texts = [text for text in flight.texts if begin_s - 3 <= text.time_s <= end_s + 5]
     crash_texts = dict.fromkeys(item.text for item in evidence_in_texts(texts) if item.kind in CRASH_KINDS)
-    return reasons + list(crash_texts)[:3]
+    return reasons + list(crash_texts)[:3]  # three texts are enough

@@ -20,7 +20,7 @@ _HOME_AFTER_ARMING_S = 2.0
 
 
 class TimeSeries:
-    """Table of numbers by time, the oldest row first. NaN means unknown.
+    """A table of numbers with a time for each row, the oldest row first. NaN means unknown.
 
     ``series["roll_deg"]`` returns a column. The names contain the units. ``len(series)`` is the number of rows.
     """
@@ -46,7 +46,7 @@ class TimeSeries:
         return f"<TimeSeries {', '.join(self.names)}: {len(self)} rows>"
 
     def add(self, time_s: float, *values: float) -> None:
-        """Add a row with one value for each column. A row older than the last row gets the time of the last row."""
+        """Add a row with one value for each column. If its time is before that of the last row, it gets that time."""
         times = self.times
         if times and time_s < times[-1]:
             time_s = times[-1]
@@ -55,15 +55,15 @@ class TimeSeries:
             column.append(value)
 
     def extend(self, times: Sequence[float], **columns: Sequence[float]) -> None:
-        """Add many rows; columns that are not given are NaN."""
+        """Add many rows. Columns without values become NaN."""
         self.times.extend(times)
         missing = array("d", [_NAN]) * len(times)
         for name, column in self._values.items():
             column.extend(columns.get(name, missing))
 
     def has(self, *names: str) -> bool:
-        """Return True if any of these columns (without names: any column) has a known value."""
-        # NaN is unequal to itself; calling math.isnan for each of millions of values would be slow.
+        """Return True if one of these columns has a known value. Without names, all columns are searched."""
+        # `value == value` is False for NaN. Calling math.isnan for each of millions of values would be slow.
         return any(value == value for name in names or self.names for value in self._values[name])
 
     def index_at(self, time_s: float) -> int:
@@ -71,7 +71,7 @@ class TimeSeries:
         return bisect_right(self.times, time_s) - 1
 
     def at(self, name: str, time_s: float, *, not_older_s: float = 10.0) -> float:
-        """Return the last known value at this time; NaN if the value is older than ``not_older_s``."""
+        """Return the last known value at or before a time; NaN if it is more than ``not_older_s`` older."""
         column, index = self._values[name], self.index_at(time_s)
         while index >= 0 and self.times[index] >= time_s - not_older_s:
             if not math.isnan(column[index]):
@@ -80,36 +80,36 @@ class TimeSeries:
         return _NAN
 
     def known(self, name: str) -> array[float]:
-        """Return the known values of a column."""
-        return array("d", (value for value in self._values[name] if value == value))  # NaN is unequal to itself
+        """Return the values of a column without NaN."""
+        return array("d", (value for value in self._values[name] if value == value))  # False for NaN
 
     def between(self, name: str, start_s: float, end_s: float) -> array[float]:
-        """Return the known values of a column in a time span, both ends included."""
+        """Return the values of a column in a time span, both ends included, without NaN."""
         part = self._values[name][bisect_left(self.times, start_s) : self.index_at(end_s) + 1]
-        return array("d", (value for value in part if value == value))  # NaN is unequal to itself
+        return array("d", (value for value in part if value == value))  # False for NaN
 
 
 class TangentPlane:
-    """A plane that touches the ellipsoid at a position; accurate to a metre within some kilometres."""
+    """A plane that touches the earth's ellipsoid at a position. Accurate to a metre within some kilometres."""
 
     def __init__(self, latitude_deg: float, longitude_deg: float) -> None:
         self.latitude_deg: float = latitude_deg
         self.longitude_deg: float = longitude_deg
-        latitude = max(-89.9, min(89.9, latitude_deg))  # so that the points north and south of it are valid
+        latitude = max(-89.9, min(89.9, latitude_deg))  # so that the points 0.005° north and south are valid
         north_m = geo.distance_m(latitude - 0.005, longitude_deg, latitude + 0.005, longitude_deg)
         east_m = geo.distance_m(latitude, longitude_deg - 0.005, latitude, longitude_deg + 0.005)
-        self.north_m_per_deg: float = north_m * 100  # the distances are those of 0.01 degrees
+        self.north_m_per_deg: float = north_m * 100  # the distances above are those of 0.01 degrees
         self.east_m_per_deg: float = east_m * 100
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-        """Return metres north and east of the origin; NaN for NaN."""
+        """Convert a position to metres north and east of the origin. NaN stays NaN."""
         east_deg = longitude_deg - self.longitude_deg
         if not -180.0 <= east_deg < 180.0 and math.isfinite(east_deg):
             east_deg = geo.wrap_longitude(east_deg)
         return (latitude_deg - self.latitude_deg) * self.north_m_per_deg, east_deg * self.east_m_per_deg
 
     def degrees(self, north_m: float, east_m: float) -> tuple[float, float]:
-        """Return latitude and longitude at an offset from the origin."""
+        """Convert metres north and east of the origin to latitude and longitude."""
         return (
             self.latitude_deg + north_m / self.north_m_per_deg,
             self.longitude_deg + east_m / self.east_m_per_deg,
@@ -117,23 +117,23 @@ class TangentPlane:
 
 
 def battery_name(number: int) -> str:
-    """Return the displayed name of a battery, counted from 1 as in ArduPilot's texts and parameters."""
+    """Return the name of a battery to display. Names count from 1, as ArduPilot's texts and parameters do."""
     return f"battery {number + 1}"
 
 
 class ModeChange(Snapshot):
-    """A change to a mode."""
+    """The vehicle's mode changed."""
 
     time_s: float
     name: str
     reason: str = ""
-    """The reason, if the log contains it: ``"battery failsafe"``."""
+    """Reason for the change, such as ``"battery failsafe"``; empty if the log does not contain the reason."""
     by_autopilot: bool | None = None
-    """True if the autopilot changed the mode itself; None if the log does not contain this."""
+    """True if the autopilot itself changed the mode; None if the log does not show who changed it."""
 
 
 class LoggedText(Snapshot):
-    """A status text."""
+    """A status text of the vehicle."""
 
     time_s: float
     severity: int | None
@@ -142,7 +142,7 @@ class LoggedText(Snapshot):
 
 
 class ParameterChange(Snapshot):
-    """A change of a parameter during the log."""
+    """A parameter changed during the log."""
 
     time_s: float
     name: str
@@ -154,11 +154,11 @@ class Silence(Snapshot):
     """A time in which nothing was received from the vehicle."""
 
     begins_s: float
-    """Time of the last message before it."""
+    """Time of the last message before the silence."""
     ends_s: float
-    """Time of the first message after it, or the end of the log."""
+    """Time of the first message after the silence, or the end of the log."""
     is_recorded: bool
-    """True if the log contains messages of others in it; otherwise the recording itself may have paused."""
+    """True if the log contains other systems' messages during the silence. Otherwise the recording may have paused."""
 
 
 class Waypoint(Snapshot):
@@ -166,7 +166,7 @@ class Waypoint(Snapshot):
 
     number: int
     command: int
-    """MAV_CMD."""
+    """Number of the command (MAV_CMD)."""
     latitude_deg: float
     """NaN for items without a position."""
     longitude_deg: float
@@ -182,7 +182,7 @@ class FailsafeEvidence(Snapshot):
     kind: str
     """A key of `aerokit.logs.flights.failsafes.KINDS`: ``"battery"``, ``"fence"`` …"""
     text: str
-    """Description, from the log."""
+    """Description of the evidence, from the log."""
     is_action: bool = False
     """True if the entry shows that the autopilot acted."""
 
@@ -195,19 +195,19 @@ class FlightLog:
     """
 
     path: Path
-    """Path of the log."""
+    """Path of the log file."""
     begins_at: float = 0.0
-    """UTC of the first entry, in seconds since 1970. A value below one year means that the clock was not set."""
+    """UTC of the first entry, in seconds since 1970. If the value is less than a year, the clock was not set."""
     ends_at: float = 0.0
-    """UTC of the last entry."""
+    """UTC of the last entry, in seconds since 1970."""
     speed: float = 1.0
-    """Simulated seconds for each recorded second; only in a ``.tlog`` of a simulation at another speed than real time.
-    All times are simulated seconds then.
+    """Simulated seconds for each recorded second: not 1 only in a ``.tlog`` of a simulation that is not in real time.
+    All times of the flight are then in simulated seconds.
     """
     vehicle: str = ""
     """Firmware and its version, if known: ``"ArduCopter V4.5.7"``."""
     autopilot: str = ""
-    """``"ArduPilot"``, ``"PX4"``."""
+    """Name of the autopilot: ``"ArduPilot"`` or ``"PX4"``."""
     system_id: int = 1
     home: Position | None = None
     """Home of the first flight in the log or, if home was not logged, the position at the first arming."""
@@ -228,35 +228,35 @@ class FlightLog:
     gps: dict[int, TimeSeries] = field(default_factory=dict)
     """Time series by receiver number: ``fix_type`` (GPS_FIX_TYPE), ``satellites``, ``hdop``, ``accuracy_m``."""
     vibration: TimeSeries = field(default_factory=lambda: TimeSeries("x_m_s2", "y_m_s2", "z_m_s2", "clips"))
-    """Vibration levels, and the count of accelerometer clipping. PX4 logs one level, stored as ``x_m_s2``."""
+    """Vibration levels, and how often an accelerometer reached its limit. PX4 logs one level, which is ``x_m_s2``."""
     estimator: TimeSeries = field(
         default_factory=lambda: TimeSeries(
             "velocity", "horizontal_position", "vertical_position", "compass", "height_or_airspeed"
         )
     )
-    """Innovation test ratios: above 1, the estimator rejects the measurement."""
+    """Innovation test ratios. If a ratio is above 1, the estimator rejects the measurement."""
     link: TimeSeries = field(default_factory=lambda: TimeSeries("lost_percent", "received_hz"))
     """Percentage of lost messages, and number of received messages per second. One row for each second."""
     radio: TimeSeries = field(default_factory=lambda: TimeSeries("rssi", "remote_rssi", "noise", "remote_noise"))
     """Signal values of a telemetry radio, in the units of the radio."""
     outputs: TimeSeries = field(default_factory=lambda: TimeSeries(*(f"output_{number}_us" for number in range(1, 9))))
-    """Pulses of the first eight outputs (SERVO_OUTPUT_RAW); only in a ``.tlog``."""
+    """Pulse lengths of the first eight outputs (SERVO_OUTPUT_RAW); only in a ``.tlog``."""
     gcs_heartbeats: array[float] = field(default_factory=lambda: array("d"))
     """Times of ground station heartbeats; only in a ``.tlog`` that includes sent messages."""
     modes: list[ModeChange] = field(default_factory=list)
     armed: list[tuple[float, float]] = field(default_factory=list)
     """Start and end of each span in which the vehicle was armed."""
     silences: list[Silence] = field(default_factory=list)
-    """Times without a message of the vehicle; only in a ``.tlog``."""
+    """Times in which no message of the vehicle arrived; only from a ``.tlog``."""
     texts: list[LoggedText] = field(default_factory=list)
     failsafe_evidence: list[FailsafeEvidence] = field(default_factory=list)
     """Evidence that `aerokit.logs.flights.failsafes.failsafes` evaluates."""
     parameters: dict[str, float] = field(default_factory=dict)
-    """First logged value of each parameter."""
+    """The first logged value of each parameter."""
     parameter_changes: list[ParameterChange] = field(default_factory=list)
     mission: list[Waypoint] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    """Problems with the log, and known reasons for missing data."""
+    """Problems of the log, and known reasons for missing data."""
     _latest: dict[str, float] = field(default_factory=dict, repr=False)
 
     @property
@@ -265,13 +265,13 @@ class FlightLog:
         return max(self.ends_at - self.begins_at, 0.0) * self.speed
 
     def battery(self, number: int) -> TimeSeries:
-        """Return the time series of a battery; created on first use."""
+        """Return the time series of a battery. The first call creates it."""
         if number not in self.batteries:
             self.batteries[number] = TimeSeries("voltage_v", "current_a", "used_mah", "remaining_percent")
         return self.batteries[number]
 
     def receiver(self, number: int) -> TimeSeries:
-        """Return the time series of a GNSS receiver; created on first use."""
+        """Return the time series of a GNSS receiver. The first call creates it."""
         if number not in self.gps:
             self.gps[number] = TimeSeries("fix_type", "satellites", "hdop", "accuracy_m")
         return self.gps[number]
@@ -282,7 +282,7 @@ class FlightLog:
         return self.modes[index - 1].name if index else ""
 
     def mode_spans(self) -> list[tuple[ModeChange, float]]:
-        """Return each mode change with its end."""
+        """Return each mode change, with the time at which the mode ends."""
         ends = [change.time_s for change in self.modes[1:]] + [self.duration_s]
         return list(zip(self.modes, ends))  # noqa: B905 - without modes, there is one end too many
 
@@ -295,7 +295,7 @@ class FlightLog:
         return value
 
     def add_mode(self, time_s: float, name: str, reason: str = "", by_autopilot: bool | None = None) -> bool:
-        """Record a mode. Return False if the flight is in this mode already."""
+        """Record the mode at a time. Return False if this is already the flight's mode."""
         if self.modes and self.modes[-1].name == name:
             return False
         self.modes.append(ModeChange(time_s, name, reason, by_autopilot))
@@ -310,16 +310,16 @@ class FlightLog:
             self.armed[-1] = (self.armed[-1][0], time_s)
 
     def set_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
-        """Record home until the first flight. ArduPilot moves home with the vehicle while it is disarmed."""
+        """Record home until shortly after the first arming. ArduPilot moves home with a disarmed vehicle."""
         is_valid = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and (latitude_deg or longitude_deg)
-        if not is_valid:  # also for NaN
+        if not is_valid:  # NaN is not valid, because it fails the comparisons
             return
         home = Position(latitude_deg, longitude_deg, amsl_m if math.isfinite(amsl_m) else None)
         if self.home is None or not self.armed or time_s <= self.armed[0][0] + _HOME_AFTER_ARMING_S:
             self.home = home
 
     def set_parameter(self, time_s: float, name: str, value: float) -> None:
-        """Record the first value of a parameter, or a change."""
+        """Record a parameter's value: its first value, or a change."""
         before = self._latest.get(name)
         self._latest[name] = value
         if name not in self.parameters:

@@ -25,17 +25,17 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _MAGIC = b"\xa3\x95"
-_MAX_UNREADABLE_TAIL = 4096  # after power-off, rows in the last bytes may be incomplete
+_MAX_UNREADABLE_TAIL = 4096  # up to this many bytes at the end are ignored: power-off may cut off rows
 _NO_UTC = "no GNSS time in the log: times count from power-on, which is shown as 1970-01-01"
 _A_YEAR_S = 365 * 86_400.0
 _MAX_UNIX_S = 4_102_444_800.0  # the year 2100; `aerokit.mavlink.tlog` has the same limit
 
 SIMULATED_LOG = b"aerokit simulator: sample log"
-"""First bytes of the logs of `aerokit.sim`."""
+"""The first bytes of the logs that `aerokit.sim` offers for download. They contain no flight."""
 
 
 def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) -> Any:
-    """Return a ``DFReader_binary``; close it with :func:`close_bin`.
+    """Open a ``.bin`` as pymavlink's ``DFReader_binary``; close it with :func:`close_bin`.
 
     Raises:
         FileFormatError: the file is not an ArduPilot log, or its formats are damaged.
@@ -50,9 +50,9 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
         if not head.startswith(_MAGIC):
             raise FileFormatError(f"{path} is not an ArduPilot log: it does not begin with A3 95")
     reader_class = import_module("pymavlink.DFReader").DFReader_binary
-    reader = reader_class.__new__(reader_class)  # __init__ is called below, so that the file can be closed if it raises
+    reader = reader_class.__new__(reader_class)  # __init__ follows separately: if it raises, `reader` has open files
     try:
-        with redirect_stdout(sys.stderr):  # pymavlink reports damage on stdout, where aerokit may print JSON
+        with redirect_stdout(sys.stderr):  # pymavlink prints about damage, but stdout may be for JSON
             reader.__init__(str(path), progress_callback=on_percent)
     except Exception as error:  # pymavlink raises arbitrary errors
         close_bin(reader)
@@ -63,7 +63,7 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
 def close_bin(reader: Any) -> None:
     """Close the files of a ``DFReader_binary``, even if its constructor has failed."""
     for name in ("data_map", "filehandle"):
-        with suppress(AttributeError, BufferError):  # the file was never opened, or is still referenced by a traceback
+        with suppress(AttributeError, BufferError):  # it was never opened, or a traceback still refers to it
             getattr(reader, name).close()
 
 
@@ -71,10 +71,10 @@ States = tuple[tuple[str, Any], ...]
 
 
 class _RowReader(LogReader):
-    """Base of readers whose records have named fields."""
+    """Base class of readers whose records have named fields."""
 
     def columns(self, entry: LogRecord) -> list[TableColumn]:
-        """Return the fields of the first record of a table, with units if the log has them."""
+        """Return the columns of a table from its first record, with units if the log has them."""
         return [
             TableColumn(unit_suffix(name, self._unit(entry.table, name)), name, _column_kind(value))
             for name, value in entry.fields.items()
@@ -86,7 +86,7 @@ class _RowReader(LogReader):
     _skipped = 0
 
     def _is_plausible_time(self, unix_s: float) -> bool:
-        """Return True if this time is possible. Otherwise, count the row as damaged."""
+        """Return True if a row's time is possible. If it is not, count the row as damaged."""
         is_plausible = 0 <= unix_s < _MAX_UNIX_S
         self._skipped += not is_plausible
         return is_plausible
@@ -103,11 +103,11 @@ class _RowReader(LogReader):
 def _column_kind(value: object) -> str:
     if isinstance(value, float):
         return "float"
-    return "int" if isinstance(value, int) else "str"  # "str" also for bytes and arrays
+    return "int" if isinstance(value, int) else "str"  # bytes and arrays are converted to "str", too
 
 
 def _position(latitude: float, longitude: float, amsl_m: float, relative_m: float | None) -> Position | None:
-    """Create a position. Return None if the estimator has diverged or has not started yet."""
+    """Create a position. Return None for impossible values, which a diverged or not yet started estimator reports."""
     try:
         check_place(latitude, longitude)
         position = Position(latitude, longitude, float(amsl_m), relative_m)
@@ -121,12 +121,12 @@ def _optional_state(name: str, value: object) -> States:
 
 
 class BinReader(_RowReader):
-    """Reads a ``.bin`` of ArduPilot with pymavlink. The log has no system id; 1 is used."""
+    """Reads a ``.bin`` of ArduPilot with pymavlink. The log does not contain the system id, so 1 is used."""
 
     _reader: Any = None
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield all records except formats, with multipliers applied."""
+        """Yield all records except the formats. Values are multiplied by the factors of their formats."""
         reader = self._reader = opened_bin(self.path)
         try:
             yield from self._rows(reader, on_bytes)
@@ -143,6 +143,7 @@ class BinReader(_RowReader):
             fields.pop("mavpackettype", None)
             if table not in ("FMT", "FMTU") and self._is_plausible_time(message._timestamp):
                 self._note_time(message._timestamp)
+                # A .bin contains no system and component id, so both are 1.
                 yield LogRecord(message._timestamp, 1, 1, table, fields, _ardupilot_states(table, fields, reader))
         if not count:
             raise FileFormatError(f"{self.path} is not an ArduPilot log: it contains no message")
@@ -153,7 +154,7 @@ class BinReader(_RowReader):
 
     def _next(self, reader: Any) -> Any:
         try:
-            with redirect_stdout(sys.stderr):  # pymavlink prints there; stdout is for JSON
+            with redirect_stdout(sys.stderr):  # pymavlink prints to stdout, which may be for JSON
                 return reader.recv_msg()
         except Exception as error:  # pymavlink raises arbitrary errors for a damaged row
             self.notes.append(f"damaged at byte {reader.offset}; the rest was skipped: {error}")
@@ -170,7 +171,7 @@ def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> Sta
     decode = _ARDUPILOT.get(table)
     try:
         return () if decode is None else decode(fields, reader)
-    except KeyError:  # an old log without that field
+    except KeyError:  # the log is old and does not have the field
         return ()
 
 
@@ -183,13 +184,13 @@ def _ardupilot_attitude(fields: Mapping[str, Any], _: Any) -> States:
 
 
 def _finite_or_none(value: float) -> float | None:
-    """Convert NaN, the value of batteries without a sensor, to None."""
+    """Convert NaN, which batteries without a sensor have, to None."""
     return value if math.isfinite(value) else None
 
 
 def _ardupilot_battery(fields: Mapping[str, Any]) -> States:
     number = fields.get("Instance", fields.get("Inst", 0))
-    if number != 0:  # the state lists all batteries, but a row has a single battery
+    if number != 0:  # the state lists all batteries, but a row has only one, so only the first is used
         return ()
     return (("batteries", (Battery(number, _finite_or_none(fields["Volt"]), _finite_or_none(fields["Curr"])),)),)
 
@@ -205,7 +206,7 @@ _ARDUPILOT: dict[str, Callable[[Mapping[str, Any], Any], States]] = {
 
 
 class _BinText(Snapshot):
-    """A `StatusText` without severity, which a ``.bin`` does not contain."""
+    """A `StatusText` without a severity, because a ``.bin`` does not contain severities."""
 
     severity: int | None = None
     text: str = ""
@@ -221,7 +222,7 @@ class _Mode:
 
 
 class UlogReader(_RowReader):
-    """Reads a ``.ulg`` of PX4 with pyulog, into memory."""
+    """Reads a ``.ulg`` of PX4 with pyulog, which loads the whole log into memory."""
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         """Yield all rows of all topics, ordered by time."""
@@ -229,7 +230,7 @@ class UlogReader(_RowReader):
             with (
                 self.path.open("rb") as file,
                 redirect_stdout(sys.stderr),
-            ):  # pymavlink prints there; stdout is for JSON
+            ):  # pyulog prints to stdout, which may be for JSON
                 log = import_module("pyulog").ULog(file)
         except Exception as error:  # pyulog raises arbitrary errors for other files
             raise FileFormatError(f"{self.path} is not a PX4 log: {error}") from error
@@ -255,7 +256,7 @@ class UlogReader(_RowReader):
 
 
 def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
-    """Yield time in microseconds, table and fields of each row of a topic."""
+    """Yield the time in microseconds, the table and the fields of each row of a topic."""
     table = f"{data.name}_{data.multi_id}" if data.multi_id else data.name
     names = list(data.data)
     for values in zip(*(data.data[name].tolist() for name in names), strict=True):
@@ -265,7 +266,7 @@ def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
 
 def _texts(log: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
     for text in log.logged_messages:
-        # The level is a character as in the Linux kernel: "6" is info. MAV_SEVERITY has the same numbers.
+        # `log_level` is the character of a level of the Linux kernel ("6" is info), whose numbers are MAV_SEVERITY's.
         severity = max(0, min(7, int(text.log_level) - ord("0")))
         yield text.timestamp, "logged_messages", {"severity": severity, "message": text.message}
 

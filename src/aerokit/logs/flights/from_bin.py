@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.flight import FlightLog
 
 NAN = math.nan
-_CHUNK_ROWS = 1 << 9  # rows unpacked at once; more rows would take the garbage collector longer to traverse
-_HEADER_SIZE = 3  # bytes of a row before its fields: A3 95 and the number of the table
-# Unknown charge: AP_BattMonitor_Logging.cpp writes -1 as a byte.
+_CHUNK_ROWS = 1 << 9  # rows that are unpacked at once; with more rows, garbage collection would take longer
+_HEADER_SIZE = 3  # bytes before the fields of a row: A3 95 and the number of the table
+# An unknown charge, because AP_BattMonitor_Logging.cpp writes -1 as a byte.
 _NO_PERCENT = 255
 _FIRMWARES = {
     "ArduCopter": MavType.QUADROTOR,
@@ -33,15 +33,15 @@ _FIRMWARES = {
     "AntennaTracker": MavType.ANTENNA_TRACKER,
     "Blimp": MavType.AIRSHIP,
 }
-_ARMED, _DISARMED = 10, 11  # events in old logs without ARM
+_ARMED, _DISARMED = 10, 11  # events (EV) that old logs have instead of ARM
 _HOME = 1
 # A position closer to 0° N 0° E means that the estimator has no position yet.
 _NULL_ISLAND_DEG = 0.01
-_INDEXING_SHARE = 0.3  # share of the total time that indexing takes, for the progress
+_INDEXING_SHARE = 0.3  # part of the progress that indexing the rows counts for
 
 
 def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Fill a flight from its file.
+    """Read the file of a flight, and fill the flight with its content.
 
     Raises:
         FileFormatError: the file is not an ArduPilot log, or was written before 2015.
@@ -65,20 +65,20 @@ class _Tables:
 
     @property
     def unix_at_0(self) -> float:
-        """UTC at power-on; 0 without GNSS time."""
+        """UTC at power-on, in seconds since 1970; 0 without GNSS time."""
         return float(getattr(self._reader.clock, "timebase", 0.0) or 0.0)
 
     def has(self, table: str, *columns: str) -> bool:
-        """Return True if there is a table with these columns that has rows."""
+        """Return True if the log has rows of this table, and the table has these columns."""
         number = self._reader.name_to_id.get(table)
         if number is None or not len(self._reader.offsets[number]):
             return False
         return {"TimeUS", *columns} <= set(self._reader.formats[number].columns)
 
     def rows(self, table: str, *columns: str) -> Iterator[tuple[Any, ...]]:
-        """Yield seconds since the start of the log, and the values of the columns; nothing if a column is missing.
+        """Yield the values of these columns for each row, after the time in seconds since the start of the log.
 
-        Texts are ``str``, numbers have the unit of the table.
+        Yields nothing if a column is missing. Texts are ``str``; numbers have the unit of the table.
         """
         for chunk in self._chunks(table, columns):
             yield from zip(*chunk, strict=True)
@@ -92,14 +92,14 @@ class _Tables:
         return times_and_columns
 
     def _chunks(self, table: str, columns: Sequence[str]) -> Iterator[list[list[Any]]]:
-        """Yield the times and the columns of some hundred rows at once; nothing if a column is missing."""
+        """Yield the times and the columns of some hundred rows at a time. Yields nothing if a column is missing."""
         if not self.has(table, *columns):
             return
         reader = self._reader
         row_format = reader.formats[reader.name_to_id[table]]
         indices = [row_format.columns.index(name) for name in ("TimeUS", *columns)]
         unpack = struct.Struct(_struct_pattern(row_format, indices)).unpack_from
-        # A row is unpacked in the order of the file; these are the positions of the columns in that order.
+        # Rows are unpacked in the order of the file. `positions` are the places of the requested columns in this order.
         positions = [sorted(indices).index(index) for index in indices]
         scales = [row_format.msg_mults[index] for index in indices]
         data, offsets = reader.data_map, reader.offsets[row_format.type]
@@ -126,6 +126,7 @@ class _Tables:
                 continue
             row_format = reader.formats[number]
             index = row_format.columns.index("TimeUS")
+            # "Q" is a 64-bit integer. A row at the end of the file may be incomplete.
             if row_format.format[index] == "Q" and offsets[0] + row_format.len <= len(reader.data_map):
                 pattern = _struct_pattern(row_format, [index])
                 (time_us,) = struct.unpack_from(pattern, reader.data_map, offsets[0] + _HEADER_SIZE)
@@ -134,13 +135,13 @@ class _Tables:
             raise FileFormatError(
                 f"{reader.filehandle.name} has no row with a time (TimeUS): it is empty, or from before 2015"
             )
-        _, time_us = min(first_rows)  # not the lowest time, which could be from a damaged row
+        _, time_us = min(first_rows)  # the first row; the lowest time could be that of a damaged row
         return int(time_us)
 
 
 def _struct_pattern(row_format: Any, indices: Sequence[int]) -> str:
-    """Return the struct layout of rows, with unneeded columns as padding."""
-    codes, begin = [], 1  # after "<"
+    """Return the struct layout of rows in which all columns except ``indices`` are padding."""
+    codes, begin = [], 1  # the layout begins with "<"
     layout = row_format.msg_struct
     while begin < len(layout):
         end = begin
@@ -153,12 +154,12 @@ def _struct_pattern(row_format: Any, indices: Sequence[int]) -> str:
 
 
 def _scaled(values: Sequence[Any], scale: float | None) -> list[Any]:
-    """Decode texts, and convert numbers to the unit of the table."""
+    """Decode the texts of a column, or convert its numbers to the unit of the table."""
     if values and isinstance(values[0], bytes):
         return [value.split(b"\0", 1)[0].decode("utf-8", "replace") for value in values]
     if scale is None:
         return list(values)
-    if 0 < scale < 1:  # divide, because 0.01 is not an exact binary number and 100 is
+    if 0 < scale < 1:  # divides, because 100 is an exact binary number, but 0.01 is not
         divisor = round(1 / scale)
         return [value / divisor for value in values]
     return [value * scale for value in values]
@@ -198,7 +199,7 @@ class _Reader:
         rows = self._tables.rows("MSG", "Message")
         flight.texts = [LoggedText(time, None, clean_text(text)) for time, text in rows]
         banners = (text.text for text in flight.texts if text.text.split(" ")[0] in _FIRMWARES)
-        banner = next(banners, "")  # "ArduCopter V4.5.7 (2a3dc4b7)"
+        banner = next(banners, "")  # such as "ArduCopter V4.5.7 (2a3dc4b7)"
         flight.vehicle = " ".join(banner.split(" ")[:2]) or "ArduPilot"
 
     def _modes(self) -> None:
@@ -233,7 +234,7 @@ class _Reader:
         for row in self._tables.rows("CMD", "CNum", "CId", "Lat", "Lng", "Alt", "Frame"):
             _, number, command, latitude, longitude, altitude, frame = row
             if not latitude and not longitude:
-                latitude = longitude = NAN
+                latitude = longitude = NAN  # the item has no position
             items[number] = Waypoint(number, command, latitude, longitude, altitude, frame)
         self._flight.mission = [items[number] for number in sorted(items)]
 
@@ -250,6 +251,7 @@ class _Reader:
                 track.add(time, latitude, longitude, amsl, relative)
         if len(track):
             return
+        # Without a position of the estimator, use that of the GPS receiver, if it has a 3D fix.
         for time, status, latitude, longitude, amsl in self._tables.rows("GPS", "Status", "Lat", "Lng", "Alt"):
             if status >= 3:
                 track.add(time, latitude, longitude, amsl, NAN)
@@ -258,7 +260,7 @@ class _Reader:
         table = next((table for table in ("XKF1", "NKF1") if self._tables.has(table, "VN", "VE", "VD")), "XKF1")
         core_columns = ("C",) if self._tables.has(table, "C") else ()
         for time_s, north, east, down, *core in self._tables.rows(table, "VN", "VE", "VD", *core_columns):
-            if not core or core[0] == 0:  # of several estimators, the first
+            if not core or core[0] == 0:  # the first of several estimators
                 self._flight.velocity.add(time_s, north, east, down)
 
     def _attitude(self) -> None:
@@ -279,7 +281,7 @@ class _Reader:
         self._add_heights(self._tables.rows("CTUN", "DAlt"))
 
     def _add_heights(self, heights: Iterator[tuple[Any, ...]]) -> None:
-        """Add height set-points to the position set-points, which have the same rate."""
+        """Add height set-points to the position set-points, which are logged at the same rate."""
         target = self._flight.position_target
         has_positions = len(target) > 0
         relative = target["altitude_relative_m"]
@@ -290,7 +292,7 @@ class _Reader:
                 target.add(time, NAN, NAN, NAN, height)
 
     def _origin(self) -> tuple[float, float] | None:
-        """Return latitude and longitude of the estimator's origin; None if unknown."""
+        """Return the latitude and longitude of the estimator's origin; None if the log does not contain it."""
         for _, kind, latitude, longitude in self._tables.rows("ORGN", "Type", "Lat", "Lng"):
             if kind != _HOME and (latitude or longitude):
                 return latitude, longitude
@@ -309,7 +311,7 @@ class _Reader:
             self._flight.battery(number).add(time_s, voltage, current, used, percent[0] if is_known else NAN)
 
     def _gps(self) -> None:
-        # The tables GPA and GPS have rows with the same times and receivers.
+        # GPA has the accuracy for each row of GPS. Rows belong together if time and receiver are the same.
         accuracy: defaultdict[tuple[float, int], float] = defaultdict(lambda: NAN)
         for time, number, accuracy_m in self._tables.rows("GPA", "I", "HAcc"):
             accuracy[time, number] = accuracy_m
@@ -328,7 +330,7 @@ class _Reader:
         table = "XKF4" if self._tables.has("XKF4", "SV") else "NKF4"
         for time_s, *values in self._tables.rows(table, *columns, *(("C", "PI") if has_cores else ())):
             ratios, core_and_primary = values[:5], values[5:]
-            # Of several estimators, the primary one (PI); a negative number counts as 0.
+            # With several estimators (cores), only the row of the primary one (PI) counts. A negative PI counts as 0.
             if not has_cores or core_and_primary[0] == max(core_and_primary[1], 0):
                 self._flight.estimator.add(time_s, *ratios)
 

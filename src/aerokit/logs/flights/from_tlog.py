@@ -1,4 +1,4 @@
-"""Reads a `FlightLog` from a ``.tlog``. Only messages that a flight needs are checked and decoded."""
+"""Reads a `FlightLog` from a ``.tlog``. Only the messages that a flight needs are checked and decoded."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ _U16, _E7, _METRES_PER_DEGREE = 0xFFFF, 1e7, 111_319.5
 # A position closer to 0° N 0° E means that the estimator has no position yet.
 _NULL_ISLAND_E7 = 100_000
 _HEARTBEAT_ID = b"\0\0\0"
-# A mode change within this time after a command is attributed to the command.
+# A mode change counts as commanded if it happens within this time after a command that changes the mode.
 _COMMAND_MAX_AGE_S = 5.0
-# Bits of a type mask that mark position, velocity and attitude as ignored.
+# Bits of a set-point's type mask. If they are set, the position, velocity or attitude is ignored.
 _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
 _MODE_COMMANDS = frozenset(
     (
@@ -51,7 +51,7 @@ _ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
 
 def read_tlog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Fill a flight from its file, for this system id, or by default for the first autopilot.
+    """Fill a flight from its file, with the data of this system id or, if that is None, of the first autopilot.
 
     Raises:
         FileFormatError: the log has no heartbeat of an autopilot with this system id.
@@ -117,12 +117,12 @@ class _Reader:
         self._handlers_of_vehicle = {_message_id_bytes(kind): handler for kind, handler in handlers.items()}
 
     def read(self, on_bytes: Callable[[int], object]) -> None:
-        # Hot loop: a log has millions of messages, and most are not decoded.
+        # This loop is optimised, because a log has millions of messages. Most of them are not decoded.
         flight, source, link = self._flight, self._source, self._link
         handlers_of_vehicle, handlers_of_any_sender = self._handlers_of_vehicle, self._handlers_of_any_sender
-        damaged = count = received = 0  # `received` counts frames since the last call of link.count
+        damaged = count = received = 0  # `received`: frames since the last call of link.count()
         expected_sequence, next_second = -1, 0.0
-        received_at, received_count = math.nan, 0  # of the vehicle's last frame
+        received_at, received_count = math.nan, 0  # time of the vehicle's last frame, and `count` at that time
         begins_at = ends_at = 0.0
         with flight.path.open("rb") as file:
             for unix_s, raw in read_tlog(file):
@@ -184,7 +184,7 @@ class _Reader:
         use_simulated_time(flight, self._clocks.speed)
 
     def _add_destinations(self) -> None:
-        """Use destinations (POSITION_TARGET_GLOBAL_INT) as set-points, if there are no continuous set-points."""
+        """Use destinations (POSITION_TARGET_GLOBAL_INT) as set-points if the log has no continuous set-points."""
         setpoints, destinations = self._flight.position_target, self._destinations
         if setpoints.has("latitude_deg"):
             return
@@ -259,8 +259,8 @@ class _Reader:
         flight.add_mode(
             time_s,
             self._autopilot.mode_of(message).name,
-            "ordered" if was_commanded else "",
-            False if was_commanded else None,
+            reason="ordered" if was_commanded else "",
+            by_autopilot=False if was_commanded else None,
         )
         armed = is_armed(message.base_mode)
         flight.set_armed(time_s, armed)
@@ -272,7 +272,8 @@ class _Reader:
         self._system_status = status
 
     def _count_other_heartbeat(self, time_s: float, system_id: int, raw: bytes) -> None:
-        vehicle_type = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]  # may be empty in a damaged frame
+        """Record a ground station's heartbeat, or that the log contains another vehicle."""
+        vehicle_type = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]  # empty if the frame is too short
         if vehicle_type == bytes((MavType.GCS,)):
             self._flight.gcs_heartbeats.append(time_s)
             return
@@ -299,7 +300,7 @@ class _Reader:
 
     def _on_parameter(self, time_s: float, message: m.ParamValue) -> None:
         bytewise = self._autopilot.encodes_parameters_bytewise(self._capabilities)
-        if message.param_id and not message.param_id.startswith("_HASH"):  # PX4's _HASH_CHECK is no parameter
+        if message.param_id and not message.param_id.startswith("_HASH"):  # PX4's _HASH_CHECK is not a parameter
             self._flight.set_parameter(time_s, message.param_id, float(value_of(message, bytewise)))
 
     def _on_version(self, time_s: float, message: m.AutopilotVersion) -> None:
@@ -327,14 +328,14 @@ class _Reader:
         )
 
     def _on_mission_count(self, time_s: float, message: m.MissionCount) -> None:
-        """Drop items beyond the new count, because they belong to an earlier mission."""
+        """Drop the items beyond the new number of items, because they belong to an earlier mission."""
         if self._is_our_mission(message):
             self._mission_items = {
                 number: item for number, item in self._mission_items.items() if number < message.count
             }
 
     def _is_our_mission(self, message: m.MissionItemInt | m.MissionItem | m.MissionCount) -> bool:
-        """Return True for missions of this vehicle. Fences, rally points and missions of other vehicles are ignored."""
+        """Return True if a message is about this vehicle's mission, and not about its fence or rally points."""
         frame, vehicle_id = message.received_frame, self._flight.system_id
         sender = None if frame is None else frame.system_id
         return message.mission_type == 0 and vehicle_id in (sender, message.target_system)
@@ -366,7 +367,7 @@ class _Reader:
 
     def _on_nav_controller_output(self, time_s: float, message: m.NavControllerOutput) -> None:
         if self._autopilot.name == "ArduPilot":
-            bearing = message.nav_bearing  # nav_bearing has a meaning for fixed wings only
+            bearing = message.nav_bearing  # meaningful for fixed wings only
             self._flight.attitude_target.add(time_s, message.nav_roll, message.nav_pitch, NAN)
             if -180 <= bearing <= 360 and not math.isnan(self._relative_m):
                 self._flight.position_target.add(time_s, NAN, NAN, NAN, self._relative_m + message.alt_error)
@@ -390,6 +391,7 @@ class _Reader:
         self._add_velocity_target(time_s, message)
 
     def _on_local_target(self, time_s: float, message: m.PositionTargetLocalNed) -> None:
+        """Add a local set-point, converted with the newest local and global positions of the vehicle."""
         if message.type_mask & _NO_POSITION != _NO_POSITION:
             local_north, local_east, local_down = self._local_position
             north, east, down = message.x - local_north, message.y - local_east, message.z - local_down
@@ -411,6 +413,7 @@ class _Reader:
             self._flight.velocity_target.add(time_s, message.vx, message.vy, message.vz)
 
     def _on_sys_status(self, time_s: float, message: m.SysStatus) -> None:
+        # BATTERY_STATUS takes precedence. A voltage of 0 or UINT16_MAX is unknown.
         if self._has_battery_status or message.voltage_battery in (0, _U16):
             return
         current_a = current(message.current_battery, self._autopilot)
@@ -424,7 +427,7 @@ class _Reader:
 
     def _on_battery_status(self, time_s: float, message: m.BatteryStatus) -> None:
         cells_mv = [mv for mv in message.voltages if mv != _U16]
-        cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]
+        cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]  # 0: the cell does not exist
         if message.id == 0 and cells_mv:
             self._has_battery_status = True
         current_a = current(message.current_battery, self._autopilot)
@@ -455,14 +458,14 @@ class _Reader:
 
 
 def _message_id_bytes(kind: type[Message]) -> bytes:
-    """Return the bytes of a message id in a frame."""
+    """Return a message's id as the bytes that a frame contains."""
     return kind.ID.to_bytes(3, "little")
 
 
 def _decoded(raw: bytes, unix_s: float) -> Message | None:
-    """Return the message of a record; None if its checksum is wrong."""
+    """Decode the frame of a record; None if its checksum is wrong."""
     if raw[0] == MAGIC_V2:
-        frame, end = Frame(), 10 + raw[1]  # faster than `Frame.parse`; a signature may follow
+        frame, end = Frame(), 10 + raw[1]  # faster than `Frame.parse`; ignores a signature after `end`
         frame.body, frame.checksum = raw[1:end], raw[end] | raw[end + 1] << 8
         frame.system_id, frame.component_id = raw[5], raw[6]
         frame.message_id, frame.received_at = raw[7] | raw[8] << 8 | raw[9] << 16, unix_s

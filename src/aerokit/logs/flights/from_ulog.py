@@ -29,7 +29,7 @@ _TOPICS = (
     *("home_position", "airspeed_validated", "radio_status"),
 )
 _ARMING_STATE_ARMED = 2
-# ``nav_state`` of vehicle_status → mode name (VehicleStatus.msg).
+# Maps ``nav_state`` of vehicle_status to names of modes (VehicleStatus.msg).
 _NAV_STATES = {
     0: "MANUAL",
     1: "ALTCTL",
@@ -51,7 +51,7 @@ _NAV_STATES = {
     22: "VTOL_TAKEOFF",
     **{22 + number: f"EXTERNAL{number}" for number in range(1, 9)},
 }
-# Flag of failsafe_flags → kind, description (FailsafeFlags.msg).
+# Maps flags of failsafe_flags to the kind of failsafe and a description (FailsafeFlags.msg).
 _FAILSAFE_FLAGS = {
     "manual_control_signal_lost": ("radio", "RC signal lost"),
     "gcs_connection_lost": ("ground station", "ground station connection lost"),
@@ -71,12 +71,12 @@ _FAILSAFE_FLAGS = {
     "vtol_fixed_wing_system_failure": ("transition", "fixed-wing system failure"),
 }
 _BATTERY_WARNINGS = {1: "low", 2: "critical", 3: "emergency", 4: "failed"}
-_LOADING_SHARE = 0.9  # share of the total time that loading takes, for the progress
+_LOADING_SHARE = 0.9  # part of the progress that loading the file counts for
 _BUFFER = 1 << 20
 
 
 def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Fill a flight from its file.
+    """Read the file of a flight, and fill the flight with its content.
 
     Raises:
         FileFormatError: the file is not a PX4 log.
@@ -84,7 +84,7 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
     """
     pyulog = import_module("pyulog")
     try:
-        # pyulog reports damage on stdout, where aerokit may print JSON.
+        # pyulog prints about damage to stdout, which may be for JSON.
         with (
             io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file,
             redirect_stdout(sys.stderr),
@@ -103,7 +103,7 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
 
 
 class _ProgressFile(io.FileIO):
-    """An unbuffered file that reports how many bytes were read."""
+    """An unbuffered file that reports its progress: the number of bytes read so far."""
 
     def __init__(self, path: Path, on_bytes: Callable[[int], object]) -> None:
         super().__init__(path)
@@ -116,7 +116,7 @@ class _ProgressFile(io.FileIO):
 
 
 class _Topic:
-    """One instance of a topic, with times in seconds since the start of the log."""
+    """The rows of one instance of a topic. Times are in seconds since the start of the log."""
 
     def __init__(self, data: dict[str, Any], began_us: int) -> None:
         self._data = data
@@ -126,18 +126,18 @@ class _Topic:
         return field in self._data
 
     def array(self, *fields: str) -> Any:
-        """Return the first existing column as a numpy array; NaN if there is none."""
+        """Return the first of these columns that exists, as a numpy array; an array of NaN if none exists."""
         for field in fields:
             if field in self._data:
                 return self._data[field].astype("float64")
         return self._data["timestamp"] * NAN
 
     def rows(self, *fields: str) -> Iterator[tuple[Any, ...]]:
-        """Yield times and values; missing fields are NaN."""
+        """Yield the time and the values of each row. Fields that the topic does not have are NaN."""
         yield from zip(self.times, *(self.array(field).tolist() for field in fields), strict=True)
 
     def changes(self, field: str) -> Iterator[tuple[float, float]]:
-        """Yield the first value, and each change."""
+        """Yield the first value of a field, and each changed value, with their times."""
         previous = None
         for time_s, value in self.rows(field):
             if value != previous:
@@ -163,7 +163,7 @@ class _Reader:
             flight.notes.append("no GNSS time in the log: times count from power-on")
         flight.system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
         for text in log.logged_messages:
-            # The level is a character as in the Linux kernel; MAV_SEVERITY has the same numbers.
+            # `log_level` is the character of a level of the Linux kernel, whose numbers are those of MAV_SEVERITY.
             severity = max(0, min(7, int(text.log_level) - ord("0")))
             flight.texts.append(LoggedText(self._time(text.timestamp), severity, clean_text(str(text.message))))
         initial = [(log.start_timestamp, *item) for item in log.initial_parameters.items()]
@@ -179,7 +179,7 @@ class _Reader:
         return max((int(time_us) - self._began_us) / 1e6, 0.0)
 
     def _topics(self, *names: str) -> list[tuple[int, _Topic]]:
-        """Return the numbered instances of the first of these topics that exists."""
+        """Return all instances of the first of these topics that the log has, each with its number."""
         for name in names:
             instances = [data for data in self._data if data.name == name]
             if instances:
@@ -219,7 +219,7 @@ class _Reader:
         if flags is None:
             return
 
-        def is_armed(time_s: float) -> bool:  # on the ground, many flags are set without meaning
+        def is_armed(time_s: float) -> bool:  # flags on the ground are ignored, because many are set there
             return any(begin + 1 < time_s <= end for begin, end in flight.armed)
 
         for name, (kind, text) in _FAILSAFE_FLAGS.items():
@@ -277,7 +277,7 @@ class _Reader:
                     self._flight.track.add(time_s, latitude / per_degree, longitude / per_degree, amsl / per_metre, NAN)
 
     def _angles(self, columns: TimeSeries, topic: _Topic | None, field: str) -> None:
-        """Add the angles of the quaternions in a field."""
+        """Add the roll, pitch and yaw angles of the quaternions in a field."""
         if topic is None or f"{field}[0]" not in topic:
             return
         numpy = import_module("numpy")
@@ -315,7 +315,7 @@ class _Reader:
         )
 
     def _origin(self, local: _Topic | None) -> tuple[float, float, float] | None:
-        """Return the last origin of the local frame; PX4 moves it on the ground, before the flight."""
+        """Return the last origin of the local frame. PX4 may move the origin on the ground, before the flight."""
         origin = None
         if local is not None:
             for _, latitude, longitude, altitude in local.rows("ref_lat", "ref_lon", "ref_alt"):
@@ -368,7 +368,7 @@ class _Reader:
         self._links()
 
     def _links(self) -> None:
-        # If there are several links, use the link that received the most messages.
+        # PX4 may have several links. The data of the link that received the most messages is used.
         links = [topic for _, topic in self._topics("telemetry_status") if "rx_message_lost_rate" in topic]
         if links:
             busiest = max(links, key=lambda topic: float(topic.array("rx_message_count")[-1]))
@@ -398,7 +398,7 @@ def _version(log: Any) -> str:
 
 
 def utc_at_boot(log: Any) -> float:
-    """Return UTC at PX4's boot, when its clock was 0; 0 without GNSS time."""
+    """Return the UTC at which PX4 booted and its clock was 0; 0 if the log has no GNSS time."""
     for data in log.data_list:
         is_gps = data.name in ("vehicle_gps_position", "sensor_gps")
         if is_gps and {"time_utc_usec", "timestamp"} <= data.data.keys():

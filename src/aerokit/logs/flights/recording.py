@@ -1,4 +1,4 @@
-"""Lost messages, silences of the vehicle and the speed of a simulation, from a recording itself."""
+"""Derives lost messages, silences of the vehicle and the speed of a simulation from a recording."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 NAN = math.nan
 _MAX_SEQUENCE_GAP = 200
 MIN_SILENCE_S = 3.0
-"""Autopilots send HEARTBEAT once a second, and most messages more often."""
+"""Minimum seconds without a message that count as a silence. Autopilots send HEARTBEAT once a second."""
 
-# Clocks of vehicles and computers drift by less than this share. A larger drift means that a simulation ran faster or
-# slower than real time. Over the minimum time of comparison, delays of the link average out.
+# Real clocks differ by less than _MAX_CLOCK_DRIFT (0.2 is 20 %). If they differ by more, the vehicle is a simulation
+# that did not run in real time. They are compared over at least _MIN_CLOCK_COMPARISON_S, because of the link's delays.
 _MAX_CLOCK_DRIFT, _MIN_CLOCK_COMPARISON_S, _MAX_CLOCK_GAP_S = 0.2, 1.0, 10.0
 
 
@@ -31,14 +31,14 @@ class ClockComparison:
     def compare(self, time_s: float, boot_ms: int) -> None:
         previous_s, previous_ms = self._previous
         self._previous = time_s, boot_ms
-        # Reboots, and pauses of the recording or of its clock, do not count.
+        # Intervals with a reboot, or with a pause of the recording or its clock, do not count.
         if boot_ms >= previous_ms and 0 <= time_s - previous_s < _MAX_CLOCK_GAP_S:
             self._recorded_s += time_s - previous_s
             self._vehicle_s += (boot_ms - previous_ms) / 1e3
 
     @property
     def speed(self) -> float:
-        """Vehicle seconds for one recorded second; 1 if the log is too short."""
+        """Seconds by which the vehicle's clock advances in a recorded second; 1 if the log is too short to compare."""
         if min(self._recorded_s, self._vehicle_s) < _MIN_CLOCK_COMPARISON_S:
             return 1.0
         return self._vehicle_s / self._recorded_s
@@ -53,17 +53,18 @@ class LinkCounter:
         self._received = self._lost = 0
 
     def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
-        """Count frames after a gap, or at the start of a second. Return the start of the next second.
+        """Count received and lost frames. Called after a gap in the sequence and at the start of a second.
 
-        ``received`` frames arrived since the last call, of which the last has this time and sequence number.
+        ``received`` frames arrived since the last call; the last of them has this time and sequence number. Returns the
+        start of the next second.
         """
         missing = (sequence - expected) & 0xFF if expected >= 0 else 0
-        if missing > _MAX_SEQUENCE_GAP:  # a delayed frame, or a frame from a second link, is not a loss
+        if missing > _MAX_SEQUENCE_GAP:  # not a loss, but a late frame or a frame of another link
             missing = 0
-        if time_s >= self._second + 1:  # only the last frame belongs to the new second
+        if time_s >= self._second + 1:  # the last frame begins a new second; the others belong to the old one
             self._received += received - 1
             received = 1
-            if int(time_s) - self._second > 1:  # silence is recorded as 100 % loss
+            if int(time_s) - self._second > 1:  # _add_row() records such a silence as 100 % loss
                 missing = 0
             self._add_row(int(time_s))
         self._received += received
@@ -71,11 +72,11 @@ class LinkCounter:
         return self._second + 1
 
     def add_silence(self, begins_s: float, ends_s: float, others: int) -> None:
-        """Record a silence of the vehicle, with the number of messages of others in it."""
+        """Record a silence of the vehicle. ``others`` is the number of messages of other systems during the silence."""
         self._silences.append(Silence(begins_s, ends_s, others > 0))
 
     def end(self, received: int, received_s: float, ends_s: float, others: int) -> None:
-        """Count the last frames. A silence until the end of the log is recorded as 100 % loss too."""
+        """Count the last frames of the log. A silence until the end of the log is also recorded as 100 % loss."""
         self._received += received
         if ends_s - received_s < MIN_SILENCE_S:
             self._add_row(self._second + 1)
@@ -88,16 +89,16 @@ class LinkCounter:
     def _add_row(self, second: int) -> None:
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
-        if second - self._second > 1:  # add rows for the seconds without frames
+        if second - self._second > 1:  # two rows stand for all seconds without frames
             self._series.add(self._second + 1, 100.0, 0)
             self._series.add(second - 1, 100.0, 0)
         self._second, self._received, self._lost = second, 0, 0
 
 
 def use_simulated_time(flight: FlightLog, speed: float) -> None:
-    """Convert all times of a recording to seconds of the vehicle, if a simulation ran at another speed.
+    """Convert all times of a recording to the vehicle's seconds, if the vehicle is a simulation at another speed.
 
-    Speeds and rates of turn are in the vehicle's seconds, so they fit only these times.
+    Recorded speeds and turn rates refer to the vehicle's seconds, so they fit the converted times only.
     """
     if abs(math.log(speed)) <= _MAX_CLOCK_DRIFT:
         return

@@ -1,4 +1,4 @@
-"""Log records in sequence, each with the vehicle states that the record changes; input of converters."""
+"""The records of a log in sequence, as input for converters. Each record has the states that it changes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ _UNITS = {"%": "percent", "c%": "centipercent", "d%": "decipercent", "m/s/s": "m
 
 
 class TableColumn(Snapshot):
-    """A column of a table: its name with the unit, the field, and ``kind``: float, int, uint, str, bool or time."""
+    """A column of a table: its name with the unit, its field, and its ``kind``.
+
+    A kind is float, int, uint, str, bool or time.
+    """
 
     name: str
     field: str
@@ -37,7 +40,7 @@ class LogRecord(Snapshot):
     """One record of a log: a MAVLink message, or a row of a flight controller's own log."""
 
     unix_s: float
-    """UTC, in seconds since 1970."""
+    """Time of the record: UTC in seconds since 1970."""
     system_id: int
     component_id: int
     table: str
@@ -49,25 +52,25 @@ class LogRecord(Snapshot):
 
 
 class LogReader:
-    """Reads a log once. ``notes`` lists problems found so far."""
+    """Reads the records of a log, once. ``notes`` lists the problems that were found so far."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.needs_states: bool = True
-        """False to leave out the states of records of a ``.tlog``. Decoding them takes most of the time."""
+        """Set it to False to omit the states of a ``.tlog``'s records, because decoding them takes most of the time."""
         self.notes: list[str] = []
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield all records in order; ``on_bytes(read)`` is called from time to time."""
+        """Yield all records in order. ``on_bytes`` is called from time to time with the number of bytes read so far."""
         raise NotImplementedError
 
     def columns(self, entry: LogRecord) -> list[TableColumn]:
-        """Return the columns of the table of a record."""
+        """Return the columns of the table to which a record belongs."""
         raise NotImplementedError
 
 
 def unit_suffix(name: str, unit: str) -> str:
-    """Append the unit to a name that does not have it: ``alt`` in mm becomes ``alt_mm``."""
+    """Append the unit to a name, unless the name ends with it: ``alt`` in mm becomes ``alt_mm``."""
     suffix = _UNITS.get(unit, unit).replace("/", "_").replace("*", "").replace("^", "")
     suffix = "".join(character for character in suffix if character.isalnum() or character == "_")
     return name if not suffix or name.lower().endswith(f"_{suffix.lower()}") else f"{name}_{suffix}"
@@ -82,7 +85,7 @@ class TlogReader(LogReader):
         self._framer = Framer()
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield all messages of the standard with valid checksums."""
+        """Yield all messages of the standard dialect that have a valid checksum."""
         framer, decode, count = self._framer, STANDARD.decode, 0
         states: tuple[tuple[str, Any], ...] = ()
         with self.path.open("rb") as file:
@@ -99,7 +102,7 @@ class TlogReader(LogReader):
         self._check_and_note(count)
 
     def columns(self, entry: LogRecord) -> list[TableColumn]:
-        """Return the fields in the standard's order and units; an array has one column for each element."""
+        """Return a column for each field, in the standard's order and units. Arrays have a column for each element."""
         assert entry.message is not None
         columns = []
         for field in entry.message.FIELDS:
@@ -149,7 +152,7 @@ class _VehicleStates:
         self._expired_at = 0.0
 
     def update(self, unix_s: float, message: Message) -> tuple[tuple[str, Any], ...]:
-        self._now = now = max(unix_s, self._now + 1e-6)  # the clock may have been set back
+        self._now = now = max(unix_s, self._now + 1e-6)  # always increases, although the clock may have been set back
         telemetry = self._telemetry
         names = self._names.get(type(message).__name__, ())
         if names:
@@ -157,7 +160,7 @@ class _VehicleStates:
                 message.received_frame.received_at = now
             telemetry.receive(message)
         if now - self._expired_at > 1.0:
-            telemetry.expire(now)  # yields status texts whose last parts are missing
+            telemetry.expire(now)  # publishes status texts whose last parts are missing
             self._expired_at, names = now, (*names, "status_text")
         cells = telemetry.cells
         return tuple((name, cells[name].latest) for name in names if cells[name].updated_at == now)

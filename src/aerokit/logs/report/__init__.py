@@ -1,4 +1,4 @@
-"""Reports on one flight, or a comparison of two, as one self-contained HTML file; see docs/report.md."""
+"""Writes a report on one flight, or a comparison of two, as a self-contained HTML file; see docs/report.md."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ __all__ = ["Report", "write_report"]
 
 
 class Report(Snapshot):
-    """The written report, and its main content."""
+    """A written report: its file and its main content."""
 
     target: Path
     bytes: int
     summaries: tuple[tuple[str, ...], ...]
-    """Sentences of the summary of each flight."""
+    """For each flight, the sentences of its summary."""
     statistics: tuple[FlightStatistics, ...]
     """Statistics of each flight."""
     failsafes: tuple[tuple[Failsafe, ...], ...]
@@ -52,21 +52,21 @@ def write_report(
     force: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Report:
-    """Write a report on a flight, or a comparison of two, as one HTML file that loads nothing.
+    """Write a report on a flight, or a comparison of two flights, as one HTML file that loads nothing.
 
-    The file appears only when it is complete. The function blocks and needs no event loop.
+    The file gets its name only when it is complete. The function blocks; it needs no event loop.
 
     Args:
         log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
-        target: the file, ``flight.html``.
-        compare_with: a second log, of any kind.
+        target: the file to write, such as ``flight.html``.
+        compare_with: a second log, of any of these formats, to compare the flight with.
         system_id: system id of the vehicle, if a ``.tlog`` contains several vehicles; None: the first vehicle.
         force: replace an existing file.
-        on_progress: called from time to time with the bytes that were read, for each log.
+        on_progress: called from time to time with the number of bytes read so far; for two logs, it starts again at 0.
 
     Raises:
         InvalidArgument: the file exists, or its name does not end in .html.
-        FileFormatError: a file is not a log, or nothing can be read.
+        FileFormatError: a file is not a flight log, or nothing in it can be read.
         OSError: a file cannot be read or written.
         ModuleNotFoundError: a package of the extra ``report`` is not installed.
     """
@@ -75,7 +75,7 @@ def write_report(
         raise InvalidArgument(f"target = {str(target_path)!r} is not allowed: the name of a report must end in .html")
     logs = [log] if compare_with is None else [log, compare_with]
     for path in logs:
-        check_log_name(Path(path))  # checked first, because the default target is derived from this name
+        check_log_name(Path(path))  # before the target, whose default is derived from the name of the log
     if target_path.exists() and not force:
         raise InvalidArgument(f"{target_path} exists; use force (--force) to replace it")
     flights = [read_flight(path, system_id=system_id, on_progress=on_progress) for path in logs]

@@ -1,4 +1,4 @@
-"""Plotly charts of a flight: a map without tiles, and timelines with mode bands."""
+"""Makes Plotly charts of a flight: a map without tiles, and timelines with a coloured band for each mode."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from aerokit.logs.report.page import Part
 
 MAX_POINTS = 2000
-"""Maximum number of points of a line over time."""
+"""Maximum number of points of a line in a timeline."""
 MAX_TRACK_POINTS = 6000
 """Maximum number of points of a drawn track. Longer lines are simplified further."""
 _TRACK_TOLERANCE_M = 0.1
 _ROUNDING_M = 0.01
 _MAX_FENCE_M = 1e6
 
-# Each palette has a contrast of 3:1 to its background, and is distinguishable with each kind of colour blindness.
+# Each colour has a contrast of 3:1 to its background. With any kind of colour blindness, the colours stay different.
 _MODE_COLOURS = {
     "light": ("#4477aa", "#cb6471", "#4b7700", "#aa2f71", "#b8860b", "#0d9ba5", "#6a3d25", "#7a5add"),
     "dark": ("#77aadd", "#f98c53", "#00ce98", "#d262a1", "#eedd88", "#69ddee", "#b07d5c", "#9685ff"),
@@ -69,7 +69,7 @@ COLOURS = {
     }
     for theme, named_colours in _NAMED_COLOURS.items()
 }
-"""Maps a theme to its colours by name. Charts refer to a colour as ``colour:NAME``."""
+"""Maps themes to their colours by name. Charts refer to a colour as ``colour:NAME``."""
 _SETPOINT, _FAILSAFE = "colour:set-point", "colour:failsafe"
 
 
@@ -78,7 +78,7 @@ def series_colour(number: int) -> str:
 
 
 def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float], list[float | None]]:
-    """Return times and values of a column for drawing; None is a gap."""
+    """Return the times and values of a column to draw. The value None interrupts the line."""
     values, times = columns[name], columns.times
     rows = rows_to_draw(values)
     return (
@@ -88,7 +88,7 @@ def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float]
 
 
 def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[int]:
-    """Select rows that preserve all peaks and gaps of a column."""
+    """Select at most about ``max_rows`` rows to draw, so that all peaks and gaps of the column stay visible."""
     count = len(values)
     if count <= max_rows:
         return list(range(count))
@@ -100,7 +100,7 @@ def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[in
         known = part
         if math.isnan(sum(part)):  # at least one value is unknown
             known = [value for value in part if not math.isnan(value)]
-            # A part in which only a few values are unknown is drawn without a gap.
+            # Draw a gap only if most values of the part are unknown.
             if len(known) * 2 < len(part):
                 selected.add(next(row for row in range(begin, end) if math.isnan(values[row])))
         if known:
@@ -115,7 +115,7 @@ def mode_colours(flight: FlightLog) -> dict[str, str]:
 
 
 def line(name: str, columns: TimeSeries, column: str, digits: int = 3, **style: Any) -> dict[str, Any] | None:
-    """Return a line over time; None if all values are unknown."""
+    """Return a line for a timeline; None if all values are unknown."""
     if not columns.has(column):
         return None
     x, y = points(columns, column, digits)
@@ -133,7 +133,7 @@ def setpoint_line(name: str, columns: TimeSeries, column: str, digits: int = 3) 
 def over_time(
     flight: FlightLog, name: str, unit: str, traces: Sequence[dict[str, Any] | None], **layout: Any
 ) -> Chart | None:
-    """Return a timeline of a flight; None without lines. Lines without a colour get the colours of the palette."""
+    """Return a timeline with these lines; None if there are no lines. Lines without a colour get one of the palette."""
     drawn = [trace for trace in traces if trace is not None]
     if not drawn:
         return None
@@ -150,13 +150,13 @@ def over_time(
 
 
 def time_range(begin_s: float, end_s: float) -> list[float]:
-    """Return the range of a time axis, with margins."""
+    """Return the range of a time axis: the given times with margins."""
     margin = max(0.02 * (end_s - begin_s), 0.5)
     return [round(begin_s - margin, 2), round(end_s + margin, 2)]
 
 
 def timeline_shapes(flight: FlightLog) -> list[dict[str, Any]]:
-    """Return Plotly's shapes for all timelines: bands of each mode, and lines at failsafes and falls."""
+    """Return Plotly's shapes for the background of all timelines: bands of modes, and lines at failsafes and falls."""
     spans: dict[str, list[str]] = {}
     for change, end in flight.mode_spans():
         band = f"M{change.time_s:.2f},0H{end:.2f}V1H{change.time_s:.2f}Z"
@@ -181,7 +181,10 @@ def _path_shape(paths: Sequence[str], **style: Any) -> dict[str, Any]:
 
 
 def track_parts(flight: FlightLog) -> list[Part]:
-    """Return the track from above, in metres from home, with a colour for each mode; empty without positions."""
+    """Return the parts of the report that show the track from above; empty if the log has no positions.
+
+    Coordinates are metres from home. Each mode has its own colour.
+    """
     places = metres_from_home(flight)
     if not places or flight.home is None:
         return []
@@ -201,7 +204,7 @@ def track_parts(flight: FlightLog) -> list[Part]:
 
 
 def simplification_note(deviation_m: float) -> list[Part]:
-    """Return a note on the deviation of a drawn line from the track; empty if the line has all points."""
+    """Return a note on how far a drawn line deviates from the track; empty if the line has all points of the track."""
     if not deviation_m:
         return []
     return [Paragraphs([f"The line is simplified: no recorded position is more than {deviation_m:.2f} m from it."])]
@@ -211,18 +214,18 @@ def drawn_track(
     places: Sequence[tuple[float, float]], max_points: int = MAX_TRACK_POINTS, keep: Iterable[int] = ()
 ) -> tuple[list[int], float]:
     """Return the rows of a track to draw, and the largest distance of any row from the drawn line."""
-    if len(places) <= MAX_POINTS:
+    if len(places) <= MAX_POINTS:  # short lines are drawn completely
         has_known = any(rounded(north) is not None and rounded(east) is not None for north, east in places)
         rows = list(range(len(places))) if has_known else []
         return rows, 0.0
     rows, deviation_m = simplify(places, max_points, _TRACK_TOLERANCE_M, keep)
     if deviation_m:
-        deviation_m = math.ceil((deviation_m + _ROUNDING_M) * 100) / 100
+        deviation_m = math.ceil((deviation_m + _ROUNDING_M) * 100) / 100  # an upper bound, in whole centimetres
     return rows, deviation_m
 
 
 def map_layout(traces: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the layout of a map that shows these traces."""
+    """Return Plotly's layout for a map that contains these traces."""
     axes: dict[str, dict[str, Any]] = {}
     for name, direction in (("x", "east"), ("y", "north")):
         values = [value for trace in traces for value in trace[name] if value is not None]
@@ -237,14 +240,14 @@ def map_layout(traces: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tuple[list[dict[str, Any]], float]:
-    """Return a line for each mode, and the largest distance of the track from these lines."""
+    """Return a line for each mode, and the largest distance of a point of the track from these lines."""
     times, heights = flight.track.times, flight.track["altitude_relative_m"]
     changes = flight.modes or [ModeChange(0.0, "")]
     starts = [0, *(bisect_left(times, change.time_s) for change in changes[1:]), len(places)]
     rows, deviation_m = drawn_track(places, keep=(row for row in starts if row < len(places)))
-    rows_by_mode: dict[str, list[int | None]] = {}  # None is a gap
+    rows_by_mode: dict[str, list[int | None]] = {}  # None interrupts the line
     for (start, end), change in zip(pairwise(starts), changes, strict=True):
-        # The line continues to the first position of the next mode.
+        # The line of a mode ends at the first position of the next mode, so that the track has no gaps.
         part = rows[bisect_left(rows, start) : bisect_left(rows, end) + 1] if start < end else []
         if part:
             mode_rows = rows_by_mode.setdefault(change.name, [])
@@ -265,7 +268,7 @@ def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tu
 
 
 def _coordinates(places: Iterable[tuple[float, float] | None]) -> dict[str, list[float | None]]:
-    """Convert metres north and east to x and y for Plotly; None is a gap."""
+    """Convert pairs of metres north and east to Plotly's x and y. None interrupts the line."""
     pairs = [(math.nan, math.nan) if place is None else place for place in places]
     return {"x": [rounded(east) for _, east in pairs], "y": [rounded(north) for north, _ in pairs]}
 
@@ -275,7 +278,7 @@ def _hover_text(time_s: float, height_m: float) -> str:
 
 
 def rounded(value: float) -> float | None:
-    """Round a coordinate for drawing. Return None, which is a gap, if the coordinate is unknown or damaged."""
+    """Round a coordinate for drawing. Return None, which interrupts the line, if it is unknown or damaged."""
     return round(value, 2) if abs(value) <= MAX_COORDINATE else None
 
 
@@ -284,7 +287,7 @@ def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any
     places = [
         plane.metres(latitude, longitude)
         for latitude, longitude in zip(target["latitude_deg"], target["longitude_deg"], strict=True)
-        if abs(latitude) <= 90  # not for NaN
+        if abs(latitude) <= 90  # False for NaN
     ]
     if not places:
         return []
@@ -316,7 +319,7 @@ def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
 
 
 def _circular_fence(flight: FlightLog) -> list[dict[str, Any]]:
-    """Return the circular fence from the parameters. Logs do not contain polygons."""
+    """Return the circular fence that the parameters define. Fences of polygons are not in the logs."""
     end_s, parameter_at = flight.duration_s, flight.parameter_at
     radius = parameter_at("GF_MAX_HOR_DIST", end_s)  # PX4
     fence_type = parameter_at("FENCE_TYPE", end_s)  # ArduPilot; bit 1 is the circle

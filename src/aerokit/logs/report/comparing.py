@@ -1,4 +1,4 @@
-"""Sections of a report that compares two flights. Times count from the first arming of each flight."""
+"""Makes the sections of a report that compares two flights. Times count from the first arming of each flight."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 NAMES = ("A", "B")
 """Names of the two flights in charts and tables."""
 
-# Field of `FlightStatistics` → label, digits.
+# Maps fields of `FlightStatistics` to their label and number of decimals.
 _STATISTICS = {
     "armed_s": ("armed, s", 0),
     "distance_m": ("distance flown, m", 0),
@@ -52,7 +52,7 @@ _STATISTICS = {
     "max_estimator_ratio": ("max estimator ratio", 2),
     "lost_percent": ("messages lost, %", 2),
 }
-# Charts: title, unit, function that returns the time series, and column.
+# The charts: title, unit, function that returns the time series of a flight, and column.
 _CHARTS: tuple[tuple[str, str, Callable[[FlightLog], TimeSeries | None], str], ...] = (
     ("Height", "metres above home", lambda flight: flight.track, "altitude_relative_m"),
     ("Roll", "degrees", lambda flight: flight.attitude, "roll_deg"),
@@ -70,7 +70,7 @@ _CHARTS: tuple[tuple[str, str, Callable[[FlightLog], TimeSeries | None], str], .
 def comparison(
     flights: tuple[FlightLog, FlightLog], statistics: tuple[FlightStatistics, FlightStatistics]
 ) -> list[Section]:
-    """Return all sections of the comparison."""
+    """Return all sections of a comparison of two flights."""
     failsafe_sections = [failsafe_section(flight) for flight in flights]
     return [
         _differences(statistics),
@@ -101,7 +101,7 @@ def _differences(statistics: tuple[FlightStatistics, FlightStatistics]) -> Secti
             continue
         difference = ""
         if value_a is not None and value_b is not None:
-            difference = f"{round(value_b - value_a, digits) + 0.0:+.{digits}f}"  # + 0.0 turns -0.0 into 0.0
+            difference = f"{round(value_b - value_a, digits) + 0.0:+.{digits}f}"  # + 0.0 converts -0.0 to 0.0
         texts = ("unknown" if value is None else f"{value:.{digits}f}" for value in (value_a, value_b))
         rows.append((name, *texts, difference))
     return Section("Differences", [Table(("statistic", *NAMES, "B − A"), rows)])
@@ -139,6 +139,7 @@ def _overlay_section(
     get_series: Callable[[FlightLog], TimeSeries | None],
     column: str,
 ) -> Section:
+    """Return a section with one column of both flights in one chart, over the time since arming."""
     traces, names_without_data = [], []
     for number, flight in enumerate(flights):
         columns = get_series(flight)

@@ -1,4 +1,4 @@
-"""Formatting of times, durations and lengths in reports."""
+"""Formats times, durations and lengths for reports."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ _A_YEAR_S = 365 * 86_400.0
 
 
 def clock(seconds: float) -> str:
-    """Format minutes and seconds since the start of the log: ``3:07.5``."""
+    """Format a time since the start of the log as minutes and seconds: ``3:07.5``."""
     minutes, remaining_s = divmod(round(max(seconds, 0.0), 1), 60)
     return f"{minutes:.0f}:{remaining_s:04.1f}"
 
@@ -31,12 +31,12 @@ def length(metres: float) -> str:
 
 
 def number(value: float) -> str:
-    """Format with about three digits."""
+    """Format a number with about three digits."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
 
 
 def date(unix_s: float) -> str:
-    """Format as UTC; "at an unknown time" if no clock was set."""
+    """Format a time as UTC. If the clock was not set, return "at an unknown time"."""
     if unix_s < _A_YEAR_S:
         return "at an unknown time"
     return f"{datetime.fromtimestamp(unix_s, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"

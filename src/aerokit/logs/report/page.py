@@ -1,4 +1,4 @@
-"""Renders sections as one HTML file. The file is self-contained, loads nothing, and all text from logs is escaped."""
+"""Renders sections as one HTML file. The file is self-contained and loads nothing; all text from logs is escaped."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Paragraphs:
-    """Paragraphs, or a list."""
+    """Paragraphs of text, or a list of texts."""
 
     lines: Sequence[str]
     is_list: bool = False
@@ -27,19 +27,19 @@ class Paragraphs:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of texts. A long table is collapsed."""
+    """A table of texts. A long table is collapsed until the reader opens it."""
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     title: str = ""
-    """Title of the collapsed table; empty: the number of rows."""
+    """Title that stands for the collapsed table; by default the number of rows."""
     marks: Sequence[str] = ()
-    """CSS class of each row: "", "warning" or "bad"."""
+    """CSS class of each row: "", "warning" or "bad". Rows without a class are plain."""
 
 
 @dataclass(frozen=True)
 class Collapsed:
-    """Parts that the page shows on demand and never prints."""
+    """Parts that are hidden until the reader opens them, and that are never printed."""
 
     title: str
     parts: Sequence[Part]
@@ -54,28 +54,31 @@ class Chart:
     """
 
     name: str
-    """Unique name in the page."""
+    """Name of the chart, unique in the page."""
     traces: Sequence[dict[str, Any]]
     layout: dict[str, Any] = field(default_factory=dict)
     height: int = 300
     label: str = ""
-    """Text alternative for screen readers."""
+    """Description for screen readers and for browsers without scripts."""
     is_timeline: bool = False
-    """True for a chart over time. Such a chart has the page's shapes as background, and zooms with the other timelines.
+    """True for a chart over time. It has the page's shapes as background, and zooms together with all other timelines.
     """
 
 
 Summary: TypeAlias = "tuple[str, Sequence[str], Sequence[str]]"
 Part: TypeAlias = "Paragraphs | Table | Collapsed | Chart"
 MAX_OPEN_ROWS = 15
-"""Maximum rows of a table that is not collapsed."""
+"""Tables with more rows than this are collapsed."""
 MAX_PRINTED_ROWS = 60
-"""Maximum rows of a table that is printed."""
+"""Tables with more rows than this are not printed."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A section: title, explanation and parts. ``missing`` is shown if the log lacks the data."""
+    """A section of the report: title, explanation and parts.
+
+    If the log does not have the data, ``missing`` is shown instead.
+    """
 
     title: str
     parts: Sequence[Part] = ()
@@ -90,10 +93,10 @@ def page(
     colours: Mapping[str, Mapping[str, str]],
     shapes: Sequence[dict[str, Any]] = (),
 ) -> str:
-    """Return the HTML.
+    """Return the HTML of the whole page.
 
-    ``summaries`` has, for each flight, a heading, the sentences, and the sentences to emphasise. ``colours`` has the
-    colours by theme ("light", "dark") and name, ``shapes`` has Plotly's shapes for all timelines.
+    ``summaries`` has a heading, the sentences, and the sentences to emphasise, for each flight. ``colours`` maps themes
+    ("light", "dark") to colours by name. ``shapes`` are Plotly's shapes for the background of all timelines.
 
     The Content-Security-Policy allows only the two included scripts, and no network access. Against hostile logs, this
     policy is a second barrier after escaping.
@@ -130,18 +133,18 @@ def _resource(name: str) -> str:
 
 
 def _hash(script: str) -> str:
-    """Hash a script for the Content-Security-Policy, with normalized line ends, as browsers do."""
+    """Return the hash of a script for the Content-Security-Policy. Like browsers, normalizes line ends before."""
     data = script.replace("\r\n", "\n").replace("\r", "\n").encode()
     return base64.b64encode(hashlib.sha256(data).digest()).decode()
 
 
 def _escape(text: str) -> str:
-    """Escape text for HTML. Control, bidirectional and invisible characters could disguise text, so become U+FFFD."""
+    """Escape text for HTML. Characters that could disguise text (control, bidirectional, invisible) become U+FFFD."""
     return escape(printable(text.replace("\t", " ").replace("\xa0", " ")))
 
 
 def _json(charts: Sequence[Chart], colours: Mapping[str, Mapping[str, str]], shapes: Sequence[dict[str, Any]]) -> str:
-    """Serialize the charts by name. The result cannot contain the end tag of the surrounding script element."""
+    """Serialize the charts as JSON in which no character can end the surrounding script element."""
     by_name = {
         chart.name: {
             "traces": chart.traces,

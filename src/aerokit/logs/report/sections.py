@@ -1,4 +1,4 @@
-"""Sections of the report on one flight: functions that return a section for a flight, or None."""
+"""Makes the sections of a report on one flight. Each function returns a section, or None if the section is omitted."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from aerokit.logs.report.page import Part
 
 _SEVERITIES = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
-# Names of GPS_FIX_TYPE values, as far as MAVLink, ArduPilot's logs and PX4's logs give them the same meaning.
+# Names of GPS_FIX_TYPE values. Higher values have different meanings in MAVLink, ArduPilot's logs and PX4's logs.
 _FIX_NAMES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed")
 _MAX_TEXTS, _MAX_CHANGES, _MAX_PARAMETERS = 2000, 2000, 5000
 _MAX_OPEN_FAILSAFES = 10
-# Parts of the names of parameters that the autopilot writes itself.
+# Parameters whose names contain one of these texts are written by the autopilot itself.
 _WRITTEN_BY_AUTOPILOT = (
     "STAT_",
     "_GND_PRESS",
@@ -40,7 +40,7 @@ _WRITTEN_BY_AUTOPILOT = (
 
 
 def _with_parts(section: Section, *charts: Part | None) -> Section:
-    """Return the section with the charts that exist. Without any chart, the section shows its text for missing data."""
+    """Add the parts that are not None to the section. Without any, the section shows its text for missing data."""
     parts = [part for part in charts if part is not None]
     return Section(section.title, parts, section.explanation, "" if parts else section.missing)
 
@@ -87,7 +87,7 @@ def mode_table(flight: FlightLog) -> Table:
 
 
 def failsafe_section(flight: FlightLog) -> Section:
-    """Return the section with each failsafe and its context."""
+    """Return the section that shows each failsafe with its context."""
     all_failsafes = failsafes(flight)
     if not all_failsafes:
         return Section(
@@ -144,7 +144,7 @@ def _velocity(flight: FlightLog) -> Section:
 def _actual_and_setpoint(
     flight: FlightLog, quantity: str, unit: str, setpoints: TimeSeries, actual: TimeSeries, columns: Mapping[str, str]
 ) -> list[Part | None]:
-    """Return a chart for each of ``columns`` (label → column), and a note if there are no set-points."""
+    """Return a chart for each of ``columns`` (maps labels to columns), and a note if there are no set-points."""
     charts = [
         over_time(
             flight,
@@ -161,7 +161,7 @@ def _actual_and_setpoint(
 
 
 def _air_speed_line(flight: FlightLog) -> dict[str, Any] | None:
-    """Return the line of air speeds; None if all are 0, as without a sensor."""
+    """Return the line of air speeds; None if all are 0, which means that there is no sensor."""
     has_speed = flight.air.has("air_speed_m_s") and max(flight.air.known("air_speed_m_s")) > 0
     return line("air speed", flight.air, "air_speed_m_s", 2) if has_speed else None
 
@@ -217,7 +217,7 @@ def _estimator(flight: FlightLog) -> Section:
 
 
 def _fix_type_axis(flight: FlightLog) -> dict[str, Any]:
-    """Return an axis with the names of the fix types in the log."""
+    """Return an axis whose labels are the names of the fix types that occur in the log."""
     values = sorted({value for gps in flight.gps.values() for value in gps.known("fix_type")})
     names = [_FIX_NAMES[int(value)] if 0 <= value < len(_FIX_NAMES) else f"{value:g}" for value in values]
     return {"tickmode": "array", "tickvals": values, "ticktext": names}
@@ -355,4 +355,4 @@ SECTIONS: tuple[Callable[[FlightLog], Section | None], ...] = (
     *(_map, _heights, failsafe_section, _modes, _batteries, _attitude, _velocity, _vibration, _estimator),
     *(_gps, _link, _texts, _parameters, _mission, _about),
 )
-"""All sections, in order."""
+"""The functions of all sections, in the order of the report."""

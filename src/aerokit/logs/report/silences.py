@@ -1,4 +1,4 @@
-"""Sentences about silences of the vehicle, and its configured reaction to a lost ground station."""
+"""Makes sentences about silences of the vehicle, and about its configured reaction to a lost ground station."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.flight import FlightLog, Silence
 
 _MAX_LISTED = 3
-# After a silence, HEARTBEAT reports the mode within this time.
+# After a silence, it takes at most this long until a HEARTBEAT reports the mode.
 _MODE_DELAY_S = 1.5
 
-# Parameters by the name of the firmware; the first one is the action.
+# Maps firmwares to the parameters of their ground station failsafe. The first parameter selects the action.
 _PARAMETERS: dict[str, tuple[str, ...]] = {
     "PX4": ("NAV_DLL_ACT", "COM_DL_LOSS_T"),
     "ArduCopter": ("FS_GCS_ENABLE", "FS_GCS_TIMEOUT", "FS_OPTIONS"),
@@ -22,7 +22,7 @@ _PARAMETERS: dict[str, tuple[str, ...]] = {
     "Rover": ("FS_GCS_ENABLE", "FS_GCS_TIMEOUT", "FS_ACTION"),
     "ArduSub": ("FS_GCS_ENABLE", "FS_GCS_TIMEOUT"),
 }
-# Values of the first parameter.
+# Maps firmwares to the meanings of the first parameter's values.
 _ACTIONS: dict[str, dict[int, str]] = {
     "PX4": {0: "no reaction", 1: "Hold", 2: "Return", 3: "Land", 5: "terminates the flight", 6: "disarms"},
     "ArduCopter": {
@@ -42,7 +42,7 @@ _ACTIONS: dict[str, dict[int, str]] = {
 
 
 def silence_sentences(flight: FlightLog) -> list[str]:
-    """Return sentences about the silences while the vehicle was armed, and about the vehicle's failsafe."""
+    """Return sentences about silences that began while the vehicle was armed, and about its ground station failsafe."""
     silences = [
         silence for silence in flight.silences if any(begin <= silence.begins_s <= end for begin, end in flight.armed)
     ]
@@ -57,7 +57,7 @@ def silence_sentences(flight: FlightLog) -> list[str]:
 
 
 def _pauses(pauses: list[Silence]) -> list[str]:
-    """Return a sentence about times without any message, in which the recording itself may have paused."""
+    """Return a sentence about times without any message. In these times, the recording itself may have paused."""
     if not pauses:
         return []
     longest = max(pauses, key=lambda pause: pause.ends_s - pause.begins_s)
@@ -87,7 +87,7 @@ def _state(flight: FlightLog, time_s: float) -> str:
 
 
 def ground_station_failsafe(flight: FlightLog, time_s: float) -> str:
-    """Say how the vehicle is configured to react to a lost ground station, or that the log does not show it."""
+    """Return a sentence about the vehicle's configured reaction to a lost ground station, also if it is unknown."""
     firmware = next((name for name in _PARAMETERS if name in flight.vehicle), "")
     if not firmware:
         return "How the vehicle reacts to a lost ground station is unknown."

@@ -1,4 +1,4 @@
-"""Simplification of lines in the plane: Ramer-Douglas-Peucker, with the largest deviation first."""
+"""Simplifies lines in the plane by the Ramer-Douglas-Peucker algorithm. The largest deviation is split first."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-# Of this many consecutive points, at least one is kept. Otherwise spirals and repeated figures take quadratic time.
+# At least one of this many consecutive points is selected. Otherwise spirals and repeated figures take quadratic time.
 _MAX_SEGMENT = 1024
 MAX_COORDINATE = 1e9
-"""Larger coordinates are damaged data and are ignored, because their squares could overflow."""
+"""Larger coordinates are damaged data. They are ignored, because their squares could overflow."""
 
 
 def simplify(
     places: Sequence[tuple[float, float]], max_points: int, tolerance: float, keep: Iterable[int] = ()
 ) -> tuple[list[int], float]:
-    """Select the points of a line that preserve its shape.
+    """Select points of a line, so that its shape is preserved.
 
     Args:
         places: coordinates; NaN interrupts the line.
-        max_points: maximum number of selected points, which takes precedence over ``tolerance``. Ends of gaps, the
-            points of ``keep``, and one point in about a thousand are selected in addition.
-        tolerance: distance within which points may be omitted.
+        max_points: maximum number of selected points, even if omitted points are farther away than ``tolerance``. The
+            ends of gaps, the points of ``keep`` and about one point in a thousand are always selected.
+        tolerance: maximum distance of an omitted point from the line through the selected points.
         keep: indices that are always selected.
 
     Returns:
-        The selected indices, with one for each gap, and the largest distance of any point from the line through the
-        selected points.
+        The selected indices, including one index for each gap, and the largest distance of an omitted point from the
+        line through the selected points.
     """
     known = [abs(x) <= MAX_COORDINATE and abs(y) <= MAX_COORDINATE for x, y in places]
     if not any(known):
@@ -43,7 +43,8 @@ def simplify(
             selected.add(index)
         elif not is_known and index and known[index - 1]:
             gaps.append(index)
-    # Heap of (negative square of the largest deviation, its index, first and last index of the segment).
+    # A heap of (negative square of the largest deviation, its index, first and last index of the segment). The square
+    # is negative, because heapq returns the smallest item first.
     segments = [
         (*_deviation(places, first, last), first, last)
         for first, last in pairwise(sorted(selected))
@@ -62,14 +63,17 @@ def simplify(
 
 
 def _deviation(places: Sequence[tuple[float, float]], first: int, last: int) -> tuple[float, int]:
-    """Return the negative square of the largest distance from the segment between two points, and its index."""
+    """Return the negative square of the largest distance of a point from the segment, and the index of this point.
+
+    The segment is the straight line between the points ``first`` and ``last``.
+    """
     x, y = places[first]
     segment_x, segment_y = places[last][0] - x, places[last][1] - y
     squared_length = segment_x * segment_x + segment_y * segment_y
     largest, largest_index = -1.0, first + 1
     for index in range(first + 1, last):
         dx, dy = places[index][0] - x, places[index][1] - y
-        if squared_length:  # subtract the way to the nearest point of the segment
+        if squared_length:  # replaces (dx, dy) by the distance vector from the segment's nearest point
             fraction = (dx * segment_x + dy * segment_y) / squared_length
             fraction = 0.0 if fraction < 0.0 else min(fraction, 1.0)
             dx, dy = dx - fraction * segment_x, dy - fraction * segment_y

@@ -1,4 +1,4 @@
-"""Statistics of a flight, for its summary and for comparisons."""
+"""Computes statistics of a flight, for its summary and for comparisons."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.falls import Fall
     from aerokit.logs.flights.flight import FlightLog, TimeSeries
 
-# Shorter steps are ignored, because they are noise of a stationary vehicle.
+# Shorter steps do not add to the length of the track, because they are noise of a stationary vehicle.
 _MIN_STEP_M = 1.0
 _MAX_LISTED = 5
-# A hovering multicopter needs 20 to 60 % throttle.
+# A hovering multicopter needs 20 to 60 % throttle, so 90 % in a descent is unusual.
 _HIGH_THROTTLE_PERCENT, _HIGH_ATTITUDE_ERROR_DEG = 90.0, 20.0
-# Below this share of the throttle or current before a descent, the motors take less power than a controlled descent
-# needs.
+# If the throttle or current in a descent is below this share of the value before, the motors have less power than a
+# controlled descent needs.
 _LOW_POWER_SHARE = 0.5
 _STOPPED = ", so look at what stopped the motors: ESCs, their supply, a command"
-# An output that was raised by this much by arming and flying drives a motor. Above this difference in the descent, the
-# autopilot tried to lift one side.
+# If the pulse of an output rises by the first value from before arming to flying, the output drives a motor. If the
+# motors' pulses in a descent differ by the second value, the autopilot tried to lift one side.
 _MOTOR_RAISED_US, _UNEQUAL_US = 200.0, 300.0
 _BEFORE_FALL_S = 5.0
 
 
 class FlightStatistics(Snapshot):
-    """Statistics of the armed time, or of the whole log if the vehicle was never armed; None means unknown."""
+    """Statistics of the time in which the vehicle was armed, or of the whole log if it never was. None: unknown."""
 
     armed_s: float | None
     distance_m: float | None
@@ -51,9 +51,9 @@ class FlightStatistics(Snapshot):
     max_climb_m_s: float | None
     max_descent_m_s: float | None
     max_tilt_deg: float | None
-    """Maximum of roll and pitch."""
+    """Maximum absolute roll or pitch angle."""
     end_distance_m: float | None
-    """Distance from home at the end."""
+    """Horizontal distance from home at the end."""
     start_voltage_v: float | None
     """Voltage of the first battery at the start. All battery values are those of the first battery."""
     end_voltage_v: float | None
@@ -65,7 +65,7 @@ class FlightStatistics(Snapshot):
     max_hdop: float | None
     max_vibration_m_s2: float | None
     clips: float | None
-    """Count of accelerometer clipping."""
+    """Number of times that an accelerometer reached its limit."""
     max_estimator_ratio: float | None
     """Maximum innovation test ratio. Above 1, the estimator rejects a measurement."""
     lost_percent: float | None
@@ -127,7 +127,7 @@ def metres_from_home(flight: FlightLog) -> list[tuple[float, float]]:
 
 
 def time_in_modes(flight: FlightLog) -> dict[str, float]:
-    """Return seconds in each mode while armed, in order of first use."""
+    """Return how many seconds the vehicle was armed in each mode, in the order of first use."""
     seconds_by_mode: dict[str, float] = {}
     for change, end in flight.mode_spans():
         for armed_from, armed_to in flight.armed or [(0.0, flight.duration_s)]:
@@ -138,7 +138,7 @@ def time_in_modes(flight: FlightLog) -> dict[str, float]:
 
 
 class _ArmedSpans:
-    """Selects rows of the armed time, or all rows if the vehicle was never armed."""
+    """Selects the rows in which the vehicle was armed, or all rows if it was never armed."""
 
     def __init__(self, flight: FlightLog) -> None:
         self._spans = flight.armed or [(-math.inf, math.inf)]
@@ -153,7 +153,7 @@ class _ArmedSpans:
         return [value for part in parts for value in part if math.isfinite(value)]
 
     def mean(self, columns: TimeSeries, name: str) -> float | None:
-        """Return the average over time; each value holds until the next row, the last one for a second."""
+        """Return the average over time. A value counts until the next row, the last value for a second."""
         times, values = columns.times, columns[name]
         total = weight = 0.0
         for begin, end in self._spans:
@@ -175,13 +175,14 @@ def _max(values: list[float]) -> float | None:
 
 
 def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> float:
+    """Return the length in metres of the track's parts in these rows, without steps that are noise."""
     length_m = 0.0
-    counted: tuple[float, float] | None = None  # the point up to which the length counts
-    for previous_row, row in pairwise([-2, *rows]):
+    counted: tuple[float, float] | None = None  # the point up to which `length_m` counts
+    for previous_row, row in pairwise([-2, *rows]):  # -2: the first row has no previous row
         point = north_east[row]
         if math.isnan(point[0]):
             continue
-        if counted is None or row != previous_row + 1:  # the start of an armed span
+        if counted is None or row != previous_row + 1:  # an armed span begins here
             counted = point
             continue
         step = math.hypot(point[0] - counted[0], point[1] - counted[1])
@@ -191,7 +192,7 @@ def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> floa
 
 
 def findings(flight: FlightLog) -> list[str]:
-    """Return sentences about each fall and hard landing; empty for most flights."""
+    """Return sentences about each fall and hard landing; empty if there is none, as in most flights."""
     sentences = []
     for fall in falls(flight):
         sentences.append(f"{fall_text(fall)}.")
@@ -201,11 +202,12 @@ def findings(flight: FlightLog) -> list[str]:
 
 
 def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
-    """Return throttle, tilt, attitude error, motor outputs and battery current in the descent, where the log has them.
+    """Return texts with the values that were measured in the descent, as far as the log has them.
 
-    An unusual value is followed by advice on what to look at.
+    They are throttle, tilt, attitude error, motor outputs and battery current. An unusual value is followed by advice
+    on what to look at.
     """
-    begin_s, end_s = fall.begins_s, fall.time_s - 0.2  # without the impact
+    begin_s, end_s = fall.begins_s, fall.time_s - 0.2  # 0.2 s before the end, to exclude the impact
     angles = ("roll_deg", "pitch_deg")
     texts = []
     currents = _currents(flight, begin_s, end_s)
@@ -225,11 +227,13 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
     motors = _motor_outputs(flight, begin_s, end_s)
     if motors:
         texts.append(motors)
-    return texts + [f"{name} {current.text('A')}{_STOPPED * current.is_low}" for name, current in currents.items()]
+    for name, current in currents.items():
+        texts.append(f"{name} {current.text('A')}{_STOPPED if current.is_low else ''}")
+    return texts
 
 
 def _currents(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _SpanAndBefore]:
-    """Return the current of each battery in a descent, by a name for the text."""
+    """Return the currents of the batteries in a descent. The keys are names for the text."""
     currents = {}
     for index, battery in sorted(flight.batteries.items()):
         current = _span_and_before(battery, "current_a", begin_s, end_s)
@@ -240,7 +244,7 @@ def _currents(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _Spa
 
 
 class _SpanAndBefore(Snapshot):
-    """Lowest, middle and highest value in a descent, and the median of the seconds before it; NaN if unknown."""
+    """Lowest, median and highest value in a descent, and the median of the seconds before it (NaN if unknown)."""
 
     low: float
     middle: float
@@ -249,7 +253,7 @@ class _SpanAndBefore(Snapshot):
 
     @property
     def is_low(self) -> bool:
-        """True if most of the descent had less than half of the value before it."""
+        """True if the median in the descent is less than half of the median before it."""
         return self.middle < _LOW_POWER_SHARE * self.before
 
     def text(self, unit: str) -> str:
@@ -259,7 +263,7 @@ class _SpanAndBefore(Snapshot):
 
 
 def _span_and_before(series: TimeSeries, name: str, begin_s: float, end_s: float) -> _SpanAndBefore | None:
-    """Return the values of a span and before it; None if the series has no known value in the span."""
+    """Return the values in a time span and before it; None if the series has no known value in the span."""
     values = series.between(name, begin_s, end_s)
     if not values:
         return None
@@ -269,11 +273,11 @@ def _span_and_before(series: TimeSeries, name: str, begin_s: float, end_s: float
 
 
 def _motor_outputs(flight: FlightLog, begin_s: float, end_s: float) -> str:
-    """Describe the outputs to the motors in a descent; empty if the log does not show which outputs drive motors."""
+    """Describe the motor outputs in a descent; empty if the log does not show which outputs drive motors."""
     armed_s = next((begin for begin, end in reversed(flight.armed) if begin < begin_s), math.nan)
     motors: dict[str, _SpanAndBefore] = {}
     for name in flight.outputs:
-        idle_us = flight.outputs.at(name, armed_s - 0.1)
+        idle_us = flight.outputs.at(name, armed_s - 0.1)  # just before arming
         pulses = _span_and_before(flight.outputs, name, begin_s, end_s)
         if pulses is not None and pulses.before - idle_us >= _MOTOR_RAISED_US:
             motors[name.split("_")[1]] = pulses
@@ -315,7 +319,7 @@ def fall_text(fall: Fall) -> str:
 
 
 def summary(flight: FlightLog, statistics: FlightStatistics) -> list[str]:
-    """Return sentences, the most important first."""
+    """Return the sentences of the summary, the most important first."""
     sentences = [
         *findings(flight),
         *silence_sentences(flight),
@@ -386,7 +390,7 @@ def _failsafes_sentence(flight: FlightLog) -> str:
 
 
 def _unknown_actions(flight: FlightLog, kinds: Iterable[str]) -> list[str]:
-    """Return the names of parameters that decide on the reaction to these kinds of failsafes, if none is in the log."""
+    """Return the parameters that decide on the reaction to these kinds of failsafes, if the log has none of them."""
     unknown: list[str] = []
     for kind in dict.fromkeys(kinds):
         names = configured_by(flight, kind)
