@@ -245,6 +245,7 @@ class CameraAdapter(CameraDevice):
 
     def expose(self, done: Callable[[Shot | None], None]) -> None:
         """Take a photo in a task, then call ``done`` with the result, or with None after an error."""
+        # The time of the order counts as the time of the picture.
         time_boot_ms, unix_time = self._host.time_boot_ms, self._host.connection.unix_time()
 
         async def take() -> None:

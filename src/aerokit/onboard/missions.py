@@ -132,7 +132,7 @@ class ComponentMissions:
         if self._on_current is None:
             return False
         try:
-            return self._on_current(index) is not False
+            return self._on_current(index) is not False  # A function that returns None accepts the item.
         except Exception as error:
             self._report_refusal("set_current", error)
             return False

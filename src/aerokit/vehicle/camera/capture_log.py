@@ -149,6 +149,7 @@ class CaptureLog:
             )
         except CommandRejected:
             return True
+        # `img_idx` counts pictures from 1, `index` from 0.
         return newest is not None and (newest.img_idx - 1) % FEEDBACK_INDEX_RANGE != index
 
     def record(self, message: Message) -> None:

@@ -201,7 +201,7 @@ def direction_to(context: VehicleContext, target: Position) -> Angles | None:
     pitch = math.degrees(math.atan2(height_m, distance_m))
     has_bearing = distance_m > MIN_BEARING_DISTANCE_M and abs(pitch) <= MAX_PITCH_FOR_YAW_DEG
     yaw_from_north = here.bearing_to(target) if has_bearing else None
-    return (pitch, None, yaw_from_north, None)
+    return (pitch, None, yaw_from_north, None)  # Any roll is accepted, and the yaw is checked from north only.
 
 
 def _height_above(here: Position, target: Position) -> float | None:

@@ -314,6 +314,7 @@ class ParameterAccess:
                 if not isinstance(answer, Parameter):
                     continue
                 self.written[name] = answer.value
+                # A late answer with the previous value must not replace the new one in the store.
                 if name in old_values and answer.value != old_values[name]:
                     self.store.mark_replaced(name, old_values[name])
             return answers
