@@ -100,6 +100,12 @@ FAULTS: tuple[str, ...] = (
 """Names of `aerokit.sim.Faults` that ``aerokit sim --fault`` accepts, described in docs/simulator.md."""
 
 
+TRANSMITTER_ON_S = 1.0
+"""The fault ``rc_lost`` begins after this time at the earliest, because ArduPilot ignores a transmitter that it has never
+received.
+"""
+
+
 def fault(text: str) -> tuple[str, bool | float | list[str], float]:
     """Parse ``NAME[=VALUE][@SECONDS]``: a fault of the simulator, its value, and the time at which it begins."""
     name_and_value, _, begin = text.partition("@")
@@ -107,6 +113,8 @@ def fault(text: str) -> tuple[str, bool | float | list[str], float]:
     if name not in FAULTS:
         raise ArgumentTypeError(f"{name!r} is not a fault{suggestion(name, FAULTS)}; faults: {', '.join(FAULTS)}")
     at_s = number(0, 1e6)(begin) if begin else 0.0
+    if name == "rc_lost":
+        at_s = max(at_s, TRANSMITTER_ON_S)
     if name in _SHARE_FAULTS:
         return name, number(0, 1)(value), at_s
     if name == "prearm_failures":

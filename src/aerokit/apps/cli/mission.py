@@ -144,7 +144,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     start = command_action("mission start", "mission started", _start_mission)
     pause = command_action("mission pause", "mission paused", lambda vehicle, _: vehicle.mission.pause())
     resume = command_action("mission resume", "mission resumed", lambda vehicle, _: vehicle.mission.resume())
-    add_action(actions, "start", start, "Start the mission.")
+    add_action(actions, "start", start, "Start the mission of an armed vehicle. `aerokit fly` also arms.")
     add_action(actions, "pause", pause, "Pause the mission and hold.")
     add_action(actions, "resume", resume, "Resume the mission.")
 

@@ -300,8 +300,8 @@ async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namesp
                 getattr(vehicle.faults, name).extend(value)
             else:
                 setattr(vehicle.faults, name, value)
-        if at_s:
-            emit(options, "fault", {"name": name, "value": value, "seconds": at_s}, f"{at_s:g} s: fault {name}")
+        begin = f"{at_s:g} s" if at_s else "from the start"
+        emit(options, "fault", {"name": name, "value": value, "seconds": at_s}, f"{begin}: fault {name}")
 
 
 def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:
