@@ -162,9 +162,8 @@ class PlanChannel:
             message = f"{error}{self._describe_items_on_vehicle(exchange, refused_item=error.item)}"
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:
-            # Only the text changes, so that the error keeps `missing` and its traceback.
             error.args = (f"{error}{self._describe_items_on_vehicle(exchange, is_silent=True)}",)
-            raise
+            raise  # This error also has `missing`, so only its text was changed.
         finally:
             if not exchange.done and connection.is_open:
                 for cancellation in exchange.cancellation():
@@ -238,9 +237,8 @@ class PlanTransfer(Generic[PlanT]):
         if len(items) == self._offset:  # The plan is empty, except for home.
             await self.clear()
             return
-        is_done = only_changes and await self._send_changes(items, method, verify=verify)
-        if is_done:
-            return
+        if only_changes and await self._send_changes(items, method, verify=verify):
+            return  # The vehicle has the plan now.
         self._cache.forget(self._context.now())
         if await self._uses_file(method, is_upload=True):
             await self._send_file(items, method)
@@ -347,9 +345,8 @@ class PlanTransfer(Generic[PlanT]):
         # The vehicle's plan is unknown until all parts are confirmed, because the call may fail or be cancelled.
         self._cache.forget(self._context.now())
         for part in _consecutive_ranges(changed_seqs):
-            is_supported = await self._send_part(items[part.start : part.stop], part.start, verify=verify)
-            if not is_supported:
-                return False
+            if not await self._send_part(items[part.start : part.stop], part.start, verify=verify):
+                return False  # The vehicle does not support partial uploads.
             vehicle_items[part.start : part.stop] = items[part.start : part.stop]
         self._cache.set(vehicle_items, self._context.now())
         return True
@@ -388,9 +385,8 @@ class PlanTransfer(Generic[PlanT]):
         if not autopilot.reports_mission_checksum or reading_takes_s < CHECKSUM_INTERVAL_S:
             return False
         checksum = mission_checksum(items)
-        has_arrived = await self._context.wait_for_plan_id(self._type, checksum)
-        if not has_arrived:
-            return False
+        if not await self._context.wait_for_plan_id(self._type, checksum):
+            return False  # The checksum did not arrive in time.
         self._cache.set(items, self._context.now())
         return True
 
