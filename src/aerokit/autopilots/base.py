@@ -208,7 +208,7 @@ class Autopilot:
     calibrates_compasses_by_command = False
     """True if MAV_CMD_DO_START_MAG_CAL (42424) calibrates compasses; otherwise PREFLIGHT_CALIBRATION does."""
     speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED,))
-    """SPEED_TYPEs of MAV_CMD_DO_CHANGE_SPEED (178) that change the speed that the type names, and not another speed."""
+    """SPEED_TYPEs with which MAV_CMD_DO_CHANGE_SPEED (178) works; with others, it changes no speed or another one."""
     circles_by: Literal["orbit", "reposition", "setpoints"] | None = None
     """Way to circle a place: MAV_CMD_DO_ORBIT (34), DO_REPOSITION (192) with a radius, or set-points; None if there is
     none.
@@ -243,7 +243,7 @@ class Autopilot:
     upload is complete.
     """
     mission_completes_at_home = False
-    """True if a mission that ends with a return is reported as complete at home, False if already at its return."""
+    """True if a mission that ends with a return is reported as complete at home, False if when the return begins."""
     mission_starts_by_command = False
     """True if MAV_CMD_MISSION_START (300) starts the mission even on the ground. The command does not arm."""
     sets_current_by_command = False
@@ -278,7 +278,7 @@ class Autopilot:
     unarmable_modes: frozenset[str] = frozenset()
     """Modes in which the autopilot refuses to arm, or disarms at once."""
     armable_by_option: Mapping[str, str] = {}
-    """Maps each mode in which arming must be allowed by a parameter to this parameter."""
+    """Maps the name of a mode to the parameter that must allow arming in this mode."""
     modes_without_position: frozenset[str] = frozenset()
     """Modes in which the autopilot arms without an estimate of the position."""
     prearm_depends_on_mode = False

@@ -225,7 +225,9 @@ class Px4(Autopilot):
             return None
         if home_altitude_amsl_m is None:
             raise InvalidArgument("take-off on PX4 needs the altitude of home: NAV_TAKEOFF is above mean sea level")
-        params = (NAN, 0, 0, NAN, NAN, NAN, home_altitude_amsl_m + altitude_relative_m)
+        altitude_amsl_m = home_altitude_amsl_m + altitude_relative_m
+        # NaN leaves pitch, heading, latitude and longitude to PX4.
+        params = (NAN, 0, 0, NAN, NAN, NAN, altitude_amsl_m)
         loiter = self.modes.find("LOITER")
         return TakeOff(mode=None, command=MavCmd.NAV_TAKEOFF, params=params, mode_after=loiter)
 

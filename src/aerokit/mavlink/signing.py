@@ -320,7 +320,7 @@ class TimestampFile:
         try:
             self._write(self.timestamp)
             self.error = None
-        except OSError as error:
+        except OSError as error:  # Signing continues without the file; the owner reports the error.
             self.error = error
 
     def _write(self, timestamp: int) -> None:

@@ -133,6 +133,7 @@ def jump(to_item: int, *, repeat: int = -1) -> MissionItem:
     For any autopilot, items are counted from 0 without home, as in :class:`Mission`: ``jump(0)`` goes to the first
     item. https://mavlink.io/en/messages/common.html#MAV_CMD_DO_JUMP
     """
+    # For ArduPilot, where home is item 0, the number is sent increased by 1. It must still fit into 16 bits.
     target = whole_number("to_item", to_item, 0, 65_534)
     return action_item(MavCmd.DO_JUMP, target, whole_number("repeat", repeat, -1, 32_767))
 
@@ -167,7 +168,7 @@ def vtol_transition(to: Literal["multicopter", "fixed_wing"]) -> MissionItem:
 
 
 def land_start() -> MissionItem:
-    """Mark the start of the landing sequence, which returns and failsafes use.
+    """Mark the start of the landing sequence. The vehicle may jump to this item for a return or in a failsafe.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_LAND_START
     """
@@ -188,7 +189,10 @@ def set_camera_trigger_distance(distance_m: float, *, trigger_now: bool = False)
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_CAM_TRIGG_DIST
     """
     return action_item(
-        MavCmd.DO_SET_CAM_TRIGG_DIST, in_range("distance_m", distance_m, 0, 1e5), 0.0, float(trigger_now)
+        MavCmd.DO_SET_CAM_TRIGG_DIST,
+        in_range("distance_m", distance_m, 0, 1e5),
+        0.0,  # the shutter time: unchanged
+        float(trigger_now),
     )
 
 
@@ -303,5 +307,5 @@ def point_gimbal(*, pitch_deg: float = 0.0, roll_deg: float = 0.0, yaw_deg: floa
     return action_item(
         MavCmd.DO_MOUNT_CONTROL,
         *(in_range(name, value, -180, 180) for name, value in angles),
-        z=float(MavMountMode.MAVLINK_TARGETING),
+        z=float(MavMountMode.MAVLINK_TARGETING),  # An item has param7, which is the mode here, in `z`.
     )

@@ -10,6 +10,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionType
 from aerokit.missions.item import (
     DEFAULT_XY,
+    DEGREE_SCALE,
     DESTINATIONS,
     FENCE_COMMANDS,
     GLOBAL_FRAMES,
@@ -123,7 +124,7 @@ def _check_frame(where: str, item: MissionItem, mission_type: int) -> None:
     _check_integer(where, "frame", item.frame, 0xFF)
     if item.frame not in _FRAMES:
         raise _wrong(where, "frame", item.frame, "a MAV_FRAME")
-    if mission_type and item.frame not in GLOBAL_FRAMES:
+    if mission_type != MavMissionType.MISSION and item.frame not in GLOBAL_FRAMES:
         raise _wrong(where, "frame", item.frame, _GLOBAL_TEXT)
     if item.command in DESTINATIONS and item.frame not in GLOBAL_FRAMES | LOCAL_FRAMES:
         raise _wrong(where, "frame", item.frame, _FRAME_TEXT)
@@ -152,7 +153,7 @@ def _check_place(where: str, item: MissionItem) -> None:
         value = getattr(item, field)
         if not isinstance(value, int) or isinstance(value, bool):
             raise _wrong(where, field, value, "an integer, because MISSION_ITEM_INT has no fraction there")
-        if scale == 10_000_000 and abs(value) > limit * scale and value != DEFAULT_XY:
+        if scale == DEGREE_SCALE and abs(value) > limit * scale and value != DEFAULT_XY:
             allowed = f"a {name} of -{limit} to {limit} degrees in 1e-7 degrees; this is {value / 1e7:g} degrees"
             raise _wrong(where, field, value, allowed)
         if not -0x80000000 <= value <= 0x7FFFFFFF:

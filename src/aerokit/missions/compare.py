@@ -140,6 +140,7 @@ _INTEGERS = {"b": (0, 0xFF), "u": (0, 0xFFFF), "i": (-0x80, 0x7F), "s": (-0x8000
 def _stored_values(item: MissionItem, field: str, storage: ItemStorage) -> Iterator[float]:
     """Yield the values that a field may have when the item is read back."""
     number, value = FIELDS.index(field), getattr(item, field)
+    # The slice of one letter is empty for a field that has none, and `_convert` takes the empty text for "not stored".
     if storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
         for letters in _ARDUPILOT.get(item.command, ("",)):
             yield from _convert(letters[number : number + 1], value)
@@ -321,16 +322,17 @@ def _same_place(
 
 def _float_step(value: float) -> float:
     """Return the distance between a 32-bit float and its neighbour."""
-    return math.ldexp(1.0, math.frexp(value)[1] - 24)
+    significant_bits = 24
+    return math.ldexp(1.0, math.frexp(value)[1] - significant_bits)
 
 
 def _same_altitude(expected: MissionItem, actual: MissionItem, storage: ItemStorage) -> bool:
-    if expected.command in FENCE_COMMANDS or _close(expected.z, actual.z):
+    if expected.command in FENCE_COMMANDS or _close(expected.z, actual.z):  # A fence has no altitudes.
         return True
     if not has_place(expected.command):
         return any(_close(stored, actual.z) for stored in _stored_values(expected, "z", storage))
     if storage not in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
-        return False
+        return False  # Only ArduPilot rounds altitudes.
     if expected.command in RALLY_COMMANDS:  # ArduPilot stores whole metres.
         return math.isfinite(expected.z) and _close(math.trunc(expected.z), actual.z)
     return abs(expected.z - actual.z) <= ALTITUDE_TOLERANCE_M

@@ -156,6 +156,10 @@ def has_place(command: int) -> bool:
     return command in PLACES or command not in _STANDARD_COMMANDS
 
 
+DEGREE_SCALE = 10_000_000
+"""Units of x and y per degree in MISSION_ITEM_INT."""
+
+
 def xy_scale(command: int, frame: int) -> int:
     """Return the scale of x and y in MISSION_ITEM_INT: 10,000,000 for degrees, 10,000 for local metres, else 1.
 
@@ -165,7 +169,7 @@ def xy_scale(command: int, frame: int) -> int:
     if not has_place(command):
         return 1
     if frame in GLOBAL_FRAMES:
-        return 10_000_000
+        return DEGREE_SCALE
     return 10_000 if frame in LOCAL_FRAMES else 1
 
 
@@ -211,7 +215,7 @@ class MissionItem(Snapshot):
         None for commands without a place, for local frames, and for 0°, 0°, which means "the current position". If the
         frame is relative to terrain, the position has no altitude; use ``z``.
         """
-        if xy_scale(self.command, self.frame) != 10_000_000:
+        if xy_scale(self.command, self.frame) != DEGREE_SCALE:
             return None
         if (self.x, self.y) in ((0, 0), (DEFAULT_XY, DEFAULT_XY)):
             return None
@@ -224,7 +228,7 @@ class MissionItem(Snapshot):
                 altitude_amsl_m=altitude if frame == MavFrame.GLOBAL else None,
                 altitude_relative_m=altitude if frame == MavFrame.GLOBAL_RELATIVE_ALT else None,
             )
-        except InvalidArgument:
+        except InvalidArgument:  # Items of vehicles and files may have coordinates out of range.
             return None
 
     def _key(self) -> tuple[Any, ...]:

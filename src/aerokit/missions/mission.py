@@ -230,7 +230,8 @@ def _read_polygon(items: Sequence[MissionItem], first: int) -> FencePolygon:
             f"item {first} ({item.name}) begins a polygon of {item.param1:g} vertices, but some of them are missing"
         )
     places = [_place(vertex, first + number) for number, vertex in enumerate(vertices)]
-    return FencePolygon(places, item.command == _POLYGON[True])
+    is_inclusion = item.command == _POLYGON[True]
+    return FencePolygon(places, is_inclusion)
 
 
 def _read_circle(item: MissionItem, index: int) -> FenceCircle:

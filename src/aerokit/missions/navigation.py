@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 _MAX_DURATION_S = 65_535.0  # ArduPilot stores seconds in 16 bits
 _MAX_RADIUS_M = 65_535.0  # ArduPilot stores metres in 16 bits
+# Value of the parameters of a command that have no meaning, or that these functions leave at their default.
+_UNSET = 0.0
 
 
 @overload
@@ -178,8 +180,8 @@ def take_off(
         MavCmd.NAV_TAKEOFF,
         *_place_or_altitude(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
         in_range("pitch_deg", pitch_deg, 0, 90),
-        0.0,
-        0.0,
+        _UNSET,
+        _UNSET,
         heading("yaw_deg", yaw_deg),
     )
 
@@ -227,9 +229,9 @@ def vtol_take_off(
     return place_item(
         MavCmd.NAV_VTOL_TAKEOFF,
         *_place_or_altitude(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
-        0.0,
-        0.0,
-        0.0,
+        _UNSET,
+        _UNSET,
+        _UNSET,
         heading("yaw_deg", yaw_deg),
     )
 
@@ -283,7 +285,7 @@ def land(
         _altitudes_or_home(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("abort_altitude_m", abort_altitude_m, 0, _MAX_RADIUS_M),
         in_range("precision", precision, 0, 2),
-        0.0,
+        _UNSET,
         heading("yaw_deg", yaw_deg),
     )
 
@@ -327,9 +329,9 @@ def vtol_land(
         latitude_deg,
         longitude_deg,
         _altitudes_or_home(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
-        0.0,
-        0.0,
-        0.0,
+        _UNSET,
+        _UNSET,
+        _UNSET,
         heading("yaw_deg", yaw_deg),
     )
 
@@ -375,8 +377,8 @@ def loiter_unlimited(
         latitude_deg,
         longitude_deg,
         (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
-        0.0,
-        0.0,
+        _UNSET,
+        _UNSET,
         in_range("radius_m", radius_m, -_MAX_RADIUS_M, _MAX_RADIUS_M),
         heading("yaw_deg", yaw_deg),
     )
@@ -428,7 +430,7 @@ def loiter_time(
         longitude_deg,
         (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("duration_s", duration_s, 0, _MAX_DURATION_S),
-        0.0,
+        _UNSET,
         in_range("radius_m", radius_m, -_MAX_RADIUS_M, _MAX_RADIUS_M),
         float(leave_tangentially),
     )
@@ -480,7 +482,7 @@ def loiter_turns(
         longitude_deg,
         (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("turns", turns, 0, 255),
-        0.0,
+        _UNSET,
         in_range("radius_m", radius_m, -2550, 2550),
         float(leave_tangentially),
     )
@@ -533,9 +535,9 @@ def loiter_to_altitude(
     return place_item(
         MavCmd.NAV_LOITER_TO_ALT,
         *_place_or_altitude(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
-        0.0,
+        _UNSET,
         in_range("radius_m", radius_m, -_MAX_RADIUS_M, _MAX_RADIUS_M),
-        0.0,
+        _UNSET,
         float(leave_tangentially),
     )
 

@@ -148,7 +148,7 @@ def _missing_fields(plan: Any) -> Iterator[tuple[str, list[str]]]:
     """Yield each object of a plan with the names of the required fields that it lacks."""
     mission, fence, rally = (_member(plan, key) for key in ("mission", "geoFence", "rallyPoints"))
     document_keys = ["fileType", "version"]
-    if mission is None and fence is None and rally is None:
+    if mission is None and fence is None and rally is None:  # A plan needs one of the three, usually the mission.
         document_keys.append("mission")
     yield _missing_in("the document", plan, *document_keys)
     yield _missing_in("mission", mission, "version", "items")
@@ -193,15 +193,15 @@ def _read_mission(value: JsonValue) -> Mission:
 
 
 def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
-    defaults = _numbers(Plan())
+    defaults = default_firmware, default_vehicle, default_cruise, default_hover = _numbers(Plan())
     if mission is None:
         return defaults
     firmware, vehicle, cruise, hover = (mission.child(key) for key in _NUMBER_KEYS.values())
     return (
-        defaults[0] if firmware is None else firmware.integer(0, 0xFF),
-        defaults[1] if vehicle is None else vehicle.integer(0, 0xFF),
-        defaults[2] if cruise is None else cruise.number(),
-        defaults[3] if hover is None else hover.number(),
+        default_firmware if firmware is None else firmware.integer(0, 0xFF),
+        default_vehicle if vehicle is None else vehicle.integer(0, 0xFF),
+        default_cruise if cruise is None else cruise.number(),
+        default_hover if hover is None else hover.number(),
     )
 
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import FileFormatError
 from aerokit.mavlink.enums import MavCmd, MavFrame
-from aerokit.missions.item import MissionItem, canonical_frame, has_place, xy_scale
+from aerokit.missions.item import DEGREE_SCALE, MissionItem, canonical_frame, has_place, xy_scale
 from aerokit.missions.wire import from_degrees, in_degrees
 
 if TYPE_CHECKING:
@@ -50,7 +50,8 @@ def _reset_items(pattern: JsonValue) -> list[MissionItem]:
     items = []
     if _flag(pattern, "useDoChangeSpeed"):
         speed = pattern["finalApproachSpeed"].number(0)
-        items.append(MissionItem(MavCmd.DO_CHANGE_SPEED, MavFrame.MISSION, 0.0, speed, -1.0))
+        airspeed, unchanged_throttle = 0.0, -1.0
+        items.append(MissionItem(MavCmd.DO_CHANGE_SPEED, MavFrame.MISSION, airspeed, speed, unchanged_throttle))
     if _flag(pattern, "stopTakingPhotos"):
         items.append(MissionItem(MavCmd.DO_SET_CAM_TRIGG_DIST, MavFrame.MISSION))
         items.append(MissionItem(MavCmd.IMAGE_STOP_CAPTURE, MavFrame.MISSION))
@@ -199,7 +200,7 @@ def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
     command, frame = value["command"].integer(0, 0xFFFF), value["frame"].integer(0, 0xFF)
     params = value["params"].elements(7)
     numbers = [param.number(null=True) for param in params]
-    if xy_scale(command, frame) == 10_000_000:  # These calls raise an error for coordinates out of range.
+    if xy_scale(command, frame) == DEGREE_SCALE:  # These calls raise an error for coordinates out of range.
         params[4].number(-90, 90, null=True)
         params[5].number(-180, 180, null=True)
     if command == MavCmd.DO_JUMP:

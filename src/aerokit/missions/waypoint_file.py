@@ -15,7 +15,7 @@ from aerokit._internal.files import read_text, write_atomically
 from aerokit._internal.formatting import short_repr
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
-from aerokit.missions.item import MissionItem, canonical_frame, xy_scale
+from aerokit.missions.item import DEGREE_SCALE, MissionItem, canonical_frame, xy_scale
 from aerokit.missions.mission import Mission
 from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps
 from aerokit.position import Position
@@ -70,6 +70,7 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
     ]
     if not rows or version[2] != "110" or not rows[0].is_home():
         return Mission([row.item() for row in rows])
+    # In the file, jump targets count home as an item, unlike in `Mission`.
     home = rows[0].home()
     return Mission(shift_jumps([row.item() for row in rows[1:]], -1), home)
 
@@ -78,8 +79,8 @@ def format_waypoints(mission: Mission, *, version: int = 110) -> str:
     """Format a mission as the text of a file, with Mission Planner's precision, or more where a number needs more.
 
     Values that are not given (NaN) become 0, because Mission Planner rejects a file that contains NaN
-    (https://github.com/ArduPilot/pymavlink/issues/1096). PX4 takes a heading of 0 for north; a .plan file keeps the
-    difference.
+    (https://github.com/ArduPilot/pymavlink/issues/1096). PX4 takes a heading of 0 for north. A .plan file
+    stores such values as null.
 
     Raises:
         InvalidArgument: ``mission`` is no mission, a number is infinite, the altitude of a place is NaN, or the version
@@ -125,7 +126,7 @@ class _Row:
         return Position(latitude, longitude, self._number("altitude")) if latitude or longitude else None
 
     def item(self) -> MissionItem:
-        has_degrees = xy_scale(self.command, self.frame) == 10_000_000
+        has_degrees = xy_scale(self.command, self.frame) == DEGREE_SCALE
         latitude = self._number("latitude", 90.0 if has_degrees else math.inf, may_be_nan=True)
         longitude = self._number("longitude", 180.0 if has_degrees else math.inf, may_be_nan=True)
         return MissionItem(
@@ -143,7 +144,9 @@ class _Row:
 
     def _integer(self, column: str, high: int) -> int:
         text = self.texts[_COLUMNS.index(column)]
-        if not (text.isascii() and text.isdigit() and int(text[:9]) <= high and len(text) < 9):
+        # Every number has at most five digits. int() would take long for a very long text.
+        is_short_number = text.isascii() and text.isdigit() and len(text) < 9
+        if not is_short_number or int(text) > high:
             raise FileFormatError(f"{self.where}: {column} = {text!r}: expected a whole number from 0 to {high}")
         return int(text)
 
@@ -174,6 +177,7 @@ def _item_row(item: MissionItem, index: int) -> str:
         raise InvalidArgument(f"{item!r} has an infinite number, which a file cannot store")
     if math.isnan(item.z) and item.position is not None:
         raise InvalidArgument(f"{item!r} has a place without an altitude, which a file cannot store")
+    # Mission Planner writes 8 decimal places of each number, but 6 of the altitude.
     columns = [(number, 8) for number in numbers] + [(item.z, 6)]
     texts = (
         *map(str, integers),

@@ -122,7 +122,7 @@ def _argument(function_name: str, name: str, number: int, hint: Any) -> CommandA
     if get_origin(hint) in (Union, types.UnionType):
         members = [member for member in get_args(hint) if member is not type(None)]
         is_optional = len(members) < len(get_args(hint))
-        hint = members[0] if len(members) == 1 else None
+        hint = members[0] if len(members) == 1 else None  # None is refused below.
     is_number = hint in (float, int, bool) or (isinstance(hint, type) and issubclass(hint, Enum))
     if not is_number:
         raise InvalidArgument(

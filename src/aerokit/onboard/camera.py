@@ -90,7 +90,7 @@ class CameraDriver:
         gimbal_id: int = 0,
     ) -> None:
         for name, text in (("vendor", vendor), ("model", model)):
-            if len(text.encode()) > 32:
+            if len(text.encode()) > 32:  # the size of the fields in CAMERA_INFORMATION
                 raise InvalidArgument(f"{name} = {text!r} is not allowed: it must have at most 32 bytes")
         self.vendor: str = vendor
         self.model: str = model
@@ -245,6 +245,7 @@ class CameraAdapter(CameraDevice):
 
     def expose(self, done: Callable[[Shot | None], None]) -> None:
         """Take a photo in a task, then call ``done`` with the result, or with None after an error."""
+        # The time of the order counts as the time of the picture.
         time_boot_ms, unix_time = self._host.time_boot_ms, self._host.connection.unix_time()
 
         async def take() -> None:
@@ -271,6 +272,7 @@ class CameraAdapter(CameraDevice):
                 time_boot_ms=self._host.time_boot_ms,
                 storage_id=1,
                 storage_count=1,
+                # With NOT_SUPPORTED, clients ignore the sizes.
                 status=StorageStatus.READY if storage.is_ready else StorageStatus.NOT_SUPPORTED,
                 total_capacity=storage.total_mib,
                 used_capacity=storage.used_mib,
@@ -366,4 +368,5 @@ def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
         else round(place.altitude_relative_m * 1000),
         q=UNKNOWN_ATTITUDE if len(known_angles) < 3 else quaternion_from_euler(*known_angles),
     )
+    # The caller may replace the URL.
     return lambda **fields: message(**{"file_url": photo.url, **fields})

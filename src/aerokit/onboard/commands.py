@@ -121,7 +121,7 @@ class ComponentCommands:
 
     def __init__(self, host: ComponentHost, tasks: BackgroundTasks) -> None:
         self.uses_threads = False
-        """True to call plain functions in threads, for blocking programs."""
+        """True if plain (not ``async``) handlers are called in threads, because they may block."""
         self.handlers: dict[int, CommandHandler] = {}
         """Maps MAV_CMD to handler. Protocol servers add their handlers."""
         self.server: CommandDispatcher = CommandDispatcher(host, self.handlers)
@@ -140,7 +140,7 @@ class ComponentCommands:
         self.handlers[command] = partial(self._execute, function, arguments_of(function))
 
     def add_guarded(self, handlers: Mapping[int, CommandHandler]) -> None:
-        """Register handlers of a protocol server that call the program's code. Its exceptions become results."""
+        """Register handlers of a protocol server that call the program's code, whose exceptions become results."""
 
         def guard(handler: CommandHandler) -> CommandHandler:
             def guarded(command: ReceivedCommand) -> int | CommandProgress | None:

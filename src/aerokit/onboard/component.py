@@ -98,7 +98,7 @@ class OnboardComponent:
         self._commands.cancel_all()
         try:
             await self._tasks.aclose()
-            with anyio.CancelScope(shield=True):
+            with anyio.CancelScope(shield=True):  # A cancelled program must save its parameters too.
                 await self.parameters.aclose()
         finally:
             self._ftp.close()

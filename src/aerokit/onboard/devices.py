@@ -102,22 +102,23 @@ STATUS_HZ = 5.0
 def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
     """Execute DO_WINCH by the driver, and send WINCH_STATUS."""
 
+    # The arguments are the parameters of the command, in order. A component has one winch, so `instance` is ignored.
     async def do_winch(
         _: CommandRequest, instance: float | None, action: int, length: float | None, rate: float | None
     ) -> None:
-        name = _WINCH_CALLS.get(action, "")
-        if not name or not overrides(winch, WinchDriver, name):
+        method = _WINCH_CALLS.get(action, "")
+        if not method or not overrides(winch, WinchDriver, method):
             raise NotSupported(f"this winch does not support action {action}")
         arguments: tuple[float | None, ...] = ()
-        if name == "pay_out":
+        if method == "pay_out":
             arguments = (length, rate)
-        elif name == "set_rate":
+        elif method == "set_rate":
             arguments = (rate,)
         if None in arguments:
             raise InvalidArgument("length or rate is missing: this action needs it")
-        if name == "pay_out" and rate is not None and rate <= 0:
+        if method == "pay_out" and rate is not None and rate <= 0:
             raise InvalidArgument(f"rate = {rate:g} is not allowed: it must be above 0")
-        await services.commands.call(getattr(winch, name), *arguments)
+        await services.commands.call(getattr(winch, method), *arguments)
 
     def status() -> m.WinchStatus:
         report = winch.report()
@@ -136,6 +137,7 @@ def add_gripper(
 ) -> None:
     """Execute DO_GRIPPER by the two functions."""
 
+    # The arguments are the parameters of the command. A component has one gripper, so `instance` is ignored.
     async def do_gripper(_: CommandRequest, instance: float | None, action: GripperActions) -> None:
         if action == GripperActions.RELEASE:
             await services.commands.call(release)

@@ -44,13 +44,13 @@ class EventSender:
         check_severity(severity)
         is_first = self._sequence < 0
         self._sequence = (self._sequence + 1) & 0xFFFF
-        levels = severity << 4 | severity  # one half byte for logs, the other for other programs
+        levels = severity << 4 | severity  # four bits for logs and four bits for other programs
         time_ms, data = self._host.time_boot_ms, bytes(arguments).ljust(MAX_ARGUMENT_BYTES, b"\0")
         destination = (0, 0)  # the message is for all components
         event = m.Event(*destination, event_id, time_ms, self._sequence, levels, data)
         self._sent.append(event)
         self._host.send(event)
-        if is_first:
+        if is_first:  # From now on, announce the last sequence number regularly, so that receivers notice losses.
             self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
 
     def _send_sequence(self) -> None:
@@ -77,11 +77,14 @@ def answer_pings(host: ComponentHost) -> None:
 
     def on_ping(ping: m.Ping, channel: Channel) -> None:
         if ping.target_system == 0 and ping.target_component == 0:  # A PING with a target is an answer.
-            host.send(m.Ping(ping.time_usec, ping.seq, *channel), channel)
+            sender_system, sender_component = channel
+            host.send(m.Ping(ping.time_usec, ping.seq, sender_system, sender_component), channel)
 
     def on_timesync(message: m.Timesync, channel: Channel) -> None:
         if message.tc1 == 0:  # A TIMESYNC with another value is an answer.
-            host.send(m.Timesync(int(host.now * 1e9), message.ts1, *channel), channel)
+            own_time_ns = int(host.now * 1e9)
+            sender_system, sender_component = channel
+            host.send(m.Timesync(own_time_ns, message.ts1, sender_system, sender_component), channel)
 
     host.on(m.Ping, on_ping)
     host.on(m.Timesync, on_timesync)

@@ -37,7 +37,8 @@ def _raises_file_fault(function: FunctionT) -> FunctionT:
             return function(*args, **kwargs)
         except OSError as error:
             number = error.errno or EINVAL
-            raise FileFault(_ERROR_NUMBERS.get(number, number) & 0xFF) from None
+            linux_number = _ERROR_NUMBERS.get(number, number)
+            raise FileFault(linux_number & 0xFF) from None  # The answer has one byte for the number.
 
     return cast("FunctionT", guarded)
 
@@ -111,7 +112,7 @@ class DirectoryFiles:
         flags = os.O_RDWR if writing else os.O_RDONLY
         if writing and create:
             flags |= os.O_CREAT | os.O_TRUNC
-        if target.exists() and not target.is_file():
+        if target.exists() and not target.is_file():  # A device or a pipe could block the program.
             raise FileFault(ENOENT)
         descriptor = os.open(target, flags | _SAFE_FLAGS, 0o644)
         # Check again, because another program may have replaced the file by a device since the check above.

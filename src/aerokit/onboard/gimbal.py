@@ -158,10 +158,11 @@ class GimbalAdapter(GimbalMount):
         if place is None:
             position = None
         else:
-            position = Position(place[0] / 1e7, place[1] / 1e7, altitude_amsl_m=place[2])
+            latitude_e7, longitude_e7, altitude_amsl_m = place
+            position = Position(latitude_e7 / 1e7, longitude_e7 / 1e7, altitude_amsl_m=altitude_amsl_m)
         self._gimbal.look_at(position)
         self.flags: int = 0
-        self._is_locked = position is not None
+        self._is_locked = position is not None  # While the gimbal looks at a position, the vehicle does not turn it.
         self._followed = 0
 
     def follow(self, system_id: int) -> None:

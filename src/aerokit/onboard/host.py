@@ -74,12 +74,13 @@ class ComponentHost:
 
     def _is_addressed(self, message: Message, sender: tuple[int, int]) -> bool:
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
-        if sender == (self.system_id, self.component_id) or sender[0] == 0:
+        if sender == (self.system_id, self.component_id) or sender[0] == 0:  # System id 0 is not a valid sender.
             return False
         if self._accepts is not None and sender[0] not in self._accepts:
             return False
         if system not in (0, self.system_id) or component not in (0, self.component_id):
             return False
+        # A command that this component does not know may be meant for another one, so do not refuse it.
         is_command_to_all = component == 0 and message.ID in _COMMANDS
         return not is_command_to_all or self.knows_command(message.command)  # type: ignore[attr-defined]
 

@@ -132,13 +132,14 @@ class ComponentMissions:
         if self._on_current is None:
             return False
         try:
-            return self._on_current(index) is not False
+            return self._on_current(index) is not False  # A function that returns None accepts the item.
         except Exception as error:
             self._report_refusal("set_current", error)
             return False
 
     def _do_set_current(self, request: CommandRequest, index: int) -> None:
-        if not self._server.set_current(index):
+        is_accepted = self._server.set_current(index)
+        if not is_accepted:
             raise InvalidArgument(f"the mission cannot continue at item {index}")
 
 

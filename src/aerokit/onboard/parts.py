@@ -49,14 +49,14 @@ def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapt
         raise InvalidArgument("this component already has a camera: open another component for the second one")
     if camera.definition is not None:
         definition = parse_definition(camera.definition)
-        services.parameters._forbid_parameters()
+        services.parameters._forbid_parameters()  # The camera's settings use the same messages.
         DefinedSettings(host, definition, camera.on_setting)
         services.memory.put(DEFINITION_PATH, camera.definition)
         adapter.definition_version, adapter.definition_uri = definition.version, f"mftp://{DEFINITION_PATH}"
     streams.builders.update(camera_builders(adapter))
     for command, handler in camera_commands(adapter).items():
         if command == MavCmd.STORAGE_FORMAT and not overrides(camera, CameraDriver, "format_storage"):
-            continue
+            continue  # The command stays UNSUPPORTED.
         services.commands.add_raw(command, partial(_run, handler))
     services.commands.handlers.update(legacy_requests(streams))
     return adapter

@@ -58,7 +58,7 @@ class ComponentSources:
         """
         if not 0 < len(distances_m) <= MAX_DISTANCES:
             raise InvalidArgument(f"distances_m has {len(distances_m)} values; 1 to {MAX_DISTANCES} are allowed")
-        if not 0 <= min_m < max_m <= 655:
+        if not 0 <= min_m < max_m <= 655:  # The fields have 16 bits, for centimetres.
             raise InvalidArgument(
                 f"min_m, max_m = {min_m}, {max_m} are not allowed: both must be 0 to 655, and min_m below max_m"
             )
@@ -67,11 +67,13 @@ class ComponentSources:
         nothing_in_range = round(max_m * 100) + 1  # defined by OBSTACLE_DISTANCE
         values = [_centimetres(distance, nothing_in_range) for distance in distances_m]
         values += [_NOT_MEASURED] * (MAX_DISTANCES - len(values))
-        limits, increment = (round(min_m * 100), round(max_m * 100)), min(255, round(increment_deg))
+        limits_cm = (round(min_m * 100), round(max_m * 100))
+        # Receivers use the float instead of this older field of 8 bits.
+        increment = min(255, round(increment_deg))
         frame = MavFrame.BODY_FRD
         self._send(
             m.ObstacleDistance(
-                self._time_us(), sensor_type, values, increment, *limits, increment_deg, first_deg, frame
+                self._time_us(), sensor_type, values, increment, *limits_cm, increment_deg, first_deg, frame
             )
         )
 

@@ -258,6 +258,7 @@ def _check_option(
     by_name = {option.name: option.value for option in options}
     if isinstance(value, str) and value in by_name:
         return by_name[value]
+    # A text that is not the name of an option may be a value only if the values of this type are texts.
     if not isinstance(value, str) or setting.wire_type == MavParamExtType.CUSTOM:
         wire_value = checked_setting(setting.name, value, setting.wire_type)
         for option in options:
@@ -340,14 +341,15 @@ def _compare(value: SettingValue, operator: str, text: str) -> bool:
     if isinstance(value, (str, bytes)):
         if operator not in ("=", "!="):
             return False
-        return settings_equal(value, text) == (operator == "=")
+        is_equal = settings_equal(value, text)
+        return is_equal if operator == "=" else not is_equal
     number = _number(text)
     if number is None:
         return False
     # Do not use ==, because a value sent as a 32-bit float differs a little from the decimal number in the file.
     is_equal = settings_equal(value, number)
     if operator in ("=", "!="):
-        return is_equal == (operator == "=")
+        return is_equal if operator == "=" else not is_equal
     if is_equal:
         return operator in (">=", "<=")
     return value > number if operator in (">", ">=") else value < number
@@ -371,7 +373,7 @@ class _Reader:
         for node in root.iterfind("parameters/parameter"):
             setting = self._setting(node)
             if setting is not None:
-                settings.setdefault(setting.name, setting)
+                settings.setdefault(setting.name, setting)  # The first definition counts.
         translations: dict[str, Mapping[str, str]] = {}
         for node in root.iterfind("localization/locale"):
             texts = {text.get("original", ""): text.get("translated", "") for text in node.iterfind("strings")}

@@ -39,7 +39,7 @@ _M = TypeVar("_M", ParamSet, ParamValue)
 
 def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa: A002
     """Encode a value as the four bytes of ``param_value``. :func:`checked_value` must have accepted the value."""
-    if not bytewise or type is ParameterType.REAL32:
+    if not bytewise or type is ParameterType.REAL32:  # Integers are also sent as the float of the same value.
         return _FLOAT.pack(value)
     if type not in _FORMATS:
         raise InvalidArgument(
@@ -99,6 +99,7 @@ def set_message(
     """Create a PARAM_SET for a checked name and value."""
     bits = to_bits(value, type, bytewise)
     message = ParamSet(target_system, target_component, name, _FLOAT.unpack(bits)[0], int(type))
+    # The bits of an integer may be those of a NaN, which a Python float does not keep exactly.
     return _with_exact_bits(message, _ExactParamSet, bits)
 
 
@@ -171,7 +172,7 @@ def number_text(value: float) -> str:
     """
     if isinstance(value, int):
         return str(int(value))
-    if value == int(value) and abs(value) < 1e9:
+    if value == int(value) and abs(value) < 1e9:  # Larger numbers are shorter with an exponent.
         return "-0.0" if str(value) == "-0.0" else str(int(value))  # int() would lose the sign of -0.0.
     number = to_float32(value)
     # Nine digits identify every 32-bit float.

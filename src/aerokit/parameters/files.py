@@ -96,7 +96,8 @@ def parse_parameter_file(text: str, source: str = "parameters", *, component_id:
             comments.append(comment.strip())
     if not lines:
         raise FileFormatError(f"{source} contains no parameters")
-    if "\t" in lines[0][1] and len(lines[0][1].split()) > 2:
+    _, first_line = lines[0]
+    if "\t" in first_line and len(first_line.split()) > 2:  # The other formats have only name and value.
         return _parse_qgroundcontrol(lines, comments, source, component_id)
     return _parse_names_and_values(lines, comments)
 

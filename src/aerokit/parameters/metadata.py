@@ -170,7 +170,8 @@ _BITS = range(64)
 
 def _parse(data: bytes) -> list[ParameterMetadata]:
     """Parse a file of either autopilot, XML or JSON."""
-    if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
+    byte_order_mark = b"\xef\xbb\xbf"
+    if data.lstrip(byte_order_mark + b" \t\r\n").startswith(b"<"):
         root = DefusedXml.fromstring(data, forbid_dtd=True)
         if root.tag == "paramfile":
             return list(_ardupilot_xml(root))

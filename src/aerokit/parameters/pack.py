@@ -87,7 +87,7 @@ def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
         RemoteProtocolError: the file is damaged, or its number of parameters differs from that in its header. ArduPilot
             sends such a file once after its list has changed; download the file again.
     """
-    magic, count, total = read_header(data)
+    magic, count, total = read_header(data)  # `total` also counts the parameters before `start`.
     if magic not in (MAGIC, _MAGIC_WITH_DEFAULTS) or count > total:
         raise RemoteProtocolError(f"the file is not a param.pck: its header is {magic:#06x}, {count} of {total}")
     parameters = list(_parameters(data, magic == _MAGIC_WITH_DEFAULTS, start))
@@ -118,6 +118,7 @@ def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -
     length = HEADER.size + len(body)
     if length > _MAX_SIZE:
         raise InvalidArgument(f"{len(rows)} parameters need {length} bytes; at most {_MAX_SIZE} are possible")
+    # In an upload, the last field of the header is the size of the file.
     return HEADER.pack(MAGIC, len(rows), length) + bytes(body)
 
 
@@ -177,13 +178,13 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
     """
     code, flags = data[position] & 0x0F, data[position] & 0xF0
     if code not in _CODES or flags & ~_HAS_DEFAULT:
-        _damaged(position, f"invalid type {code} or flags {flags >> 4}")
+        _raise_damaged(position, f"invalid type {code} or flags {flags >> 4}")
     if position + 1 == len(data):
         return None
     # The name begins with characters of the previous name, which the file does not repeat.
     common, own_length = data[position + 1] & 0x0F, (data[position + 1] >> 4) + 1
     if common > len(previous_name) or common + own_length > NAME_LENGTH:
-        _damaged(position, f"invalid name length {common} + {own_length} after {previous_name!r}")
+        _raise_damaged(position, f"invalid name length {common} + {own_length} after {previous_name!r}")
     kind, format_ = _CODES[code]
     start = position + 2 + own_length
     end = start + format_.size * (2 if flags else 1)
@@ -199,7 +200,8 @@ def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parame
     while position < len(data):
         entry = read_entry(data, position, previous_name)
         if entry is None:
-            _damaged(position, "it ends inside an entry")
+            _raise_damaged(position, "it ends inside an entry")
+        # A file with defaults omits those that equal the value.
         default = entry.value if entry.default is None and with_defaults else entry.default
         yield Parameter(_text(entry.name, position), entry.value, entry.type, default, index)
         position, previous_name, index = _skip_padding(data, entry.end), entry.name, index + 1
@@ -213,11 +215,11 @@ def _skip_padding(data: bytes, position: int) -> int:
 
 def _text(name: bytes, position: int) -> str:
     if not all(0x20 < byte < 0x7F for byte in name):
-        _damaged(position, f"invalid name {name!r}")
+        _raise_damaged(position, f"invalid name {name!r}")
     return name.decode("ascii")
 
 
-def _damaged(position: int, problem: str) -> NoReturn:
+def _raise_damaged(position: int, problem: str) -> NoReturn:
     raise RemoteProtocolError(f"param.pck is damaged at byte {position}: {problem}")
 
 
@@ -235,15 +237,18 @@ def _code_of(parameter: Parameter) -> int:
 def _entry(name: bytes, previous_name: bytes, code: int, *values: float) -> bytes:
     common, pack = _common_length(name, previous_name), _CODES[code][1].pack
     type_and_flags = code | (_HAS_DEFAULT if len(values) > 1 else 0)
+    # Four bits for the shared characters, and four for the number of own characters minus 1.
     lengths = common | (len(name) - common - 1) << 4
     return bytes((type_and_flags, lengths)) + name[common:] + b"".join(map(pack, values))
 
 
 def _common_length(name: bytes, previous_name: bytes) -> int:
-    """Return how many characters at the beginning of the two names are equal."""
-    # The last character is not compared, because an entry must contain at least one character of its name.
+    """Return the length of the prefix that a name shares with the previous name, without the name's last character.
+
+    The last character is left out, because the format requires at least one character after the prefix.
+    """
     common = 0
-    for char, previous_char in zip(name[:-1], previous_name):  # noqa: B905 - the shorter one ends it
+    for char, previous_char in zip(name[:-1], previous_name):  # noqa: B905 - the lengths may differ
         if char != previous_char:
             break
         common += 1
@@ -268,4 +273,5 @@ def px4_hash(table: ParameterTable, volatile: Container[str] = ()) -> int:
     for name in sorted(table):
         if name not in volatile:
             data += name.encode() + to_bits(table[name].value, table[name].type, bytewise=True)
+    # zlib inverts the CRC before and after the computation; both inversions are undone here.
     return zlib.crc32(data, _ALL_ONES) ^ _ALL_ONES

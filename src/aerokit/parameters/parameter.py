@@ -162,7 +162,7 @@ def same_value(left: float, right: float) -> bool:
     if left == right or are_both_nan:
         return True
     if isinstance(left, int) and isinstance(right, int):
-        return False
+        return False  # Large integers may differ although they are equal as 32-bit floats.
     try:
         return to_float32(left) == to_float32(right)
     except OverflowError:
@@ -265,7 +265,7 @@ def settings_equal(left: SettingValue, right: SettingValue) -> bool:
     if left == right or are_both_nan:
         return True
     if not isinstance(left, float) and not isinstance(right, float):
-        return False
+        return False  # Large integers may differ although they are equal as 32-bit floats.
     try:
         return _FLOAT.pack(left) == _FLOAT.pack(right) and math.isfinite(left)
     except (OverflowError, struct.error):

@@ -111,7 +111,8 @@ class ParameterTable(Mapping[str, Parameter]):
         """Return a copy sorted by index. Parameters without an index come last."""
 
         def sort_key(parameter: Parameter) -> int:
-            return 1 << 16 if parameter.index is None else parameter.index  # Indices have 16 bits.
+            above_all_indices = 1 << 16  # Indices have 16 bits.
+            return above_all_indices if parameter.index is None else parameter.index
 
         return ParameterTable(sorted(self._by_name.values(), key=sort_key))
 

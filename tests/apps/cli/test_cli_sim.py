@@ -237,3 +237,10 @@ def test_fault_refuses_arming_as_documented(name: str) -> None:
             return copter.is_armed
 
     assert run_virtual(scenario()) is (DOCUMENTED_FAULTS[name] == "no")
+
+
+def test_lost_transmitter_was_on_for_a_second() -> None:
+    """ArduPilot does not miss a transmitter that it has never received."""
+    assert fault("rc_lost") == fault("rc_lost@0.3") == ("rc_lost", True, 1.0)
+    assert fault("rc_lost@5") == ("rc_lost", True, 5.0)
+    assert fault("gps_lost") == ("gps_lost", True, 0.0)

@@ -100,6 +100,10 @@ FAULTS: tuple[str, ...] = (
 """Names of `aerokit.sim.Faults` that ``aerokit sim --fault`` accepts, described in docs/simulator.md."""
 
 
+TRANSMITTER_ON_S = 1.0
+"""Earliest time of the fault ``rc_lost``, because ArduPilot ignores a transmitter that it has never received."""
+
+
 def fault(text: str) -> tuple[str, bool | float | list[str], float]:
     """Parse ``NAME[=VALUE][@SECONDS]``: a fault of the simulator, its value, and the time at which it begins."""
     name_and_value, _, begin = text.partition("@")
@@ -107,6 +111,8 @@ def fault(text: str) -> tuple[str, bool | float | list[str], float]:
     if name not in FAULTS:
         raise ArgumentTypeError(f"{name!r} is not a fault{suggestion(name, FAULTS)}; faults: {', '.join(FAULTS)}")
     at_s = number(0, 1e6)(begin) if begin else 0.0
+    if name == "rc_lost":
+        at_s = max(at_s, TRANSMITTER_ON_S)
     if name in _SHARE_FAULTS:
         return name, number(0, 1)(value), at_s
     if name == "prearm_failures":
@@ -224,7 +230,7 @@ def add_vehicle_kind(command: argparse.ArgumentParser, kinds: str) -> None:
 
 
 def add_baud(command: argparse._ActionsContainer) -> None:
-    help_text = "baud rate of serial ports whose address has none (57600)"
+    help_text = "baud rate of serial ports whose address has none (default: 57600)"
     command.add_argument("--baud", type=int, default=57600, help=help_text)
 
 

@@ -36,9 +36,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--host",
         default="127.0.0.1",
         metavar="IP",
-        help="address to listen on; 0.0.0.0: all interfaces (127.0.0.1)",
+        help="address to listen on; 0.0.0.0: all interfaces (default: 127.0.0.1)",
     )
-    foxglove.add_argument("--port", type=port, default=8765, help="TCP port to listen on; 0: any free port (8765)")
+    foxglove.add_argument(
+        "--port", type=port, default=8765, help="TCP port to listen on; 0: any free port (default: 8765)"
+    )
     foxglove.add_argument(
         "--messages",
         action="append",
@@ -87,7 +89,7 @@ def _add_common(action: argparse.ArgumentParser, rate_hz: float, what: str) -> N
         type=number(0.1, 50 if rate_hz < 10 else 100),
         default=rate_hz,
         metavar="HZ",
-        help=f"maximum rate of each {what} ({rate_hz:g})",
+        help=f"maximum rate of each {what} (default: {rate_hz:g})",
     )
     action.add_argument(
         "--listen-only",

@@ -84,7 +84,9 @@ PICTURES: dict[CalibrationPose, str] = {
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("sensor", choices=_SENSORS, help="what to calibrate")
     add_link(command)
-    command.add_argument("--system-id", type=system_id, metavar="ID", help="system id of the vehicle (the only one)")
+    command.add_argument(
+        "--system-id", type=system_id, metavar="ID", help="system id of the vehicle (default: the only one)"
+    )
     command.add_argument(
         "--propellers-removed", action="store_true", help="for escs: confirms that no propeller is mounted"
     )

@@ -114,7 +114,8 @@ def add_address(
         type=address,
         default=default_address() if default is None else None,
         metavar="ADDRESS",
-        help=f"{what}udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … ({default or usual_default})",
+        help=f"{what}udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 …"
+        f" (default: {default or usual_default})",
         **keywords,
     )
     offer(argument, addresses)
@@ -139,13 +140,15 @@ def add_vehicle(command: argparse.ArgumentParser) -> None:
     """Add the options that select a vehicle and its connection."""
     group = command.add_argument_group("vehicle")
     add_address(group, "--connect")
-    group.add_argument("--system-id", type=system_id, metavar="ID", help="system id of the vehicle (the only one)")
+    group.add_argument(
+        "--system-id", type=system_id, metavar="ID", help="system id of the vehicle (default: the only one)"
+    )
     group.add_argument(
         "--patience",
         type=number(0.1, 3600),
         default=10.0,
         metavar="S",
-        help="time out after S seconds without progress (10)",
+        help="time out after S seconds without progress (default: 10)",
     )
     add_signing_key(group, f"signing key of the vehicle (${SIGNING_KEY_VARIABLE})")
 

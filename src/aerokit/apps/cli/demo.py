@@ -34,20 +34,20 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--connect",
         type=address,
         metavar="ADDRESS",
-        help="vehicle to fly: udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … (a simulated one)",
+        help="vehicle to fly: udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … (default: a simulated one)",
     )
     offer(address_option, addresses)
-    add_vehicle_kind(command, "copter, plane (ArduPilot), px4, px4_plane (copter)")
+    add_vehicle_kind(command, "copter or plane with ArduPilot, px4 or px4_plane (default: copter)")
     add_faults(command)
     command.add_argument(
         "--altitude",
         type=number(1, 500),
         default=10.0,
         metavar="M",
-        help="altitude above home in metres (10)",
+        help="altitude above home in metres (default: 10)",
     )
     command.add_argument(
-        "--side", type=number(1, 5000), default=20.0, metavar="M", help="side of the square in metres (20)"
+        "--side", type=number(1, 5000), default=20.0, metavar="M", help="side of the square in metres (default: 20)"
     )
     command.add_argument(
         "--record",
@@ -57,9 +57,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help=f"record all messages ({_DEFAULT_LOG}); an existing file is kept as demo.1.tlog",
     )
     command.add_argument(
-        "--speedup", type=number(0.1, 100), default=5.0, metavar="X", help="simulation speed factor (5)"
+        "--speedup", type=number(0.1, 100), default=5.0, metavar="X", help="simulation speed factor (default: 5)"
     )
-    command.add_argument("--system-id", type=system_id, metavar="ID", help="system id of the vehicle (the only one)")
+    command.add_argument(
+        "--system-id", type=system_id, metavar="ID", help="system id of the vehicle (default: the only one)"
+    )
     add_baud(command)
     add_signing_key(command, f"signing key of the --connect vehicle (${SIGNING_KEY_VARIABLE})")
     add_json(command)

@@ -38,10 +38,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         type=integer(1, _MAX_PICTURES, "a number of pictures"),
         default=1,
         metavar="N",
-        help="number of pictures (1)",
+        help="number of pictures (default: 1)",
     )
     photo.add_argument(
-        "--interval", type=number(0.1, 3600), default=2.0, metavar="S", help="seconds between pictures (2)"
+        "--interval", type=number(0.1, 3600), default=2.0, metavar="S", help="seconds between pictures (default: 2)"
     )
     photo.add_argument(
         "--to",
@@ -70,7 +70,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
             "--camera",
             type=int,
             metavar="ID",
-            help="component id, or 1 to 6 for one attached to the autopilot (the first)",
+            help="component id, or 1 to 6 for one attached to the autopilot (default: the first)",
         )
 
 
@@ -194,13 +194,13 @@ def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
         help="degrees from the horizon: -90 is straight down",
     )
     point.add_argument(
-        "yaw", type=number(-360, 360), nargs="?", default=0.0, metavar="YAW", help="degrees to the right (0)"
+        "yaw", type=number(-360, 360), nargs="?", default=0.0, metavar="YAW", help="degrees to the right (default: 0)"
     )
     point.add_argument(
         "--frame",
         choices=("earth", "vehicle"),
         default="vehicle",
-        help="yaw from north, or from the nose (vehicle)",
+        help="yaw from north, or from the nose (default: vehicle)",
     )
     run = command_action("gimbal look", "looking at {latitude:g} {longitude:g} {altitude:g} m", _look_at, _gimbal)
     look = add_action(actions, "look", run, "Keep the gimbal pointed at a position.")
@@ -221,7 +221,7 @@ def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
             "--gimbal",
             type=int,
             metavar="ID",
-            help="component id, or 1 to 6 for one attached to the autopilot (the first)",
+            help="component id, or 1 to 6 for one attached to the autopilot (default: the first)",
         )
 
 

@@ -148,7 +148,7 @@ def check_network_port(port: int, meaning: str, *, udp: bool) -> Finding:
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_doctor)
     add_link(command, default="default: check this computer")
-    add_seconds(command, "listen for S seconds (6)", 6.0)
+    add_seconds(command, "listen for S seconds (default: 6)", 6.0)
 
 
 async def run_doctor(options: argparse.Namespace) -> int:

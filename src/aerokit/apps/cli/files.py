@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 def add_arguments(command: argparse.ArgumentParser) -> None:
     actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
     listing = add_action(actions, "ls", _list, "List a directory.")
-    listing.add_argument("path", nargs="?", default="/", help="directory on the vehicle (/)")
+    listing.add_argument("path", nargs="?", default="/", help="directory on the vehicle (default: /)")
     get = add_action(actions, "get", _get, "Download a file; a partial download is resumed.")
     get.add_argument("path", help="path on the vehicle")
-    get.add_argument("to", nargs="?", help="local file or directory (the same name in this directory)")
+    get.add_argument("to", nargs="?", help="local file or directory (default: the same name in this directory)")
     put = add_action(actions, "put", _put, "Upload a file.")
     put.add_argument("file", help="local file")
     put.add_argument("path", help="path on the vehicle")
@@ -109,16 +109,16 @@ def add_logs_arguments(command: argparse.ArgumentParser) -> None:
     actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
     add_action(actions, "list", _list_logs, "List the flight logs.")
     get = add_action(actions, "get", _get_logs, "Download flight logs; a partial download is resumed.")
-    get.add_argument("ids", nargs="*", type=int, metavar="ID", help="ids of logs (the newest)")
+    get.add_argument("ids", nargs="*", type=int, metavar="ID", help="ids of logs (default: the newest)")
     get.add_argument("--all", action="store_true", help="every log")
     get.add_argument(
         "--to",
         type=directory,
         default=Path(),
         metavar="DIRECTORY",
-        help="directory to write them to, which is created if needed (this directory)",
+        help="directory to write them to, which is created if needed (default: this directory)",
     )
-    get.add_argument("--method", choices=("auto", "ftp", "log"), default="auto", help="download method (auto)")
+    get.add_argument("--method", choices=("auto", "ftp", "log"), default="auto", help="download method (default: auto)")
     erase = add_action(actions, "erase", _erase, "Erase all flight logs.")
     erase.add_argument("--yes", action="store_true", help="do not ask")
 

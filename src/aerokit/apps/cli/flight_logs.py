@@ -36,7 +36,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         " without a suffix: a folder with one table for each message type",
     )
     command.add_argument(
-        "--tables", choices=("csv", "parquet"), default="csv", help="format of the tables in a folder (csv)"
+        "--tables", choices=("csv", "parquet"), default="csv", help="format of the tables in a folder (default: csv)"
     )
     command.add_argument("--force", action="store_true", help="replace existing files")
     add_json(command)
@@ -87,13 +87,13 @@ def add_report_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("log", type=Path, metavar="LOG", help=".tlog, .bin (ArduPilot) or .ulg (PX4)")
     command.add_argument("other", type=Path, nargs="?", metavar="LOG2", help="a second log to compare with")
     command.add_argument(
-        "-o", "--output", type=Path, metavar="OUT.html", help="output file (the name of the log, with .html)"
+        "-o", "--output", type=Path, metavar="OUT.html", help="output file (default: the name of the log, with .html)"
     )
     command.add_argument(
         "--system",
         type=int,
         metavar="ID",
-        help="system id of the vehicle, if a .tlog has several (the first)",
+        help="system id of the vehicle, if a .tlog has several (default: the first)",
     )
     add_force(command)
     command.add_argument("--open", action="store_true", help="open the report in the browser")

@@ -175,14 +175,14 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--on-interrupt",
         choices=tuple(INTERRUPT_ACTIONS),
         default="return",
-        help="what the vehicle does after Ctrl-C in the air; a second Ctrl-C exits without it (return)",
+        help="what the vehicle does after Ctrl-C in the air; a second Ctrl-C exits without it (default: return)",
     )
     command.add_argument(
         "--ready",
         type=number(0, 3600),
         default=120.0,
         metavar="S",
-        help="seconds to wait until the vehicle is ready to arm (120)",
+        help="seconds to wait until the vehicle is ready to arm (default: 120)",
     )
     add_max_distance(command)
     simulated = command.add_argument_group("simulated")
@@ -190,11 +190,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--sim", action="store_true", help="fly on a simulated vehicle at the planned home; does not ask"
     )
     kind = simulated.add_argument(
-        "--vehicle", type=vehicle_kind, metavar="KIND", help="copter, plane, px4 … (the plan's vehicle type)"
+        "--vehicle", type=vehicle_kind, metavar="KIND", help="copter, plane, px4 … (default: the plan's vehicle type)"
     )
     offer(kind, kinds)
     simulated.add_argument(
-        "--speedup", type=number(0.1, 100), default=10.0, metavar="X", help="simulation speed factor (10)"
+        "--speedup", type=number(0.1, 100), default=10.0, metavar="X", help="simulation speed factor (default: 10)"
     )
     add_faults(simulated)
     add_record(command)

@@ -47,7 +47,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_baud(command)
     add_record(command)
     command.add_argument(
-        "--every", type=number(0.1, 1e6), default=10.0, metavar="S", help="seconds between statistics (10)"
+        "--every", type=number(0.1, 1e6), default=10.0, metavar="S", help="seconds between statistics (default: 10)"
     )
     command.add_argument("--seconds", type=number(0.1, 1e6), metavar="S", help="stop after S seconds")
     add_json(command)

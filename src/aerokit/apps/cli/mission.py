@@ -144,7 +144,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     start = command_action("mission start", "mission started", _start_mission)
     pause = command_action("mission pause", "mission paused", lambda vehicle, _: vehicle.mission.pause())
     resume = command_action("mission resume", "mission resumed", lambda vehicle, _: vehicle.mission.resume())
-    add_action(actions, "start", start, "Start the mission.")
+    add_action(actions, "start", start, "Start the mission of an armed vehicle. `aerokit fly` also arms.")
     add_action(actions, "pause", pause, "Pause the mission and hold.")
     add_action(actions, "resume", resume, "Resume the mission.")
 
@@ -155,7 +155,7 @@ def add_max_distance(command: argparse.ArgumentParser) -> None:
         type=number(1, 1e8),
         default=MAX_DISTANCE_M,
         metavar="M",
-        help="refuse a plan with a position farther than this from the vehicle (100000)",
+        help="refuse a plan with a position farther than this from the vehicle (default: 100000)",
     )
 
 
@@ -175,7 +175,7 @@ def _add_parts(action: argparse.ArgumentParser) -> None:
         type=_part,
         default=["mission"],
         metavar="PART",
-        help=f"{', '.join(PARTS)} (mission)",
+        help=f"{', '.join(PARTS)} (default: mission)",
     )
     offer(parts, lambda: PARTS)
 

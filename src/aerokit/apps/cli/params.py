@@ -54,7 +54,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     listing = add_action(actions, "list", _list, "List parameters with their values.")
-    pattern = listing.add_argument("pattern", nargs="?", default="*", help="part of the names, or 'BATT_*' (all)")
+    pattern = listing.add_argument(
+        "pattern", nargs="?", default="*", help="part of the names, or 'BATT_*' (default: all)"
+    )
     offer(pattern, parameter_names)
     add_metadata(listing)
     listing.add_argument("--changed", action="store_true", help="only those that differ from their default")
@@ -64,7 +66,7 @@ def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
     save = add_action(actions, "save", _save, "Save all parameters to a file.")
     save.add_argument("file", type=writable_file)
     add_force(save)
-    save.add_argument("--format", choices=_FORMATS, default=_FORMATS[0], help="file format (missionplanner)")
+    save.add_argument("--format", choices=_FORMATS, default=_FORMATS[0], help="file format (default: missionplanner)")
     diff = add_action(actions, "diff", _diff, "Compare the vehicle's parameters with a file.")
     diff.add_argument("file")
 

@@ -44,8 +44,8 @@ def _add_web(command: argparse.ArgumentParser) -> None:
         default=_LOOPBACK,
         help=f"address to listen on ({_LOOPBACK}: this machine only); on others, reading needs the token too",
     )
-    web.add_argument("--port", type=port, default=8080, help="TCP port; 0: any free port (8080)")
-    web.add_argument("--token-file", metavar="FILE", help="file with the token (a random token at each start)")
+    web.add_argument("--port", type=port, default=8080, help="TCP port; 0: any free port (default: 8080)")
+    web.add_argument("--token-file", metavar="FILE", help="file with the token (default: a random token at each start)")
     web.add_argument("--read-only", action="store_true", help="reject all orders")
     web.add_argument(
         "--allow-host",
@@ -59,7 +59,7 @@ def _add_web(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="parameter metadata of the firmware, for units, ranges and descriptions (apm.pdef.xml or parameters.json)",
     )
-    web.add_argument("--tiles", metavar="URL", help="map tiles: https://tiles.example/{z}/{x}/{y}.png (none)")
+    web.add_argument("--tiles", metavar="URL", help="map tiles: https://tiles.example/{z}/{x}/{y}.png (default: none)")
     web.add_argument("--attribution", default="", metavar="TEXT", help="attribution of the tiles, shown on the map")
 
 

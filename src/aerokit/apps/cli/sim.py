@@ -155,12 +155,14 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         " gives each vehicle its own address: pty:/tmp/ttyV{n}, udpout:127.0.0.1:{14550+n}; n counts from 0, id is"
         f" the system id ({DEFAULT_SIM_ADDRESS})",
     )
-    command.add_argument("--count", type=count, default=1, metavar="N", help="number of vehicles, 1 to 250 (1)")
     command.add_argument(
-        "--speedup", type=number(0.1, 100), default=1.0, metavar="X", help="simulation speed factor (1)"
+        "--count", type=count, default=1, metavar="N", help="number of vehicles, 1 to 250 (default: 1)"
     )
     command.add_argument(
-        "--system-id", type=system_id, default=1, metavar="ID", help="system id of the first vehicle (1)"
+        "--speedup", type=number(0.1, 100), default=1.0, metavar="X", help="simulation speed factor (default: 1)"
+    )
+    command.add_argument(
+        "--system-id", type=system_id, default=1, metavar="ID", help="system id of the first vehicle (default: 1)"
     )
     command.add_argument(
         "--home",
@@ -174,9 +176,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         type=number(0, 1000),
         default=5.0,
         metavar="M",
-        help="eastward distance between vehicles in metres (5)",
+        help="eastward distance between vehicles in metres (default: 5)",
     )
-    command.add_argument("--seed", type=int, default=0, help="random seed of the first vehicle (0)")
+    command.add_argument("--seed", type=int, default=0, help="random seed of the first vehicle (default: 0)")
     _add_devices(command)
     _add_conditions(command)
 
@@ -233,9 +235,9 @@ def _add_conditions(command: argparse.ArgumentParser) -> None:
         "--wind",
         type=wind,
         metavar="NORTH,EAST[,GUSTS]",
-        help="velocity of the air and of gusts in m/s: -3,0 (no wind)",
+        help="velocity of the air and of gusts in m/s: -3,0 (default: no wind)",
     )
-    command.add_argument("--battery", type=number(0, 100), metavar="PERCENT", help="charge at the start (100)")
+    command.add_argument("--battery", type=number(0, 100), metavar="PERCENT", help="charge at the start (default: 100)")
     command.add_argument(
         "--boot-time",
         type=number(0, 600),
@@ -245,7 +247,7 @@ def _add_conditions(command: argparse.ArgumentParser) -> None:
     add_faults(command)
     add_signing_key(command, "signing key of the vehicles; ArduPilot's first port accepts unsigned messages too")
     command.add_argument(
-        "--duration", type=number(0.1, 1e6), metavar="S", help="stop after S simulated seconds (at Ctrl-C)"
+        "--duration", type=number(0.1, 1e6), metavar="S", help="stop after S simulated seconds (default: at Ctrl-C)"
     )
     command.add_argument(
         "--picture",
@@ -300,8 +302,8 @@ async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namesp
                 getattr(vehicle.faults, name).extend(value)
             else:
                 setattr(vehicle.faults, name, value)
-        if at_s:
-            emit(options, "fault", {"name": name, "value": value, "seconds": at_s}, f"{at_s:g} s: fault {name}")
+        begin = f"{at_s:g} s" if at_s else "from the start"
+        emit(options, "fault", {"name": name, "value": value, "seconds": at_s}, f"{begin}: fault {name}")
 
 
 def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:

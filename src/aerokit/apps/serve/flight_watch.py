@@ -82,7 +82,7 @@ class FlightWatch:
 
     @property
     def crash(self) -> dict[str, Any] | None:
-        """The crash of the vehicle: ``text``, a clause with the sink rate, and ``at_unix_s``, the time of the impact.
+        """The crash: ``text``, such as "hit the ground at 11.6 m/s", and ``at_unix_s``, the time of the impact.
 
         None if there was no crash, or if the vehicle has moved or was armed again since the crash.
         """

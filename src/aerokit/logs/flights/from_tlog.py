@@ -9,8 +9,9 @@ from aerokit.autopilots import Autopilot, autopilot_for, is_armed
 from aerokit.connection.heartbeats import is_autopilot
 from aerokit.errors import FileFormatError
 from aerokit.logs.flights.codes import clean_text
-from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TimeSeries, Waypoint
+from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TimeSeries
 from aerokit.logs.flights.recording import MIN_SILENCE_S, ClockComparison, LinkCounter, use_simulated_time
+from aerokit.logs.flights.tlog_missions import RecordedMission
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavState, MavType
@@ -103,14 +104,15 @@ class _Reader:
         self._is_breached = False
         self._destinations = TimeSeries(*flight.position_target.names)
         self._link = LinkCounter(flight)
-        self._mission_items: dict[int, Waypoint] = {}
+        self._mission = RecordedMission(flight)
         handlers: dict[type[Message], Callable[[float, Any], None]] = {
             m.CommandLong: self._on_command,
             m.CommandInt: self._on_command,
             m.SetMode: self._on_set_mode,
-            m.MissionItemInt: self._on_mission_item,
-            m.MissionItem: self._on_mission_item,
-            m.MissionCount: self._on_mission_count,
+            m.MissionItemInt: self._mission.on_item,
+            m.MissionItem: self._mission.on_item,
+            m.MissionCount: self._mission.on_count,
+            m.FileTransferProtocol: self._mission.on_file_transfer,
         }
         self._handlers_of_any_sender = {_message_id_bytes(kind): handler for kind, handler in handlers.items()}
         handlers.update(self._vehicle_handlers())
@@ -169,7 +171,7 @@ class _Reader:
         flight = self._flight
         self._add_texts(flight.duration_s, self._texts.expire(math.inf))
         self._add_destinations()
-        flight.mission = [self._mission_items[number] for number in sorted(self._mission_items)]
+        flight.mission = self._mission.waypoints
         if damaged:
             flight.notes.append(f"{damaged} messages are damaged and were skipped")
         if self._other_vehicles:
@@ -312,33 +314,6 @@ class _Reader:
 
     def _on_home(self, time_s: float, message: m.HomePosition) -> None:
         self._flight.set_home(time_s, message.latitude / _E7, message.longitude / _E7, message.altitude / 1e3)
-
-    def _on_mission_item(self, time_s: float, message: m.MissionItemInt | m.MissionItem) -> None:
-        if not self._is_our_mission(message):
-            return
-        scale = _E7 if isinstance(message, m.MissionItemInt) else 1.0
-        has_position = bool(message.x or message.y)
-        self._mission_items[message.seq] = Waypoint(
-            message.seq,
-            message.command,
-            message.x / scale if has_position else NAN,
-            message.y / scale if has_position else NAN,
-            message.z,
-            message.frame,
-        )
-
-    def _on_mission_count(self, time_s: float, message: m.MissionCount) -> None:
-        """Drop the items beyond the new number of items, because they belong to an earlier mission."""
-        if self._is_our_mission(message):
-            self._mission_items = {
-                number: item for number, item in self._mission_items.items() if number < message.count
-            }
-
-    def _is_our_mission(self, message: m.MissionItemInt | m.MissionItem | m.MissionCount) -> bool:
-        """Return True if a message is about this vehicle's mission, and not about its fence or rally points."""
-        frame, vehicle_id = message.received_frame, self._flight.system_id
-        sender = None if frame is None else frame.system_id
-        return message.mission_type == 0 and vehicle_id in (sender, message.target_system)
 
     def _on_fence(self, time_s: float, message: m.FenceStatus) -> None:
         if message.breach_status and not self._is_breached:

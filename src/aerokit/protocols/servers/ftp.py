@@ -19,7 +19,7 @@ FilesT = TypeVar("FilesT", bound=FileSystem)
 
 _BURST_BYTES = 35_000  # A burst ends after this number of bytes.
 _BURST_BLOCKS = 24  # number of blocks that a burst sends at once
-_CRC_PAUSE_S = 0.002
+_CRC_PAUSE_S = 0.002  # pause between two blocks of a CRC calculation, in which other requests are answered
 _MAX_SIZE = 0xFFFFFFFF  # maximum file size in bytes, because sizes and offsets have 32 bits in MAVFTP
 
 Op = MavFtpOpcode

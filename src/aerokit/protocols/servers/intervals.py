@@ -72,7 +72,10 @@ class MessageStreams:
             self._host.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
 
     def answer_with(self, message_id: int, command: ReceivedCommand) -> int:
-        """Send the requested messages and return ACCEPTED; DENIED for an unknown id, FAILED if there is no message."""
+        """Send the requested messages and return ACCEPTED.
+
+        Return DENIED if the id is unknown, and FAILED if there is nothing to send for it yet.
+        """
         builder = self.builders.get(message_id)
         if builder is None:
             return MavResult.DENIED

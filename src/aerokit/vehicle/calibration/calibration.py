@@ -117,7 +117,7 @@ class CalibrationControl:
         ArduPilot reports progress and fitness of each compass, and must reboot afterwards. PX4 asks for up to six
         poses, and for a turn about the vertical axis in each.
         """
-        return self._start("compass", procedures.ardupilot_compass, param=2)
+        return self._start("compass", procedures.ardupilot_compass, command_param=2)
 
     def accelerometer(self) -> Calibration:
         """Calibrate the accelerometers in six poses.
@@ -125,26 +125,27 @@ class CalibrationControl:
         ArduPilot waits for a confirmation in each pose, and must reboot afterwards. PX4 detects the poses itself, in
         any order.
         """
-        return self._start("accelerometer", procedures.ardupilot_accelerometer, param=5)
+        return self._start("accelerometer", procedures.ardupilot_accelerometer, command_param=5)
 
     def gyroscope(self) -> Calibration:
         """Calibrate the gyroscopes, while the vehicle stands still."""
-        return self._start("gyroscope", _acknowledged("keep the vehicle still"), param=1)
+        return self._start("gyroscope", _acknowledged("keep the vehicle still"), command_param=1)
 
     def level(self) -> Calibration:
         """Calibrate the level attitude, while the vehicle stands level and still."""
-        return self._start("level", _acknowledged("place the vehicle level and keep it still"), param=5, value=2)
+        procedure = _acknowledged("place the vehicle level and keep it still")
+        return self._start("level", procedure, command_param=5, param_value=2)
 
     def barometer(self) -> Calibration:
         """Calibrate the barometer.
 
         ArduPilot uses the present pressure as the pressure on the ground; PX4 uses the GPS altitude.
         """
-        return self._start("barometer", _acknowledged("shelter the vehicle from wind"), param=3)
+        return self._start("barometer", _acknowledged("shelter the vehicle from wind"), command_param=3)
 
     def airspeed(self) -> Calibration:
         """Calibrate the airspeed sensors, first sheltered from wind; PX4 then asks a person to blow into the tube."""
-        return self._start("airspeed", procedures.ardupilot_airspeed, param=6, value=2)
+        return self._start("airspeed", procedures.ardupilot_airspeed, command_param=6, param_value=2)
 
     def radio(self) -> Calibration:
         """Calibrate the remote control: write RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
@@ -166,7 +167,8 @@ class CalibrationControl:
         Raises:
             InvalidArgument: the intent is another text. Nothing was sent.
         """
-        return self._start("escs", procedures.ardupilot_escs, param=7)
+        # `checks_arguments` has refused every other intent.
+        return self._start("escs", procedures.ardupilot_escs, command_param=7)
 
     def _start(
         self,
@@ -174,8 +176,8 @@ class CalibrationControl:
         ardupilot: Procedure,
         *,
         px4: Procedure = procedures.px4_by_status_texts,
-        param: int = 0,
-        value: float = 1,
+        command_param: int = 0,
+        param_value: float = 1,
     ) -> Calibration:
         """Prepare a calibration.
 
@@ -183,14 +185,14 @@ class CalibrationControl:
             sensor: name of the public method.
             ardupilot: procedure for ArduPilot.
             px4: procedure for PX4.
-            param: number of the parameter of MAV_CMD_PREFLIGHT_CALIBRATION that starts this calibration; 0 if the
-                procedure does not need it.
-            value: value of this parameter. All parameters before it are 0.
+            command_param: number of the parameter of MAV_CMD_PREFLIGHT_CALIBRATION that starts this calibration; 0 if
+                the procedure does not need it.
+            param_value: value of this parameter. All parameters before it are 0.
         """
         run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
         is_px4 = self._context.session.autopilot.calibration_protocol == "texts"
         procedure = px4 if is_px4 else ardupilot
-        params = (0,) * (param - 1) + (value,) if param else ()
+        params = (0,) * (command_param - 1) + (param_value,) if command_param else ()
         return Calibration(run, procedure(run, *params))
 
 

@@ -23,9 +23,11 @@ if TYPE_CHECKING:
 
 CANCEL_ALL = (MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 0, 0, 0)
 REPORT_HZ = 4.0
-# Seconds to wait for the last text: PX4's HEARTBEAT leaves CALIBRATING before the text arrives.
+# Value of ESC_CALIBRATION with which ArduCopter calibrates the ESCs at its next boot.
+CALIBRATE_AT_BOOT = 3
+# Seconds to wait for the text with the result after HEARTBEAT no longer reports CALIBRATING. PX4 sends the text later.
 END_GRACE_S = 3.0
-# Below two seconds, because a cancelled call must end within that time.
+# Maximum seconds for restoring a parameter. A cancelled call restores it, and must end within two seconds.
 RESTORE_TIMEOUT_S = 1.5
 # ArduPilot repeats its request every second. If a request arrives this soon after our confirmation, ArduPilot sent it
 # before the confirmation arrived.
@@ -52,9 +54,10 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
     with ExitStack() as cleanup:
 
         def on_text(text: str) -> None:
-            if report := parse_report(text):
+            if report := parse_report(text):  # None for a text that is not about a calibration
                 reports.append(report)
 
+        # `every_arrival`: a repeated text is a new report.
         cleanup.callback(telemetry.status_text.observe(lambda _, text: on_text(text.text), every_arrival=True))
 
         def has_ended_silently() -> bool:
@@ -108,7 +111,7 @@ async def acknowledged(run: CalibrationRun, *params: float, instruction: str) ->
     """ArduPilot: run a calibration that consists of one command. The acknowledgement of the command is the result."""
     run.check_ready()
     yield run.step(None, instruction)
-    await run.begin(None)
+    await run.begin(cancel=None)
     await run.start(*params)
     yield run.result()
 
@@ -128,9 +131,9 @@ async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[Calib
     run.check_ready()
     old_value = await _read_parameter(run, "ESC_CALIBRATION")
     yield run.step(None, "remove the propellers, then continue", needs_confirmation=True)
-    await run.begin(None)
+    await run.begin(cancel=None)
     try:
-        await run.parameters().set("ESC_CALIBRATION", 3)
+        await run.parameters().set("ESC_CALIBRATION", CALIBRATE_AT_BOOT)
     except ParameterRejected:  # The vehicle refused, so there is nothing to restore.
         raise
     except BaseException:  # The vehicle may have set the value, although the call failed or was cancelled.
@@ -224,13 +227,14 @@ def _status_name(status: int) -> str:
 
 async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
     """ArduPilot: yield the six poses that the vehicle requests one after the other, and confirm each."""
-    await run.begin(None, ACCELEROMETER_CANNOT_CANCEL)
+    await run.begin(cancel=None, cannot_cancel_reason=ACCELEROMETER_CANNOT_CANCEL)
     requests: deque[int] = deque()
-    confirmed, confirmed_at = 0, -math.inf
+    confirmed_pose, confirmed_at = 0, -math.inf
     now = run.session.connection.now
 
     def on_request(message: CommandLong) -> None:
-        is_repeated = message.param1 == confirmed and now() - confirmed_at < POSE_REPEAT_S
+        is_repeated = message.param1 == confirmed_pose and now() - confirmed_at < POSE_REPEAT_S
+        # ArduPilot also reports the result by this command: `param1` is then SUCCESS or FAILED instead of a pose.
         if message.command == MavCmd.ACCELCAL_VEHICLE_POS and not is_repeated:
             requests.append(int(message.param1))
 
@@ -255,7 +259,7 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
                 text = f"place the vehicle {pose.value}, keep it still, then continue"
                 yield run.step((request - 1) / len(POSES), text, pose, remaining, needs_confirmation=True)
                 await run.command(MavCmd.ACCELCAL_VEHICLE_POS, request)
-                confirmed, confirmed_at = request, now()
+                confirmed_pose, confirmed_at = request, now()
                 requests.clear()  # ArduPilot repeated the request until it received the confirmation.
 
 

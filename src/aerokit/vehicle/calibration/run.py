@@ -103,6 +103,7 @@ class CalibrationRun:
 
     async def command(self, command: int, *params: float, accepts: Collection[int] = ()) -> None:
         """Send a command of the calibration and wait for its answer. The results in ``accepts`` raise no error."""
+        # ArduPilot calibrates its gyroscopes before it acknowledges the start. None selects the usual time-out.
         attempt_timeout = START_TIMEOUT_S if command == MavCmd.PREFLIGHT_CALIBRATION else None
         try:
             await self.context.sender.auxiliary_command(command, *params, attempt_timeout=attempt_timeout)
@@ -122,7 +123,7 @@ class CalibrationRun:
         """Register that the calibration has ended on the vehicle."""
         if not self._ended.is_set():
             self._ended.set()
-            self._cancel_order_stack.close()
+            self._cancel_order_stack.close()  # The cancel command, if one was sent, need not be repeated.
             if self.is_running:
                 self._runs.remove(self)
                 self.context.on_finish.remove(self.abandon)
@@ -190,6 +191,7 @@ class CalibrationRun:
                         while not self._is_cancelled(self._cancel_command[0]):  # noqa: ASYNC110
                             await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
                         return
+                # Nothing is sent to a silent vehicle, so wait for a HEARTBEAT since the last attempt.
                 await self.session.wait_for_heartbeat(self._cancel_sent_at)
                 is_taken_over = self._sent_cancel is not None and bool(self._sent_cancel.end)
                 if self._has_rebooted or is_taken_over:
@@ -210,7 +212,7 @@ class CalibrationRun:
         if self._has_rebooted:
             return True
         assert self._cancel_sent_at is not None
-        # PX4 is cancelled by PREFLIGHT_CALIBRATION with zeros, ArduPilot by commands of their own.
+        # PX4's cancel command is PREFLIGHT_CALIBRATION with zeros. ArduPilot has other cancel commands.
         if cancel_command != MavCmd.PREFLIGHT_CALIBRATION:
             return self.session.commands.accepted_at(int(cancel_command)) >= self._cancel_sent_at
         status = self.session.telemetry.system_status

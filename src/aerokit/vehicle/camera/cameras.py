@@ -140,7 +140,8 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             consecutive_missing = 0
             available = 1 if self._link.is_autopilot_attached else MAX_CAPTURES
             for index in range(max(0, count - available), count):
-                consecutive_missing = 0 if await self._log.fetch(index) else consecutive_missing + 1
+                capture = await self._log.fetch(index)
+                consecutive_missing = consecutive_missing + 1 if capture is None else 0
                 if consecutive_missing == MAX_CONSECUTIVE_MISSING:
                     break
             return self.captures()
@@ -194,6 +195,7 @@ class Cameras:
         for message_type, callback in (
             (m.Heartbeat, self._on_heartbeat),
             (m.CameraInformation, self._on_information),
+            # Camera ids count from 1, but `cam_idx` from 0. CAMERA_TRIGGER has no id.
             (m.CameraFeedback, lambda message: self._on_capture(message, message.cam_idx + 1)),
             (m.CameraImageCaptured, lambda message: self._on_capture(message, message.camera_id or 1)),
             (m.CameraTrigger, lambda message: self._on_capture(message, 1)),
@@ -223,7 +225,7 @@ class Cameras:
                 f"number = {number} is not allowed: 1 to 6 (attached to the autopilot) or 7 to 255 (component id)"
             )
         if number not in self._cameras:
-            if number == self._first_link.number:
+            if number == self._first_link.number:  # `first` already stands for this camera.
                 return self.first
             link = CameraLink(self._context, self._components.component, number)
             link.start_polling()

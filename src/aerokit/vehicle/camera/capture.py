@@ -83,7 +83,7 @@ def from_image(message: CameraImageCaptured, camera: int, received_at: float) ->
         success=message.capture_result == 1,
         received_at=received_at,
         taken_at=_utc(message.time_utc),
-        place=place_of(message.lat, message.lon, message.alt / 1000, message.relative_alt / 1000),
+        place=place_of(message.lat, message.lon, message.alt / 1000, message.relative_alt / 1000),  # altitudes in mm
         quaternion=quaternion,
         roll_deg=roll,
         pitch_deg=pitch,
@@ -129,7 +129,7 @@ def from_trigger(message: CameraTrigger, camera: int, received_at: float, teleme
     return Capture(
         camera=camera,
         index=message.seq,
-        success=None,
+        success=None,  # PX4 reports only that it has triggered the camera.
         received_at=received_at,
         taken_at=_utc(message.time_usec),
         place=place,
@@ -160,7 +160,7 @@ def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
     """Convert to roll, pitch and yaw in degrees. For a camera that points straight up or down, roll is 0."""
     length = math.sqrt(sum(value * value for value in quaternion))
     w, x, y, z = (value / length for value in quaternion)
-    sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
+    sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))  # Rounding may exceed 1, for which asin() would fail.
     if abs(sine) > MAX_PITCH_SINE:  # gimbal lock: the whole turn about the common axis counts as yaw
         roll, yaw = 0.0, -2 * math.copysign(1, sine) * math.atan2(x, w)
     else:
@@ -292,7 +292,7 @@ def _segments(jpeg: bytes) -> Iterator[bytes]:
 
     The length includes its own 2 bytes.
     """
-    start = 2
+    start = 2  # after the two bytes FF D8, with which every JPEG begins
     while jpeg[start + 1 : start + 2] != bytes((SCAN,)):
         length = int.from_bytes(jpeg[start + 2 : start + 4], "big")
         segment = jpeg[start : start + 2 + length]
@@ -330,18 +330,18 @@ def _gps_tags(capture: Capture) -> dict[int, Any]:
     assert place is not None
     tags: dict[int, Any] = {
         0: b"\2\3\0\0",  # GPSVersionID
-        1: "N" if place.latitude_deg >= 0 else "S",
-        2: _sexagesimal(place.latitude_deg),
-        3: "E" if place.longitude_deg >= 0 else "W",
-        4: _sexagesimal(place.longitude_deg),
-        18: "WGS-84",
+        1: "N" if place.latitude_deg >= 0 else "S",  # GPSLatitudeRef
+        2: _sexagesimal(place.latitude_deg),  # GPSLatitude
+        3: "E" if place.longitude_deg >= 0 else "W",  # GPSLongitudeRef
+        4: _sexagesimal(place.longitude_deg),  # GPSLongitude
+        18: "WGS-84",  # GPSMapDatum
     }
-    if place.altitude_amsl_m is not None:
+    if place.altitude_amsl_m is not None:  # GPSAltitudeRef (1: below sea level) and GPSAltitude
         tags |= {5: bytes((place.altitude_amsl_m < 0,)), 6: round(abs(place.altitude_amsl_m), 3)}
-    if capture.yaw_deg is not None:
+    if capture.yaw_deg is not None:  # GPSImgDirectionRef (T: from true north) and GPSImgDirection
         tags |= {16: "T", 17: round(capture.yaw_deg % 360.0, 2)}
     time = _time_of(capture)
-    if time is not None:
+    if time is not None:  # GPSTimeStamp and GPSDateStamp
         seconds = time.second + time.microsecond / 1e6
         tags |= {7: (float(time.hour), float(time.minute), seconds), 29: time.strftime("%Y:%m:%d")}
     return tags

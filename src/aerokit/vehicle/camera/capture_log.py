@@ -33,7 +33,8 @@ FETCH_ATTEMPTS, REQUEST_TIMEOUT_S = 12, 1.0
 TRIGGER_GRACE_S = 0.3
 # Two messages of different types with the same index report the same picture if they arrive within this time.
 DUPLICATE_WINDOW_S = 10.0
-# A status that is older than the newest one by less than this arrived late. If it is older, the camera has restarted.
+# A status whose time stamp is lower than that of the newest one by less than this arrived late. If the difference is
+# greater, the camera has restarted.
 REORDER_WINDOW_MS = 5000
 # If an index exceeds the reported count by more than this, the camera's count does not follow the standard.
 MAX_COUNT_LEAD = 100
@@ -53,7 +54,7 @@ class _Entry:
         if isinstance(message, m.CameraImageCaptured):
             self.utc_us, self.boot_us = message.time_utc, message.time_boot_ms * 1000
         else:
-            stamp: int = getattr(message, "time_usec", 0)
+            stamp: int = getattr(message, "time_usec", 0)  # UTC, or the time since boot if the sender has no UTC
             is_utc = stamp >= SECONDS_IN_1990 * 1_000_000
             self.utc_us, self.boot_us = (stamp, 0) if is_utc else (0, stamp)
 
@@ -64,7 +65,7 @@ class _Entry:
             return self.utc_us == other.utc_us
         if self.boot_us and other.boot_us:
             return self.boot_us == other.boot_us
-        return self.capture.place == other.capture.place
+        return self.capture.place == other.capture.place  # Only the place is left to compare.
 
     def was_taken_later(self, other: _Entry) -> bool:
         """Return True if the time stamps show that this picture is later. Returns False if they cannot be compared."""
@@ -113,11 +114,14 @@ class CaptureLog:
     async def fetch(self, index: int) -> Capture | None:
         """Request a missed capture. Returns None if the camera has deleted it or does not answer."""
         if not self.has(index) and self._link.is_trigger:
-            return None
-        self._requested.add(index)
+            return None  # PX4's trigger cannot send a capture again.
+        self._requested.add(index)  # The answer, an old index, must not count as a reset of the camera.
         try:
             for _ in range(FETCH_ATTEMPTS):
-                if self.has(index) or await self._request(index):
+                if self.has(index):
+                    break
+                is_deleted = await self._request(index)
+                if is_deleted:
                     break
         finally:
             self._requested.discard(index)
@@ -137,7 +141,7 @@ class CaptureLog:
                     where=lambda message: message.image_index == index,
                     timeout=REQUEST_TIMEOUT_S,
                 )
-                return False
+                return False  # If the answer was lost, another request may succeed.
             newest = await request(  # The autopilot stores only its newest capture.
                 m.CameraFeedback,
                 where=lambda message: message.cam_idx + 1 == self._link.number,
@@ -145,6 +149,7 @@ class CaptureLog:
             )
         except CommandRejected:
             return True
+        # `img_idx` counts pictures from 1, `index` from 0.
         return newest is not None and (newest.img_idx - 1) % FEEDBACK_INDEX_RANGE != index
 
     def record(self, message: Message) -> None:
@@ -215,14 +220,17 @@ class CaptureLog:
         if self._shows_reset(entry, previous):
             self._reset()
             previous = None
-        is_new = previous is None or previous.capture.success is False
-        # Repeated messages add nothing, and CAMERA_TRIGGER adds nothing to CAMERA_IMAGE_CAPTURED.
-        if previous is not None and not is_new and previous.kind in (entry.kind, m.CameraImageCaptured):
-            return
+        is_new = previous is None or previous.capture.success is False  # A failed picture's index may be used again.
+        if previous is not None and not is_new:
+            is_repeated = previous.kind is entry.kind
+            # CAMERA_TRIGGER contains nothing that CAMERA_IMAGE_CAPTURED of the same picture does not contain.
+            has_better_message = previous.kind is m.CameraImageCaptured
+            if is_repeated or has_better_message:
+                return
         self._store(entry)
         self._update_highest(entry)
         if isinstance(message, m.CameraImageCaptured):
-            self._count_boot_ms = message.time_boot_ms
+            self._count_boot_ms = message.time_boot_ms  # An older CAMERA_CAPTURE_STATUS does not count this picture.
         # If the index is far above the count, the camera does not count as the standard says: leave the count as it is.
         if self._is_count_used and capture.index <= self._count + MAX_COUNT_LEAD:
             self._count = max(self._count, capture.index)
@@ -242,9 +250,9 @@ class CaptureLog:
 
     def _add_failed(self, message: Message, entry: _Entry) -> None:
         # The index of a failed picture may be used again, so such an entry never replaces a successful one.
-        index, failed = entry.capture.index, self._failed
-        if failed is not None and failed.capture.index == index and failed.reports_same_picture(entry):
-            return
+        index, last_failed = entry.capture.index, self._failed
+        if last_failed is not None and last_failed.capture.index == index and last_failed.reports_same_picture(entry):
+            return  # The message is repeated.
         self._failed = entry
         previous = self._by_index.get(index)
         if previous is None or previous.capture.success is False:

@@ -324,7 +324,7 @@ class StorageMixin(CameraMixin):
                 message = await self._link.request(m.CameraSettings, timeout=MODE_REQUEST_TIMEOUT_S)
                 if message is not None:
                     reported = mode_of(message)
-                if m.CameraSettings in self._link.unavailable:
+                if m.CameraSettings in self._link.unavailable:  # The camera cannot report its mode.
                     return
                 if reported != mode:
                     await anyio.sleep(MODE_POLL_INTERVAL_S)
@@ -369,7 +369,7 @@ class StorageMixin(CameraMixin):
         await self._link.command(
             MavCmd.STORAGE_FORMAT, number, 1, 1, attempts=1, progress_timeout=timeout, on_progress=on_progress
         )
-        for callback in self._link.on_cleared:
+        for callback in self._link.on_cleared:  # The captures on the medium are lost.
             callback()
         await self._link.request(m.StorageInformation, 0, timeout=MODE_REQUEST_TIMEOUT_S)
 
@@ -382,8 +382,9 @@ class StorageMixin(CameraMixin):
             OperationTimeout: no camera was found.
         """
         await self._link.identify()
+        # The reset also changes the mode, so it ends the retries of an earlier order to change the mode.
         with self._link.new_order("mode") as order:
-            await self._link.command(MavCmd.RESET_CAMERA_SETTINGS, 1, self._link.device, order=order)
+            await self._link.command(MavCmd.RESET_CAMERA_SETTINGS, 1, self._link.device, order=order)  # 1: reset
         await self._link.request(m.CameraSettings, timeout=MODE_REQUEST_TIMEOUT_S)
 
     def _on_settings(self, message: m.CameraSettings) -> None:

@@ -160,7 +160,7 @@ class CameraLink(CameraOrders):
         connected_for_s = self.now() - self._session.transfers.began_at
         with anyio.move_on_after(max(0.0, DISCOVERY_TIMEOUT_S - connected_for_s)):
             await self._is_bound.wait()
-        if self.number is None:
+        if self.number is None:  # The only other possibility is a camera that is attached to the autopilot.
             self.bind(AUTOPILOT_CAMERA_IDS[0])
 
     async def _request_information(self) -> None:
@@ -238,7 +238,7 @@ class CameraLink(CameraOrders):
             if frame is not None and frame.component_id == component_id and self._is_from_this_camera(message):
                 callback(message)
 
-        if bus.dialect.get(message_type.ID) is not None:
+        if bus.dialect.get(message_type.ID) is not None:  # The user's dialect may lack a message.
             self._session.at_close(bus.attach(message_type, on_message, system_id=self._session.system_id))
 
     def _is_from_this_camera(self, message: Any) -> bool:
@@ -259,7 +259,7 @@ class CameraLink(CameraOrders):
                 self._session.background.start(self._identify_again, "aerokit camera after silence")
 
     async def _identify_again(self) -> None:
-        with suppress(AerokitError):
+        with suppress(AerokitError):  # The next call to the camera identifies it again, and raises the error.
             await self.identify()
 
     def _on_reboot(self) -> None:
@@ -293,20 +293,19 @@ class ActiveOperation:
         self._is_over = False
         link.on_finish.append(self._finish)
 
-    def commit(self, error: BaseException | None = None) -> bool:
-        """Record the result of the start; return True if the start failed but the operation may run, so that it must be
-        stopped.
-        """
-        is_surely_not_started = error is not None and (
-            # Nothing was sent, or the camera refused.
-            not self.order.may_move or isinstance(error, CommandRejected)
-        )
-        if is_surely_not_started:
+    def record_start(self) -> None:
+        """Record that the camera has accepted the start."""
+        self.order.commit()
+
+    def may_run_despite(self, error: BaseException) -> bool:
+        """Record that the start failed. Return True if the camera may nevertheless execute it, and must be stopped."""
+        was_sent, was_refused = self.order.may_move, isinstance(error, CommandRejected)
+        if not was_sent or was_refused:
             self.order.withdraw()
             self.discard()
             return False
         self.order.commit()
-        return error is not None
+        return True
 
     def discard(self) -> None:
         """Mark the operation as ended without sending its stop command."""
@@ -355,10 +354,11 @@ class CameraBlock:
         try:
             await self._start(operation.order)
         except BaseException as error:
-            if operation.commit(error):
+            if operation.may_run_despite(error):
+                # Raise the error without delay: the stop command is sent at once, and retried in the background.
                 await operation.stop(is_awaited=False)
             raise
-        operation.commit()
+        operation.record_start()
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if self._operation is not None:

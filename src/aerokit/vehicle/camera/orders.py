@@ -90,7 +90,10 @@ class CameraOrders:
         return self._context.on_finish
 
     def topic(self, subject: str) -> Topic:
-        """Arbiter topic of a subject such as ``"video"``; the same for all objects of this camera."""
+        """Key under which the arbiter keeps the orders to one function of this camera apart from all others.
+
+        ``subject`` names the function, such as ``"video"``. All objects of the same camera return the same key.
+        """
         return ("camera", self.component.component_id, self.device, subject)
 
     def begin_order(self, subject: str) -> Order:
@@ -102,7 +105,10 @@ class CameraOrders:
 
     @contextmanager
     def new_order(self, subject: str) -> Iterator[Order]:
-        """Begin an order; withdraw it if the block raises, otherwise commit it."""
+        """Begin an order, which becomes final at the end of the block.
+
+        If the block raises, the order is withdrawn, and the previous order becomes valid again.
+        """
         order = self.begin_order(subject)
         try:
             yield order
@@ -122,6 +128,7 @@ class CameraOrders:
             order.may_move = True  # From here on, the camera may execute the order.
         session, started_at = self._session, self._session.connection.now()
         arbiter = self._context.arbiter
+        # The arbiter sets `sent.end` when the command must no longer be repeated.
         with arbiter.auxiliary_order(order) as sent_order, arbiter.sending(sent_order) as sent:
             try:
                 await session.commands.send_long(
@@ -132,6 +139,7 @@ class CameraOrders:
                     **options,
                 )
             except CommandRejected as error:
+                # The status texts with the reasons may arrive after the answer.
                 await session.wait_for_status_texts()
                 raise session.with_reasons(error, started_at) from None
 
@@ -151,12 +159,12 @@ class CameraOrders:
                 await send()
                 return
             except CommandTimeout as error:
-                worked = await had_effect() if order.is_newest else None
+                is_executed = await had_effect() if order.is_newest else None
                 if not order.is_newest:  # A newer order may have been given while the camera was asked.
                     raise CommandTimeout(f"{error}; not sent again: {SUPERSEDED}") from None
-                if worked:
+                if is_executed:
                     return
-                if worked is None or attempt == MAX_ORDER_ATTEMPTS:
+                if is_executed is None or attempt == MAX_ORDER_ATTEMPTS:
                     raise
 
     def send_now(self, command: int, *params: float) -> None:
@@ -181,7 +189,7 @@ class CameraOrders:
                 if order.is_newest:
                     await self.command(command, *params, order=order, is_sent=True)
             except AerokitError as error:
-                if order.is_newest:
+                if order.is_newest:  # Otherwise a newer order has made this one obsolete, so its failure is no error.
                     errors.append(error)
             finally:
                 answered.set()
@@ -241,7 +249,7 @@ class _PolledCell:
         self.message_type, self.period_s = message_type, period_s
         self.read_at = self.requested_at = -math.inf
         self.is_refused = self.is_doubtful = False
-        cell._feed_from(self)
+        cell._feed_from(self)  # From now on, the state value calls `pending` and `watchers_changed`.
 
     @property
     def pending(self) -> bool:
@@ -309,7 +317,7 @@ class MessageRequests:
         timeout: float,
     ) -> MessageT | None:
         command, legacy_params = LEGACY_REQUESTS[message_type]
-        if message_type in NUMBERED_MESSAGES and params:
+        if message_type in NUMBERED_MESSAGES and params:  # The caller requests one item by its number.
             legacy_params = (params[0], *legacy_params[1:])
         with self._link.component.subscribe(message_type, capacity=100) as answers:
             with suppress(CommandTimeout):  # The message may arrive although the acknowledgement was lost.

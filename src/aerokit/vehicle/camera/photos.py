@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 START, STOP = MavCmd.IMAGE_START_CAPTURE, MavCmd.IMAGE_STOP_CAPTURE
 TRIGGER, TRIGGER_INTERVAL = MavCmd.DO_TRIGGER_CONTROL, MavCmd.DO_SET_CAM_TRIGG_INTERVAL
+UNCHANGED = -1  # leaves the shutter time, or the sequence number of the trigger, as it is
 # Seconds without a capture after which the status of a series is requested, and seconds to wait for the status.
 CHECK_INTERVAL_S, STATUS_TIMEOUT_S = 1.0, 2.0
 # Number of status requests before an order, for a camera that has answered such a request before, and for all others.
@@ -57,8 +58,10 @@ class Shutter:
 
     async def reliable_status(self) -> CameraStatus | None:
         """Request the status repeatedly, because it decides whether an order was executed and may be sent again."""
-        first_attempts = 1 if self._never_answered else FIRST_STATUS_ATTEMPTS
-        for _ in range(STATUS_ATTEMPTS if self._reports_status else first_attempts):
+        # A camera that has never sent its status may not support the message. It gets fewer requests, and only one if
+        # it has left all requests of an earlier order unanswered.
+        attempts_before_first = 1 if self._never_answered else FIRST_STATUS_ATTEMPTS
+        for _ in range(STATUS_ATTEMPTS if self._reports_status else attempts_before_first):
             status = await self.status(STATUS_TIMEOUT_S)
             if status is not None or self.link.is_trigger or m.CameraCaptureStatus in self.link.unavailable:
                 return status
@@ -81,7 +84,8 @@ class Shutter:
                         if not is_old or capture.index not in known_indices:
                             return self._checked(capture)
                     round_trip_s = self.link.round_trip_s or 0.0
-                    if await new_captures.wait(max(CHECK_INTERVAL_S, 2.0 * round_trip_s)):
+                    has_arrived = await new_captures.wait(max(CHECK_INTERVAL_S, 2.0 * round_trip_s))
+                    if has_arrived:
                         continue
                     status = await self.status()
                     if status is None:
@@ -94,6 +98,7 @@ class Shutter:
                     was_lost = error is not None and is_series_unchanged and _has_taken_none(before, status)
                     if was_lost and attempts < MAX_ORDER_ATTEMPTS:
                         attempts, error = attempts + 1, await self.order_photo(before, is_repeated=True)
+            # `error` is set if the last order was not acknowledged.
             raise error or self.link.timeout_error(
                 f"accepted the order, but reported no picture within {timeout:g} s; it may have taken one"
             )
@@ -104,7 +109,8 @@ class Shutter:
         """Request the capture of the ordered picture, if the status shows that it was taken."""
         if before is not None:
             was_taken = status.image_count > before.image_count
-            return await self.log.fetch(before.image_count) if was_taken else None
+            new_index = before.image_count  # Indices begin at 0.
+            return await self.log.fetch(new_index) if was_taken else None
         # Without a status from before an accepted order, the newest picture counts as the ordered one.
         newest = status.image_count - 1
         if is_accepted and not status.is_capturing and newest >= 0 and newest not in known_indices:
@@ -122,13 +128,16 @@ class Shutter:
         A repeated order has the same sequence number as before, so that a camera does not execute it twice.
         """
         if not is_repeated:
-            count = 0 if before is None else before.image_count
-            self._sequence_number = max(count + 1, self._sequence_number + 1)
+            pictures = 0 if before is None else before.image_count
+            # Also above the number of pictures, because an earlier program may have used the numbers up to there.
+            self._sequence_number = max(pictures + 1, self._sequence_number + 1)
         try:
             if self.link.is_trigger:
                 await self._send_digicam_control()
             else:
-                await self.link.command(START, self.link.device, 0, 1, self._sequence_number, attempts=1)
+                interval_s, count = 0, 1  # a single picture
+                params = (self.link.device, interval_s, count, self._sequence_number)
+                await self.link.command(START, *params, attempts=1)
         except CommandTimeout as error:
             return error
         except CommandRejected as error:
@@ -147,14 +156,14 @@ class Shutter:
     async def start_series(self, order: Order, seconds: float, count: int, before: CameraStatus | None) -> None:
         """Start a series; repeat the order only if the camera reports that it has not started."""
         if self.link.is_trigger:
-            await self.link.command(TRIGGER_INTERVAL, seconds * 1000.0, -1)
-            await self.link.command(TRIGGER, 1, -1, 0, 0, order=order)
+            await self.link.command(TRIGGER_INTERVAL, seconds * 1000.0, UNCHANGED)  # milliseconds, shutter time
+            await self.link.command(TRIGGER, 1, UNCHANGED, 0, 0, order=order)  # 1 enables the trigger.
             return
 
         async def has_started() -> bool | None:
             status = await self.reliable_status()
             if status is None or before is None:
-                return None
+                return None  # Without both reports, the number of pictures cannot be compared.
             return status.is_in_series or status.is_capturing or status.image_count > before.image_count
 
         command = (START, self.link.device, seconds, count, 0)
@@ -162,7 +171,7 @@ class Shutter:
 
     @property
     def stop_command(self) -> tuple[float, ...]:
-        return (TRIGGER, 0, -1, 0, 0) if self.link.is_trigger else (STOP, self.link.device)
+        return (TRIGGER, 0, UNCHANGED, 0, 0) if self.link.is_trigger else (STOP, self.link.device)
 
 
 def _has_taken_none(before: CameraStatus | None, status: CameraStatus) -> bool:
@@ -212,10 +221,11 @@ class PhotoInterval:
             await self._begin(operation)
         except BaseException as error:
             self._new_captures.__exit__()
-            if operation.commit(error):
+            if operation.may_run_despite(error):
+                # Raise the error without delay: the stop command is sent at once, and retried in the background.
                 await operation.stop(is_awaited=False)
             raise
-        operation.commit()
+        operation.record_start()
         return self
 
     async def _begin(self, operation: ActiveOperation) -> None:
@@ -262,7 +272,9 @@ class PhotoInterval:
             if self._waiting and self._next_index is not None:
                 await self._fetch_missing()
                 continue
-            if await self._new_captures.wait(max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S):
+            patience_s = max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S  # longer than the interval
+            has_arrived = await self._new_captures.wait(patience_s)
+            if has_arrived:
                 silent_checks = 0
                 continue
             silent_checks += 1

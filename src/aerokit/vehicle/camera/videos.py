@@ -159,11 +159,13 @@ class VideoMixin(CameraMixin):
         if first is None or not self._streams:
             raise self._link.timeout_error("reported no video stream")
         for number in range(1, first.count + 1):
-            if number not in self._streams and not await self._request_stream(number):
+            is_reported = number in self._streams or await self._request_stream(number)
+            if not is_reported:
                 raise self._link.timeout_error(f"did not report its video stream {number}")
         return self.streams.value
 
     async def _request_stream(self, number: int) -> bool:
+        """Request information about one stream; return True if it arrives."""
         message = await self._link.request(
             m.VideoStreamInformation, number, where=lambda message: message.stream_id == number
         )

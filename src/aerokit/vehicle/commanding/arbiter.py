@@ -65,7 +65,8 @@ class CommandArbiter:
         self.mode_settles_at: float = -math.inf
         """Time until which HEARTBEAT may report the mode of an abandoned order."""
         self._any_mode_until = self._arming_accepted_at = self._disarmed_at = -math.inf
-        # Time of the last change from disarmed to armed, and the order of the program that caused it, if one did.
+        # Time of the last change from disarmed to armed, and the order with which this program caused it; None if
+        # another party armed the vehicle.
         self._armed_at = -math.inf
         self._armed_by_program: Order | None = None
         # Three lists: the newest steering order and the auxiliary orders in progress; the posted orders; the commands

@@ -397,7 +397,7 @@ class Components:
         from aerokit.vehicle.parameters.parameters import Parameters
 
         sender = self._context.sender
-        if component_id == self._session.component_id:
+        if component_id == self._session.component_id:  # The autopilot uses the same objects as the vehicle.
             return Component(self._session, sender, self._files, self._parameters, self.component)
         session = ComponentSession(self._session, component_id)
         files = Files(session.transfers)

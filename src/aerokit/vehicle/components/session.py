@@ -46,7 +46,7 @@ class ComponentSession:
         self.commands: CommandSender = session.commands
         self.on_reboot: list[Callable[[], None]] = session.on_reboot
         self.rates: MessageRates = MessageRates(
-            session.connection, session.commands, session.system_id, component_id, {}
+            session.connection, session.commands, session.system_id, component_id, stream_groups={}
         )
         self.subscriber: ComponentSubscriber = ComponentSubscriber(
             session.connection,
@@ -157,7 +157,7 @@ class _WebDownload:
         self._is_aborted = True
         for connection in self._connections:
             if connection.sock is not None:
-                with suppress(OSError):
+                with suppress(OSError):  # The connection may have ended already.
                     connection.sock.shutdown(SHUT_RDWR)
 
     def _connect_with(self, connection_type: type[HTTPConnection]) -> Callable[..., HTTPConnection]:
@@ -165,7 +165,7 @@ class _WebDownload:
 
         def connect(host: str, **options: Any) -> HTTPConnection:
             if self._is_aborted:
-                raise OSError("aborted")
+                raise OSError("the download was aborted")
             connection = connection_type(host, **options)
             self._connections.append(connection)
             return connection

@@ -305,7 +305,7 @@ class Settings:
         return await transfers.run(exchange)
 
     async def _read_again(self, names: Iterable[str], idle_timeout_s: float) -> None:
-        # A setting that cannot be read may have changed, so its previous value is discarded.
+        """Read settings that may have changed. The values of those that cannot be read are discarded."""
         assert self._definition is not None
         settings = self._definition.settings
         readable = [name for name in names if name in settings and not settings[name].write_only]

@@ -157,7 +157,8 @@ class Actuators(ReadOnly):
                 check_range("values", value, -1, 1)
         params = [math.nan if value is None else float(value) for value in values]
         params += [math.nan] * (ACTUATORS - len(params))
-        order = SimpleOrder("set_actuators", MavCmd.DO_SET_ACTUATOR, (*params, 0))
+        first_set = 0  # index of the set: actuators 1 to 6
+        order = SimpleOrder("set_actuators", MavCmd.DO_SET_ACTUATOR, (*params, first_set))
         await order.send(self._context, topic="actuators")
 
     async def raise_landing_gear(self) -> None:
@@ -281,11 +282,13 @@ class Actuators(ReadOnly):
             CommandTimeout: there was no acknowledgement.
             OperationTimeout: no status text reported the release.
         """
+        # `checks_arguments` has refused every other intent.
         await PARACHUTE.send_until_text(
             self._context,
             ParachuteAction.RELEASE,
             topic="parachute",
             is_done=lambda text, _: text.startswith("Parachute: Released"),
+            # `is_done` has not accepted the text, and all other texts about the parachute are reasons for a refusal.
             is_refusal=lambda text: text.startswith("Parachute: "),
             timeout=PARACHUTE_TIMEOUT_S,
         )

@@ -52,12 +52,13 @@ class Gripper(ReadOnly):
     async def _move(self, action: GripperActions) -> None:
         context, topic = self._context, ("gripper", self._number)
         order = SimpleOrder(f"gripper {action.name.lower()}", MavCmd.DO_GRIPPER, (NUMBER, action))
-        if not context.session.autopilot.reports_gripper_by_text:
+        if not context.session.autopilot.reports_gripper_by_text:  # The acknowledgement reports the end.
             await order.send(context, self._number, topic=topic)
             return
 
         def has_moved(text: str, since_acknowledgement_s: float) -> bool:
             has_begun = text == BEGINS[action]
+            # For an electro-permanent gripper, ArduPilot reports no end, so wait as long as its movement takes.
             return text == ENDS[action] or (has_begun and since_acknowledgement_s >= EPM_WAIT_S)
 
         await order.send_until_text(context, self._number, topic=topic, is_done=has_moved, timeout=GRIP_TIMEOUT_S)

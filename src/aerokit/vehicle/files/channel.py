@@ -125,7 +125,7 @@ class FileChannel:
                 self._close_soon(file.session, path)
                 raise
             except Exception:
-                with suppress(FileTimeout):
+                with suppress(FileTimeout):  # The first error tells more.
                     await self._close(file.session, path, min(idle_timeout_s, CLOSE_TIMEOUT_S))
                 raise
             except BaseException:  # A cancelled call must not wait.
@@ -154,7 +154,7 @@ class FileChannel:
                         await self._close(session, path, idle_timeout_s)
                     continue
                 pause_s = SESSION_TIMEOUT_S.get(error.code)
-                # The pause may exceed the caller's idle time-out by one second.
+                # The extra second lets the default idle time-out of 10 s suffice for PX4's 10.5 s.
                 if not may_wait or pause_s is None or pause_s > idle_timeout_s + 1.0:
                     raise
                 may_wait = False

@@ -388,6 +388,7 @@ def _content_of(source: str | os.PathLike[str]) -> bytes:
 
 def _parse_entry(text: bytes) -> FileEntry | None:
     """Parse one entry of a listing; return None for an entry that is not a file or a subdirectory."""
+    # The kind is D for a directory and F for a file. MAVFTP also has S for an entry to skip.
     kind, name_and_size = text[:1], text[1:].decode("utf-8", "replace")
     name, _, size_text = name_and_size.partition("\t")
     if kind == b"D" and name_and_size not in (".", ".."):
@@ -405,7 +406,7 @@ def _crc32_in(path: str, reply: FtpMessage) -> int:
 
 
 def _crc32(data: bytes, previous_crc: int = 0) -> int:
-    """Return the CRC-32 of MAVFTP, which does not invert the start value and the result, as zlib does."""
+    """Return the CRC-32 as MAVFTP defines it. Unlike zlib, MAVFTP does not invert the start value and the result."""
     return zlib.crc32(data, previous_crc ^ CRC_INVERSION) ^ CRC_INVERSION
 
 

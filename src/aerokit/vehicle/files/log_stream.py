@@ -53,20 +53,20 @@ class UlogAssembler:
         prefix = b""  # the header of the file, or a ULog message that marks a gap
         if gap:
             self.lost += gap
-            self._buffer.clear()
-            self._is_aligned = False
+            self._buffer.clear()  # The rest of this ULog message is lost.
+            self._is_aligned = False  # Skip data up to the beginning of the next ULog message.
         self._next = (message.sequence + 1) % 0x10000
         if not self._has_header:
             self._has_header = self._is_aligned = data.startswith(MAGIC)
             if not self._has_header:
-                return b""
+                return b""  # The log begins with its header, so nothing before the header is used.
             prefix, data = data[:HEADER_BYTES], data[HEADER_BYTES:]
         elif not self._is_aligned:
             if first_offset == NO_MESSAGE_START:
-                return b""
+                return b""  # The rest of a message whose beginning was lost.
             self._is_aligned, data = True, data[first_offset:]
             gap_ms = round(1000 * (now - self._received_at))
-            prefix = DROPOUT + min(0xFFFF, gap_ms).to_bytes(2, "little")
+            prefix = DROPOUT + min(0xFFFF, gap_ms).to_bytes(2, "little")  # The field has 16 bits.
         self._received_at = now
         self._buffer += data
         return prefix + self._pop_complete()

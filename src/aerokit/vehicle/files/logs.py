@@ -360,7 +360,7 @@ async def log_path(
     for directory in directories:
         try:
             entries = await files.list(directory, idle_timeout_s=idle_timeout_s)
-        except FileError:
+        except FileError:  # The vehicle has no such directory.
             continue
         numbered: dict[int, FileEntry] = {}
         for entry in entries:
@@ -383,7 +383,7 @@ async def listed_logs(
     for directory in directories:
         try:
             entries = await files.list(directory, idle_timeout_s=idle_timeout_s)
-        except FileError:
+        except FileError:  # The vehicle has no such directory.
             continue
         logs = await _list_in(files, directory, idle_timeout_s)
         return None if entries and not logs else logs
@@ -401,8 +401,10 @@ async def _list_in(files: Files, directory: str, idle_timeout_s: float) -> tuple
     logs = []
     for number, match in enumerate(matches):
         if match is not None:
-            path_below_directory = match[3].partition("/log/")[2]
-            logs.append(ListedLog(number, int(match[1]), int(match[2]), f"{directory}/{path_below_directory}"))
+            time_utc, size, path = match.groups()
+            # `directory` is PX4's directory "log", seen from the root of MAVFTP.
+            path_below_directory = path.partition("/log/")[2]
+            logs.append(ListedLog(number, int(time_utc), int(size), f"{directory}/{path_below_directory}"))
     if len(logs) < len(matches):  # A file with other lines is not PX4's list.
         return ()
     return tuple(logs)

@@ -76,7 +76,7 @@ class ReleaseCommand:
             self._send()
 
         async def send_until_acknowledged() -> None:
-            with suppress(AerokitError):
+            with suppress(AerokitError):  # This task runs in the background, so no call waits for its errors.
                 if not is_sent:
                     await self._session.wait_for_heartbeat()
                     if not self._is_still_due():
@@ -87,7 +87,7 @@ class ReleaseCommand:
                 except CommandTimeout:
                     if not self._is_target_silent():
                         raise
-                    # The target did not hear the command, so repeat it when the target is back.
+                    # The target did not receive the command, so repeat it when the target is back.
                     await self._wait_target_heartbeat()
                     if self._is_still_due():
                         self._send()
@@ -280,7 +280,7 @@ class GimbalControl:
 
         try:
             await wait(STATUS_TIMEOUT_S)
-        except OperationTimeout:
+        except OperationTimeout:  # The manager may not send its status by itself, or the message was lost.
             orders.ask_in_background(GimbalManagerStatus.ID)
             await wait(CONFIRM_TIMEOUT_S - STATUS_TIMEOUT_S)
         device = orders.device
@@ -325,8 +325,9 @@ class GimbalControl:
         release.send_soon()
 
     def _end(self) -> None:
+        """Forget the control that this block has requested or has. Sends nothing."""
         self._is_ended = True
-        self._lost.set()
+        self._lost.set()  # Calls of `until_lost` end too.
         requests = self._orders.registry.control_requests
         if self._control_request in requests:
             requests.remove(self._control_request)

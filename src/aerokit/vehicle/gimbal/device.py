@@ -128,7 +128,8 @@ def _version(number: int) -> str:
 # Gimbals without their own component id are numbered from 1 to this.
 MAX_GIMBAL_NUMBER = 6
 
-# A status that is older than the newest one by less than this arrived late. If it is older, the manager has rebooted.
+# A status whose time stamp is lower than that of the newest one by less than this arrived late. If the difference is
+# greater, the manager has rebooted.
 REORDER_WINDOW_MS = 5_000
 
 ATTITUDE_MESSAGES = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"

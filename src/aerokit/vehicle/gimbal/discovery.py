@@ -133,6 +133,7 @@ class GimbalRegistry:
         if device_id > MAX_GIMBAL_NUMBER and device_id != component_id:
             return None  # The message is about another component.
         has_own_id = component_id > MAX_GIMBAL_NUMBER and component_id != self._session.component_id
+        # A sender with its own component id may send 0 for itself.
         is_sender = device_id > MAX_GIMBAL_NUMBER or (device_id == 0 and has_own_id)
         number = 0 if is_sender else device_id or 1  # Older autopilots send 0 for their gimbal.
         return self._marked_discovered(self.device(component_id, number))
@@ -161,7 +162,10 @@ class GimbalRegistry:
 
     def _on_status(self, message: GimbalManagerStatus) -> None:
         device = self._managed_device(message, message.gimbal_device_id)
-        if device is not None and device.update_status(message) and device is self.first:
+        if device is None:
+            return
+        is_newest = device.update_status(message)
+        if is_newest and device is self.first:
             self.placeholder.set_controllers(message)
 
     def _on_manager(self, message: GimbalManagerInformation) -> None:
@@ -177,6 +181,7 @@ class GimbalRegistry:
         if frame is None:
             return None
         sender = frame.component_id
+        # If several components send messages as the manager of a gimbal, orders go to the one of the highest rank.
         rank = RANK_INFORMATION if isinstance(message, GimbalManagerInformation) else RANK_STATUS
         if sender == self._session.component_id:
             rank = RANK_AUTOPILOT

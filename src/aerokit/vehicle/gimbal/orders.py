@@ -42,7 +42,7 @@ STANDARD_RULES = GimbalRules()
 
 
 class GimbalOrders:
-    """Orders to one gimbal, or to the first one. A new order ends the wait for the previous one."""
+    """Orders to one gimbal, or to the first gimbal. A new order ends the wait for the previous one."""
 
     def __init__(self, context: VehicleContext, registry: GimbalRegistry, device: GimbalDevice | None) -> None:
         self.context: VehicleContext = context
@@ -120,7 +120,8 @@ class GimbalOrders:
             await send()
         except CommandRejected:
             self.raise_if_taken()
-            if not self.claim_if_denied(command):
+            was_claimed = self.claim_if_denied(command)
+            if not was_claimed:  # The manager refused for another reason.
                 raise
             await send()
 
@@ -129,7 +130,8 @@ class GimbalOrders:
         if self.session.commands.is_unsupported(PITCHYAW, self.manager_id):
             return False
         pitch_rate, yaw_rate = rates or (NAN, NAN)
-        params = (pitch, yaw, pitch_rate, yaw_rate, flags, 0, self.gimbal_id_param)
+        reserved = 0
+        params = (pitch, yaw, pitch_rate, yaw_rate, flags, reserved, self.gimbal_id_param)
         try:
             await self.send_claiming_control(PITCHYAW, lambda: self.send(order, PITCHYAW, *params))
         except CommandRejected as error:
@@ -171,7 +173,7 @@ class GimbalOrders:
                     raise
             else:
                 return True
-        if not order.is_newest:  # A newer order was given during the wait for the answer.
+        if not order.is_newest:  # A newer order was given during the wait for the answer, so nothing more is sent.
             return True
         stabilized = {"stab_roll": 1, "stab_pitch": 1, "stab_yaw": 1}
         self.session.send(MountConfigure(self.session.system_id, self.manager_id, mode, **stabilized))
@@ -182,8 +184,9 @@ class GimbalOrders:
         attitude = self.session.telemetry.attitude.latest
         heading = 0.0 if attitude is None else attitude.yaw_deg
         yaw_from_nose = yaw if from_nose else math.remainder(yaw - heading, 360.0)
-        if not await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, yaw_from_nose):
-            # MOUNT_CONTROL, for older firmware, has a yaw from north.
+        were_angles_sent = await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, yaw_from_nose)
+        if not were_angles_sent:
+            # MOUNT_CONTROL, for older firmware, has a yaw from north, and all angles in centidegrees.
             yaw_from_north = yaw + heading if from_nose else yaw
             message = MountControl(
                 self.session.system_id,
@@ -232,7 +235,7 @@ class GimbalOrders:
         """Return the manager. If none is known, first ask the device whether it is its own manager."""
         device = self.device
         if device.manager_id is None and device.component_id:
-            with suppress(CommandRejected, CommandTimeout):
+            with suppress(CommandRejected, CommandTimeout):  # The autopilot then counts as the manager.
                 await self.ask(GimbalManagerInformation.ID, device.component_id, attempts=1)
                 await self.wait_for(lambda: device.manager_id, GimbalManagerInformation, MANAGER_TIMEOUT_S)
         return self.manager_id
@@ -253,9 +256,10 @@ class GimbalOrders:
         Returns True if control was claimed.
         """
         commands, manager_id = self.session.commands, self.manager_id
+        # An open control block has requested control itself, and reports if it loses control.
         if self.device.control_blocks or commands.last_result(command, manager_id) != MavResult.DENIED:
             return False
-        commands.forget_result(command, manager_id)
+        commands.forget_result(command, manager_id)  # One denial must not lead to a second claim.
         params = self._primary_params(self.own_ids)
         commands.send_unconfirmed(CONFIGURE, *params, component_id=manager_id)
         self._claimed = manager_id

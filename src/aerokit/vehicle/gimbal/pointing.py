@@ -117,6 +117,7 @@ async def wait_until_there(
 ) -> None:
     """Wait until an attitude newer than ``since`` shows that the target is reached; errors as for `Gimbal.point`."""
     session, checked_at = orders.session, since
+    # `vehicle.gimbal` has one `public_device` for its state values, even while `attitude_source` and `device` change.
     deadline, reboots = session.connection.now() + timeout, orders.public_device.reboots
     watched = (orders.public_device.attitude, orders.attitude_source.attitude, orders.device.controllers)
     with orders.device.in_use(), ChangeSignal(session, *watched, every_arrival=True) as changes:
@@ -200,7 +201,7 @@ def direction_to(context: VehicleContext, target: Position) -> Angles | None:
     pitch = math.degrees(math.atan2(height_m, distance_m))
     has_bearing = distance_m > MIN_BEARING_DISTANCE_M and abs(pitch) <= MAX_PITCH_FOR_YAW_DEG
     yaw_from_north = here.bearing_to(target) if has_bearing else None
-    return (pitch, None, yaw_from_north, None)
+    return (pitch, None, yaw_from_north, None)  # Any roll is accepted, and the yaw is checked from north only.
 
 
 def _height_above(here: Position, target: Position) -> float | None:
@@ -222,7 +223,7 @@ RETRACT, NEUTRAL = GimbalDeviceFlags.RETRACT, GimbalDeviceFlags.NEUTRAL
 
 @checks_arguments
 class PointingMixin(GimbalMixin):
-    """Orders by angles. A newer order ends the previous one."""
+    """Orders that point the gimbal at angles. A newer order ends the previous one."""
 
     async def point(
         self,
@@ -267,7 +268,8 @@ class PointingMixin(GimbalMixin):
         async def send() -> None:
             flags = LEVEL if from_nose else LOCKED
             # The gimbal manager's command has no roll, so an order with roll uses the mount command.
-            if roll_deg or not await orders.send_pitch_yaw(order, pitch_deg, yaw_deg, flags=flags):
+            was_sent = not roll_deg and await orders.send_pitch_yaw(order, pitch_deg, yaw_deg, flags=flags)
+            if not was_sent:
                 await orders.send_mount_angles(order, pitch_deg, roll_deg, yaw_deg, from_nose=from_nose)
 
         angles = ordered_angles(pitch_deg, yaw_deg, roll_deg or None, from_nose=from_nose)
@@ -329,7 +331,8 @@ class PointingMixin(GimbalMixin):
         orders, order = self._orders, self._orders.begin_order()
 
         async def send() -> None:
-            if not await orders.send_pitch_yaw(order, NAN, NAN, flags=flag):
+            is_supported = await orders.send_pitch_yaw(order, NAN, NAN, flags=flag)
+            if not is_supported:
                 await orders.send_mount_mode(order, mode)
 
         if not wait:
@@ -344,7 +347,7 @@ class PointingMixin(GimbalMixin):
     def _check_limits(self, pitch: float, roll: float, yaw: float | None) -> None:
         device = self._orders.device
         if device.manager_information is None or not device.checks_limits:
-            return
+            return  # The program has not requested the limits by `information()`.
         limits = information_of(device.device_id, self._orders.manager_id, device.manager_information, device=None)
         checks = (
             ("pitch_deg", pitch, limits.pitch_deg),

@@ -95,7 +95,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._order = orders.begin_order()
         self._in_use.enter_context(orders.device.in_use())
         try:
-            if not await orders.send_pitch_yaw(self._order, NAN, NAN, *self._value, flags=self._flags):
+            is_supported = await orders.send_pitch_yaw(self._order, NAN, NAN, *self._value, flags=self._flags)
+            if not is_supported:
                 orders.raise_not_supported("has no gimbal manager, which is needed for rates")
             self._began_at = self._now()
             orders.context.on_finish.append(self._finish)
@@ -159,7 +160,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
 
     def _zero_rates_command(self) -> ReleaseCommand:
         orders, order = self._orders, self._order
-        params = (NAN, NAN, 0.0, 0.0, self._flags, 0, orders.gimbal_id_param)
+        no_angles, zero_rates, reserved = (NAN, NAN), (0.0, 0.0), 0
+        params = (*no_angles, *zero_rates, self._flags, reserved, orders.gimbal_id_param)
 
         def is_still_due() -> bool:
             return order is not None and order.is_newest and not orders.is_taken

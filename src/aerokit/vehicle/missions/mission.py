@@ -8,7 +8,7 @@ import anyio
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavCmd, MavLandedState, MavResult, MissionState
+from aerokit.mavlink.enums import MavCmd, MavLandedState, MavMissionType, MavResult, MissionState
 from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.ground import GroundCheck
@@ -77,12 +77,12 @@ class MissionEndDetector:
         return has_landed if is_on_ground else is_reported
 
     def _is_end_reported(self) -> bool:
-        """Return True if the vehicle reports the end of the mission, which may also be a fall."""
+        """Return True if the vehicle reports the end of the mission. A vehicle that has fallen may report it too."""
         if self._tracker.is_complete:
             # ArduPilot reports completion at home, PX4 already when it begins to return.
             at_home = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
             return not self._ends_by_landing or self._is_on_ground or at_home
-        # ArduPlane returns in another mode than its mission mode, which stops the mission.
+        # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.
         if self._ends_in_air and self._is_landing:
             return self._is_on_ground or self._is_home
         self._return_began_at = None  # The vehicle is not returning.
@@ -95,7 +95,10 @@ class MissionEndDetector:
         return not reports_state and last is not None and self._tracker.reached == last
 
     def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
-        """Return the reason why the mission can no longer end. ``order`` is the last order for the mission."""
+        """Return the reason why the vehicle will not fly the mission to its end; None if it may still do so.
+
+        ``order`` is the last order for the mission.
+        """
         session, now = self._session, self._session.connection.now()
         if self._vehicle_context.arbiter.newest not in (self._order, order):
             return "another order was given"
@@ -141,7 +144,7 @@ class MissionEndDetector:
         if self._return_began_at is None:
             self._return_began_at = now
         if now - self._return_began_at > RETURN_TIMEOUT_S:
-            return True
+            return True  # The vehicle may be at a rally point instead, whose position is unknown here.
         home = session.telemetry.home.latest
         if home is None:
             return False
@@ -293,7 +296,8 @@ class MissionControl(VehiclePlan["Mission"]):
         """
         vehicle_context, session = self._vehicle_context, self._session
         mode = vehicle_context.sender.mode_for("mission.wait_finished", "mission")
-        items = (self._context.caches[0].items or ())[self._context.offset_of(0) :]
+        items_with_home = self._context.caches[MavMissionType.MISSION].items or ()
+        items = items_with_home[self._context.offset_of(MavMissionType.MISSION) :]
         end = MissionEndDetector(vehicle_context, self._tracker, mode, items)
         with session.streaming("mission_current", "landed_state", "position"), end.ground.watching():
             await await_progress(
@@ -343,7 +347,7 @@ class MissionControl(VehiclePlan["Mission"]):
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
         """Set the current item. Item 0 also resets ArduPilot's jump counts, unless ``keeps_jump_counts``."""
         vehicle_context, session = self._vehicle_context, self._session
-        seq = item + self._context.offset_of(0)
+        seq = item + self._context.offset_of(MavMissionType.MISSION)
         if session.autopilot.sets_current_by_command:
             # ArduPilot also resets the jump counts if it gets the number 0, which is the number of home.
             number = 0 if item == 0 and not keeps_jump_counts else seq
@@ -395,6 +399,7 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             with vehicle_context.arbiter.changing_mode():
                 await vehicle_context.sender.send_long(order, MavCmd.MISSION_START, modes=(mode,))
+                # Only PX4 refuses after it has accepted, and PX4 does not get this command.
                 await vehicle_context.sender.await_mode(
                     mode, order, refusals=[], timeout=timeout, reported_since=order.given_at
                 )

@@ -50,7 +50,7 @@ class MissionStallDetector:
         self._session, self._tracker, self._mode = session, tracker, mode
         self._items, self._is_paused = items or (), is_paused
         self._stall = StallDetector(session)
-        # At the last call, the vehicle should have been moving because of this item, and since this time.
+        # The item because of which the vehicle had to be moving at the last call, and since when. None: it might stand.
         self._item: int | None = None
         self._should_move_since = session.connection.now()
 

@@ -163,7 +163,7 @@ class PlanChannel:
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:
             error.args = (f"{error}{self._describe_items_on_vehicle(exchange, is_silent=True)}",)
-            raise
+            raise  # This error also has `missing`, so only its text was changed.
         finally:
             if not exchange.done and connection.is_open:
                 for cancellation in exchange.cancellation():
@@ -238,7 +238,7 @@ class PlanTransfer(Generic[PlanT]):
             await self.clear()
             return
         if only_changes and await self._send_changes(items, method, verify=verify):
-            return
+            return  # The vehicle has the plan now.
         self._cache.forget(self._context.now())
         if await self._uses_file(method, is_upload=True):
             await self._send_file(items, method)
@@ -280,7 +280,7 @@ class PlanTransfer(Generic[PlanT]):
                 raise NotSupported(f"{self._name}: the vehicle has no file transfer; nothing was sent")
             return True
         # ArduPilot clears the old mission before it reads the file, and refuses to do so while it flies the mission.
-        is_flying = is_upload and self._type == 0 and self._context.is_flying_mission
+        is_flying = is_upload and self._type == MavMissionType.MISSION and self._context.is_flying_mission
         return has_ftp and self._cache.has_file is not False and not is_flying  # `has_file` is None until tried.
 
     def _on_file_error(self, error: Exception, method: str) -> None:
@@ -346,7 +346,7 @@ class PlanTransfer(Generic[PlanT]):
         self._cache.forget(self._context.now())
         for part in _consecutive_ranges(changed_seqs):
             if not await self._send_part(items[part.start : part.stop], part.start, verify=verify):
-                return False
+                return False  # The vehicle does not support partial uploads.
             vehicle_items[part.start : part.stop] = items[part.start : part.stop]
         self._cache.set(vehicle_items, self._context.now())
         return True
@@ -386,7 +386,7 @@ class PlanTransfer(Generic[PlanT]):
             return False
         checksum = mission_checksum(items)
         if not await self._context.wait_for_plan_id(self._type, checksum):
-            return False
+            return False  # The checksum did not arrive in time.
         self._cache.set(items, self._context.now())
         return True
 

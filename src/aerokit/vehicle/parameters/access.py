@@ -104,7 +104,8 @@ class ParameterAccess:
                 from aerokit.vehicle.parameters.store import ParameterCache
 
                 cached_list = _CachedList(self, ParameterCache(None if cache is True else cache), idle_timeout_s)
-                if await cached_list.load_if_current(refresh):
+                is_loaded = await cached_list.load_if_current(refresh)
+                if is_loaded:
                     return self.store.table
             await self._download(method, idle_timeout_s, on_progress)
             if cached_list is not None:
@@ -258,7 +259,7 @@ class ParameterAccess:
             is_boosted = True
             self._boosts += 1
             if self._boosts == 1:
-                self._set_interval(interval_s * 1e6)
+                self._set_interval(interval_s * 1e6)  # microseconds
 
         timer = asyncio.get_running_loop().call_later(after_s, boost)
         try:
@@ -290,6 +291,7 @@ class ParameterAccess:
             for name in names:
                 self.written.pop(name, None)
                 self.store.clear_replaced(name)
+            # Recently written parameters are read back, so their answers take as long as those of reads.
             recent = self._recently_written() & set(names)
             exchange = ParameterWrites(
                 transfers.system_id,
@@ -303,7 +305,7 @@ class ParameterAccess:
                 idle_timeout_s=idle_timeout_s,
                 on_progress=on_progress,
             )
-            # Recently written parameters are read back, and many reads need the raised rate.
+            # Many reads need the raised rate.
             boost_after_s = 0.0 if len(recent) > MAX_READS_UNBOOSTED else math.inf
             with self._boosted(after_s=boost_after_s):
                 answers = await transfers.run(exchange)
@@ -312,6 +314,7 @@ class ParameterAccess:
                 if not isinstance(answer, Parameter):
                     continue
                 self.written[name] = answer.value
+                # A late answer with the previous value must not replace the new one in the store.
                 if name in old_values and answer.value != old_values[name]:
                     self.store.mark_replaced(name, old_values[name])
             return answers
@@ -340,7 +343,7 @@ class ParameterAccess:
             async with self._writing:
                 await self._upload_pack(parameters, idle_timeout_s, on_progress)
             answers = await self._read_back(parameters, idle_timeout_s)
-        except (FileError, FileTimeout, NotSupported):
+        except (FileError, FileTimeout, NotSupported):  # With "auto", all parameters are set one by one instead.
             if method == "ftp":
                 raise
         not_applied = [param for param in parameters if not self._was_applied(param, answers.get(param.name))]

@@ -116,11 +116,11 @@ class ParameterStore:
         if frame is None or frame.component_id != self._transfers.component_id:
             return
         if message.param_id == HASH_NAME or not message.param_id:
-            return
+            return  # The hash is sent like a parameter, but is not one.
         received = parameter_of(message, self.bytewise)
         name, old = received.name, self._known.get(received.name)
         if old is None and len(self._known) >= MAX_PARAMETERS:
-            return
+            return  # A faulty vehicle may send new names without end.
         replaced_value = self.replaced_value(name)
         if old is not None and replaced_value is not None and same_value(received.value, replaced_value):
             return  # This message is from before the last write.

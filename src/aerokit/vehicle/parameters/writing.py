@@ -153,7 +153,7 @@ def warn_of_rename(renamed: Renamed) -> None:
     """Issue the warning, attributed to the line of the program that called aerokit."""
     from aerokit.parameters.renames import ParameterRenamedWarning
 
-    depth, frame = 2, sys._getframe(1)
+    depth, frame = 2, sys._getframe(1)  # `stacklevel` 2 is the caller of this function, and so is frame 1.
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("aerokit."):
         depth, frame = depth + 1, frame.f_back
     warnings.warn(renamed.warning, ParameterRenamedWarning, stacklevel=depth)
@@ -267,6 +267,7 @@ class ParameterWriter:
             results.update({name: _failed_write(name, pending[name], None, error) for name, error in errors.items()})
             results.update({plan.resolved.requested: self._result(plan, answers) for plan in plans})
             pending = {name: pending[name] for name, error in errors.items() if isinstance(error, ParameterRejected)}
+            # A rejected parameter may exist now, because ArduPilot shows some only after an …_ENABLE was set.
             has_new_parameters = bool(plans) and self._access.store.count != count_before
             if not pending or not has_new_parameters:
                 break

@@ -135,7 +135,7 @@ class _Response:
             return
         while line := await self._reader.readline():
             size = int(line.split(b";")[0] or b"0", 16)
-            if not 0 < size <= MAX_CHUNK_SIZE:
+            if not 0 < size <= MAX_CHUNK_SIZE:  # A chunk of size 0 ends the body.
                 return
             yield await self._reader.readexactly(size)
             await self._reader.readline()  # Skip the line break after the chunk.
@@ -221,7 +221,7 @@ class NtripClient:
             if not self._session.is_closed:
                 await self._ended.wait()
             if writer is not None:
-                with suppress(OSError):
+                with suppress(OSError):  # The connection may have failed before it was closed.
                     await writer.wait_closed()
 
     async def _run(self, response: _Response) -> None:
@@ -242,8 +242,9 @@ class NtripClient:
                         continue
                     self._reconnects += 1
                     logger.info("%s: connected again", self._name)
-                    if await self._forward(response):
-                        pause_s = MIN_RETRY_S  # The caster sent corrections, so the next attempt may follow soon.
+                    message_count = await self._forward(response)
+                    if message_count > 0:  # The connection was useful, so the next attempt may follow soon.
+                        pause_s = MIN_RETRY_S
         except (ConnectionClosed, LinkLost) as error:
             self._problem = f"the vehicle's connection has ended: {error}"
         finally:
@@ -333,11 +334,13 @@ class NtripClient:
     async def _read_source_table(self, response: _Response) -> dict[str, bool]:
         """Read a source table: map each mount point to True if it needs the position (field ``nmea``)."""
         text = b""
+        # If the table does not arrive completely, use the rows that have arrived.
         with suppress(OSError, ValueError, EOFError, asyncio.TimeoutError):
             async for data in response.body():
                 text += data
                 if b"ENDSOURCETABLE" in data or len(text) > MAX_TABLE_SIZE:
                     break
+        # In a row, column 1 is the name of the mount point, and column 11 is `nmea`.
         rows = [line.split(";") for line in text.decode("latin-1").splitlines() if line.startswith("STR;")]
         return {printable(row[1]): len(row) > 11 and row[11] == "1" for row in rows if len(row) > 1}
 
@@ -368,8 +371,8 @@ def gga_sentence(session: VehicleSession) -> bytes | None:
         quality = QUALITIES.get(receivers[0].fix_type, quality)
         satellites = receivers[0].satellites or satellites
     utc = time.strftime("%H%M%S", time.gmtime(session.connection.unix_time()))
-    latitude = f"{_format_angle(place.latitude_deg, 2)},{'S' if place.latitude_deg < 0 else 'N'}"
-    longitude = f"{_format_angle(place.longitude_deg, 3)},{'W' if place.longitude_deg < 0 else 'E'}"
+    latitude = f"{_format_angle(place.latitude_deg, degree_digits=2)},{'S' if place.latitude_deg < 0 else 'N'}"
+    longitude = f"{_format_angle(place.longitude_deg, degree_digits=3)},{'W' if place.longitude_deg < 0 else 'E'}"
     # HDOP (1.0) and the height of the geoid (0.0) are mandatory but made up, because casters use only the position.
     fields = (
         f"GPGGA,{utc}.00,{latitude},{longitude},{quality},{satellites:02d},1.0,{place.altitude_amsl_m:.1f},M,0.0,M,,"
@@ -378,8 +381,8 @@ def gga_sentence(session: VehicleSession) -> bytes | None:
     return f"${fields}*{checksum:02X}\r\n".encode()
 
 
-def _format_angle(degrees: float, digits: int) -> str:
+def _format_angle(degrees: float, *, degree_digits: int) -> str:
     """Format an angle as degrees and minutes without a separator between them: 4723.86456."""
     whole_degrees, rest = divmod(round(abs(degrees) * 60 * 100_000), 60 * 100_000)
     minutes, fraction = divmod(rest, 100_000)
-    return f"{whole_degrees:0{digits}d}{minutes:02d}.{fraction:05d}"
+    return f"{whole_degrees:0{degree_digits}d}{minutes:02d}.{fraction:05d}"

@@ -15,7 +15,7 @@ export const BUTTONS = [
   ["pick", "Go to …", "", [], "main"],
   ["hold", "Hold", "stop and hold its position", [], "rest"],
   ["land", "Land", "land at its current position", [], "rest"],
-  ["return_to_launch", "Return", "return to the launch position", [], "rest"],
+  ["return_to_launch", "Return", "return to the launch position and land there", [], "rest"],
   ["disarm", "Disarm", "stop the motors", [], ""],
   ["mission/start", "Start mission", ({ item = "N" }) => `fly its mission from item ${item}; it takes off if the mission has a takeoff item`, [["item", "From item", 0, "1"]], ""],
   ["mission/pause", "Pause", "pause its mission and hold", [], ""],

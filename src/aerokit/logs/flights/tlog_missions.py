@@ -1,0 +1,100 @@
+"""``RecordedMission``: the mission in a recording, transferred item by item or as a file by MAVFTP."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, TypeAlias
+
+from aerokit.errors import RemoteProtocolError
+from aerokit.logs.flights.flight import Waypoint
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavFtpOpcode, MavMissionType
+from aerokit.missions.wire import HEADER, NO_CLEAR, PACKED_PATHS, read_header, to_wire, unpack_items
+from aerokit.protocols.ftp import FtpMessage
+
+if TYPE_CHECKING:
+    from aerokit.logs.flights.flight import FlightLog
+
+MissionMessage: TypeAlias = "m.MissionItemInt | m.MissionItem | m.MissionCount | m.FileTransferProtocol"
+
+_DEGREES_E7 = 1e7
+_PATH = PACKED_PATHS[MavMissionType.MISSION].encode()
+_OPENING = (MavFtpOpcode.OPENFILERO, MavFtpOpcode.OPENFILEWO, MavFtpOpcode.CREATEFILE)
+_READING = (MavFtpOpcode.READFILE, MavFtpOpcode.BURSTREADFILE)
+
+
+class RecordedMission:
+    """The last mission that was sent to a vehicle or read from it."""
+
+    def __init__(self, flight: FlightLog) -> None:
+        self._flight = flight
+        self._items: dict[int, Waypoint] = {}
+        self._is_file_open = False  # True while a program writes or reads the mission file
+        self._file = bytearray()  # its beginning, up to the first block that is missing
+        self._later_blocks: dict[int, bytes] = {}  # the blocks after that, by their offset
+
+    @property
+    def waypoints(self) -> list[Waypoint]:
+        return [self._items[number] for number in sorted(self._items)]
+
+    def on_item(self, time_s: float, message: m.MissionItemInt | m.MissionItem) -> None:
+        if not self._is_of_vehicle(message) or message.mission_type != MavMissionType.MISSION:
+            return
+        self._add(message)
+
+    def on_count(self, time_s: float, message: m.MissionCount) -> None:
+        """Drop the items beyond the new number of items, because they belong to an earlier mission."""
+        if self._is_of_vehicle(message) and message.mission_type == MavMissionType.MISSION:
+            self._items = {number: item for number, item in self._items.items() if number < message.count}
+
+    def on_file_transfer(self, time_s: float, message: m.FileTransferProtocol) -> None:
+        """Collect the blocks of ArduPilot's mission file, which a program writes or reads."""
+        if not self._is_of_vehicle(message):
+            return
+        ftp = FtpMessage.decode(message.payload)
+        if ftp.opcode in _OPENING:
+            self._is_file_open = ftp.data.rstrip(b"\0") == _PATH
+            self._file.clear()
+            self._later_blocks.clear()
+        elif self._is_file_open and ftp.data and ftp.offset >= len(self._file):
+            is_block_read = ftp.is_ack and ftp.request_opcode in _READING
+            if is_block_read or ftp.opcode == MavFtpOpcode.WRITEFILE:
+                self._later_blocks[ftp.offset] = ftp.data
+                while block := self._later_blocks.pop(len(self._file), b""):
+                    self._file += block
+                self._read_file()
+
+    def _read_file(self) -> None:
+        """Replace the mission by the items of the file, as soon as the file is complete."""
+        if len(self._file) < HEADER.size:
+            return
+        try:
+            header = read_header(bytes(self._file[: HEADER.size]))
+            if len(self._file) < header.length:
+                return
+            items = unpack_items(bytes(self._file[: header.length]), MavMissionType.MISSION)
+        except RemoteProtocolError:  # Another program wrote something else to this file.
+            self._is_file_open = False
+            return
+        self._is_file_open = False
+        if not header.options & NO_CLEAR:
+            self._items.clear()
+        for number, item in enumerate(items, header.first):
+            self._add(to_wire(item, number, target_system=0, target_component=0))
+
+    def _add(self, message: m.MissionItemInt | m.MissionItem) -> None:
+        scale = _DEGREES_E7 if isinstance(message, m.MissionItemInt) else 1.0
+        has_position = bool(message.x or message.y)
+        self._items[message.seq] = Waypoint(
+            message.seq,
+            message.command,
+            message.x / scale if has_position else math.nan,
+            message.y / scale if has_position else math.nan,
+            message.z,
+            message.frame,
+        )
+
+    def _is_of_vehicle(self, message: MissionMessage) -> bool:
+        """Return True if the vehicle of this flight sent or received the message."""
+        sender = None if message.received_frame is None else message.received_frame.system_id
+        return self._flight.system_id in (sender, message.target_system)
