@@ -58,6 +58,7 @@ class MotorTest:
             self._copter.info("starting motor test")
         self.is_running = True
         self._test_number += 1
+        # The number identifies the test: the end of a replaced test has no effect.
         self._copter.call_later(self._duration_s(command), partial(self._stop, self._test_number))
         return MavResult.ACCEPTED
 

@@ -280,8 +280,9 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
 
 
 _LAND_BEYOND_M = 100.0
+_FENCE_RTL = 1
 _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
-    1: _MODES[_RTL],
+    _FENCE_RTL: _MODES[_RTL],
     2: _MODES[_LAND],
     3: _MODES[_SMART_RTL],
     4: _MODES[_BRAKE],
@@ -311,10 +312,10 @@ class CopterFence(ArduPilotFence[CopterHost]):
         if action == REPORT_ONLY:
             return
         # The firmware treats an unknown action as RTL (fence.cpp).
-        modes = _FENCE_ACTIONS.get(action, _FENCE_ACTIONS[1])
+        modes = _FENCE_ACTIONS.get(action, _FENCE_ACTIONS[_FENCE_RTL])
         if self.beyond_m(new_breaches) > _LAND_BEYOND_M:
             modes = (CopterMode.LAND,)
-        # Try the modes in turn, until one of them is not refused.
+        # Try the modes in turn; `any` stops at the first mode that the vehicle accepts.
         self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
 
     def on_cleared(self) -> None:

@@ -240,18 +240,18 @@ class ArduPilotGimbal:
             return None
         roll, pitch, yaw = map(math.radians, self.angles)
         return m.GimbalDeviceAttitudeStatus(
-            0,  # target_system and target_component 0: broadcast
-            0,
-            self._vehicle.time_boot_ms,
-            _device_flags(self),
-            quaternion_from_euler(roll, pitch, yaw),
-            math.nan,  # three unknown angular velocities
-            math.nan,
-            math.nan,
-            0,  # no failure flags
-            math.nan,  # unknown yaw and yaw rate of the vehicle
-            math.nan,
-            _DEVICE_ID,
+            target_system=0,  # broadcast
+            target_component=0,
+            time_boot_ms=self._vehicle.time_boot_ms,
+            flags=_device_flags(self),
+            q=quaternion_from_euler(roll, pitch, yaw),
+            angular_velocity_x=math.nan,  # NaN: unknown
+            angular_velocity_y=math.nan,
+            angular_velocity_z=math.nan,
+            failure_flags=0,
+            delta_yaw=math.nan,
+            delta_yaw_velocity=math.nan,
+            gimbal_device_id=_DEVICE_ID,
         )
 
     def manager_information(self) -> m.GimbalManagerInformation | None:

@@ -233,7 +233,7 @@ class RoverFence(ArduPilotFence[RoverHost]):
             vehicle.arming.disarm()
         else:
             modes = _MODES.get(action, ())
-            # Try the modes in turn, until one of them is not refused.
+            # Try the modes in turn; `any` stops at the first mode that the vehicle accepts.
             self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
 
     def on_mode_changed(self) -> None:

@@ -55,7 +55,8 @@ _FORMAT_S, _FORMAT_PERCENTS = 0.5, (0, 25, 50, 75)
 def _format(camera: CameraBody, command: ReceivedCommand) -> int | CommandProgress:
     """Format the card, which takes two seconds. Param 2 is 1 to format, param 3 is 1 to reset the image log."""
     captures = camera.captures
-    if command.param1 not in (0.0, 1.0) or not camera.card.is_inserted:
+    is_card_known = command.param1 in (0.0, 1.0)  # 0 selects all cards, and the camera has one card.
+    if not is_card_known or not camera.card.is_inserted:
         return MavResult.DENIED
     if captures.is_busy or captures.is_recording:
         return MavResult.TEMPORARILY_REJECTED

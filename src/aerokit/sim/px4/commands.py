@@ -372,7 +372,7 @@ def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         Cmd.SET_MESSAGE_INTERVAL: requests.set_interval,
         Cmd.GET_MESSAGE_INTERVAL: requests.get_interval,
     }
-    for command, message_id in _LEGACY_REQUESTS.items():
+    for command, message_id in _LEGACY_REQUESTS.items():  # Each lambda keeps its own id as a default value.
         handlers[command] = lambda request, message_id=message_id: requests.send_now(message_id, request)  # type: ignore[misc]
     return handlers
 

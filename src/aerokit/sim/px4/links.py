@@ -170,6 +170,7 @@ class Px4StreamRates:
         intervals_us = self._intervals_us[channel] = {}
         for message_id, rate in self._rates_at_start(mode).items():
             intervals_us[message_id] = _interval_us(rate)
+            # GPS_GLOBAL_ORIGIN has a rate, but is sent only once and after a change.
             if rate and self._is_built(message_id) and message_id != m.GpsGlobalOrigin.ID:
                 channel.streams.set_interval(message_id, 1.0 / rate, first)
         for message_id, rate in _ALWAYS_HZ.items():
