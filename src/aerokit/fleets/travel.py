@@ -151,7 +151,7 @@ class Travel(SelectionBase):
             raise OperationRejected(f"{action}: {separation.reason}; nothing was sent")
         if separation.decision == "corridors":
             delays_s = separation.delays_s
-            return await self._fly_to(action, targets, speed_m_s, timeout, stagger_s, delays_s, (), max_distance_m)
+            return await self._fly_to(action, targets, speed_m_s, timeout, stagger_s, delays_s, names, max_distance_m)
         return await self._fly_in_layers(action, targets, speed_m_s, timeout, separation.heights_m, max_distance_m)
 
     def _resolve_targets(

@@ -85,7 +85,7 @@ class TravelActions(VehicleBase):
         """
         target = travel_target(target)
         place = self._position.command_place(target)
-        _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
+        _check_travel(speed_m_s, heading_deg, tolerance_m)
         self._position.check_reach("target", [target], max_distance_m)
         arrival_radius_m = self._position.arrival_radius_m if tolerance_m is None else tolerance_m
         self._check_can_turn(heading_deg)
@@ -334,9 +334,7 @@ class TravelActions(VehicleBase):
         return math.remainder(math.radians(heading_deg), 2 * math.pi)
 
 
-def _check_travel(
-    speed_m_s: float | None, heading_deg: float | None, tolerance_m: float | None, timeout: float | None
-) -> None:
+def _check_travel(speed_m_s: float | None, heading_deg: float | None, tolerance_m: float | None) -> None:
     if speed_m_s is not None:
         check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
     if heading_deg is not None:
