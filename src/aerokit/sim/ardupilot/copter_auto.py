@@ -81,8 +81,7 @@ class _CircleLeg:
                 self._approach = None
             return
         motion = self._copter.motion
-        max_acceleration = _TURN_SHARE_OF_ACCELERATION * motion.limits.acceleration_m_s2
-        max_rate = math.sqrt(max_acceleration / max(0.5, self._radius))
+        max_rate = math.sqrt(_TURN_SHARE_OF_ACCELERATION * motion.limits.acceleration_m_s2 / max(0.5, self._radius))
         rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)
         self._report_new_turn()  # The first turn is reported before the copter moves.
         self._angle += rate * dt
@@ -330,8 +329,7 @@ class CopterAuto(MissionMode):
         """Return True if the copter has reached a waypoint and has waited there for ``seconds``."""
         if not self._is_leg_complete:
             return False
-        if self._reached_at == 0.0:  # The copter has just reached the waypoint.
-            self._reached_at = self.vehicle.now
+        self._reached_at = self._reached_at or self.vehicle.now  # 0 until the copter reaches the waypoint.
         # The firmware counts whole seconds (mode_auto.cpp, verify_nav_wp).
         if math.floor(self.vehicle.now - self._reached_at) < seconds:
             return False

@@ -230,8 +230,8 @@ class _Flight:
         if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
             return MavResult.DENIED
-        first_item = command.param1  # PX4 checks this index, but then continues at the current item.
-        if not -1 <= first_item < px4.mission.count:
+        # PX4 checks the index of the first item (param 1), but then continues at the current item.
+        if not -1 <= command.param1 < px4.mission.count:
             return MavResult.DENIED
         result = self._change(modes.MISSION)
         if result == MavResult.ACCEPTED and not px4.arming.arm("mission start"):
