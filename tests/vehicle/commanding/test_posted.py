@@ -462,7 +462,7 @@ async def test_classic_arming_a_pilot_ends_says_it_may_still_come(grounded: Flig
     async with anyio.create_task_group() as tasks:
 
         async def arm() -> None:
-            with pytest.raises(OperationRejected, match=r"the mode changed to .*may still be carried out"):
+            with pytest.raises(OperationRejected, match=r"the mode changed to .*may still execute the command"):
                 await change_armed(grounded.vehicle, True)
 
         tasks.start_soon(arm)
