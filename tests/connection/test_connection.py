@@ -104,10 +104,10 @@ async def test_own_ids_accept_the_full_range(system_id: int, component_id: int) 
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
-        ({"source_system": 0}, "source_system = 0 is not allowed: 1 to 255"),
-        ({"source_system": 256}, "source_system = 256 is not allowed: 1 to 255"),
-        ({"source_component": -1}, "source_component = -1 is not allowed: 0 to 255"),
-        ({"source_component": 256}, "source_component = 256 is not allowed: 0 to 255"),
+        ({"source_system": 0}, "source_system = 0 is not allowed: it must be 1 to 255"),
+        ({"source_system": 256}, "source_system = 256 is not allowed: it must be 1 to 255"),
+        ({"source_component": -1}, "source_component = -1 is not allowed: it must be 0 to 255"),
+        ({"source_component": 256}, "source_component = 256 is not allowed: it must be 0 to 255"),
     ],
 )
 async def test_own_ids_out_of_range_are_refused(wrong: dict[str, int], text: str) -> None:

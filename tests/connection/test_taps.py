@@ -189,7 +189,7 @@ async def test_version_can_be_changed_while_open() -> None:
         assert [(frame.version, frame.sequence) for frame in ear.frames] == [(2, 0), (1, 1)]
         with pytest.raises(InvalidArgument, match="PLAY_TUNE"):
             connection.send(PlayTune(1, 1, "A"))
-        with pytest.raises(InvalidArgument, match="mavlink_version = 3 is not allowed: 1 or 2"):
+        with pytest.raises(InvalidArgument, match="mavlink_version = 3 is not allowed: it must be 1 or 2"):
             connection.mavlink_version = 3
         assert connection.mavlink_version == 1
     far.close()

@@ -39,7 +39,7 @@ def test_only_block_and_rates() -> None:
     [
         ({"only": ["ATITUDE"]}, r"only = 'ATITUDE' matches no message .*did you mean 'ATTITUDE'"),
         ({"block": ["X_*"]}, r"block = 'X_\*' matches no message"),
-        ({"rates": {"ATTITUDE": 0}}, "rates: ATTITUDE = 0 Hz is not allowed: above 0"),
+        ({"rates": {"ATTITUDE": 0}}, "rates: ATTITUDE = 0 Hz is not allowed: it must be above 0"),
         ({"rates": {"ATTITUDE": 1001}}, "at most 1000"),
         ({"rates": {"ATTITUDE": float("nan")}}, "above 0"),
     ],

@@ -147,10 +147,13 @@ def test_single_number_is_altitude_above_home(build: Any) -> None:
 
 
 WRONG: list[tuple[Callable[[], object], str]] = [
-    (lambda: missions.waypoint(91, 8, altitude_relative_m=30), "latitude_deg = 91 is not allowed: -90 to 90"),
+    (
+        lambda: missions.waypoint(91, 8, altitude_relative_m=30),
+        "latitude_deg = 91 is not allowed: it must be -90 to 90",
+    ),
     (
         lambda: missions.waypoint(47, 181, altitude_relative_m=30),
-        "longitude_deg = 181 is not allowed: -180 to 180",
+        "longitude_deg = 181 is not allowed: it must be -180 to 180",
     ),
     (lambda: missions.waypoint(NAN, 8, altitude_relative_m=30), "latitude_deg = nan"),
     (lambda: missions.waypoint("47", 8, altitude_relative_m=30), "latitude_deg = '47'"),  # type: ignore[call-overload]
@@ -180,7 +183,7 @@ WRONG: list[tuple[Callable[[], object], str]] = [
     (lambda: missions.loiter_turns(256, altitude_relative_m=3), "turns = 256 .* 0 to 255"),
     (lambda: missions.loiter_time(math.inf, altitude_relative_m=3), "duration_s = inf"),
     (lambda: missions.rally_point(47, 8, altitude_relative_m=40_000), "altitude = 40000"),
-    (lambda: missions.change_speed(-5), "speed_m_s = -5 is not allowed: 0 to 1000, or -1, or -2"),
+    (lambda: missions.change_speed(-5), "speed_m_s = -5 is not allowed: it must be 0 to 1000, or -1, or -2"),
     (lambda: missions.change_speed(5, kind="warp"), "kind = 'warp' .* 'air', 'ground'"),  # type: ignore[arg-type]
     (lambda: missions.change_speed(5, throttle_percent=101), "throttle_percent = 101"),
     (lambda: missions.delay(0), "duration_s = 0"),
@@ -189,7 +192,7 @@ WRONG: list[tuple[Callable[[], object], str]] = [
     (lambda: missions.condition_yaw(361), "heading_deg = 361"),
     (lambda: missions.condition_yaw(1, direction="left"), "direction = 'left'"),  # type: ignore[arg-type]
     (lambda: missions.set_servo(0, 1500), "servo = 0 .* 1 to 32"),
-    (lambda: missions.set_servo(1, 3000), "pwm_us = 3000 is not allowed: 500 to 2500, or 0"),
+    (lambda: missions.set_servo(1, 3000), "pwm_us = 3000 is not allowed: it must be 500 to 2500, or 0"),
     (lambda: missions.set_relay(16, True), "relay = 16"),
     (lambda: missions.jump(-1), "to_item = -1"),
     (lambda: missions.jump(1.0), "to_item = 1.0 .* whole"),  # type: ignore[arg-type]

@@ -196,7 +196,7 @@ def test_definition_accepts_value(name: str, value: object, sent: object) -> Non
         ("CAM_WBMODE", 3, r"CAM_WBMODE = 3 is not allowed: 'Auto' \(0\), 'Sunny' \(4\), 'Cloudy' \(5\)"),
         ("CAM_WBMODE", "sunny", r"did you mean 'Sunny'\?"),
         ("CAM_OFFSET", 70000, r"-32768\.\.32767"),
-        ("CAM_EV", 3.1, r"CAM_EV = 3\.1 is not allowed: -3\.\.3"),
+        ("CAM_EV", 3.1, r"CAM_EV = 3\.1 is not allowed: it must be -3\.\.3"),
         ("CAM_EV", "bright", "a number"),
         ("CAM_EV", float("nan"), "a finite number"),
         ("CAM_QUALITY", 91, r"10, 15, 20 …"),

@@ -145,7 +145,7 @@ def test_file_failing_later_is_a_lost_link(tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, math.nan])
 def test_speed_must_be_above_zero(speed: float) -> None:
-    with pytest.raises(InvalidArgument, match="is not allowed: above 0"):
+    with pytest.raises(InvalidArgument, match="is not allowed: it must be above 0"):
         Replay("flight.tlog", speed)
 
 

@@ -275,7 +275,7 @@ def check_range(name: str, value: float, minimum: float, maximum: float, *, abov
         is_allowed = False
     if not is_allowed:
         allowed = f"above {minimum:g} and at most {maximum:g}" if above else f"{minimum:g} to {maximum:g}"
-        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}")
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: it must be {allowed}")
 
 
 def check_finite(name: str, *values: float) -> None:

@@ -95,7 +95,7 @@ async def foxglove_bridge(
     if not 0 < rate_hz <= MAX_RATE_HZ:
         raise InvalidArgument(f"rate_hz = {rate_hz} is not allowed: it must be above 0 and at most {MAX_RATE_HZ:g}")
     if not 0 <= port <= 65535:
-        raise InvalidArgument(f"port = {port} is not allowed: 0 to 65535")
+        raise InvalidArgument(f"port = {port} is not allowed: it must be 0 to 65535")
     message_types = _message_types(connection, messages)
     channels = _TopicChannels(connection)
     server = _serve(channels, host, port)

@@ -324,9 +324,11 @@ class Subscription(Generic[ItemT]):
         overflow: Overflow = "drop_oldest",
     ) -> None:
         if capacity < 1:
-            raise InvalidArgument(f"capacity = {capacity} is not allowed: at least 1")
+            raise InvalidArgument(f"capacity = {capacity} is not allowed: it must be at least 1")
         if overflow not in ("drop_oldest", "drop_newest", "error"):
-            raise InvalidArgument(f"overflow = {overflow!r} is not allowed: 'drop_oldest', 'drop_newest' or 'error'")
+            raise InvalidArgument(
+                f"overflow = {overflow!r} is not allowed: it must be 'drop_oldest', 'drop_newest' or 'error'"
+            )
         # Function that explains in time-out errors why no items arrive. The default, `str`, returns "": no explanation.
         self._explain_timeout: Callable[[], str] = str
         self.missed: int = 0

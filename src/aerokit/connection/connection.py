@@ -89,9 +89,9 @@ class Connection:
         heartbeat: OwnHeartbeat | None = OwnHeartbeat(),  # noqa: B008 - it is immutable
     ) -> None:
         if not 1 <= source_system <= 255:
-            raise InvalidArgument(f"source_system = {source_system} is not allowed: 1 to 255")
+            raise InvalidArgument(f"source_system = {source_system} is not allowed: it must be 1 to 255")
         if not 0 <= source_component <= 255:
-            raise InvalidArgument(f"source_component = {source_component} is not allowed: 0 to 255")
+            raise InvalidArgument(f"source_component = {source_component} is not allowed: it must be 0 to 255")
         _check_version(mavlink_version)
         if dialect.get(Heartbeat.ID) is not Heartbeat:
             raise InvalidArgument(
@@ -550,4 +550,4 @@ def _filter_by_system(system_id: int, sink: Sink) -> Sink:
 
 def _check_version(version: int) -> None:
     if version not in (1, 2):
-        raise InvalidArgument(f"mavlink_version = {version} is not allowed: 1 or 2")
+        raise InvalidArgument(f"mavlink_version = {version} is not allowed: it must be 1 or 2")

@@ -92,7 +92,7 @@ async def open_connection(
         ConnectionClosed, BusyError: the given link was used before.
     """
     if not baud > 0:
-        raise InvalidArgument(f"baud = {baud} is not allowed: above 0")
+        raise InvalidArgument(f"baud = {baud} is not allowed: it must be above 0")
     link = _create_link(address, baud, reconnect, peers)
     _import_messages()
     connection = Connection(

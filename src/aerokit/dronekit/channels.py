@@ -91,7 +91,7 @@ class Channels(_ChannelDict):
     @count.setter
     def count(self, count: int) -> None:
         if not MIN_CHANNELS <= count <= MAX_CHANNELS:
-            raise InvalidArgument(f"count = {count!r} is not allowed: {MIN_CHANNELS} to {MAX_CHANNELS}")
+            raise InvalidArgument(f"count = {count!r} is not allowed: it must be {MIN_CHANNELS} to {MAX_CHANNELS}")
         with self._changing:
             self._set_count(count)
             for number in NUMBERS[count:]:

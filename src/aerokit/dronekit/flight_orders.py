@@ -169,8 +169,8 @@ def checked_location(location: LocationGlobal | LocationGlobalRelative) -> tuple
         except TypeError:
             is_good = False
         if not is_good:
-            allowed = "it must be a finite number" if limit == math.inf else f"-{limit:g} to {limit:g} degrees"
-            raise InvalidArgument(f"location.{name} = {value!r} is not allowed: {allowed}")
+            allowed = "a finite number" if limit == math.inf else f"-{limit:g} to {limit:g} degrees"
+            raise InvalidArgument(f"location.{name} = {value!r} is not allowed: it must be {allowed}")
     return round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt)
 
 
@@ -208,7 +208,7 @@ class CurrentCommand:
     def choose(self, seq: int) -> None:
         """Set the next command without waiting. Raises InvalidArgument if ``seq`` is not from 0 to 65,535."""
         if not 0 <= operator.index(seq) <= MAX_SEQ:
-            raise InvalidArgument(f"next = {seq!r} is not allowed: 0 to {MAX_SEQ}")
+            raise InvalidArgument(f"next = {seq!r} is not allowed: it must be 0 to {MAX_SEQ}")
         self._core.order("commands.next", self._choose, operator.index(seq))
 
     def _on_current(self, message: m.MissionCurrent) -> None:
@@ -325,5 +325,7 @@ def _tune_text(tune: str | bytes) -> str:
     except (UnicodeError, AttributeError):
         raise InvalidArgument(f"tune = {tune!r} is not allowed: it must be ASCII text") from None
     if "\0" in notes or len(notes) > sum(TUNE_SIZES):
-        raise InvalidArgument(f"tune of {len(notes)} characters is not allowed: at most {sum(TUNE_SIZES)}, without NUL")
+        raise InvalidArgument(
+            f"tune of {len(notes)} characters is not allowed: it must have at most {sum(TUNE_SIZES)}, without NUL"
+        )
     return notes

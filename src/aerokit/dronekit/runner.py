@@ -219,7 +219,7 @@ def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
     from aerokit.sim.motion import HOME
 
     if not 0.1 <= options.speedup <= 100:
-        raise InvalidArgument(f"speedup = {options.speedup:g} is not allowed: 0.1 to 100")
+        raise InvalidArgument(f"speedup = {options.speedup:g} is not allowed: it must be 0.1 to 100")
     home = HOME if options.home is None else parse_home(options.home)
     served = serve_for_program(options.vehicle, home, options.speedup)
     tcp, udp = (address.replace("tcpin:", "tcp:").replace("udpout:", "udp:") for address in served.addresses)

@@ -129,7 +129,9 @@ class SITL:
     def download(self, system: str, version: str, target: str | None = None, verbose: bool = False) -> None:
         """Select the kind of vehicle. Downloads nothing; ``version`` is ignored."""
         if system not in KINDS:
-            raise InvalidArgument(f"dronekit_sitl: system = {system!r} is not allowed: one of {', '.join(KINDS)}")
+            raise InvalidArgument(
+                f"dronekit_sitl: system = {system!r} is not allowed: it must be one of {', '.join(KINDS)}"
+            )
         self._kind = KINDS[system]
 
     def launch(

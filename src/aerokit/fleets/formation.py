@@ -117,7 +117,7 @@ class Formation(Snapshot):
     def _check(self) -> None:
         object.__setattr__(self, "offsets", dict(self.offsets))
         if self.frame not in ("north", "heading"):
-            raise InvalidArgument(f"frame = {self.frame!r} is not allowed: 'north' or 'heading'")
+            raise InvalidArgument(f"frame = {self.frame!r} is not allowed: it must be 'north' or 'heading'")
         for name, offset in self.offsets.items():
             if not isinstance(offset, Offset):
                 raise InvalidArgument(f"offsets[{name!r}] = {offset!r} is not an Offset")

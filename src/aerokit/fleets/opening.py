@@ -92,15 +92,17 @@ async def fleet(
     """
     rules = PolicyRules(on_error, on_error_by_group or {})
     if min_distance_m is not None and not 0 < min_distance_m < 10_000:
-        raise InvalidArgument(f"min_distance_m = {min_distance_m!r} is not allowed: above 0 and below 10,000 metres")
+        raise InvalidArgument(
+            f"min_distance_m = {min_distance_m!r} is not allowed: it must be above 0 and below 10,000 metres"
+        )
     if on_too_close not in ("hold", "report"):
-        raise InvalidArgument(f"on_too_close = {on_too_close!r} is not allowed: 'hold' or 'report'")
+        raise InvalidArgument(f"on_too_close = {on_too_close!r} is not allowed: it must be 'hold' or 'report'")
     unknown = [group for group in on_error_by_group or {} if group and group not in (groups or {})]
     if unknown:
         allowed = f"the groups are {', '.join(groups)}" if groups else "there are no groups"
         raise InvalidArgument(f"on_error_by_group = {short_repr(unknown[0])} is not allowed: {allowed}")
     if count is not None and count < 1:
-        raise InvalidArgument(f"count = {count} is not allowed: 1 or more, or None")
+        raise InvalidArgument(f"count = {count} is not allowed: it must be 1 or more, or None")
     sources_by_name = _named_sources(sources)
     async with AsyncExitStack() as stack:
         networks: dict[str, Connection] = {}
@@ -184,7 +186,7 @@ def _requested_ids(
         ids[name] = list(numbers)
     for number in (number for numbers in ids.values() for number in numbers or ()):
         if not isinstance(number, int) or not 1 <= number <= 255:
-            raise InvalidArgument(f"system_ids: {short_repr(number)} is not allowed: 1 to 255")
+            raise InvalidArgument(f"system_ids: {short_repr(number)} is not allowed: it must be 1 to 255")
     return ids
 
 

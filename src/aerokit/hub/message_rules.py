@@ -61,7 +61,9 @@ class Filters:
                 self._check(field, pattern)
         for pattern, hz in self._rates.items():
             if not 0 < hz <= MAX_RATE_HZ:
-                raise InvalidArgument(f"rates: {pattern} = {hz:g} Hz is not allowed: above 0, at most {MAX_RATE_HZ:g}")
+                raise InvalidArgument(
+                    f"rates: {pattern} = {hz:g} Hz is not allowed: it must be above 0, at most {MAX_RATE_HZ:g}"
+                )
 
     def period(self, message_id: int) -> float | None:
         """Return the minimum interval of a message in seconds: None if it is not sent, 0 if there is no limit."""

@@ -34,7 +34,7 @@ def change_speed(
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_CHANGE_SPEED
     """
     if kind not in _SPEEDS:
-        raise InvalidArgument(f"kind = {kind!r} is not allowed: {', '.join(map(repr, _SPEEDS))}")
+        raise InvalidArgument(f"kind = {kind!r} is not allowed: it must be {', '.join(map(repr, _SPEEDS))}")
     return action_item(
         MavCmd.DO_CHANGE_SPEED,
         _SPEEDS[kind],
@@ -100,7 +100,9 @@ def condition_yaw(
     """
     directions = {"shortest": 0.0, "clockwise": 1.0, "counterclockwise": -1.0}
     if direction not in directions:
-        raise InvalidArgument(f"direction = {direction!r} is not allowed: {', '.join(map(repr, directions))}")
+        raise InvalidArgument(
+            f"direction = {direction!r} is not allowed: it must be {', '.join(map(repr, directions))}"
+        )
     return action_item(
         MavCmd.CONDITION_YAW,
         in_range("heading_deg", heading_deg, 0, 360),
@@ -163,7 +165,7 @@ def vtol_transition(to: Literal["multicopter", "fixed_wing"]) -> MissionItem:
     """
     states = {"multicopter": 3.0, "fixed_wing": 4.0}
     if to not in states:
-        raise InvalidArgument(f"to = {to!r} is not allowed: {', '.join(map(repr, states))}")
+        raise InvalidArgument(f"to = {to!r} is not allowed: it must be {', '.join(map(repr, states))}")
     return action_item(MavCmd.DO_VTOL_TRANSITION, states[to])
 
 

@@ -333,7 +333,7 @@ def in_range(name: str, value: object, low: float, high: float, *, also_allowed:
     ):
         return float(value)
     alternatives = "".join(f", or {number:g}" for number in also_allowed)
-    raise InvalidArgument(f"{name} = {value!r} is not allowed: {low:g} to {high:g}{alternatives}")
+    raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be {low:g} to {high:g}{alternatives}")
 
 
 def whole_number(name: str, value: object, low: int, high: int) -> float:

@@ -132,7 +132,7 @@ class FenceCircle(Snapshot):
         if not isinstance(self.center, Position):
             raise InvalidArgument(f"center = {self.center!r} is not a Position")
         if not isinstance(self.radius_m, (float, int, Real)) or not 0 < self.radius_m < 3e7:
-            raise InvalidArgument(f"radius_m = {self.radius_m!r} is not allowed: above 0 and below 3e7")
+            raise InvalidArgument(f"radius_m = {self.radius_m!r} is not allowed: it must be above 0 and below 3e7")
 
 
 class Fence(Snapshot):

@@ -91,7 +91,7 @@ def format_waypoints(mission: Mission, *, version: int = 110) -> str:
             f"mission = {short_repr(mission)} is not a Mission: pass Mission([…]), or plan.mission of a Plan"
         )
     if version not in (110, 120):
-        raise InvalidArgument(f"version = {version!r} is not allowed: 110 (home is item 0) or 120 (no home)")
+        raise InvalidArgument(f"version = {version!r} is not allowed: it must be 110 (home is item 0) or 120 (no home)")
     rows = [f"QGC WPL {version}"]
     items = mission.items
     if version == 110:

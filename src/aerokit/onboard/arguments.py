@@ -37,7 +37,7 @@ class Param(Snapshot):
 
     def _check(self) -> None:
         if not isinstance(self.number, int) or not 1 <= self.number <= MAX_ARGUMENTS:
-            raise InvalidArgument(f"Param({short_repr(self.number)}) is not allowed: 1 to 7")
+            raise InvalidArgument(f"Param({short_repr(self.number)}) is not allowed: it must be 1 to 7")
 
 
 class CommandArgument(Snapshot):
@@ -57,14 +57,14 @@ class CommandArgument(Snapshot):
             raise InvalidArgument(f"{self.name} = {value} is not allowed: it must be a finite number")
         if not self.range.minimum <= value <= self.range.maximum:
             low, high = self.range.minimum, self.range.maximum
-            raise InvalidArgument(f"{self.name} = {value:g} is not allowed: {low:g} to {high:g}")
+            raise InvalidArgument(f"{self.name} = {value:g} is not allowed: it must be {low:g} to {high:g}")
         if self.type is float:
             return value
         if value != int(value):
             raise InvalidArgument(f"{self.name} = {value:g} is not allowed: it must be a whole number")
         if self.type is bool:
             if value not in (0, 1):
-                raise InvalidArgument(f"{self.name} = {value:g} is not allowed: 0 or 1")
+                raise InvalidArgument(f"{self.name} = {value:g} is not allowed: it must be 0 or 1")
             return bool(value)
         try:
             return self.type(int(value))

@@ -82,7 +82,7 @@ class CommandRequest:
     def report_progress(self, percent: int) -> None:
         """Send IN_PROGRESS with this percentage (0 to 100) now, and repeat it until the next report."""
         if not 0 <= percent <= 100:
-            raise InvalidArgument(f"percent = {percent} is not allowed: 0 to 100")
+            raise InvalidArgument(f"percent = {percent} is not allowed: it must be 0 to 100")
         self._report(percent)
 
     def __repr__(self) -> str:

@@ -22,7 +22,7 @@ _UNAVAILABLE = 0  # MAV_EVENT_ERROR_REASON_UNAVAILABLE
 def check_severity(severity: int) -> None:
     """Raise InvalidArgument unless ``severity`` is a MAV_SEVERITY."""
     if not MavSeverity.EMERGENCY <= severity <= MavSeverity.DEBUG:
-        raise InvalidArgument(f"severity = {severity} is not allowed: 0 (EMERGENCY) to 7 (DEBUG)")
+        raise InvalidArgument(f"severity = {severity} is not allowed: it must be 0 (EMERGENCY) to 7 (DEBUG)")
 
 
 class EventSender:
@@ -36,7 +36,7 @@ class EventSender:
 
     def send(self, event_id: int, arguments: bytes, severity: int) -> None:
         if not 0 <= event_id <= 0xFFFFFFFF:
-            raise InvalidArgument(f"event_id = {event_id} is not allowed: 0 to 4294967295")
+            raise InvalidArgument(f"event_id = {event_id} is not allowed: it must be 0 to 4294967295")
         if len(arguments) > MAX_ARGUMENT_BYTES:
             raise InvalidArgument(
                 f"arguments has {len(arguments)} bytes; at most {MAX_ARGUMENT_BYTES} fit into the message"

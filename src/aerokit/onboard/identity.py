@@ -45,7 +45,7 @@ class Identity(Snapshot):
                 raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a text of at most {size} bytes")
         _ = self.version_number  # Raises InvalidArgument if the version is invalid.
         if not 0 <= self.uid < 1 << 64:
-            raise InvalidArgument(f"uid = {self.uid} is not allowed: 0 to 2**64 - 1")
+            raise InvalidArgument(f"uid = {self.uid} is not allowed: it must be 0 to 2**64 - 1")
 
     @property
     def version_number(self) -> int:

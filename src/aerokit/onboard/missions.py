@@ -83,7 +83,7 @@ class ComponentMissions:
             InvalidArgument: there is no such item.
         """
         if not 0 <= index < len(self.items()):
-            raise InvalidArgument(f"index = {index} is not allowed: 0 to {len(self.items()) - 1}")
+            raise InvalidArgument(f"index = {index} is not allowed: it must be 0 to {len(self.items()) - 1}")
         self._server.current = index
         self._host.send(self._server.current_message())
 
@@ -154,5 +154,5 @@ def _result_of(verdict: object) -> int:
 
 def _type_of(kind: str) -> int:
     if kind not in _NAMES:
-        raise InvalidArgument(f"kind = {kind!r} is not allowed: 'mission', 'fence' or 'rally'")
+        raise InvalidArgument(f"kind = {kind!r} is not allowed: it must be 'mission', 'fence' or 'rally'")
     return _NAMES[kind]

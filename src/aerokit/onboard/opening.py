@@ -140,5 +140,5 @@ def _heartbeat(type_: int, autopilot: int) -> Heartbeat:
     """Return the first heartbeat of a component."""
     for name, value in (("type", type_), ("autopilot", autopilot)):
         if not 0 <= value <= 255:
-            raise InvalidArgument(f"{name} = {value} is not allowed: 0 to 255")
+            raise InvalidArgument(f"{name} = {value} is not allowed: it must be 0 to 255")
     return Heartbeat(type_, autopilot, 0, 0, MavState.ACTIVE, MAVLINK_VERSION)

@@ -182,7 +182,9 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         if isinstance(checked, bytes):
             raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a text")
         if metadata.values and checked not in metadata.values:
-            raise InvalidArgument(f"{name} = {checked:g} is not allowed: {', '.join(map(str, metadata.values))}")
+            raise InvalidArgument(
+                f"{name} = {checked:g} is not allowed: it must be {', '.join(map(str, metadata.values))}"
+            )
         # `problem` need not check the allowed values, which are checked above, or whether the parameter is read-only:
         # this program may change it.
         problem = metadata.replace(read_only=False, values={}).problem(checked)

@@ -44,7 +44,7 @@ class ComponentServices:
             InvalidArgument: the rate is above 200 Hz, or the message already has a function.
         """
         if not 0.0 <= hz <= 1.0 / MIN_STREAM_INTERVAL_S:
-            raise InvalidArgument(f"hz = {hz} is not allowed: 0 to {1.0 / MIN_STREAM_INTERVAL_S:g}")
+            raise InvalidArgument(f"hz = {hz} is not allowed: it must be 0 to {1.0 / MIN_STREAM_INTERVAL_S:g}")
         if message_type.ID in self.streams.builders:
             raise InvalidArgument(f"{message_type.NAME} already has a function")
 

@@ -63,7 +63,7 @@ class ComponentSources:
                 f"min_m, max_m = {min_m}, {max_m} are not allowed: both must be 0 to 655, and min_m below max_m"
             )
         if not 0 < increment_deg <= 360:
-            raise InvalidArgument(f"increment_deg = {increment_deg} is not allowed: above 0, at most 360")
+            raise InvalidArgument(f"increment_deg = {increment_deg} is not allowed: it must be above 0, at most 360")
         nothing_in_range = round(max_m * 100) + 1  # defined by OBSTACLE_DISTANCE
         values = [_centimetres(distance, nothing_in_range) for distance in distances_m]
         values += [_NOT_MEASURED] * (MAX_DISTANCES - len(values))
@@ -157,9 +157,9 @@ class ComponentSources:
         """
         for name, angle in (("right_deg", right_deg), ("down_deg", down_deg)):
             if not -90 <= angle <= 90:
-                raise InvalidArgument(f"{name} = {angle} is not allowed: -90 to 90")
+                raise InvalidArgument(f"{name} = {angle} is not allowed: it must be -90 to 90")
         if not 0 <= distance_m < math.inf:
-            raise InvalidArgument(f"distance_m = {distance_m} is not allowed: 0 or more")
+            raise InvalidArgument(f"distance_m = {distance_m} is not allowed: it must be 0 or more")
         angles = (math.radians(right_deg), math.radians(down_deg))
         kind = LandingTargetType.LIGHT_BEACON
         frame = MavFrame.BODY_FRD

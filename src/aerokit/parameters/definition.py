@@ -289,12 +289,13 @@ def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
     is_above = high is not None and number > high and not settings_equal(number, high)
     if is_below or is_above:
         lowest, highest = ("" if limit is None else f"{limit:g}" for limit in (low, high))
-        raise InvalidArgument(f"{setting.name} = {short_repr(value)} is not allowed: {lowest}..{highest}")
+        raise InvalidArgument(f"{setting.name} = {short_repr(value)} is not allowed: it must be {lowest}..{highest}")
     if isinstance(number, int) and isinstance(step, int) and step > 1:
         first = low if isinstance(low, int) else 0
         if (number - first) % step:
             raise InvalidArgument(
-                f"{setting.name} = {short_repr(value)} is not allowed: {first}, {first + step}, {first + 2 * step} …"
+                f"{setting.name} = {short_repr(value)} is not allowed: it must be {first}, {first + step},"
+                f" {first + 2 * step} …"
             )
     return number
 

@@ -133,7 +133,9 @@ def parameter_file_text(
 ) -> str:
     """Format parameters as the text of a file; see :func:`write_parameter_file`."""
     if format not in ("missionplanner", "mavproxy", "qgroundcontrol"):
-        raise InvalidArgument(f"format = {format!r} is not allowed: missionplanner, mavproxy or qgroundcontrol")
+        raise InvalidArgument(
+            f"format = {format!r} is not allowed: it must be missionplanner, mavproxy or qgroundcontrol"
+        )
     rows = sorted(_rows(values), key=lambda row: row[0])
     if not rows:
         raise InvalidArgument("there are no parameters to write")

@@ -217,10 +217,10 @@ class CommandExchange(Exchange[CommandAck]):
         if attempt_timeout > 0:  # Other values are refused below, with the value that the caller gave.
             attempt_timeout = max(attempt_timeout, min_timeout_s)
         if attempts < 1:
-            raise InvalidArgument(f"attempts = {attempts} is not allowed: at least 1")
+            raise InvalidArgument(f"attempts = {attempts} is not allowed: it must be at least 1")
         for name, seconds in (("attempt_timeout", attempt_timeout), ("progress_timeout", progress_timeout)):
             if not seconds > 0:
-                raise InvalidArgument(f"{name} = {seconds!r} is not allowed: above 0")
+                raise InvalidArgument(f"{name} = {seconds!r} is not allowed: it must be above 0")
         self._message = message
         self._own_ids = (own_system, own_component)
         self._attempts, self._attempt_timeout = attempts, attempt_timeout
@@ -387,7 +387,7 @@ _HINTS: dict[int, str] = {
 def _check_target(target_system: int, command: int) -> None:
     if not 1 <= target_system <= 255:
         raise InvalidArgument(
-            f"{command_name(command)}: target_system = {target_system} is not allowed: 1 to 255"
+            f"{command_name(command)}: target_system = {target_system} is not allowed: it must be 1 to 255"
             " (0 would command every vehicle on the link)"
         )
 

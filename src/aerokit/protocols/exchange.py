@@ -268,7 +268,7 @@ class Transfer(Exchange[ResultT]):
     ) -> None:
         super().__init__()
         if not idle_timeout_s > 0:
-            raise InvalidArgument(f"idle_timeout_s = {idle_timeout_s!r} is not allowed: above 0")
+            raise InvalidArgument(f"idle_timeout_s = {idle_timeout_s!r} is not allowed: it must be above 0")
         self.target_system: int = target_system
         self.target_component: int = target_component
         self.round_trip: RoundTrip = RoundTrip() if round_trip is None else round_trip

@@ -191,4 +191,4 @@ def _end_of_frame(data: bytes, begin: int) -> int | None:
 
 def _check_number(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
-        raise InvalidArgument(f"{name} = {value!r} is not allowed: {low:g} to {high:g}")
+        raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be {low:g} to {high:g}")

@@ -68,7 +68,7 @@ class FaultInjector:
     def drop_packets(self, share: float, *, after_s: float = 0.0, for_s: float | None = None) -> None:
         """Lose a share of the packets, from 0 to 1, in both directions. The vehicle's seed determines which ones."""
         if not 0.0 <= share <= 1.0:
-            raise InvalidArgument(f"share = {share!r} is not allowed: 0 to 1")
+            raise InvalidArgument(f"share = {share!r} is not allowed: it must be 0 to 1")
         self._set("loss", share, 0.0, after_s, for_s)
         self._set("loss_incoming", share, 0.0, after_s, for_s)
 
@@ -101,7 +101,7 @@ class FaultInjector:
     def set_battery(self, percent: float, *, after_s: float = 0.0) -> None:
         """Set the remaining battery charge in percent. The battery then continues to drain."""
         if not 0.0 <= percent <= 100.0:
-            raise InvalidArgument(f"percent = {percent!r} is not allowed: 0 to 100")
+            raise InvalidArgument(f"percent = {percent!r} is not allowed: it must be 0 to 100")
         self._schedule(partial(setattr, self._vehicle.battery, "percent", percent), after_s)
 
     def end(self, *, after_s: float = 0.0) -> None:

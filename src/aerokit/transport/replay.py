@@ -29,7 +29,7 @@ class Replay(BaseLink):
     def __init__(self, path: str | os.PathLike[str], speed: float | None = 1.0) -> None:
         factor = math.inf if speed is None else float(speed)
         if not factor > 0:
-            raise InvalidArgument(f"speed = {speed!r} is not allowed: above 0")
+            raise InvalidArgument(f"speed = {speed!r} is not allowed: it must be above 0")
         options = () if factor == 1.0 else (("speed", repr(factor).removesuffix(".0")),)
         super().__init__(str(LinkAddress("replay", path=os.fspath(path), options=options)))
         self.ignored_writes: int = 0

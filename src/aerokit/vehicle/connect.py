@@ -192,9 +192,11 @@ def _check_arguments(
     system_id: int | None, timeout: float, rates: Mapping[type[Message], float] | None, dialect: Dialect
 ) -> None:
     if system_id is not None and not 1 <= system_id <= 255:
-        raise InvalidArgument(f"system_id = {system_id} is not allowed: 1 to 255, or None for the first vehicle found")
+        raise InvalidArgument(
+            f"system_id = {system_id} is not allowed: it must be 1 to 255, or None for the first vehicle found"
+        )
     if not timeout > 0:
-        raise InvalidArgument(f"timeout = {timeout} is not allowed: above 0")
+        raise InvalidArgument(f"timeout = {timeout} is not allowed: it must be above 0")
     for message_type, hz in (rates or {}).items():
         check_rate(message_type, hz)
         if dialect.get(message_type.ID) is not message_type:

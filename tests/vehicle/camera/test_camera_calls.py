@@ -386,7 +386,7 @@ async def test_tracking_outside_the_image_is_refused() -> None:
     async with on_board(SimulatedCamera(capabilities=ALL)) as vehicle:
         one = vehicle.camera
         for x, y, radius in ((-0.1, 0.5, 0), (0.5, 1.1, 0), (0.5, 0.5, 2)):
-            with pytest.raises(InvalidArgument, match="is not allowed: 0 to 1"):
+            with pytest.raises(InvalidArgument, match="is not allowed: it must be 0 to 1"):
                 await one.track_point(x, y, radius=radius)
         with pytest.raises(InvalidArgument, match="left must be less than right"):
             await one.track_rectangle(0.5, 0.1, 0.4, 0.2)

@@ -148,7 +148,7 @@ async def test_request_where_selects_the_message() -> None:
 async def test_invalid_component_id_is_refused() -> None:
     async with on_board() as vehicle:
         for wrong in (0, 256, -1):
-            with pytest.raises(InvalidArgument, match=f"component_id = {wrong} is not allowed: 1 to 255"):
+            with pytest.raises(InvalidArgument, match=f"component_id = {wrong} is not allowed: it must be 1 to 255"):
                 vehicle.component(wrong)
         assert vehicle.component(100) is vehicle.component(100)
 

@@ -304,7 +304,7 @@ async def test_disallowed_values_are_refused() -> None:
         shelf.sent.clear()
         for name, value, complaint in (
             ("CAM_WBMODE", "Snowy", r"CAM_WBMODE = 'Snowy' is not allowed: 'Auto' \(0\), 'Sunny' \(4\)"),
-            ("CAM_EV", 4, r"CAM_EV = 4 is not allowed: -3\.\.3"),
+            ("CAM_EV", 4, r"CAM_EV = 4 is not allowed: it must be -3\.\.3"),
             ("CAM_LENS", "other", "CAM_LENS = 'other' is not allowed: it can only be read"),
             ("CAM_ISO", 100, "CAM_ISO = 100 is not allowed now: the setting is excluded by CAM_EXPMODE = Auto"),
             ("CAM_QUALITY", 91, "10, 15, 20"),

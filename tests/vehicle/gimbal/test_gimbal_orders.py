@@ -565,6 +565,6 @@ async def test_nan_attitude_is_unknown(wrong: float) -> None:
 
 async def test_look_at_system_refuses_bool() -> None:
     async with mounted() as flight:
-        with pytest.raises(InvalidArgument, match="system_id = True is not allowed: 1 to 255"):
+        with pytest.raises(InvalidArgument, match="system_id = True is not allowed: it must be 1 to 255"):
             await flight.vehicle.gimbal.look_at_system(True)
         assert not flight.wire.commands(MavCmd.DO_SET_ROI_SYSID)

@@ -379,7 +379,7 @@ async def test_item_number_is_unchecked_while_count_unknown() -> None:
     async with open_flight(rates={}) as flight:
         mission = flight.vehicle.mission
         assert not mission.count.is_known
-        with pytest.raises(InvalidArgument, match="item = 65535 is not allowed: 0 to 65534"):
+        with pytest.raises(InvalidArgument, match="item = 65535 is not allowed: it must be 0 to 65534"):
             await mission.set_current(65535)
         with pytest.raises(CommandRejected):
             await mission.set_current(65534)

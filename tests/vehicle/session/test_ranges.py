@@ -29,21 +29,33 @@ async def entered(block: Any) -> None:
 
 
 REFUSED: dict[str, Callable[[Any], Awaitable[object]]] = {
-    "altitude_m = -1 is not allowed: above 0 and at most 10000": lambda v: v.take_off(-1),
-    "altitude = 200000 is not allowed: -12000 to 100000": lambda v: v.go_to(place(v, altitude_relative_m=200_000)),
-    "speed_m_s = -1 is not allowed: above 0 and at most 1000": lambda v: v.set_speed(-1),
-    "speed_m_s = -2 is not allowed: above 0 and at most 1000": lambda v: v.go_to(place(v), speed_m_s=-2),
-    "heading_deg = -1 is not allowed: 0 to 360": lambda v: v.go_to(place(v), heading_deg=-1),
-    "tolerance_m = -1 is not allowed: above 0 and at most 100000": lambda v: v.go_to(place(v), tolerance_m=-1),
-    "heading_deg = 999 is not allowed: -360 to 360": lambda v: v.set_heading(999),
-    "rate_deg_s = -1 is not allowed: 0 to 360": lambda v: v.set_heading(0, rate_deg_s=-1),
-    "tolerance_deg = -1 is not allowed: above 0 and at most 180": lambda v: v.set_heading(0, tolerance_deg=-1),
-    "pitch_deg = 999 is not allowed: -360 to 360": lambda v: v.gimbal.point(999, 0),
-    "rate_hz = 1 is not allowed: 2 to 400": lambda v: entered(v.guided.velocity(rate_hz=1)),
-    "valid_for_s = 61 is not allowed: above 0 and at most 60": lambda v: entered(v.guided.velocity(valid_for_s=61)),
-    "max_lag_s = 61 is not allowed: above 0 and at most 60": lambda v: entered(v.guided.velocity(max_lag_s=61)),
-    "rate_hz of ATTITUDE = -1 is not allowed: above 0 and at most 1000": lambda v: entered(v.rate(m.Attitude, -1)),
-    "rate_hz = -1 is not allowed: above 0 and at most 1000": lambda v: entered(v.streams(-1)),
+    "altitude_m = -1 is not allowed: it must be above 0 and at most 10000": lambda v: v.take_off(-1),
+    "altitude = 200000 is not allowed: it must be -12000 to 100000": lambda v: v.go_to(
+        place(v, altitude_relative_m=200_000)
+    ),
+    "speed_m_s = -1 is not allowed: it must be above 0 and at most 1000": lambda v: v.set_speed(-1),
+    "speed_m_s = -2 is not allowed: it must be above 0 and at most 1000": lambda v: v.go_to(place(v), speed_m_s=-2),
+    "heading_deg = -1 is not allowed: it must be 0 to 360": lambda v: v.go_to(place(v), heading_deg=-1),
+    "tolerance_m = -1 is not allowed: it must be above 0 and at most 100000": lambda v: v.go_to(
+        place(v), tolerance_m=-1
+    ),
+    "heading_deg = 999 is not allowed: it must be -360 to 360": lambda v: v.set_heading(999),
+    "rate_deg_s = -1 is not allowed: it must be 0 to 360": lambda v: v.set_heading(0, rate_deg_s=-1),
+    "tolerance_deg = -1 is not allowed: it must be above 0 and at most 180": lambda v: v.set_heading(
+        0, tolerance_deg=-1
+    ),
+    "pitch_deg = 999 is not allowed: it must be -360 to 360": lambda v: v.gimbal.point(999, 0),
+    "rate_hz = 1 is not allowed: it must be 2 to 400": lambda v: entered(v.guided.velocity(rate_hz=1)),
+    "valid_for_s = 61 is not allowed: it must be above 0 and at most 60": lambda v: entered(
+        v.guided.velocity(valid_for_s=61)
+    ),
+    "max_lag_s = 61 is not allowed: it must be above 0 and at most 60": lambda v: entered(
+        v.guided.velocity(max_lag_s=61)
+    ),
+    "rate_hz of ATTITUDE = -1 is not allowed: it must be above 0 and at most 1000": lambda v: entered(
+        v.rate(m.Attitude, -1)
+    ),
+    "rate_hz = -1 is not allowed: it must be above 0 and at most 1000": lambda v: entered(v.streams(-1)),
 }
 
 

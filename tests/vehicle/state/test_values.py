@@ -31,7 +31,7 @@ def test_position_setpoint_is_encoded() -> None:
 @pytest.mark.parametrize(
     ("fields", "text"),
     [
-        ({"latitude_deg": 91.0, "longitude_deg": 0.0}, "latitude_deg = 91.0 is not allowed: -90 to 90"),
+        ({"latitude_deg": 91.0, "longitude_deg": 0.0}, "latitude_deg = 91.0 is not allowed: it must be -90 to 90"),
         ({"latitude_deg": 0.0, "longitude_deg": 473977000.0}, "longitude_deg"),
         ({"latitude_deg": math.nan, "longitude_deg": 0.0}, "latitude_deg = nan"),
         (

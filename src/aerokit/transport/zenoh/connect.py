@@ -77,7 +77,7 @@ class ZenohConnect(NetworkLink):
     ) -> None:
         super().__init__(f"zenoh://{check_name('fleet', fleet)}/{check_name('name', name)}")
         if control not in CONTROL_MODES:
-            raise InvalidArgument(f"control = {control!r} is not allowed: {', '.join(CONTROL_MODES)}")
+            raise InvalidArgument(f"control = {control!r} is not allowed: it must be {', '.join(CONTROL_MODES)}")
         self.client: str = check_name("client", client or _own_name())
         """Name of this client on the network."""
         self._keys = KeySpace(fleet, name)

@@ -222,7 +222,8 @@ class Cameras:
         """Return the camera with this number, always the same object, even before the camera is discovered."""
         if number not in AUTOPILOT_CAMERA_IDS and not 7 <= number <= 255:
             raise InvalidArgument(
-                f"number = {number} is not allowed: 1 to 6 (attached to the autopilot) or 7 to 255 (component id)"
+                f"number = {number} is not allowed: it must be 1 to 6 (attached to the autopilot) or 7 to 255"
+                " (component id)"
             )
         if number not in self._cameras:
             if number == self._first_link.number:  # `first` already stands for this camera.

@@ -150,7 +150,9 @@ class ArmingActions(VehicleBase):
             OperationTimeout: the vehicle accepted the command but did not arm.
         """
         if len(reason.encode()) > CHUNK_LENGTH:
-            raise InvalidArgument(f"reason = {short_repr(reason)} is not allowed: at most {CHUNK_LENGTH} bytes")
+            raise InvalidArgument(
+                f"reason = {short_repr(reason)} is not allowed: it must have at most {CHUNK_LENGTH} bytes"
+            )
         arming_mode = self._mode_to_arm_in(mode)
         if arming_mode is not None:
             await self._change_to_arming_mode(arming_mode)

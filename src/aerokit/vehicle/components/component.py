@@ -387,7 +387,7 @@ class Components:
     def component(self, component_id: int) -> Component:
         """Return the object for a component id, always the same object. The component need not have been discovered."""
         if not 1 <= component_id <= 255:
-            raise InvalidArgument(f"component_id = {component_id} is not allowed: 1 to 255")
+            raise InvalidArgument(f"component_id = {component_id} is not allowed: it must be 1 to 255")
         if component_id not in self._by_id:
             self._by_id[component_id] = self._new(component_id)
         return self._by_id[component_id]

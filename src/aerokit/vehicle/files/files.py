@@ -230,7 +230,7 @@ class Files:
     ) -> None:
         """Cut a file to ``size`` bytes, or extend it with zeros. Supported by PX4, not by ArduPilot."""
         if not isinstance(size, int) or not 0 <= size <= MAX_FILE_SIZE:
-            raise InvalidArgument(f"size = {size!r} is not allowed: 0 to {MAX_FILE_SIZE}")
+            raise InvalidArgument(f"size = {size!r} is not allowed: it must be 0 to {MAX_FILE_SIZE}")
         await self._request(MavFtpOpcode.TRUNCATEFILE, path, idle_timeout_s, timeout, offset=size)
 
     async def remove(self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> None:

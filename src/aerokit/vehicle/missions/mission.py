@@ -342,7 +342,7 @@ class MissionControl(VehiclePlan["Mission"]):
         if count == 0:
             raise InvalidArgument("the vehicle's mission is empty: call upload() first; nothing was sent")
         if not isinstance(item, int) or isinstance(item, bool) or not 0 <= item <= last:
-            raise InvalidArgument(f"item = {item!r} is not allowed: 0 to {last}")
+            raise InvalidArgument(f"item = {item!r} is not allowed: it must be 0 to {last}")
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
         """Set the current item. Item 0 also resets ArduPilot's jump counts, unless ``keeps_jump_counts``."""
