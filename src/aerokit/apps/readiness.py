@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 from typing import TYPE_CHECKING, Literal, NamedTuple
+
+from aerokit.errors import AerokitError
+from aerokit.events import LinkState
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -72,3 +77,43 @@ def readiness_lines(vehicle: Vehicle, found: Readiness) -> list[str]:
         words = "also missing for flight" if lines else arms_but(vehicle)
         lines += [f"{words}:", *(f"  {text}" for text in found.against_flight)]
     return lines
+
+
+MIN_CHECK_INTERVAL_S = 5.0
+"""Minimum seconds between two requests for arming checks, because the failing sensors of a vehicle may alternate."""
+
+
+class ArmingCheckRequests:
+    """Decides when to request the arming checks of vehicles: when a check fails, and when other sensors fail."""
+
+    def __init__(self) -> None:
+        self._failing: dict[Vehicle, tuple[str, ...]] = {}
+        self.requested_at: dict[Vehicle, float] = {}
+        """Time of the last request to each vehicle."""
+
+    def are_due(self, vehicle: Vehicle) -> bool:
+        """Return True if the caller should now call `run_arming_checks`."""
+        failing, now = _failing_checks(vehicle), vehicle.connection.now()
+        if failing is None:
+            self._failing.pop(vehicle, None)
+            return False
+        is_early = now - self.requested_at.get(vehicle, -math.inf) < MIN_CHECK_INTERVAL_S
+        if failing == self._failing.get(vehicle) or is_early:
+            return False
+        self._failing[vehicle], self.requested_at[vehicle] = failing, now
+        return True
+
+
+async def run_arming_checks(vehicle: Vehicle) -> None:
+    """Ask a vehicle why it cannot arm. Its answers are status texts, which `Vehicle.missing_for_flight` includes."""
+    with contextlib.suppress(AerokitError):  # if the vehicle does not answer, its state shows that
+        await vehicle.why_not_armable()
+
+
+def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
+    """Return the failing sensors of a vehicle. None if it is armed, or if its arming checks pass."""
+    sensors = vehicle.sensors.latest
+    is_disarmed = vehicle.armed.latest is False
+    if vehicle.link_state.latest is not LinkState.CONNECTED or not is_disarmed or sensors is None:
+        return None
+    return tuple(sensors.failing) if sensors.prearm_checks_pass is False else None

@@ -137,6 +137,19 @@ async def test_refusal_and_old_values_are_shown() -> None:
         assert " old)" not in screen
 
 
+async def test_reason_against_arming_is_requested_from_vehicle() -> None:
+    """By itself, ArduPilot sends the reasons every 30 s."""
+    async with stage(1) as it:
+        it.copters[0].faults.prearm_failures.append("Compass not healthy")
+        await anyio.sleep(4)
+        it.app.update_view()
+        await anyio.sleep(3)
+        it.app.update_view()
+        await it.wait_drawn("Compass not healthy")
+        await anyio.sleep(20)
+    assert len(it.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 1
+
+
 async def test_control_characters_in_texts_are_replaced() -> None:
     async with stage(1) as on:
         on.copters[0].send_text(4, "hello \x1b[2J\x9b2J \x1b]0;title\x07 there")

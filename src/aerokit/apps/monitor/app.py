@@ -17,6 +17,7 @@ from textual.widgets.option_list import Option
 
 from aerokit.apps.monitor.lines import ARROWS, LINK_STYLES, UNKNOWN, Canvas, VehicleText, number
 from aerokit.apps.monitor.model import MonitorModel
+from aerokit.apps.readiness import ArmingCheckRequests, run_arming_checks
 from aerokit.connection.opening import OBSERVER_SYSTEM_ID, explain_no_vehicle, open_connection
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import AerokitError
@@ -129,6 +130,7 @@ class Monitor(App[None]):
         super().__init__(ansi_color=True)
         self.theme = next(theme for theme in ANSI_THEMES if theme in self.available_themes)
         self._model, self._commands, self._name = model, commands, name
+        self._arming_checks = ArmingCheckRequests()
         self._began_at = model.connection.now()
         self._listed_ids: list[int] = []
         self._shown: dict[str, object] = {}
@@ -179,6 +181,9 @@ class Monitor(App[None]):
     def update_view(self) -> None:
         """Update the model, and the widgets whose content has changed."""
         self._model.update()
+        for vehicle in self._model.vehicles.values():
+            if self._arming_checks.are_due(vehicle):
+                self._commands.start(partial(run_arming_checks, vehicle))
         base = self.screen_stack[0]
         self._update_list(base.query_one("#vehicles", OptionList))
         self._show("title", self._title())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import math
 from collections import deque
@@ -14,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit._internal.formatting import to_jsonable
+from aerokit.apps.readiness import ArmingCheckRequests, run_arming_checks
 from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.flight_watch import FlightWatch
 from aerokit.apps.serve.requests import HttpProblem
 from aerokit.connection.connection import Connection
 from aerokit.connection.tasks import BackgroundTasks
-from aerokit.errors import AerokitError, InvalidArgument
+from aerokit.errors import InvalidArgument
 from aerokit.events import Event, LinkReport, LinkState, StatusTextReceived
 from aerokit.vehicle.connect import vehicles_on
 from aerokit.vehicle.vehicle import Vehicle, overview
@@ -44,8 +44,6 @@ TRACK_GAP_S = 3.0
 PREARM_TEXT_MAX_AGE_S = 35.0
 """Maximum age in seconds of a text about a failed arming check. ArduPilot repeats these texts every 30 s."""
 _CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
-MIN_CHECK_INTERVAL_S = 5.0
-"""Minimum seconds between two requests for arming checks, because the failing sensors of a vehicle may alternate."""
 
 
 class ServedVehicles:
@@ -63,8 +61,7 @@ class ServedVehicles:
         self._texts: dict[int, deque[dict[str, Any]]] = {}
         self._tracks: dict[int, list[tuple[Position, bool]]] = {}  # True marks the first position after a gap
         # For each vehicle, the failing sensors at the last request for arming checks, and the time of this request.
-        self._requested_for: dict[Vehicle, tuple[str, ...]] = {}
-        self._requested_at: dict[Vehicle, float] = {}
+        self._arming_checks = ArmingCheckRequests()
         self._watches: dict[Vehicle, FlightWatch] = {}
         self._listeners: list[Listener] = []
         self._attached: dict[Connection, list[Detach]] = {}
@@ -200,14 +197,8 @@ class ServedVehicles:
     async def _request_arming_checks(self) -> None:
         while True:
             for vehicle in tuple(self._vehicles.values()):
-                failing = _failing_checks(vehicle)
-                now = vehicle.connection.now()
-                is_due = now - self._requested_at.get(vehicle, -math.inf) >= MIN_CHECK_INTERVAL_S
-                if failing is None:
-                    self._requested_for.pop(vehicle, None)
-                elif failing != self._requested_for.get(vehicle) and is_due:
-                    self._requested_for[vehicle], self._requested_at[vehicle] = failing, now
-                    self._background.start(partial(_run_checks, vehicle), "aerokit serve check")
+                if self._arming_checks.are_due(vehicle):
+                    self._background.start(partial(run_arming_checks, vehicle), "aerokit serve check")
             await anyio.sleep(TRACK_INTERVAL_S)
 
     def _state_of(self, vehicle: Vehicle) -> dict[str, Any]:
@@ -236,20 +227,13 @@ class ServedVehicles:
         if not missing or vehicle.link_state.latest is not LinkState.CONNECTED:
             return missing
         # Texts that are older than the last request for checks may describe problems that are already solved.
-        age_s = min(vehicle.connection.now() - self._requested_at.get(vehicle, -math.inf), PREARM_TEXT_MAX_AGE_S)
+        age_s = min(
+            vehicle.connection.now() - self._arming_checks.requested_at.get(vehicle, -math.inf), PREARM_TEXT_MAX_AGE_S
+        )
         oldest_unix_s = vehicle.connection.unix_time() - age_s
         recent = [entry["text"] for entry in self.texts(vehicle.system_id) if entry["time_unix_s"] >= oldest_unix_s]
         reasons = (vehicle.autopilot.arming_reason(text) for text in recent)
         return list(dict.fromkeys([*filter(None, reasons), *missing]))
-
-
-def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
-    """Return the failing sensors of a vehicle. None if it is armed, or if its arming checks pass."""
-    sensors = vehicle.sensors.latest
-    is_disarmed = vehicle.armed.latest is False
-    if vehicle.link_state.latest is not LinkState.CONNECTED or not is_disarmed or sensors is None:
-        return None
-    return tuple(sensors.failing) if sensors.prearm_checks_pass is False else None
 
 
 def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
@@ -300,8 +284,3 @@ def _unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
         return None
     arming_mode, option = autopilot.mode_to_arm_in(), autopilot.armable_by_option.get(mode.name)
     return {"mode": mode.name, "arms_in": None if arming_mode is None else arming_mode.name, "unless": option}
-
-
-async def _run_checks(vehicle: Vehicle) -> None:
-    with contextlib.suppress(AerokitError):  # if the vehicle does not answer, its state shows that
-        await vehicle.why_not_armable()
