@@ -41,6 +41,12 @@ CLASSES: dict[int, Any] = {**development.mavlink_map, **v20.mavlink_map}
 IDS = sorted(message_id for message_id in CLASSES if message_id >= 0)
 
 
+@pytest.fixture(autouse=True)
+def program_dialect(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Any call of ``mavutil.mavlink_connection`` in this process changes the program's dialect for all tests."""
+    monkeypatch.setattr(mavutil, "mavlink", v20)
+
+
 def raw_frame(message_id: int, payload: bytes, *, version: int = 2, sequence: int = 5, signature: bytes = b"") -> bytes:
     source = bytes((sequence, SYSTEM, COMPONENT))
     if version == 1:
