@@ -88,7 +88,7 @@ def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
     if px4.sticks.are_fresh:
         health |= _RC_BIT
     load, current = 120, -100  # A load of 12 %, and a current that is not measured (-1 A).
-    no_errors = (0,) * 6  # communication: drop rate and errors, then four counters of the autopilot
+    no_errors = (0, 0, 0, 0, 0, 0)  # communication: drop rate and errors, then four counters of the autopilot
     extended = (0, 0, 1)  # present, enabled and healthy sensors of the extended masks
     return m.SysStatus(present, enabled, health, load, voltage, current, percent, *no_errors, *extended)
 
