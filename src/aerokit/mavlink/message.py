@@ -100,21 +100,21 @@ class Field:
         extension: bool,
         carries_bytes: bool = False,
     ) -> None:
-        self.name = name
+        self.name: str = name
         """Name of the attribute: the name in the standard. A Python keyword gets a trailing underscore."""
-        self.type = type
+        self.type: str = type
         """Type without brackets: ``"uint16_t"``, ``"float"``, ``"char"`` …"""
-        self.array_length = array_length
+        self.array_length: int = array_length
         """Number of elements; 0 if the field is not an array."""
-        self.units = units
+        self.units: str = units
         """Unit, for example ``"cm/s"``, or empty."""
-        self.enum = enum
+        self.enum: str = enum
         """Name of the enum of the values, or empty."""
-        self.invalid = invalid
+        self.invalid: str = invalid
         """Value that means "unknown", as in the XML: for example ``"UINT16_MAX"``, or empty."""
-        self.description = description
+        self.description: str = description
         """Description in the standard."""
-        self.extension = extension
+        self.extension: bool = extension
         """True if MAVLink 1 does not have the field."""
         self.is_text: bool = type == "char" and not carries_bytes
         """True if the value is a ``str``. A few ``char`` arrays are ``bytes``, because they carry numbers."""
