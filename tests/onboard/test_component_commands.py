@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from typing import Annotated
 
 import pytest
@@ -10,8 +11,10 @@ from onboard_peers import autopilot_and_client, payload_and_station
 
 from aerokit.errors import BusyError, CommandRejected, InvalidArgument
 from aerokit.mavlink import messages as m
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, MavType
 from aerokit.onboard import CommandRequest, Param, Range
+from aerokit.protocols.servers.commands import MAX_RESULTS
 
 pytestmark = pytest.mark.anyio
 
@@ -99,6 +102,62 @@ async def test_running_command_reports_progress_and_is_not_started_twice() -> No
         accepted,
     ]
     assert started == 1
+
+
+@pytest.mark.parametrize("duration_s", [0.0, 3.0])
+async def test_repeated_command_with_nan_is_executed_once(duration_s: float) -> None:
+    started = 0
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest) -> None:
+            nonlocal started
+            started += 1
+            await asyncio.sleep(duration_s)
+
+        with station.collecting(m.CommandAck) as acks:
+            for confirmation in range(2):
+                message = station.command_long(MavCmd.USER_1, 1, math.nan, math.nan, confirmation=confirmation)
+                station.connection.send(message)
+                await asyncio.sleep(1.0)
+    assert started == 1
+    assert MavResult.TEMPORARILY_REJECTED not in [ack.result for ack in acks]
+
+
+async def test_repetition_after_command_of_other_sender_is_not_executed() -> None:
+    senders: list[tuple[int, int]] = []
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(request: CommandRequest) -> None:
+            senders.append(request.sender)
+
+        with station.collecting(m.CommandAck) as acks:
+            station.connection.send(station.command_long(MavCmd.USER_1, 1))
+            await asyncio.sleep(0.5)
+            station.connection.send_as(FrameEncoder(200, 190), station.command_long(MavCmd.USER_1, 1))
+            await asyncio.sleep(0.5)
+            station.connection.send(station.command_long(MavCmd.USER_1, 1, confirmation=1))
+            await asyncio.sleep(0.5)
+    assert senders == [(255, 190), (200, 190)]
+    assert [(ack.target_system, ack.result) for ack in acks] == [
+        (system, MavResult.ACCEPTED) for system in (255, 200, 255)
+    ]
+
+
+async def test_results_of_many_senders_are_bounded() -> None:
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest) -> None:
+            pass
+
+        for number in range(2 * MAX_RESULTS):
+            encoder = FrameEncoder(1 + number % 250, 10 + number // 250)
+            station.connection.send_as(encoder, station.command_long(MavCmd.USER_1, 1))
+            await asyncio.sleep(0.001)
+        await asyncio.sleep(0.1)
+        assert len(payload._commands._running._ended) == MAX_RESULTS
 
 
 async def test_cancelled_command_ends_with_cancelled() -> None:

@@ -247,6 +247,21 @@ async def test_autopilot_executes_commands_and_reports_them_in_heartbeat() -> No
     assert raised.value.result == MavResult.UNSUPPORTED
 
 
+@pytest.mark.parametrize(("value", "is_forced"), [(0, False), (2989, False), (21196, True)])
+async def test_only_standard_value_forces_disarming(value: int, is_forced: bool) -> None:
+    """2989 is ArduPilot's value for arming: a disarm with it must not stop the motors in flight."""
+    calls: list[bool] = []
+
+    class Flying(AutopilotDriver):
+        async def disarm(self, force: bool) -> None:
+            calls.append(force)
+
+    async with autopilot_and_client() as (node, vehicle):
+        node.add_autopilot(Flying())
+        await vehicle.command(MavCmd.COMPONENT_ARM_DISARM, 0, value)
+    assert calls == [is_forced]
+
+
 async def test_gripper_grabs_and_releases() -> None:
     moves: list[str] = []
 

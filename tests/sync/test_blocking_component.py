@@ -14,7 +14,7 @@ import aerokit.sync
 from aerokit.errors import CommandRejected, InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavType
-from aerokit.onboard import CameraDriver, CommandRequest, Photo, Range
+from aerokit.onboard import AutopilotDriver, CameraDriver, CommandRequest, Photo, Range
 
 
 @contextmanager
@@ -46,6 +46,43 @@ def test_plain_function_runs_in_thread_and_reports_progress() -> None:
             vehicle.command(MavCmd.USER_1, 13)
     assert raised.value.result == MavResult.DENIED
     assert len(set(threads) - {threading.get_ident()}) >= 1
+
+
+class SlowVehicle(AutopilotDriver):
+    def __init__(self) -> None:
+        self.has_begun, self.may_end = threading.Event(), threading.Event()
+        self.count = 0
+
+    def arm(self, force: bool) -> None:  # type: ignore[override]
+        self.count += 1
+        self.has_begun.set()
+        assert self.may_end.wait(10)
+
+
+def test_cancelled_arming_in_thread_is_reported_as_armed() -> None:
+    """A thread cannot be stopped: the motors start, so HEARTBEAT must say so, and a second thread must not begin."""
+    driver = SlowVehicle()
+    with autopilot_and_client() as (node, vehicle):
+        node.add_autopilot(driver)
+        ids = (vehicle.system_id, vehicle.component_id)
+        arm = m.CommandLong(*ids, MavCmd.COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0)
+        with vehicle.subscribe(m.CommandAck, capacity=100) as acks:
+
+            def result() -> int:
+                while True:
+                    ack = acks.get(timeout=5)
+                    if ack.command == MavCmd.COMPONENT_ARM_DISARM and ack.result != MavResult.IN_PROGRESS:
+                        return int(ack.result)
+
+            vehicle.send(arm)
+            assert driver.has_begun.wait(10)
+            vehicle.send(m.CommandCancel(*ids, MavCmd.COMPONENT_ARM_DISARM))
+            vehicle.send(arm)
+            assert result() == MavResult.TEMPORARILY_REJECTED
+            driver.may_end.set()
+            assert result() == MavResult.ACCEPTED
+        assert vehicle.armed.wait_until(bool, timeout=5)
+    assert driver.count == 1
 
 
 def test_parameters_and_missions_are_used_from_the_program() -> None:

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest
     from aerokit.onboard.services import ComponentServices
 
-FORCES = (21196, 2989)
-"""Values of param 2 that force arming or disarming: the value of the standard, and ArduPilot's value for arming."""
+FORCE, FORCE_ARM = 21196, 2989
+"""Values of param 2: the standard's value, which forces arming or disarming, and ArduPilot's, which only forces arming.
+"""
 _REBOOT, _SHUTDOWN = 1, 2
 
 
@@ -77,7 +78,8 @@ def add_autopilot(
     # The arguments of each handler after the first are the parameters of its command, in order.
 
     async def arm_disarm(_: CommandRequest, is_armed: bool, force: float | None) -> None:
-        await call("arm" if is_armed else "disarm", force in FORCES)
+        is_forced = force == FORCE or (is_armed and force == FORCE_ARM)
+        await call("arm" if is_armed else "disarm", is_forced)
         report(is_armed, None)
 
     async def set_mode(request: CommandRequest, base_mode: float | None, custom_mode: int) -> None:

@@ -127,6 +127,8 @@ class ComponentCommands:
         self.server: CommandDispatcher = CommandDispatcher(host, self.handlers)
         self._running = RunningCommands(host, self.server)
         self._host, self._tasks = host, tasks
+        # Tasks of commands whose code runs in a thread now. A thread cannot be stopped.
+        self._tasks_in_threads: set[asyncio.Task[Any] | None] = set()
         host.knows_command = self.handlers.__contains__
 
     def add(self, command: int, function: Callable[..., Any]) -> None:
@@ -166,7 +168,12 @@ class ComponentCommands:
         return self._call_in_thread(function, *arguments)
 
     async def _call_in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        result = await asyncio.to_thread(function, *arguments)
+        task = asyncio.current_task()
+        self._tasks_in_threads.add(task)
+        try:
+            result = await asyncio.to_thread(function, *arguments)
+        finally:
+            self._tasks_in_threads.discard(task)
         return await result if inspect.isawaitable(result) else result
 
     def add_raw(self, command: int, function: Callable[[ReceivedCommand], Awaitable[int]]) -> None:
@@ -188,6 +195,8 @@ class ComponentCommands:
 
         def cancel() -> None:
             nonlocal is_cancelled
+            if task in self._tasks_in_threads:
+                return  # The command cannot be cancelled. Its sender gets the result.
             if task is not None:
                 task.cancel()
             elif not is_cancelled:  # The task has not started yet.

@@ -28,7 +28,7 @@ class ComponentTwin(OpenedTwin["OnboardComponent"]):
         """Decorator: execute a MAV_CMD by a plain function, in a thread.
 
         Arguments and results are those of `aerokit.onboard.OnboardComponent.command`. COMMAND_CANCEL cannot stop a
-        thread: the sender gets CANCELLED, and the function runs on to its end.
+        thread, so it is ignored: the function runs to its end, and the sender gets its result.
 
         Raises:
             InvalidArgument: the command already has a handler, or an annotation of the function is not supported.

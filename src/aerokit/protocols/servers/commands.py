@@ -155,6 +155,8 @@ UNKNOWN_PROGRESS = 255
 
 RESULT_MAX_AGE_S = 5.0
 """For this time after its end, a repeated command is answered with the same result instead of being executed again."""
+MAX_RESULTS = 256
+"""Maximum number of stored results. If there are more, the oldest is forgotten."""
 
 
 class Outcome(NamedTuple):
@@ -189,8 +191,9 @@ class RunningCommands:
         self._host = host
         self._server = server
         self._running: dict[int, RunningCommand] = {}
-        # Maps MAV_CMD to the last command that has ended, its result, and the time of its end.
-        self._ended: dict[int, tuple[ReceivedCommand, Outcome, float]] = {}
+        # Maps MAV_CMD and sender to the sender's last such command that has ended, its result, and the time of its end.
+        # The command that ended last is the last entry.
+        self._ended: dict[tuple[int, tuple[int, int]], tuple[ReceivedCommand, Outcome, float]] = {}
         host.on(CommandCancel, self._on_cancel)
 
     def __len__(self) -> int:
@@ -202,8 +205,9 @@ class RunningCommands:
         if running is not None and _is_repeated(command, running.command):
             self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
             return None
-        if command.command in self._ended:
-            ended_command, outcome, ended_at = self._ended[command.command]
+        ended = self._ended.get((command.command, command.sender))
+        if ended is not None:
+            ended_command, outcome, ended_at = ended
             if _is_repeated(command, ended_command) and self._host.now - ended_at <= RESULT_MAX_AGE_S:
                 self._server.answer(command, *outcome)
                 return None
@@ -230,8 +234,16 @@ class RunningCommands:
         command = running.command
         if self._running.get(command.command) is running:
             del self._running[command.command]
-            self._ended[command.command] = (command, outcome, self._host.now)
+            self._record_result(command, outcome)
             self._server.answer(command, *outcome)
+
+    def _record_result(self, command: ReceivedCommand, outcome: Outcome) -> None:
+        """Store the result for repetitions of the command, which may arrive after a command of another sender."""
+        key = (command.command, command.sender)
+        self._ended.pop(key, None)  # The new entry must be the last one.
+        if len(self._ended) >= MAX_RESULTS:
+            del self._ended[next(iter(self._ended))]
+        self._ended[key] = (command, outcome, self._host.now)
 
     def cancel_all(self) -> None:
         """Cancel all running commands, because the component ends."""
@@ -246,7 +258,11 @@ class RunningCommands:
 
 def _is_repeated(command: ReceivedCommand, first: ReceivedCommand) -> bool:
     """Return True if ``command`` is a repeated transmission of the command ``first``."""
-    return command.confirmation > 0 and (command.sender, command.params) == (first.sender, first.params)
+    if command.confirmation == 0 or command.sender != first.sender:
+        return False
+    pairs = zip(command.params, first.params, strict=True)
+    # NaN, which many commands use for a missing parameter, does not equal itself.
+    return all(param == earlier or (math.isnan(param) and math.isnan(earlier)) for param, earlier in pairs)
 
 
 def whole(value: float) -> int:
