@@ -64,6 +64,20 @@ async def test_only_crashed_vehicle_accepts_forced_disarm() -> None:
         assert state_of(stage)["crash"] is not None, "the vehicle still lies there"
 
 
+async def test_forced_disarm_without_recent_velocity_is_refused() -> None:
+    """HEARTBEATs go on, but the vehicle may have taken off since its last velocity."""
+    async with open_stage() as stage:
+        await fly_up(stage)
+        await fall(stage)
+        assert state_of(stage)["crash"] is not None
+        await anyio.sleep(0.06)  # the next request gets a new snapshot
+        stage.flight.vehicle.velocity._add_age(5.0)
+        assert state_of(stage)["crash"] is None
+        refused = await stage.submit("disarm", {"force": True})
+        assert (refused.status_code, refused.json()["error"]) == (409, "NotCrashed")
+        assert stage.flight.copter.is_armed
+
+
 async def test_crash_ends_with_next_arming() -> None:
     async with open_stage() as stage:
         await fly_up(stage)
@@ -231,6 +245,35 @@ def test_crashed_vehicle_that_flies_again_is_no_longer_crashed() -> None:
     assert flight.fly(sinking(40, 90.0, 0.0))
     flight.fly([(0.3, -2.5), (0.8, -2.5)])
     assert not flight.fly([(1.0, 0.0)] * 50)
+
+
+@pytest.mark.parametrize("reports_landed_state", [True, False])
+def test_crashed_vehicle_that_takes_off_slowly_is_no_longer_crashed(reports_landed_state: bool) -> None:
+    flight = FakeFlight()
+    assert flight.fly(sinking(40, 90.0, 0.0))
+    climb_m_s, seconds = (0.2, 3) if reports_landed_state else (0.5, 5)
+    if reports_landed_state:
+        flight.landed_state.set(MavLandedState.ON_GROUND, flight.now)
+        flight.landed_state.set(MavLandedState.IN_AIR, flight.now)
+    flight.fly([(climb_m_s * STEP_S * step, -climb_m_s) for step in range(10 * seconds)])
+    assert not flight.fly([(climb_m_s * seconds, 0.0)] * 50)
+
+
+def test_crashed_vehicle_that_is_moved_for_a_second_stays_crashed() -> None:
+    flight = FakeFlight()
+    assert flight.fly(sinking(40, 90.0, 0.0))
+    flight.fly([*[(0.0, -0.5)] * 10, (0.0, 0.0)] * 3)
+    assert flight.watch.crash is not None
+
+
+def test_old_landed_state_is_no_evidence_of_crash() -> None:
+    flight = FakeFlight()
+    flight.landed_state.set(MavLandedState.ON_GROUND, flight.now)
+    flight.landed_state.age = 10.0
+    assert not flight.fly(sinking(70, 90.0, 30.0))
+    recent = FakeFlight()
+    recent.landed_state.set(MavLandedState.ON_GROUND, recent.now)
+    assert recent.fly(sinking(70, 90.0, 30.0))
 
 
 async def test_automatic_disarming_is_reported_with_its_parameter() -> None:

@@ -42,6 +42,10 @@ CRASH_ARMED_WITHIN_S = 30.0
 """Impacts count only if the vehicle was armed in this many seconds before. Estimates of other vehicles may jump, for
 example after a reboot."""
 MOVING_M_S = 2.0
+"""An armed vehicle that moves at this speed after a crash flies again. At a lower speed, it must move for
+``CRASH_STILL_S``."""
+LANDED_STATE_MAX_AGE_S = 3.0
+"""Maximum age in seconds of a landed state that counts as evidence of a crash."""
 _IN_AIR = (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING)
 
 
@@ -64,6 +68,7 @@ class FlightWatch:
         self._impact_height_m: float | None = None
         self._was_sudden_stop = False
         self._still_since, self._still_samples = math.inf, 0
+        self._moving_since = math.inf  # Since when the crashed vehicle has been moving.
         self._armed_at: float | None = None
         self._armed_until = -math.inf
         self._was_in_air = False
@@ -84,7 +89,7 @@ class FlightWatch:
     def crash(self) -> dict[str, Any] | None:
         """The crash: ``text``, such as "hit the ground at 11.6 m/s", and ``at_unix_s``, the time of the impact.
 
-        None if there was no crash, or if the vehicle has moved or was armed again since the crash.
+        None if there was no crash, or if the vehicle has moved, taken off or was armed again since the crash.
         """
         return self._crash
 
@@ -134,6 +139,9 @@ class FlightWatch:
 
     def _on_landed(self, before: int | None, landed: int) -> None:
         self._was_in_air = self._was_in_air or landed in _IN_AIR
+        has_taken_off = before == MavLandedState.ON_GROUND and landed in _IN_AIR
+        if has_taken_off and self._crash is not None and self._vehicle.armed.latest:
+            self._dismiss_impact()
 
     def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
         if self._vehicle.autopilot.vehicle_type in SURFACE_TYPES:
@@ -160,11 +168,13 @@ class FlightWatch:
     def _evaluate_impact(self, at: float, ground_speed_m_s: float, climb_m_s: float) -> None:
         if self._is_impact_dismissed or self._impact_at is None:
             return
+        is_still = ground_speed_m_s < STILL_M_S and climb_m_s < CRASH_STILL_CLIMB_M_S
         if self._crash is not None:
-            if self._vehicle.armed.latest and max(ground_speed_m_s, climb_m_s) >= MOVING_M_S:
+            self._moving_since = math.inf if is_still else min(self._moving_since, at)
+            is_moving = max(ground_speed_m_s, climb_m_s) >= MOVING_M_S or at - self._moving_since >= CRASH_STILL_S
+            if self._vehicle.armed.latest and is_moving:
                 self._dismiss_impact()  # the vehicle flies again
             return
-        is_still = ground_speed_m_s < STILL_M_S and climb_m_s < CRASH_STILL_CLIMB_M_S
         if is_still and self._is_at_impact_height():
             self._still_since = min(self._still_since, at)
             self._still_samples += 1
@@ -186,7 +196,9 @@ class FlightWatch:
         if at - self._still_since < CRASH_STILL_S or self._still_samples < CRASH_STILL_SAMPLES:
             return False
         vehicle, height_m = self._vehicle, height_above_home(self._vehicle.telemetry)
-        if vehicle.armed.latest is False or vehicle.landed_state.latest == MavLandedState.ON_GROUND:
+        landed = vehicle.landed_state
+        is_on_ground = landed.latest == MavLandedState.ON_GROUND and landed.age <= LANDED_STATE_MAX_AGE_S
+        if vehicle.armed.latest is False or is_on_ground:
             return True
         return self._was_sudden_stop and height_m is not None and abs(height_m) < CRASH_HEIGHT_M
 
@@ -202,6 +214,7 @@ class FlightWatch:
     def _forget_impact(self) -> None:
         self._crash = self._impact_at = self._impact_height_m = None
         self._still_since, self._still_samples, self._is_impact_dismissed = math.inf, 0, False
+        self._moving_since = math.inf
 
     def _reset(self) -> None:
         self._forget_impact()

@@ -21,6 +21,7 @@ from aerokit.connection.connection import Connection
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import InvalidArgument
 from aerokit.events import Event, LinkReport, LinkState, StatusTextReceived
+from aerokit.vehicle.commanding.ground import VELOCITY_MAX_AGE_S
 from aerokit.vehicle.connect import vehicles_on
 from aerokit.vehicle.vehicle import Vehicle, overview
 
@@ -101,8 +102,13 @@ class ServedVehicles:
         return vehicle
 
     def crash(self, vehicle: Vehicle) -> dict[str, Any] | None:
-        """Return the impact after which a vehicle has not moved; None if there was none, or it is silent."""
-        return self._watch(vehicle).crash if vehicle.link_state.latest is LinkState.CONNECTED else None
+        """Return the impact after which a vehicle has not moved; None if there was none, or if it may have moved since.
+
+        It may have moved if it is silent, or reports no velocity.
+        """
+        is_connected = vehicle.link_state.latest is LinkState.CONNECTED
+        is_observed = is_connected and vehicle.velocity.age <= VELOCITY_MAX_AGE_S
+        return self._watch(vehicle).crash if is_observed else None
 
     def texts(self, system_id: int) -> list[dict[str, Any]]:
         return list(self._texts.get(system_id, ()))
@@ -208,11 +214,13 @@ class ServedVehicles:
         wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if ``arm`` does not change the mode.
         """
         mission, watch, missing = vehicle.mission, self._watch(vehicle), self._missing_for_flight(vehicle)
+        is_connected = vehicle.link_state.latest is LinkState.CONNECTED
         return {
             **overview(vehicle),
             "missing_for_flight": missing,
             "not_armable": not_armable(vehicle, missing),
-            "crash": watch.crash,
+            # A silent vehicle gets no orders, so the page may show its last known crash.
+            "crash": self.crash(vehicle) if is_connected else watch.crash,
             "disarming": watch.disarming,
             "unread": _unread(vehicle, watch.disarm_parameter),
             "failsafe": ground_station_failsafe(vehicle),
