@@ -152,6 +152,40 @@ def block_loop(seconds: float) -> None:
     loop._now += seconds
 
 
+def suspend_computer(vehicle: aerokit.Vehicle, seconds: float) -> None:
+    """Suspend the computer: other clocks advance, but the loop's clock stands still, and no data arrives."""
+    watch = vehicle.connection._receiver._loop_watch
+    suspended_s = watch._suspended_before + seconds
+    watch._suspended = lambda: suspended_s
+
+
+class HeldHeartbeats:
+    """Holds back what reports the mode, as the socket does while the event loop is blocked, and loses what is newer."""
+
+    def __init__(self, wire: Wire) -> None:
+        assert wire._receiver is not None
+        self._receiver, self._framer = wire._receiver, Framer()
+        self._held: list[bytes] = []
+        self._is_holding = True
+        wire._link._receiver = self  # type: ignore[attr-defined]
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        for frame in self._framer.receive(data, 0.0):
+            if not self._is_holding or frame.message_id not in (m.Heartbeat.ID, m.CurrentMode.ID):
+                self._receiver.bytes_received(frame.raw, peer)
+            elif frame.message_id == m.Heartbeat.ID:
+                self._held.append(frame.raw)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._receiver, name)
+
+    def release_first_after(self, blocked_s: float) -> None:
+        """Block the event loop; then the first HEARTBEAT is read, and later ones arrive again."""
+        block_loop(blocked_s)
+        self._is_holding = False
+        self._receiver.bytes_received(self._held[0], None)
+
+
 def speed_of(copter: SimulatedCopter) -> float:
     motion = copter.motion
     return math.hypot(motion.velocity_north, motion.velocity_east, motion.velocity_down)

@@ -100,6 +100,16 @@ def test_order_without_heartbeat_is_sent_once() -> None:
     assert "sent once within 3.0 s; not sent again: no HEARTBEAT received since then" in text_of(machine)
 
 
+@pytest.mark.parametrize(("now", "expected"), [(3.2, [1]), (3.4, []), (14.0, [])])
+def test_order_is_not_resent_after_old_heartbeat(now: float, expected: list[int]) -> None:
+    """The event loop was blocked, and the HEARTBEAT arrived at its beginning."""
+    machine = order(Status(heartbeat_at=0.8))
+    assert confirmations(machine) == [0]
+    machine.expire(now)
+    assert confirmations(machine) == expected
+    assert machine.done is (now > 4.0)
+
+
 def test_order_waits_for_last_sending() -> None:
     order_status = Status(heartbeat_at=0.75)
     machine = order(order_status, attempts=2)

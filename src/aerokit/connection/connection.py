@@ -347,6 +347,13 @@ class Connection:
         """Return the event loop's time in seconds; all ages and deadlines use this clock."""
         return self._clock()
 
+    def _slept_since(self, at: float) -> float:
+        """Return how many seconds the computer was suspended since this time, while the event loop's clock stood still.
+
+        Publishes :class:`ComputerSlept` before it returns, so that all ages are right.
+        """
+        return self._receiver.slept_since(at)
+
     @checked
     def new_cell(self, name: str, waits_for: str) -> StateCell[Any]:
         """Make a cell whose values are time-stamped with the receive time of their message; see :class:`StateCell`."""

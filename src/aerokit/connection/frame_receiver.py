@@ -164,6 +164,9 @@ class FrameReceiver:
         self._update_checks()
         self._loop_watch.close()
 
+    def slept_since(self, at: float) -> float:
+        return self._loop_watch.slept_since(at)
+
     def reset(self) -> None:
         """Discard partial frames after the link was reopened."""
         self._peers.reset()

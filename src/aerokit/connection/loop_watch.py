@@ -6,6 +6,7 @@ import asyncio
 import math
 import sys
 import time
+from collections import deque
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ BLOCKED_THRESHOLD_S = 0.25
 # If nothing was read in this many loop iterations, all data that waited during the pause has been read. One iteration
 # would not prove this, because some loops run timers before they read sockets.
 IDLE_ITERATIONS = 3
+
+MAX_SLEEPS = 16
 
 # Platform → (clock that includes suspended time, clock of the loop). On Windows, the loop's clock includes that time.
 CLOCKS = {
@@ -71,6 +74,8 @@ class LoopWatch:
         self._timer: asyncio.TimerHandle | None = None
         self.oldest_arrival: float = math.inf
         """Earliest possible receive time of data that is read now; infinite while no data can have waited."""
+        # The last times at which the computer woke, with the seconds for which it was suspended.
+        self._sleeps: deque[tuple[float, float]] = deque(maxlen=MAX_SLEEPS)
         self._check_sleep_at = -math.inf  # The clocks are not read again before this time, because reading is slow.
         self._has_read = False
         self._idle_iterations = 0
@@ -102,6 +107,15 @@ class LoopWatch:
         self._has_read = True
         return self._assume_waiting_data()
 
+    def slept_since(self, at: float) -> float:
+        """Return how many seconds the computer was suspended since this loop time.
+
+        Detects a suspension at once, which the timer may notice 0.2 s later.
+        """
+        if self._timer is not None and self._has_slept():
+            self._assume_waiting_data()
+        return sum(seconds for woke_at, seconds in self._sleeps if woke_at > at)
+
     def _tick(self) -> None:
         now = self._loop.time()
         late_s = now - self._due
@@ -123,6 +137,7 @@ class LoopWatch:
         if slept_s <= LATE_THRESHOLD_S:
             return False
         self._ran_at -= slept_s  # The loop's clock stood still meanwhile, and data may have waited all this time.
+        self._sleeps.append((self._loop.time(), slept_s))
         self._on_slept(slept_s)
         return True
 

@@ -89,6 +89,12 @@ ATTEMPT_TIMEOUT_S = 1.0
 # While an order waits for a new HEARTBEAT to be sent again, it checks for one at this interval.
 POLL_INTERVAL_S = 0.05
 
+MAX_HEARTBEAT_AGE_S = 2.5
+"""Maximum age in seconds of a HEARTBEAT after which an order is repeated.
+
+A HEARTBEAT is older if the event loop was blocked. Since its arrival, a failsafe or a pilot may have taken over.
+"""
+
 # An order is repeated at the earliest after this fraction of ``attempt_timeout``. It is below 1, because a repetition
 # follows a HEARTBEAT, and HEARTBEATs arrive at 1 Hz with some jitter.
 MIN_RESEND_FRACTION = 0.75
@@ -290,6 +296,7 @@ class CommandExchange(Exchange[CommandAck]):
             return
         # If the last HEARTBEAT is not older than this, the link to the vehicle works, so the order may be repeated.
         min_heartbeat_at = self._sent_at + MIN_RESEND_FRACTION * self._attempt_timeout
+        min_heartbeat_at = max(min_heartbeat_at, now - MAX_HEARTBEAT_AGE_S)
         if self._sent_count < self._attempts and order_status.heartbeat_at >= min_heartbeat_at:
             self._send(now)
             return

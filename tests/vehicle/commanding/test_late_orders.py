@@ -10,14 +10,30 @@ from itertools import count, pairwise
 import anyio
 import anyio.lowlevel
 import pytest
-from flight_harness import Flight, block_loop, in_the_air, open_px4
+from flight_harness import (
+    Flight,
+    HeldHeartbeats,
+    block_loop,
+    in_the_air,
+    open_flight,
+    open_px4,
+    suspend_computer,
+)
 
 from aerokit import Position, StickInput, TargetMeasurement, VelocitySetpoint
 from aerokit import messages as m
-from aerokit.errors import CommandTimeout, InvalidArgument, OperationRejected, SetpointStreamStopped, ValueUnknownError
+from aerokit.errors import (
+    CommandTimeout,
+    HeartbeatTimeout,
+    InvalidArgument,
+    OperationRejected,
+    SetpointStreamStopped,
+    ValueUnknownError,
+)
 from aerokit.mavlink.enums import CopterMode
 from aerokit.mavlink.enums import MavCmd as C
 from aerokit.sim import SimulatedCopter
+from aerokit.sim.faults import CommandFault
 
 pytestmark = pytest.mark.anyio
 
@@ -177,6 +193,74 @@ async def test_terminated_flight_gets_no_mode_afterwards() -> None:
         await asyncio.wait([task, terminating])
         await anyio.sleep(5)
         assert not flight.wire.mode_orders()
+
+
+@pytest.mark.parametrize(("blocked_s", "is_sent"), [(4.0, True), (14.0, False)])
+async def test_take_off_command_after_blocked_loop_needs_heartbeat(blocked_s: float, is_sent: bool) -> None:
+    """The HEARTBEAT that confirms the mode arrived before the pause; those of the pause were lost."""
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+        await flight.vehicle._session.wait_for_heartbeat()
+        heartbeats = HeldHeartbeats(flight.wire)
+        going = asyncio.ensure_future(flight.vehicle.take_off(10))
+        await anyio.sleep(1.2)
+        assert flight.wire.mode_orders() == [CopterMode.GUIDED]
+        heartbeats.release_first_after(blocked_s)
+        await anyio.sleep(0.1)
+        assert flight.vehicle.mode_name == "GUIDED"
+        assert not flight.wire.commands(C.NAV_TAKEOFF)
+        await anyio.sleep(1.5)
+        assert bool(flight.wire.commands(C.NAV_TAKEOFF)) is is_sent
+        if not is_sent:
+            with pytest.raises(HeartbeatTimeout, match="the rest of the order was not sent"):
+                await going
+        going.cancel()
+
+
+async def test_setpoints_after_blocked_loop_need_heartbeat() -> None:
+    async with in_the_air() as flight:
+        await flight.vehicle.set_mode("LOITER")
+        heartbeats = HeldHeartbeats(flight.wire)
+
+        async def fly() -> None:
+            async with flight.vehicle.guided.velocity() as stream:
+                await stream.fly(VelocitySetpoint(3, 0, 0), 20)
+
+        flying = asyncio.ensure_future(fly())
+        await anyio.sleep(1.2)
+        heartbeats.release_first_after(14.0)
+        with pytest.raises(HeartbeatTimeout):
+            await flying
+        assert not flight.wire.setpoints()
+
+
+async def test_order_is_not_repeated_after_computer_slept() -> None:
+    async with in_the_air() as flight:
+        flight.copter.faults.commands[C.DO_SET_MODE] = CommandFault(ignore=True)
+        landing = asyncio.ensure_future(flight.vehicle.set_mode("LAND"))
+        await anyio.sleep(0.3)
+        suspend_computer(flight.vehicle, 600.0)
+        with pytest.raises(CommandTimeout, match="not sent again: the computer slept"):
+            await landing
+        assert flight.wire.mode_orders() == [CopterMode.LAND]
+
+
+async def test_setpoints_end_when_computer_slept() -> None:
+    """The pilot or a failsafe may fly the vehicle since."""
+    async with in_the_air() as flight:
+        with pytest.raises(SetpointStreamStopped, match="the computer slept for 60 s"):
+            async with flight.vehicle.guided.velocity() as stream:
+                await stream.fly(VelocitySetpoint(3, 0, 0), 2.0)
+                flight.copter.faults.silent = True
+                flight.wire.clear()
+                suspend_computer(flight.vehicle, 60.0)
+                await stream.fly(VelocitySetpoint(3, 0, 0), 5.0)
+        assert not flight.wire.setpoints()
+        assert not flight.wire.mode_orders()
+        flight.copter.faults.silent = False
+        await anyio.sleep(3.0)
+        assert flight.vehicle.mode_name == "BRAKE"
 
 
 async def _fly_sticks(flight: Flight) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import anyio
 import pytest
-from flight_harness import Flight, Px4Flight, block_loop, open_flight, open_px4
+from flight_harness import Flight, Px4Flight, block_loop, open_flight, open_px4, suspend_computer
 
 from aerokit import Position
 from aerokit import messages as m
@@ -252,6 +252,20 @@ async def test_old_measurement_is_dropped_after_blocked_loop() -> None:
         assert (stream.sent, stream.dropped) == (1, 2)
         stream.send(STILL)
         assert stream.sent == 2
+
+
+async def test_measurement_from_before_sleep_of_computer_is_dropped() -> None:
+    async with open_flight(copter()) as flight:
+        await flight.vehicle.wait_ready()
+        async with flight.vehicle.external.odometry() as stream:
+            measured_at = anyio.current_time()
+            await anyio.sleep(0.1)
+            suspend_computer(flight.vehicle, 60.0)
+            stream.send(STILL.replace(measured_at=measured_at))
+            assert (stream.sent, stream.dropped) == (0, 1)
+            await anyio.sleep(0.1)
+            stream.send(STILL)
+            assert (stream.sent, stream.dropped) == (1, 1)
 
 
 async def test_measurements_pause_while_vehicle_is_silent() -> None:

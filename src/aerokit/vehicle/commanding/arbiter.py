@@ -6,6 +6,7 @@ import itertools
 import math
 from collections import deque
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import CommandRejected, OperationRejected
@@ -25,8 +26,7 @@ ARM_HEARTBEAT_DELAY_S = 1.5
 MODE_MAX_AGE_S = 2.5
 """Maximum age in seconds of a HEARTBEAT that counts as the vehicle's present state.
 
-Two HEARTBEATs may be lost within this time. The ground-station failsafes of ArduPilot and PX4 act later
-(FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s).
+Two HEARTBEATs may be lost. Ground-station failsafes act later (FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s).
 """
 OWN_MODES_MAX_AGE_S = 10.0
 """For this many seconds after the program ordered a mode, a change to that mode does not count as a takeover."""
@@ -56,6 +56,7 @@ class CommandArbiter:
 
     def __init__(self, now: Callable[[], float], telemetry: Telemetry) -> None:
         self._now, self._telemetry = now, telemetry
+        self.slept_since: Callable[[float], float] = lambda _: 0.0  # see `Connection._slept_since`
         self.newest: Order | None = None
         """The last steering order given by an action or a raw command."""
         self.arming_orders = 0
@@ -238,6 +239,7 @@ class CommandArbiter:
             modes=modes,
             armed=armed,
             is_done=is_done,
+            slept_s=partial(self.slept_since, self._now()),
         )
         if order.armed is None:  # A posted order to arm has already ended earlier orders to arm.
             self._supersede_arming(armed)
@@ -309,6 +311,7 @@ class CommandArbiter:
     @property
     def is_state_recent(self) -> bool:
         """True while the last HEARTBEAT is recent enough to describe the vehicle's state."""
+        self.slept_since(self._now())  # adds a sleep of the computer to the age
         return self._telemetry.armed.age <= MODE_MAX_AGE_S
 
     @contextmanager

@@ -181,6 +181,8 @@ class Order:
 
         CURRENT_MODE may report the mode before the HEARTBEAT that reports the mode and, after a landing, disarming.
         """
+        self.was_sent: bool = False
+        """True once a command of the order was sent. The next command is a further step."""
         self.is_confirmed: bool = False
         """True once a change to one of the order's modes, or to its armed state, was reported."""
         # Sets of modes, by their numbers in HEARTBEAT.custom_mode.
@@ -290,7 +292,8 @@ class SentCommand:
     """One command of an order after its first transmission. Decides whether the command may be sent again.
 
     The command may be sent again while the vehicle has reported neither the command's effect nor an action of another
-    party. The effect is a change to one of ``modes`` or to ``armed``; ``is_done`` reports any other effect.
+    party. The effect is a change to one of ``modes`` or to ``armed``; ``is_done`` reports any other effect. ``slept_s``
+    returns for how many seconds the computer was suspended since the first transmission.
     """
 
     def __init__(
@@ -302,8 +305,10 @@ class SentCommand:
         modes: Collection[Mode] = (),
         armed: bool | None = None,
         is_done: Callable[[], bool] = lambda: False,
+        slept_s: Callable[[], float] = lambda: 0.0,
     ) -> None:
         self.order = order
+        order.was_sent = True
         self.heartbeat_at: float = -math.inf
         """Time of the last HEARTBEAT."""
         self._is_reported = False
@@ -313,7 +318,7 @@ class SentCommand:
         self.arms = armed
         """True if the command arms the vehicle, False if it disarms it, None if it does neither."""
         self._is_overruled = False
-        self._is_done = is_done
+        self._is_done, self._slept_s = is_done, slept_s
 
     @property
     def is_confirmed(self) -> bool:
@@ -326,6 +331,8 @@ class SentCommand:
         """Reason why the command is not sent again, as a clause for error texts; empty while it may be sent again."""
         if self.is_confirmed:
             return "its effect was reported"
+        if self._slept_s() > 0:  # Hours may have passed since the transmission.
+            return "the computer slept"
         return self.order.end or (SUPERSEDED if self._is_overruled else "") or self.order.unexplained
 
     def on_newer_command(self, armed: bool | None) -> None:

@@ -6,11 +6,13 @@ import math
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+import anyio
+
 from aerokit._internal.arguments import check_range
-from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationRejected
+from aerokit.errors import CommandRejected, CommandTimeout, HeartbeatTimeout, NotSupported, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, MAX_ATTEMPTS, rejection
-from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S
+from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S, STEERING
 from aerokit.vehicle.commanding.ground import ImpactDetector
 from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, REQUEST_COMMANDS
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
@@ -48,14 +50,18 @@ class OrderSender:
     ) -> None:
         """Send one command of an order until it is acknowledged or its effect is reported.
 
-        The effect is a change to one of ``modes``, to ``armed``, or ``is_done()``.
+        The effect is a change to one of ``modes``, to ``armed``, or ``is_done()``. A further step of an order that
+        steers waits for a recent HEARTBEAT.
 
         Raises:
             OperationRejected: the order has ended: it was superseded or taken over.
+            HeartbeatTimeout: the vehicle was silent before a further step.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
         """
         self.raise_if_ended(order)
+        if order.was_sent and STEERING in order.ended_by:
+            await self.await_recent_state(order)
         order.may_move = order.may_move or command in CHANGED_BY_COMMAND
         started = self._session.connection.now()
         with self._arbiter.sending(order, modes=modes, armed=armed, is_done=is_done) as sent:
@@ -79,6 +85,24 @@ class OrderSender:
         """Raise OperationRejected if the order has ended, so that its remaining commands are not sent."""
         if order.end:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
+
+    async def await_recent_state(self, order: Order) -> None:
+        """Before a further step of an order, wait for the next HEARTBEAT if the last one is not recent.
+
+        The event loop may have been blocked since the previous step.
+
+        Raises:
+            OperationRejected: the order has ended meanwhile.
+            HeartbeatTimeout: the last HEARTBEAT is older than ``MAX_SILENCE_S``, or no other one arrived by then.
+        """
+        if self._arbiter.is_state_recent:
+            return
+        with anyio.move_on_after(max(0.0, MAX_SILENCE_S - self._session.telemetry.armed.age)):
+            await self._session.wait_for_heartbeat()
+        if not self._arbiter.is_state_recent:
+            link = self._session.describe_link()
+            raise HeartbeatTimeout(f"the vehicle is silent; {link}; the rest of the order was not sent")
+        self.raise_if_ended(order)
 
     def _unanswered(self, error: CommandTimeout, order: Order) -> Exception:
         """Return the error for a command without an answer: the takeover if there was one, otherwise the time-out."""

@@ -81,6 +81,7 @@ class ValueStream(Generic[ValueT]):
         self._timer: asyncio.TimerHandle | None = None
         self._stop_error: AerokitError | None = None
         self._has_raised_stop = self._was_entered = self._is_changing_mode = False
+        self._began_sending_at = math.inf
 
     @property
     def is_running(self) -> bool:
@@ -115,6 +116,7 @@ class ValueStream(Generic[ValueT]):
 
     def _begin_sending(self) -> None:
         self._replace_value(self._value)
+        self._began_sending_at = self._now()
         self._tick(self._now())
 
     def _tick(self, due: float) -> None:
@@ -146,6 +148,9 @@ class ValueStream(Generic[ValueT]):
         """Return why the stream must stop, as a clause, else None; ``lag`` is the delay of this tick in seconds."""
         # A value does not expire while the mode is changed, because the program cannot supply values then.
         age = 0.0 if self._is_changing_mode else self._now() - self._set_at
+        slept_s = self._session.connection._slept_since(self._began_sending_at)
+        if slept_s > self._max_lag_s:
+            return f"the computer slept for {slept_s:.0f} s"
         if lag > self._max_lag_s:
             return f"the event loop was blocked for {lag:.1f} s"
         if age > self._valid_for_s:
@@ -292,6 +297,7 @@ class SteeringStream(ValueStream[ValueT]):
             self._raise_if_stopped()
         else:
             await self._context.sender.ensure_mode(mode, order)
+            await self._context.sender.await_recent_state(order)
             self._begin_sending()
         self._mode = mode
 

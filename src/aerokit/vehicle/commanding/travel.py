@@ -135,6 +135,7 @@ class TravelActions(VehicleBase):
                 raise
             await self._sender.ensure_mode(self._sender.mode_for("go_to", "setpoint"), order)
             self._sender.raise_if_ended(order)
+            await self._sender.await_recent_state(order)
             address, position = (self.system_id, self.component_id), (place["x"], place["y"], place["z"])
             message = SetPositionTargetGlobalInt(0, *address, place["frame"], POSITION_ONLY, *position, *(0.0,) * 8)
             self.connection.send(message)

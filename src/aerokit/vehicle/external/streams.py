@@ -192,7 +192,8 @@ class MeasurementStream(Generic[MeasurementT]):
             return
         (messages, measured_at), self._waiting = self._waiting, None
         session, now = self._session, self._session.connection.now()
-        if now - measured_at > self._valid_for_s or session.watch.is_silent or not session.connection.is_open:
+        age_s = now - measured_at + session.connection._slept_since(measured_at)
+        if age_s > self._valid_for_s or session.watch.is_silent or not session.connection.is_open:
             self._dropped += 1
             return
         # Periods follow each other without a gap, so that the average rate is right. After a pause, they start anew.
