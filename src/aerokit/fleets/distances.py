@@ -10,8 +10,8 @@ from aerokit._internal import geo
 from aerokit.errors import ValueUnknownError
 from aerokit.fleets.events import TooClose
 from aerokit.fleets.separation import pairs_within, to_local_points
-from aerokit.mavlink.enums import MavLandedState
 from aerokit.position import Position
+from aerokit.vehicle.state.telemetry import is_reported_on_ground
 
 if TYPE_CHECKING:
     from aerokit.fleets.action import FleetContext
@@ -123,7 +123,7 @@ class DistanceMonitor:
             position = vehicle.position.latest
             if position is None or position.altitude_amsl_m is None or vehicle.position.age > POSITION_MAX_AGE_S:
                 continue
-            if vehicle.is_armed and vehicle.landed_state.latest != MavLandedState.ON_GROUND:
+            if vehicle.is_armed and not is_reported_on_ground(vehicle.telemetry):
                 positions[member.name] = position.latitude_deg, position.longitude_deg, position.altitude_amsl_m
         return positions
 

@@ -101,6 +101,20 @@ async def test_without_mission_state_last_item_is_the_end(
         assert all_of(reached)[-1].seq == mission.count.value
 
 
+async def test_landed_state_from_before_take_off_ends_no_mission() -> None:
+    """PX4 reports completion when it begins to return; EXTENDED_SYS_STATE is lost from the arming on."""
+    async with armed(open_px4, return_to_launch()) as flight:
+        assert isinstance(flight, Px4Flight)
+        flight.px4.faults.lose(m.ExtendedSysState, times=10**6)
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=200)
+        assert flight.vehicle.is_confirmed_disarmed
+        assert (flight.vehicle.position.value.altitude_relative_m or 0.0) < 1.0
+        assert flight.vehicle.landed_state.age > 20.0
+        assert "on the ground" not in flight.vehicle.describe_now()
+
+
 async def test_wait_finished_continues_through_pause() -> None:
     async with armed(open_flight) as flight:
         mission = flight.vehicle.mission

@@ -10,13 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit import enums, messages
+from aerokit.connection.cells import Source
 from aerokit.errors import InvalidArgument
+from aerokit.mavlink.enums import MavLandedState
 from aerokit.missions.navigation import waypoint
 from aerokit.position import Home, Position
 from aerokit.vehicle.state import equipment as gimbal
 from aerokit.vehicle.state.condition import EstimatorHealth, SensorHealth
 from aerokit.vehicle.state.equipment import GpsReceiver
 from aerokit.vehicle.state.movement import Attitude, Velocity
+from aerokit.vehicle.state.telemetry import Telemetry, is_reported_on_ground
 
 angles = st.floats(-179, 179)
 
@@ -209,3 +212,13 @@ def test_vertical_camera_rotation_is_yaw(pitch_deg: float, roll_deg: float) -> N
 def test_zero_quaternion_has_no_attitude() -> None:
     attitude = gimbal.from_device(pointing((0.0, 0.0, 0.0, 0.0), FROM_NORTH), None)
     assert attitude == gimbal.GimbalAttitude(None, None, None)
+
+
+@pytest.mark.parametrize(("age_s", "is_on_ground"), [(0.0, True), (4.9, True), (5.1, False)])
+def test_old_landed_state_is_no_report_of_the_ground(age_s: float, is_on_ground: bool) -> None:
+    now = [100.0]
+    telemetry = Telemetry(lambda: now[0], system_id=1, component_id=1)
+    assert not is_reported_on_ground(telemetry)
+    telemetry.landed_state.set(MavLandedState.ON_GROUND, Source(1, 1, "the test"))
+    now[0] += age_s
+    assert is_reported_on_ground(telemetry) is is_on_ground

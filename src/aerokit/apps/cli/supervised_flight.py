@@ -25,8 +25,8 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.events import SILENT_AFTER_S
-from aerokit.mavlink.enums import MavLandedState
 from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
+from aerokit.vehicle.state.telemetry import is_reported_on_ground
 
 if TYPE_CHECKING:
     import argparse
@@ -117,7 +117,7 @@ class SupervisedFlight(ABC):
         self._modes_armed_in.add(self._vehicle.mode_name)
 
     async def _wait_disarmed_on_ground(self) -> None:
-        if self._vehicle.landed_state.latest == MavLandedState.ON_GROUND:
+        if is_reported_on_ground(self._vehicle.telemetry):
             with suppress(OperationTimeout):
                 await self._vehicle.armed.wait_until(lambda armed: not armed, timeout=_AUTO_DISARM_TIMEOUT_S)
 
@@ -196,7 +196,7 @@ class SupervisedFlight(ABC):
 
     @property
     def _is_armed_on_ground(self) -> bool:
-        return self._vehicle.is_armed and self._vehicle.landed_state.latest == MavLandedState.ON_GROUND
+        return self._vehicle.is_armed and is_reported_on_ground(self._vehicle.telemetry)
 
     @property
     def _is_in_our_mode(self) -> bool:

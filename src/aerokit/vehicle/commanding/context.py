@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from aerokit.mavlink.enums import MavLandedState
 from aerokit.vehicle.commanding.arbiter import CommandArbiter
 from aerokit.vehicle.commanding.cleanup import ArmCleanup, FlightCleanup
 from aerokit.vehicle.commanding.health import Health
 from aerokit.vehicle.commanding.progress import VehiclePosition
 from aerokit.vehicle.commanding.sender import OrderSender
 from aerokit.vehicle.state.states import States
-from aerokit.vehicle.state.telemetry import height_above_home
+from aerokit.vehicle.state.telemetry import height_above_home, is_reported_on_ground
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,7 +58,7 @@ class VehicleContext:
         hold_mode, mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol), telemetry.mode.latest
         if mode is not None and mode == hold_mode:
             where = "holding in"
-        elif telemetry.is_armed and telemetry.landed_state.latest == MavLandedState.ON_GROUND:
+        elif telemetry.is_armed and is_reported_on_ground(telemetry):
             where = "on the ground in"  # A copter in LAND stays armed for some seconds after the touchdown.
         else:
             where = "in"

@@ -20,6 +20,7 @@ from aerokit.vehicle.commanding.progress import (
     StallDetector,
     await_progress,
 )
+from aerokit.vehicle.state.telemetry import is_reported_on_ground
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -235,7 +236,7 @@ class FlightActions(VehicleBase):
 
         def is_down() -> bool:
             is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
-            is_landed = landed.latest == MavLandedState.ON_GROUND and landed.updated_at > order.given_at
+            is_landed = is_reported_on_ground(self.telemetry) and landed.updated_at > order.given_at
             return ground.confirms(is_disarmed or is_landed or (has_left_surfacing_mode() and not is_deep()))
 
         def has_left_surfacing_mode() -> bool:

@@ -8,13 +8,14 @@ import anyio
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavCmd, MavLandedState, MavMissionType, MavResult, MissionState
+from aerokit.mavlink.enums import MavCmd, MavMissionType, MavResult, MissionState
 from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.ground import GroundCheck
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
 from aerokit.vehicle.missions.plans import VehiclePlan
 from aerokit.vehicle.missions.stalling import MissionStallDetector
+from aerokit.vehicle.state.telemetry import is_reported_on_ground
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -153,8 +154,8 @@ class MissionEndDetector:
 
     @property
     def _is_on_ground(self) -> bool:
-        landed = self._session.telemetry.landed_state.latest
-        return self._session.telemetry.is_confirmed_disarmed or landed == MavLandedState.ON_GROUND
+        telemetry = self._session.telemetry
+        return telemetry.is_confirmed_disarmed or is_reported_on_ground(telemetry)
 
 
 @checks_arguments

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.mavlink.enums import MavCmd, MavLandedState, MissionState
+from aerokit.mavlink.enums import MavCmd, MissionState
 from aerokit.vehicle.commanding.progress import StallDetector
-from aerokit.vehicle.state.telemetry import height_above_home
+from aerokit.vehicle.state.telemetry import height_above_home, is_reported_on_ground
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -87,4 +87,4 @@ class MissionStallDetector:
         telemetry = self._session.telemetry
         height_m = height_above_home(telemetry)
         is_low = height_m is not None and height_m < GROUND_HEIGHT_M
-        return is_low or telemetry.landed_state.latest == MavLandedState.ON_GROUND
+        return is_low or is_reported_on_ground(telemetry)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.autopilots import Autopilot, autopilot_for
 from aerokit.connection.cells import Source, StateCell
 from aerokit.connection.heartbeats import is_autopilot
+from aerokit.mavlink.enums import MavLandedState
 from aerokit.mavlink.message import decoder_of, offset_of
 from aerokit.vehicle.state.field import MESSAGE_IDS, Context, MessageSource, StreamedMessage, message_type
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, LAZY, SOURCES, STATES, States
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 FALLBACK_DELAY_S = 2.0
 # Maximum number of mode names to store. A faulty vehicle could send AVAILABLE_MODES with ever new modes.
 MAX_MODE_NAMES = 256
+LANDED_STATE_MAX_AGE_S = 5.0
+"""Maximum age in seconds of a landed state that counts as the present one. Vehicles send it at 1 Hz or faster."""
 
 Handler = Callable[[Any, Source], None]
 
@@ -300,6 +303,12 @@ class Telemetry(States):
     def _publish_texts(self, texts: Iterable[StatusText], source: Source) -> None:
         for text in texts:
             self.status_text.set(text, source)
+
+
+def is_reported_on_ground(telemetry: Telemetry) -> bool:
+    """Return True if the vehicle reports that it is on the ground. An old report may be from before its take-off."""
+    landed = telemetry.landed_state
+    return landed.latest == MavLandedState.ON_GROUND and landed.age <= LANDED_STATE_MAX_AGE_S
 
 
 def height_above_home(telemetry: Telemetry) -> float | None:
