@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
 from aerokit.errors import OperationTimeout
@@ -53,3 +55,13 @@ def test_set_current_retries_then_times_out() -> None:
     assert 2 <= sent <= 5
     with pytest.raises(OperationTimeout, match="reported nothing"):
         exchange.result()
+
+
+@pytest.mark.parametrize(("now", "attempts"), [(3.0, 2), (9.0, 1)])
+def test_item_is_not_set_again_after_old_heartbeat(now: float, attempts: int) -> None:
+    """The event loop was blocked, and the HEARTBEAT arrived at its beginning."""
+    status = SimpleNamespace(end="", heartbeat_at=0.8)
+    exchange = SetCurrentItem(1, 1, 2, order_status=status, idle_timeout_s=20.0)
+    exchange.start(0.0)
+    exchange.expire(now)
+    assert len(exchange.take_outbox()) == attempts

@@ -90,9 +90,10 @@ ATTEMPT_TIMEOUT_S = 1.0
 POLL_INTERVAL_S = 0.05
 
 MAX_HEARTBEAT_AGE_S = 2.5
-"""Maximum age in seconds of a HEARTBEAT after which an order is repeated.
+"""Maximum age in seconds of a HEARTBEAT that counts as the vehicle's present state.
 
-A HEARTBEAT is older if the event loop was blocked. Since its arrival, a failsafe or a pilot may have taken over.
+Two HEARTBEATs may be lost. Ground-station failsafes act later (FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s). A HEARTBEAT may
+be older when it is processed, if the event loop was blocked.
 """
 
 # An order is repeated at the earliest after this fraction of ``attempt_timeout``. It is below 1, because a repetition

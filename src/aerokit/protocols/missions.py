@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from aerokit.errors import MissionRejected, MissionTimeout, OperationTimeout
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType
 from aerokit.mavlink.messages import MissionAck, MissionClearAll, MissionCurrent, MissionSetCurrent
+from aerokit.protocols.command import MAX_HEARTBEAT_AGE_S
 from aerokit.protocols.exchange import Transfer, TransferOptions
 
 if TYPE_CHECKING:
@@ -227,7 +228,9 @@ class SetCurrentItem(Transfer[None]):
         self._reported = message.seq
 
     def expire(self, now: float) -> None:
-        end = "" if self._order_status is None else self._order_status.end
+        status = self._order_status
+        end = "" if status is None else status.end
+        min_heartbeat_at = max(self._sent_at, now - MAX_HEARTBEAT_AGE_S)
         if end or self._is_idle(now):
             reported = "nothing" if self._reported is None else f"item {self._reported}"
             self._fail(
@@ -237,8 +240,8 @@ class SetCurrentItem(Transfer[None]):
                     + (f"; not sent again: {end}" if end else "")
                 )
             )
-        elif self._order_status is not None and self._order_status.heartbeat_at < self._sent_at:
-            self.deadline = now + POLL_INTERVAL_S  # No HEARTBEAT since the last transmission: wait for one.
+        elif status is not None and status.heartbeat_at < min_heartbeat_at:
+            self.deadline = now + POLL_INTERVAL_S  # No recent HEARTBEAT since the last transmission: wait for one.
         else:
             self._send(now)
 

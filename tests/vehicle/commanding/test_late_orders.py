@@ -235,6 +235,27 @@ async def test_setpoints_after_blocked_loop_need_heartbeat() -> None:
         assert not flight.wire.setpoints()
 
 
+async def test_hold_after_blocked_loop_needs_heartbeat() -> None:
+    """The ground station failsafe acted during the pause, and HEARTBEAT reported that after the socket was full."""
+    async with in_the_air() as flight:
+        going = asyncio.ensure_future(flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500)))
+        await anyio.sleep(2)
+        flight.copter.faults.silent = True
+        await anyio.sleep(3)
+        flight.wire.clear()
+        going.cancel()
+        await asyncio.wait([going])
+        assert flight.vehicle.is_hold_pending
+        heartbeats = HeldHeartbeats(flight.wire)
+        flight.copter.faults.silent = False
+        await anyio.sleep(1.5)
+        assert flight.copter.set_mode(CopterMode.RTL)
+        heartbeats.release_first_after(14.0)
+        await anyio.sleep(5)
+        assert flight.vehicle.mode_name == "RTL"
+        assert not flight.wire.mode_orders()
+
+
 async def test_order_is_not_repeated_after_computer_slept() -> None:
     async with in_the_air() as flight:
         flight.copter.faults.commands[C.DO_SET_MODE] = CommandFault(ignore=True)

@@ -10,6 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import CommandRejected, OperationRejected
+from aerokit.protocols.command import MAX_HEARTBEAT_AGE_S
 from aerokit.vehicle.commanding.order import SUPERSEDED, Order, SentCommand
 
 if TYPE_CHECKING:
@@ -23,11 +24,8 @@ MODE_GRACE_S = 3.0
 """Seconds by which HEARTBEAT (1 Hz) may lag behind an accepted command that changes the mode."""
 ARM_HEARTBEAT_DELAY_S = 1.5
 """Seconds after an accepted arm command in which HEARTBEAT (1 Hz) may still report the previous state."""
-MODE_MAX_AGE_S = 2.5
-"""Maximum age in seconds of a HEARTBEAT that counts as the vehicle's present state.
-
-Two HEARTBEATs may be lost. Ground-station failsafes act later (FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s).
-"""
+MODE_MAX_AGE_S = MAX_HEARTBEAT_AGE_S
+"""Maximum age in seconds of a HEARTBEAT that counts as the vehicle's present state."""
 OWN_MODES_MAX_AGE_S = 10.0
 """For this many seconds after the program ordered a mode, a change to that mode does not count as a takeover."""
 

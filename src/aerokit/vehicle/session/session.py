@@ -35,6 +35,7 @@ from aerokit.mavlink.messages import (
     GpsGlobalOrigin,
     HomePosition,
 )
+from aerokit.protocols.command import MAX_HEARTBEAT_AGE_S
 from aerokit.vehicle.session.commands import CommandSender
 from aerokit.vehicle.session.rates import MessageRates
 from aerokit.vehicle.session.subscriber import ComponentSubscriber, WatchedStream
@@ -243,10 +244,15 @@ class VehicleSession:
             raise OperationRejected(f"{action}: the vehicle is {state}; nothing was sent")
 
     async def wait_for_heartbeat(self, since: float | None = None) -> None:
-        """Wait for a HEARTBEAT that is received after ``since``, or after this call if ``since`` is None."""
+        """Wait for a HEARTBEAT that is received after ``since``, or after this call if ``since`` is None.
+
+        A HEARTBEAT that waited long while the event loop was blocked does not count.
+        """
         # Every HEARTBEAT updates `armed`.
         armed, start = self.telemetry.armed, self.connection.now() if since is None else since
-        await armed.wait_until(lambda _: armed.updated_at > start, description="the next HEARTBEAT")
+        await armed.wait_until(
+            lambda _: armed.updated_at > start and armed.age <= MAX_HEARTBEAT_AGE_S, description="the next HEARTBEAT"
+        )
 
     @contextmanager
     def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
