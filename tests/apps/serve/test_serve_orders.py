@@ -9,7 +9,7 @@ from typing import Any
 import anyio
 import httpx
 import pytest
-from flight_harness import open_flight
+from flight_harness import open_flight, suspend_computer
 from serve_stage import HOST, TOKEN, Stage, open_stage
 
 import aerokit
@@ -144,6 +144,17 @@ async def test_values_beyond_json_are_refused(order: str, content: bytes) -> Non
         assert answer.status_code == 400
         listed = await stage.client.get("/api/orders", headers=BEARER)
         assert (listed.status_code, listed.json()) == (200, {"orders": []})
+
+
+async def test_order_based_on_state_from_before_sleep_is_refused() -> None:
+    async with open_stage() as stage:
+        seen_at = str(asyncio.get_running_loop().time())
+        accepted = await stage.submit("mode", {"mode": "GUIDED"}, Aerokit_Seen_At=seen_at)
+        await asyncio.sleep(0.5)
+        suspend_computer(stage.flight.vehicle, 600.0)
+        refused = await stage.submit("arm", Aerokit_Seen_At=seen_at)
+        assert (accepted.status_code, refused.status_code, refused.json()["error"]) == (200, 409, "Late")
+        assert not stage.flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM)
 
 
 async def test_unknown_vehicle_id_is_refused() -> None:

@@ -6,7 +6,7 @@ import asyncio
 
 import anyio
 import pytest
-from flight_harness import Flight, open_flight, open_px4
+from flight_harness import Flight, open_flight, open_px4, suspend_computer
 
 from aerokit.errors import AerokitError, CommandTimeout, OperationRejected
 from aerokit.mavlink import FrameEncoder
@@ -114,6 +114,20 @@ async def test_pilot_arming_after_mode_change_stays_armed(grounded: Flight, capl
     assert grounded.copter.is_armed
     assert ordered(grounded) == [1]
     assert "it stays armed, because another party may have armed it" in caplog.text
+
+
+async def test_pilot_arming_while_computer_slept_stays_armed(grounded: Flight) -> None:
+    """The arm command was lost. By the loop's clock, the next HEARTBEAT follows within a second."""
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.ignore(ARM)
+    with anyio.move_on_after(0.1):
+        await grounded.vehicle.arm()
+    assert ordered(grounded) == [1]
+    suspend_computer(grounded.vehicle, 600.0)
+    assert grounded.copter.arming.arm()
+    grounded.copter.faults.commands.clear()
+    await anyio.sleep(ARM_WATCH_S)
+    assert ordered(grounded) == [1]
 
 
 async def test_pilot_arming_later_by_sticks_stays_armed(grounded: Flight) -> None:

@@ -76,6 +76,15 @@ async def test_autotune_is_not_started_again_after_pause() -> None:
         assert max(late - early for early, late in pairwise(sent)) < 3
 
 
+async def test_autotune_is_not_started_again_after_computer_slept() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        asyncio.get_running_loop().call_later(2.5, suspend_computer, flight.vehicle, 20.0)
+        with pytest.raises(CommandTimeout, match="may go on tuning"):
+            await flight.vehicle.autotune()
+        assert len(flight.wire.commands(C.DO_AUTOTUNE_ENABLE)) == 3
+
+
 async def test_follow_slow_function_gives_no_velocity_peaks() -> None:
     """The function returns the latest position; a new one arrives once a second."""
     async with in_the_air() as flight:

@@ -337,7 +337,9 @@ class OrderRunner:
         """Raise the error that applies if the order must not be sent now."""
         vehicle.connection.raise_if_ended()
         now = asyncio.get_running_loop().time()
-        if seen_at_s is not None and not 0 <= now - seen_at_s <= STATE_MAX_AGE_S:
+        # While the computer sleeps, the loop's clock stands still, and the page still shows the state from before.
+        slept_s = 0.0 if seen_at_s is None else vehicle.connection._slept_since(seen_at_s)
+        if seen_at_s is not None and not 0 <= now - seen_at_s + slept_s <= STATE_MAX_AGE_S:
             raise HttpProblem(
                 409,
                 "Late",

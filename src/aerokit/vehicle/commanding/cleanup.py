@@ -366,6 +366,8 @@ class ArmCleanup:
         The order armed it if the vehicle accepted the order and has not reported disarmed since. Without an
         acknowledgement, the order armed it if the next HEARTBEAT reports armed and there was no takeover.
         """
+        if self._arbiter.slept_since(order.given_at) > 0:  # Another party had time to arm it while the computer slept.
+            return False
         reported_after_s = self._session.telemetry.armed.updated_at - order.given_at
         if not order.end and reported_after_s <= ARM_HEARTBEAT_DELAY_S:
             return True

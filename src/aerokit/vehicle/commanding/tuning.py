@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import anyio
@@ -75,7 +74,7 @@ class TuningActions(VehicleBase):
                     percent = answer.progress
                     await anyio.sleep(POLL_INTERVAL_S if percent < TUNED_PERCENT else 0)
                     self._sender.raise_if_ended(order)
-                    if percent < TUNED_PERCENT and self.connection.now() - _received_at(answer) > MAX_ANSWER_AGE_S:
+                    if percent < TUNED_PERCENT and self._age_of(answer) > MAX_ANSWER_AGE_S:
                         raise CommandTimeout(
                             "autotune: this program was blocked for too long and could not poll PX4; PX4 may go on"
                             " tuning"
@@ -96,7 +95,7 @@ class TuningActions(VehicleBase):
         link = self._session.describe_link()
         raise CommandTimeout(f"autotune: MAV_CMD_DO_AUTOTUNE_ENABLE was not acknowledged; PX4 may go on tuning; {link}")
 
-
-def _received_at(answer: CommandAck) -> float:
-    frame = answer.received_frame
-    return math.inf if frame is None else frame.received_at
+    def _age_of(self, answer: CommandAck) -> float:
+        frame = answer.received_frame
+        received_at = self.connection.now() if frame is None else frame.received_at
+        return self.connection.now() - received_at + self.connection._slept_since(received_at)
