@@ -12,6 +12,7 @@ from typing import Any
 
 import anyio
 import pytest
+from flight_harness import block_loop
 from hub_stage import COPTER, STATION, Program, SlowLink, settle
 from wrong_types import misuses
 
@@ -87,6 +88,44 @@ async def test_frames_are_forwarded_unchanged() -> None:
         assert tablet.received == ["HEARTBEAT", "ATTITUDE", "HEARTBEAT"]
         assert of(hub, "b").dropped == {"no_route": 1}
         assert of(hub, "a").systems == ((1, 1),)
+
+
+@virtual
+async def test_commands_are_not_forwarded_after_blocked_loop() -> None:
+    copter, station, events = Program(1, 1), Program(255, 190), list[HubEvent]()
+    async with joined(copter, station) as hub:
+        hub.on_event(events.append)
+        copter.send(COPTER)
+        station.send(STATION)
+        await anyio.sleep(1.0)
+        for blocked_s, expected in ((0.8, ["HEARTBEAT", "COMMAND_LONG"]), (10.0, ["HEARTBEAT"])):
+            copter.frames.clear()
+            station.send(STATION, ORDER)
+            block_loop(blocked_s)
+            await anyio.sleep(1.0)
+            assert copter.received == expected
+        assert of(hub, "b").dropped == {"late": 1}
+        assert "COMMAND_LONG for 1/1 was dropped after 10.0 s: it waited too long" in events[-1].text
+        station.send(ORDER)
+        await settle()
+        assert copter.received == ["HEARTBEAT", "COMMAND_LONG"]
+
+
+@virtual
+async def test_queued_commands_are_dropped_when_computer_slept() -> None:
+    link, station = SlowLink(), Program(255, 190)
+    async with station, Hub([Endpoint(link, name="radio"), station.endpoint("b")]) as hub:
+        assert hub._switch is not None
+        link.receiver.bytes_received(FrameEncoder(1, 1).encode(COPTER), None)
+        await settle()
+        link.unsent = 10**6
+        station.send(STATION, ORDER)
+        await anyio.sleep(0.2)
+        assert of(hub, "radio").waiting == 2
+        watch = hub._switch._loop_watch
+        watch._suspended = lambda: watch._suspended_before + 600.0
+        await anyio.sleep(0.2)
+        assert (of(hub, "radio").waiting, of(hub, "radio").dropped["late"]) == (1, 1)
 
 
 @virtual

@@ -10,6 +10,7 @@ from aerokit.connection.frame_receiver import MAX_PEERS, PeerTable
 from aerokit.hub.message_rules import Filters, MessageKind
 from aerokit.hub.port import UNLIMITED, EndpointCounters, Port, SigningGateway, joined
 from aerokit.hub.senders import IdentityGuard
+from aerokit.hub.shared_link import SharedLink
 from aerokit.hub.values import EndpointStatistics
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2
 from aerokit.transport import ReconnectingLink, create_link
@@ -57,6 +58,7 @@ class Attachment:
             self.link: Link = ReconnectingLink(make_link)
         else:
             self.link = address
+        self._is_shared = isinstance(self.link, SharedLink)
         self.name: str = endpoint.name or self.link.address
         self.keeps_peers = True
         self.is_open: bool = False
@@ -162,7 +164,9 @@ class Attachment:
                 self._report_full(framer, port_peer)
             if frames:
                 port = self._ports.get(port_peer) or self._add_port(port_peer)
-                self._switch.receive(port, framer, frames, data if is_whole else None, now)
+                # Frames of our own program come without a socket, and therefore are never late.
+                are_late = not self._is_shared and self._switch.may_be_late(now)
+                self._switch.receive(port, framer, frames, data if is_whole else None, now, are_late=are_late)
                 if port_peer != peer:  # A peer of a udpbcast link has answered the broadcast: send to this peer only.
                     self.link.keep_peer(peer)
         except Exception as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.hub.message_rules import ORDER_MAX_AGE_S, MessageKind, kind_of
@@ -286,6 +287,14 @@ class Port:
             assert raw is not None
             self.batch.append(raw)
             self.flush(unix_time)
+
+    def drop_orders(self) -> None:
+        """Drop all queued commands."""
+        self._drop(self._queue.expire(math.inf))
+
+    def drop_late(self, frame: Frame, target: tuple[int, int], since: float) -> None:
+        """Drop a command that was received at this port, and has waited since this time."""
+        self._drop([("late", QueuedFrame(frame.raw, MessageKind.ORDER, frame.message_id, target, since))])
 
     def close(self) -> None:
         self._drop(self._queue.clear())

@@ -7,7 +7,8 @@ import time
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
-from aerokit.hub.message_rules import TargetFields
+from aerokit.connection.loop_watch import LoopWatch
+from aerokit.hub.message_rules import ORDER_MAX_AGE_S, TargetFields
 from aerokit.hub.port import MAX_JOINED_BYTES
 from aerokit.hub.routing import Router
 
@@ -47,9 +48,12 @@ class Switch:
         self._loop = asyncio.get_running_loop()
         self._clock = self._loop.time
         self._unix_epoch_s = time.time() - self._clock()
-        self.router: Router[Port] = Router(TargetFields(dialect), period)
+        self._targets = TargetFields(dialect)
+        self.router: Router[Port] = Router(self._targets, period)
         self.router.on_vehicle = _write_single_frames
         self._on_error = on_error
+        self._loop_watch = LoopWatch(lambda _: None, lambda _: self._drop_queued_orders())
+        self._loop_watch.start()
         self.recording: Recording | None = None
         """Recording of every forwarded frame."""
         self._ports_to_flush: list[Port] = []
@@ -73,14 +77,33 @@ class Switch:
         port.close()
 
     def close(self) -> None:
+        self._loop_watch.close()
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
         self._ports_to_flush.clear()
         self._queueing_ports.clear()
 
-    def receive(self, port: Port, framer: Framer, frames: list[Frame], data: bytes | None, now: float) -> None:
-        """Forward frames received at a port. ``data`` has their bytes; None if other bytes were between them."""
+    def may_be_late(self, now: float) -> bool:
+        """Return True if commands that are read now may be too old, because the event loop was blocked.
+
+        They may have waited in a socket since the loop last ran, or the computer was suspended.
+        """
+        watch = self._loop_watch
+        return now > watch.late_after and now - watch.arrival(now) > ORDER_MAX_AGE_S
+
+    def _drop_queued_orders(self) -> None:
+        """Drop all commands that wait for full links, because they are too old after the computer was suspended."""
+        for port in self._queueing_ports:
+            port.drop_orders()
+
+    def receive(
+        self, port: Port, framer: Framer, frames: list[Frame], data: bytes | None, now: float, *, are_late: bool = False
+    ) -> None:
+        """Forward frames received at a port. ``data`` has their bytes; None if other bytes were between them.
+
+        With ``are_late``, commands among them are dropped.
+        """
         # Hot path: local variables are faster than attributes.
         node, guard, peer = port.node, port.guard, port.peer
         if node is None or port.is_read_only:
@@ -98,6 +121,8 @@ class Switch:
             frames, late = self._admitted(port, framer, frames)
             if port.gateway is not None or len(frames) != received_count:
                 data = None  # The bytes as received are no longer those of the frames to forward.
+        if are_late:
+            frames, data = self._without_orders(port, frames, now), None
         plans = self.router.route_all(node, frames, now, late)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
             for frame, plan in zip(frames, plans, strict=True):
@@ -140,6 +165,17 @@ class Switch:
             if received in framer.late:
                 late.append(frame)
         return admitted, late
+
+    def _without_orders(self, port: Port, frames: list[Frame], now: float) -> list[Frame]:
+        """Drop commands, and return the other frames."""
+        remaining = []
+        for frame in frames:
+            target = self._targets.target_of(frame)
+            if self._targets.is_order(frame.message_id):
+                port.drop_late(frame, target, self._loop_watch.arrival(now))
+            else:
+                remaining.append(frame)
+        return remaining
 
     def _forward_together(self, plans: list[ForwardingPlan[Port]], data: bytes) -> bool:
         """Forward ``data`` as it is if its frames go to the same ports, and fit into one write. Else return False."""
