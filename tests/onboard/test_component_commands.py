@@ -7,6 +7,7 @@ import math
 from typing import Annotated
 
 import pytest
+from flight_harness import block_loop
 from onboard_peers import autopilot_and_client, payload_and_station
 
 from aerokit.errors import BusyError, CommandRejected, InvalidArgument
@@ -143,6 +144,26 @@ async def test_repetition_after_command_of_other_sender_is_not_executed() -> Non
     assert [(ack.target_system, ack.result) for ack in acks] == [
         (system, MavResult.ACCEPTED) for system in (255, 200, 255)
     ]
+
+
+@pytest.mark.parametrize(("blocked_s", "is_executed"), [(3.0, True), (10.0, False)])
+async def test_command_from_before_blocked_loop_is_not_executed(blocked_s: float, is_executed: bool) -> None:
+    """Its sender has given up, and people may have come near since."""
+    calls = 0
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest) -> None:
+            nonlocal calls
+            calls += 1
+
+        await asyncio.sleep(1.0)
+        station.connection.send(station.command_long(MavCmd.USER_1, 1))
+        block_loop(blocked_s)
+        await asyncio.sleep(1.0)
+        assert calls == is_executed
+        await station.command(MavCmd.USER_1, 2)
+        assert calls == is_executed + 1
 
 
 async def test_results_of_many_senders_are_bounded() -> None:

@@ -24,6 +24,8 @@ logger: logging.Logger = logging.getLogger("aerokit")
 TEXT_SIZE = 50
 MAX_TEXT_SIZE = 254
 """Maximum number of characters of a status text; longer texts are cut."""
+MAX_COMMAND_AGE_S = 5.0
+"""Maximum age in seconds of a command that is executed. Senders give up earlier."""
 _COMMANDS = (m.CommandLong.ID, m.CommandInt.ID)
 
 
@@ -67,7 +69,7 @@ class ComponentHost:
 
         def on_message(message: Message) -> None:
             sender = sender_of(message)
-            if not self._is_closed and self._is_addressed(message, sender):
+            if not self._is_closed and self._is_addressed(message, sender) and not self._is_late(message):
                 self._guarded(lambda: handler(message, sender))
 
         self._detachments.append(self.connection.bus.attach(message_class, on_message))
@@ -83,6 +85,16 @@ class ComponentHost:
         # A command that this component does not know may be meant for another one, so do not refuse it.
         is_command_to_all = component == 0 and message.ID in _COMMANDS
         return not is_command_to_all or self.knows_command(message.command)  # type: ignore[attr-defined]
+
+    def _is_late(self, message: Message) -> bool:
+        """Return True for a command that may have waited too long while the event loop was blocked."""
+        frame = message.received_frame
+        age_s = 0.0 if frame is None else self.now - frame.received_at
+        if message.ID not in _COMMANDS or age_s <= MAX_COMMAND_AGE_S:
+            return False
+        ids = (self.system_id, self.component_id)
+        logger.warning("component %d/%d: a command that may be %.0f s old was not executed", *ids, age_s)
+        return True
 
     def send(self, message: Message, channel: Channel = None) -> None:
         """Send a message to one system, or to all if ``channel`` is None. Does nothing after the connection ended."""
