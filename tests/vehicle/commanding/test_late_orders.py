@@ -27,6 +27,7 @@ from aerokit.errors import (
     HeartbeatTimeout,
     InvalidArgument,
     OperationRejected,
+    OperationTimeout,
     SetpointStreamStopped,
     ValueUnknownError,
 )
@@ -225,6 +226,22 @@ async def test_take_off_command_after_blocked_loop_needs_heartbeat(blocked_s: fl
             with pytest.raises(HeartbeatTimeout, match="the rest of the order was not sent"):
                 await going
         going.cancel()
+
+
+async def test_arm_after_blocked_loop_needs_heartbeat() -> None:
+    """The vehicle has disarmed by itself during the pause, but HEARTBEATs were lost."""
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.set_mode("GUIDED")
+        await flight.vehicle._session.wait_for_heartbeat()
+        heartbeats = HeldHeartbeats(flight.wire)
+        arming = asyncio.ensure_future(flight.vehicle.arm())
+        await anyio.sleep(1.2)
+        flight.copter.arming.disarm()
+        heartbeats.release_first_after(14.0)
+        assert flight.vehicle.is_armed
+        with pytest.raises(OperationTimeout, match=r"arm\(\): not done within 10 s"):
+            await arming
 
 
 async def test_setpoints_after_blocked_loop_need_heartbeat() -> None:

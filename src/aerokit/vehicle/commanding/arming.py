@@ -241,7 +241,7 @@ class ArmingActions(VehicleBase):
         await await_progress(
             self._session,
             "arm()" if armed else "disarm()",
-            is_done=lambda: cell.latest is armed and cell.updated_at > started,
+            is_done=lambda: cell.latest is armed and cell.updated_at > started and self._arbiter.is_state_recent,
             # A mode change or a failsafe does not keep the vehicle from disarming.
             failure_reason=lambda: order.takeover_reason if armed else None,
             describe=lambda: "; ".join(self._session.texts_since(started)) or "the vehicle sent no status text",

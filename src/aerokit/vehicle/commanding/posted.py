@@ -176,5 +176,4 @@ class PostedOrder:
         if self._was_left:
             raise InvalidArgument(f"the `with` block of this order was left: {command_name(command)} was not sent")
         self._refusal_watch.close()
-        self._order.was_sent = False  # Each command of a posted order is a decision of the program, not a further step.
         self._refusals = self._refusal_watch.enter_context(self._session.refusals_of(command))
