@@ -97,9 +97,9 @@ class OrderSender:
         """
         if self._arbiter.is_state_recent:
             return
-        with anyio.move_on_after(max(0.0, MAX_SILENCE_S - self._session.telemetry.armed.age)):
+        with anyio.move_on_after(max(0.0, MAX_SILENCE_S - self._session.telemetry.armed.age)) as scope:
             await self._session.wait_for_heartbeat()
-        if not self._arbiter.is_state_recent:
+        if scope.cancelled_caught:
             link = self._session.describe_link()
             raise HeartbeatTimeout(f"the vehicle is silent; {link}; the rest of the order was not sent")
         self.raise_if_ended(order)
