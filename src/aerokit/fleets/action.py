@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Awaitable, Callable, Mapping
 from fnmatch import fnmatchcase
 from functools import partial
@@ -33,6 +34,31 @@ if TYPE_CHECKING:
     from aerokit.fleets.policy import PolicyOrder, PolicyRules
     from aerokit.missions.mission import Mission
     from aerokit.vehicle.vehicle import Vehicle
+
+
+START_TOLERANCE_S = 0.001
+"""By how much the delay between the starts of two members may be shorter than ``stagger_s``."""
+
+
+async def wait_to_start(member: Member, delay_s: float, action: str) -> float:
+    """Wait before a member's order, and then for its next HEARTBEAT if the last one is not recent.
+
+    Return how much longer than ``delay_s`` this took.
+
+    Raises:
+        OperationRejected: the computer slept meanwhile, so that the order would be late, or the member is unavailable.
+        HeartbeatTimeout: the member is silent.
+    """
+    connection = member.vehicle.connection
+    began_at = connection.now()
+    await anyio.sleep(delay_s)
+    await member.vehicle._sender.await_recent_state()
+    if connection._slept_since(began_at) > 0:
+        raise OperationRejected(f"{action}: the computer slept before {member.name} started; nothing was sent to it")
+    member.refresh()
+    if not member.is_available:
+        raise OperationRejected(f"{action}: {member.name} is {member.status}")
+    return connection.now() - began_at - delay_s
 
 
 class FleetAction:
@@ -79,6 +105,7 @@ class FleetAction:
         self._failed_first: tuple[int, str] | None = None
         self._order_errors: dict[str, str] = {}
         self._pending_orders = 0
+        self._started_at = -math.inf  # when the last member started
         self._is_applying_policy = False
         self._finished = asyncio.Event()
         # An error that is not of aerokit, raised by a function of the program; `run` raises it at the end.
@@ -147,8 +174,12 @@ class FleetAction:
         try:
             if member.name in self._stopped:  # by the policy, before this task began
                 return
-            if delay_s:
-                await anyio.sleep(delay_s)
+            wait_s = delay_s
+            while wait_s > START_TOLERANCE_S:
+                await wait_to_start(member, wait_s, self.name)
+                # After a blocked event loop, the delays of several members may end at once.
+                wait_s = self._started_at + self._stagger_s - self._context.now()
+            self._started_at = self._context.now()
             if not member.is_available:
                 raise OperationRejected(f"{self.name}: {member.name} is {member.status}")
             value = await self._execute_in_time(member)

@@ -24,6 +24,9 @@ __all__ = [
 
 DELAY_STEP_S = 1.0
 
+SLACK_S = 3.0
+"""How late a vehicle may start in its corridor, in seconds, if the program chooses no other ``slack_s``."""
+
 
 class Route(Snapshot):
     """A straight path between two points in metres north, east and up of a common origin."""
@@ -56,6 +59,7 @@ class Deconfliction(Snapshot):
     - ``"refused"``: the conflicts cannot be resolved.
 
     ``conflicts`` has the conflicts of the direct paths, without separation. Heights are in metres above sea level.
+    In corridors, a vehicle that would start more than ``slack_s`` seconds late does not start.
     """
 
     decision: Literal["clear", "layers", "corridors", "refused"]
@@ -64,6 +68,7 @@ class Deconfliction(Snapshot):
     conflicts: Sequence[Conflict] = ()
     heights_m: Mapping[str, float] = {}
     delays_s: Mapping[str, float] = {}
+    slack_s: float = SLACK_S
 
 
 def find_conflicts(paths: Sequence[Path], min_distance_m: float, *, slack_s: float = math.inf) -> tuple[Conflict, ...]:
@@ -137,7 +142,7 @@ def separate_by_time(
     min_distance_m: float,
     speed_m_s: float,
     *,
-    slack_s: float = 3.0,
+    slack_s: float = SLACK_S,
     max_delay_s: float = 300.0,
 ) -> Deconfliction:
     """Separate conflicting routes by time.
@@ -161,7 +166,7 @@ def separate_by_time(
             delays = {route.name: delays[route.name] for route in routes}  # back in the order of `routes`
             max_s = max(delays.values())
             reason = f"{_describe_pairs(conflicts)} come too close; starts are delayed by up to {max_s:g} s"
-            return Deconfliction("corridors", reason, min_distance_m, conflicts, {}, delays)
+            return Deconfliction("corridors", reason, min_distance_m, conflicts, {}, delays, slack_s)
         refusal = f"{blocked_route.name} would have to wait for {blocker} longer than {max_delay_s:g} s"
         # Routes wait only for those before them in the order, so the next try begins with the blocked route.
         order = [blocked_route, *(route for route in order if route is not blocked_route)]

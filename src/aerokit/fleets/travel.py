@@ -11,13 +11,14 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.formatting import short_repr
 from aerokit.errors import InvalidArgument, OperationRejected, ValueUnknownError
-from aerokit.fleets.action import SelectionBase
+from aerokit.fleets.action import SelectionBase, wait_to_start
 from aerokit.fleets.distances import LocalOrigin, altitude_amsl, position_of
 from aerokit.fleets.events import PathsCompared
 from aerokit.fleets.members import Member
 from aerokit.fleets.paths import LocalPoint, Path, PathPoint
 from aerokit.fleets.policy import FleetResult
 from aerokit.fleets.separation import (
+    SLACK_S,
     Deconfliction,
     Route,
     find_conflicts,
@@ -57,11 +58,12 @@ class Travel(SelectionBase):
             speed_m_s: ground speed in m/s; None: unchanged.
             max_distance_m: reject targets that are farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.
-            stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
+            stagger_s: delay in seconds between the starts of consecutive members; None: all at once. Not for corridors.
             separation: result of :meth:`plan_separation` for these targets.
 
         Raises:
-            InvalidArgument: a name is unknown, or a target is too far away. Nothing was sent.
+            InvalidArgument: a name is unknown, a target is too far away, or ``stagger_s`` would change the delays of
+                corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, and nothing was sent; or a member became
                 unavailable after a leg, and the other members stay in their layers.
@@ -93,7 +95,7 @@ class Travel(SelectionBase):
         by: SeparationMethod = "layers",
         speed_m_s: float | None = None,
         max_altitude_m: float | None = None,
-        slack_s: float = 3.0,
+        slack_s: float = SLACK_S,
     ) -> Deconfliction:
         """Compare the straight paths to these targets and plan their separation. Nothing is sent.
 
@@ -106,7 +108,8 @@ class Travel(SelectionBase):
                 ``"refuse"`` refuses crossing paths.
             speed_m_s: ground speed of all members in m/s, for corridors.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
-            slack_s: for corridors: how early or late a member may be relative to another, in seconds.
+            slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member that
+                would start later, because the event loop was blocked, does not start.
 
         Raises:
             InvalidArgument: a name is unknown, or a required argument is missing.
@@ -146,12 +149,13 @@ class Travel(SelectionBase):
         if separation is None and self._context.min_distance_m is not None:
             separation = self.plan_separation(targets, speed_m_s=speed_m_s)
         if separation is None or separation.decision == "clear":
-            return await self._fly_to(action, targets, speed_m_s, timeout, stagger_s, None, names, max_distance_m)
+            return await self._fly_to(action, targets, speed_m_s, timeout, max_distance_m, names, stagger_s=stagger_s)
         if separation.decision == "refused":
             raise OperationRejected(f"{action}: {separation.reason}; nothing was sent")
         if separation.decision == "corridors":
-            delays_s = separation.delays_s
-            return await self._fly_to(action, targets, speed_m_s, timeout, stagger_s, delays_s, names, max_distance_m)
+            if stagger_s:
+                raise InvalidArgument(f"{action}: stagger_s would change the delays of corridors; nothing was sent")
+            return await self._fly_to(action, targets, speed_m_s, timeout, max_distance_m, names, corridors=separation)
         return await self._fly_in_layers(action, targets, speed_m_s, timeout, separation.heights_m, max_distance_m)
 
     def _resolve_targets(
@@ -197,14 +201,20 @@ class Travel(SelectionBase):
         targets: Mapping[str, Position],
         speed_m_s: float | None,
         timeout: float | None,
-        stagger_s: float | None = None,
-        delays_s: Mapping[str, float] | None = None,
+        max_distance_m: float,
         names: tuple[str, ...] = (),
-        max_distance_m: float = MAX_DISTANCE_M,
+        *,
+        stagger_s: float | None = None,
+        corridors: Deconfliction | None = None,
     ) -> FleetResult:
         async def fly(member: Member) -> None:
-            if delays_s and delays_s.get(member.name):
-                await anyio.sleep(delays_s[member.name])
+            delay_s = corridors.delays_s.get(member.name, 0.0) if corridors else 0.0
+            if delay_s:
+                late_s = await wait_to_start(member, delay_s, action)
+                if corridors and late_s > corridors.slack_s:
+                    raise OperationRejected(
+                        f"{action}: {member.name} would start {late_s:.1f} s late in its corridor; it stays"
+                    )
             await member.vehicle.go_to(
                 targets[member.name], speed_m_s=speed_m_s, timeout=timeout, max_distance_m=max_distance_m
             )
@@ -235,7 +245,7 @@ class Travel(SelectionBase):
                     f"{action}: {', '.join(missing)} became unavailable between two legs; the others stay in their"
                     " layers"
                 )
-            result = await self._fly_to(action, leg, speed_m_s, timeout, max_distance_m=max_distance_m)
+            result = await self._fly_to(action, leg, speed_m_s, timeout, max_distance_m)
             if not result.is_complete:
                 break
         assert result is not None

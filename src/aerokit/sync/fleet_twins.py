@@ -15,6 +15,7 @@ from aerokit._internal.arguments import checked
 from aerokit.fleets.opening import TooCloseAction
 from aerokit.fleets.opening import fleet as fleet_async
 from aerokit.fleets.policy import PolicyName
+from aerokit.fleets.separation import SLACK_S
 from aerokit.sync.blocks import BlockTwin
 from aerokit.sync.fleet_blocks import FleetTwin, SelectionTwin, opened_fleet
 from aerokit.sync.twins import Connection, Subscription, Vehicle
@@ -119,11 +120,12 @@ class Selection(SelectionTwin["AsyncSelection"]):
             speed_m_s: ground speed in m/s; None: unchanged.
             max_distance_m: reject targets that are farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.
-            stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
+            stagger_s: delay in seconds between the starts of consecutive members; None: all at once. Not for corridors.
             separation: result of :meth:`plan_separation` for these targets.
 
         Raises:
-            InvalidArgument: a name is unknown, or a target is too far away. Nothing was sent.
+            InvalidArgument: a name is unknown, a target is too far away, or ``stagger_s`` would change the delays of
+                corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, and nothing was sent; or a member became
                 unavailable after a leg, and the other members stay in their layers.
@@ -146,7 +148,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         by: SeparationMethod = "layers",
         speed_m_s: float | None = None,
         max_altitude_m: float | None = None,
-        slack_s: float = 3.0,
+        slack_s: float = SLACK_S,
     ) -> Deconfliction:
         """Compare the straight paths to these targets and plan their separation. Nothing is sent.
 
@@ -159,7 +161,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
                 ``"refuse"`` refuses crossing paths.
             speed_m_s: ground speed of all members in m/s, for corridors.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
-            slack_s: for corridors: how early or late a member may be relative to another, in seconds.
+            slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member that
+                would start later, because the event loop was blocked, does not start.
 
         Raises:
             InvalidArgument: a name is unknown, or a required argument is missing.

@@ -86,10 +86,10 @@ class OrderSender:
         if order.end:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
-    async def await_recent_state(self, order: Order) -> None:
-        """Before a further step of an order, wait for the next HEARTBEAT if the last one is not recent.
+    async def await_recent_state(self, order: Order | None = None) -> None:
+        """Before a step of an order that has waited, wait for the next HEARTBEAT if the last one is not recent.
 
-        The event loop may have been blocked since the previous step.
+        The event loop may have been blocked meanwhile. Without ``order``, nothing of the order was sent yet.
 
         Raises:
             OperationRejected: the order has ended meanwhile.
@@ -101,8 +101,10 @@ class OrderSender:
             await self._session.wait_for_heartbeat()
         if scope.cancelled_caught:
             link = self._session.describe_link()
-            raise HeartbeatTimeout(f"the vehicle is silent; {link}; the rest of the order was not sent")
-        self.raise_if_ended(order)
+            unsent = "the rest of the order was not sent" if order else "nothing was sent to it"
+            raise HeartbeatTimeout(f"the vehicle is silent; {link}; {unsent}")
+        if order:
+            self.raise_if_ended(order)
 
     def _unanswered(self, error: CommandTimeout, order: Order) -> Exception:
         """Return the error for a command without an answer: the takeover if there was one, otherwise the time-out."""

@@ -1,0 +1,100 @@
+"""Members whose orders wait (staggered starts, corridors) while the event loop is blocked or the computer sleeps."""
+
+from __future__ import annotations
+
+import asyncio
+from itertools import pairwise
+
+import anyio
+import pytest
+from fleet_stage import Stage, open_stage
+from flight_harness import block_loop, suspend_computer
+
+from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected
+from aerokit.fleets.separation import Deconfliction
+from aerokit.mavlink.enums import MavCmd
+from aerokit.position import Position
+from aerokit.testing.track import min_distance_m, record_track
+
+pytestmark = pytest.mark.anyio
+
+
+async def ready_in_guided(stage: Stage) -> None:
+    (await stage.fleet.wait_ready()).raise_for_errors()
+    (await stage.fleet.set_mode("GUIDED")).raise_for_errors()
+    stage.clear()
+
+
+async def test_staggered_member_is_not_armed_after_computer_slept() -> None:
+    async with open_stage(2) as stage:
+        await ready_in_guided(stage)
+        arming = asyncio.ensure_future(stage.fleet.arm(stagger_s=5))
+        await anyio.sleep(2)
+        suspend_computer(stage.fleet.vehicles["north/1"], 600.0)
+        result = await arming
+        assert isinstance(result.failed["north/2"], OperationRejected)
+        assert "the computer slept" in str(result.failed["north/2"])
+        assert not stage.orders_to("north/2")
+
+
+async def test_staggered_member_is_not_armed_after_blocked_loop_without_heartbeat() -> None:
+    async with open_stage(2) as stage:
+        await ready_in_guided(stage)
+        arming = asyncio.ensure_future(stage.fleet.arm(stagger_s=5))
+        await anyio.sleep(2)
+        for copter in stage.copters.values():
+            copter.faults.silent = True
+        block_loop(14.0)
+        result = await arming
+        assert isinstance(result.failed["north/2"], HeartbeatTimeout)
+        assert not stage.orders_to("north/2")
+
+
+async def test_staggered_members_start_apart_after_blocked_loop() -> None:
+    async with open_stage(4) as stage:
+        await ready_in_guided(stage)
+        asyncio.get_running_loop().call_later(1.0, block_loop, 4.0)
+        (await stage.fleet.arm(stagger_s=2)).raise_for_errors()
+        starts = sorted(stage.orders_to(name)[0][0] for name in stage.copters)
+        assert all(later - earlier > 1.99 for earlier, later in pairwise(starts))
+
+
+async def crossing_targets(stage: Stage) -> dict[str, Position]:
+    """Return targets on three paths of the same length that cross at their middles."""
+    await stage.take_off()
+    middle = stage.fleet.vehicles["north/2"]
+    await middle.go_to(middle.position.value.offset(north_m=-12.4))
+    stage.clear()
+    offsets = {"north/1": (60.0, 60.0), "north/2": (84.8, 0.0), "north/3": (60.0, -60.0)}
+    return {
+        name: stage.fleet.vehicles[name].position.value.offset(north_m=north_m, east_m=east_m)
+        for name, (north_m, east_m) in offsets.items()
+    }
+
+
+def plan_corridors(stage: Stage, targets: dict[str, Position]) -> Deconfliction:
+    plan = stage.fleet.plan_separation(targets, min_distance_m=8, by="corridors", speed_m_s=5, slack_s=1)
+    assert plan.delays_s == {"north/1": 0.0, "north/2": 3.0, "north/3": 6.0}
+    return plan
+
+
+async def test_member_late_in_its_corridor_does_not_start() -> None:
+    """The event loop is blocked from the end of one delay to that of the other."""
+    async with open_stage(3, spacing_m=30) as stage:
+        targets = await crossing_targets(stage)
+        plan = plan_corridors(stage, targets)
+        tracks = [record_track(stage.copters[name]) for name in ("north/2", "north/3")]
+        asyncio.get_running_loop().call_later(2.9, block_loop, 3.2)
+        result = await stage.fleet.go_to(targets, separation=plan, speed_m_s=5)
+        assert set(result.failed) == {"north/2"}
+        assert "s late in its corridor" in str(result.failed["north/2"])
+        assert min_distance_m(*tracks)[0] > 8
+        assert not [order for _, order in stage.orders_to("north/2") if order.command == MavCmd.DO_REPOSITION]
+
+
+async def test_stagger_with_corridors_is_refused() -> None:
+    async with open_stage(3, spacing_m=30) as stage:
+        targets = await crossing_targets(stage)
+        with pytest.raises(InvalidArgument, match="stagger_s would change the delays of corridors"):
+            await stage.fleet.go_to(targets, separation=plan_corridors(stage, targets), speed_m_s=5, stagger_s=3)
+        assert not any(map(stage.orders_to, stage.copters))
