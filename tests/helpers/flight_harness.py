@@ -179,6 +179,10 @@ class HeldHeartbeats:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._receiver, name)
 
+    def stop(self) -> None:
+        """Let the HEARTBEATs pass again."""
+        self._is_holding = False
+
     def release_first_after(self, blocked_s: float) -> None:
         """Block the event loop; then the first HEARTBEAT is read, and later ones arrive again."""
         block_loop(blocked_s)

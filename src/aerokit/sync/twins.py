@@ -2609,7 +2609,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
-            OperationTimeout: MISSION_CURRENT did not confirm the item.
+            OperationTimeout: MISSION_CURRENT did not confirm the item, or the vehicle fell silent before it was sent.
         """
         self._loop.run(self.aio.set_current, item, timeout=timeout)
 

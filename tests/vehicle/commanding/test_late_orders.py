@@ -33,6 +33,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import CopterMode
 from aerokit.mavlink.enums import MavCmd as C
+from aerokit.missions import Mission, waypoint
 from aerokit.sim import SimulatedCopter
 from aerokit.sim.faults import CommandFault
 
@@ -336,3 +337,64 @@ async def test_lost_hold_of_left_block_survives_cancellation(
         assert task.cancelled()
         await anyio.sleep(5.0)
         assert flight.vehicle.mode_name == "BRAKE"
+
+
+async def test_take_off_command_is_not_sent_after_computer_slept() -> None:
+    """After the sleep, the vehicle is still armed in the mode that the first step ordered."""
+    async with open_flight() as flight:
+        flight.copter.parameters["DISARM_DELAY"] = 0.0
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+        await flight.vehicle._session.wait_for_heartbeat()
+        heartbeats = HeldHeartbeats(flight.wire)
+        going = asyncio.ensure_future(flight.vehicle.take_off(10))
+        await anyio.sleep(1.2)
+        assert flight.wire.mode_orders() == [CopterMode.GUIDED]
+        suspend_computer(flight.vehicle, 600.0)
+        heartbeats.stop()
+        with pytest.raises(OperationRejected, match="the computer slept; the rest of the order was not sent"):
+            await going
+        assert not flight.wire.commands(C.NAV_TAKEOFF)
+
+
+async def test_arm_command_is_not_sent_after_computer_slept() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.set_mode("LAND")
+        await flight.vehicle._session.wait_for_heartbeat()
+        heartbeats = HeldHeartbeats(flight.wire)
+        arming = asyncio.ensure_future(flight.vehicle.arm(mode="GUIDED"))
+        await anyio.sleep(1.2)
+        suspend_computer(flight.vehicle, 600.0)
+        heartbeats.stop()
+        with pytest.raises(OperationRejected, match="the computer slept"):
+            await arming
+        assert not flight.wire.commands(C.COMPONENT_ARM_DISARM)
+
+
+async def test_hold_at_end_of_orbit_is_sent_although_computer_slept() -> None:
+    """The vehicle still flies the circle, so that the hold only stops it."""
+    async with open_px4() as flight:
+        await flight.take_off()
+        center = flight.vehicle.position.value
+        orbit = flight.vehicle.orbit(center, radius_m=12, speed_m_s=4, turns=0.5, max_silence_s=None)
+        orbiting = asyncio.ensure_future(orbit)
+        await anyio.sleep(6.0)
+        suspend_computer(flight.vehicle, 600.0)
+        await orbiting
+        assert flight.vehicle.mode_name == "LOITER"
+
+
+async def test_item_is_not_set_after_transfer_and_silence() -> None:
+    async with open_px4() as flight:
+        items = [waypoint(47.4, 8.55, altitude_relative_m=20.0), waypoint(47.41, 8.55, altitude_relative_m=20.0)]
+        await flight.vehicle.mission.upload(Mission(items), max_distance_m=1e8)
+        await flight.vehicle.mission._context.lock.acquire()
+        setting = asyncio.ensure_future(flight.vehicle.mission.set_current(1))
+        await anyio.sleep(1.0)
+        flight.px4.faults.silent = True
+        await anyio.sleep(4.0)
+        flight.vehicle.mission._context.lock.release()
+        with pytest.raises(HeartbeatTimeout, match="the rest of the order was not sent"):
+            await setting
+        assert not flight.wire.all(m.MissionSetCurrent)

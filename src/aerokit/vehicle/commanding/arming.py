@@ -171,10 +171,12 @@ class ArmingActions(VehicleBase):
         self, may_change_mode: bool, force: bool, timeout: float, max_silence_s: float | None
     ) -> None:
         """Arm in the present mode. If a parameter may forbid arming in this mode, change the mode after a refusal."""
+        began_at = self.connection.now()
         try:
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
-            may_be_forbidden = may_change_mode and self._is_in_optional_mode()
+            has_slept = self._arbiter.slept_since(began_at) > 0
+            may_be_forbidden = may_change_mode and not has_slept and self._is_in_optional_mode()
             other_mode = self.autopilot.mode_to_arm_in() if may_be_forbidden else None
             if other_mode is None:
                 raise
@@ -282,6 +284,7 @@ class ArmingActions(VehicleBase):
         await self._sender.ensure_mode(mode, order)
         await self._wait_until_armable()
         self._sender.raise_if_ended(order)
+        self._sender.raise_if_slept(order)
         if self._arbiter.arming_orders != arming_orders_before:
             raise OperationRejected("arm(): another arm or disarm command was given; the arm command was not sent")
         if not self._arbiter.is_state_recent:

@@ -129,6 +129,7 @@ class FlightCleanup:
 
         PX4 may be flying to a place in LOITER, its hold mode.
         """
+        order.only_stops = True
         if self._holds_by_reposition:
             await self._sender.send_long(order, *STOP_HERE)
             await self._sender.ensure_mode(mode, order)

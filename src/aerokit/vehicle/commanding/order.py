@@ -183,6 +183,8 @@ class Order:
         """
         self.was_sent: bool = False
         """True once a command of the order was sent. The next command is a further step."""
+        self.only_stops: bool = False
+        """True once the remaining steps only stop the vehicle, so that they are also sent if the computer slept."""
         self.is_confirmed: bool = False
         """True once a change to one of the order's modes, or to its armed state, was reported."""
         # Sets of modes, by their numbers in HEARTBEAT.custom_mode.

@@ -54,7 +54,8 @@ class OrderSender:
         steers waits for a recent HEARTBEAT.
 
         Raises:
-            OperationRejected: the order has ended: it was superseded or taken over.
+            OperationRejected: the order has ended: it was superseded or taken over. Or the computer slept before a
+                further step.
             HeartbeatTimeout: the vehicle was silent before a further step.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
@@ -92,9 +93,11 @@ class OrderSender:
         The event loop may have been blocked meanwhile. Without ``order``, nothing of the order was sent yet.
 
         Raises:
-            OperationRejected: the order has ended meanwhile.
+            OperationRejected: the order has ended meanwhile, or the computer slept since it was given.
             HeartbeatTimeout: the last HEARTBEAT is older than ``MAX_SILENCE_S``, or no other one arrived by then.
         """
+        if order:
+            self.raise_if_slept(order)
         if self._arbiter.is_state_recent:
             return
         with anyio.move_on_after(max(0.0, MAX_SILENCE_S - self._session.telemetry.armed.age)) as scope:
@@ -105,6 +108,12 @@ class OrderSender:
             raise HeartbeatTimeout(f"the vehicle is silent; {link}; {unsent}")
         if order:
             self.raise_if_ended(order)
+            self.raise_if_slept(order)
+
+    def raise_if_slept(self, order: Order) -> None:
+        """Raise OperationRejected if the computer slept since the order was given, so that a further step is late."""
+        if not order.only_stops and self._arbiter.slept_since(order.given_at) > 0:
+            raise OperationRejected("the computer slept; the rest of the order was not sent")
 
     def _unanswered(self, error: CommandTimeout, order: Order) -> Exception:
         """Return the error for a command without an answer: the takeover if there was one, otherwise the time-out."""

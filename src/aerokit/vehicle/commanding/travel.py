@@ -160,7 +160,7 @@ class TravelActions(VehicleBase):
             now = self.connection.now()
             if unacknowledged_target is None or now - sent_at < RESEND_S:
                 return
-            if self._arbiter.is_state_recent and not order.end:
+            if self._arbiter.is_state_recent and not order.end and not self._arbiter.slept_since(sent_at):
                 sent_at = now
                 self.connection.send(unacknowledged_target)
 

@@ -204,7 +204,7 @@ class MissionControl(VehiclePlan["Mission"]):
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
-            OperationTimeout: MISSION_CURRENT did not confirm the item.
+            OperationTimeout: MISSION_CURRENT did not confirm the item, or the vehicle fell silent before it was sent.
         """
         self._check_item(item)
         with self._vehicle_context.arbiter.auxiliary_order() as order:
@@ -375,6 +375,7 @@ class MissionControl(VehiclePlan["Mission"]):
         async with self._context.lock:  # PX4 ignores the command during a transfer.
             if order_status is not None:
                 self._vehicle_context.sender.raise_if_ended(order_status.order)
+                await self._vehicle_context.sender.await_recent_state(order_status.order)
             await transfers.run(
                 SetCurrentItem(
                     *target,
