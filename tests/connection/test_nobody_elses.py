@@ -8,6 +8,7 @@ from contextlib import asynccontextmanager
 
 import anyio
 import pytest
+from flight_harness import block_loop, suspend_computer
 from test_routes import ATTITUDE, COPTER, PeersLink, command
 
 import aerokit
@@ -322,6 +323,48 @@ async def test_reboot_on_same_host_takes_route_after_silence(link: PeerKeepingLi
         await rebooted.live("15000@copter", 6, DISARMED)
         assert peer_of(vehicle, link) == "15000@copter"
         assert not is_armed(vehicle)
+
+
+async def both_live(copter: Copter, other: Copter, times: int, interval_s: float = 0.5) -> None:
+    for _ in range(times):
+        other.send("14551@copter", DISARMED)
+        other.send_attitude("14551@copter")
+        copter.send("14550@copter", ARMED)
+        copter.send_attitude("14550@copter")
+        await anyio.sleep(interval_s)
+
+
+@pytest.mark.parametrize("slept_s", [0.0, 600.0])
+@pytest.mark.parametrize("is_heard", [True, False])
+async def test_duplicate_vehicle_on_same_host_takes_no_route_after_blocked_loop(
+    link: PeerKeepingLink, is_heard: bool, slept_s: float
+) -> None:
+    """Frames of both waited, or were lost. Then the first frame is one of the other vehicle."""
+    async with flown(link) as (vehicle, copter):
+        other = Copter(link, first=100, booted_at=-5000.0)
+        await both_live(copter, other, 8)
+        received = route_events(vehicle.connection)
+        block_loop(6.0)
+        if slept_s:
+            suspend_computer(vehicle, slept_s)
+        await both_live(copter, other, 3 if is_heard else 0, 0.0)
+        await anyio.sleep(0.3)
+        other.send("14551@copter", DISARMED)
+        other.send_attitude("14551@copter")
+        await both_live(copter, other, 8)
+        assert peer_of(vehicle, link) == "14550@copter"
+        assert is_armed(vehicle)
+        assert not [event for event in received if isinstance(event, (events.RouteChanged, events.ArmedChanged))]
+
+
+async def test_reboot_on_same_host_during_blocked_loop_takes_route_after_silence(link: PeerKeepingLink) -> None:
+    async with flown(link) as (vehicle, _):
+        block_loop(6.0)
+        rebooted = Copter(link, first=100, booted_at=vehicle.connection.now())
+        await rebooted.live("14551@copter", 2)
+        assert peer_of(vehicle, link) == "14550@copter"
+        await rebooted.live("14551@copter", 3)
+        assert peer_of(vehicle, link) == "14551@copter"
 
 
 async def test_reboot_on_same_port_is_accepted_at_once(link: PeerKeepingLink) -> None:

@@ -148,7 +148,7 @@ class FrameReceiver:
         self.heartbeats: dict[tuple[int, int], Heartbeat] = {}
         """Last HEARTBEAT of every (system id, component id) on the link."""
         self.observers: FrameObservers = FrameObservers(self._on_observers_changed)
-        self._loop_watch = LoopWatch(self._on_blocked, self._on_slept)
+        self._loop_watch = LoopWatch(self._on_blocked, self._on_slept, on_caught_up=self._on_caught_up)
         self._is_closed = False
         bus.one_at_a_time = multilink is not None
         gate.on_change = self._update_checks
@@ -254,6 +254,9 @@ class FrameReceiver:
     def _on_slept(self, seconds: float) -> None:
         logger.warning("the computer slept for %.0f s: the age of all vehicle values includes this time", seconds)
         self._bus.publish(ComputerSlept(self._clock(), 0, seconds))
+
+    def _on_caught_up(self, paused_s: float) -> None:
+        self._routes.exclude_pause(self._clock(), paused_s)
 
     def _update_checks(self) -> None:
         """Turn the fast path off if routes, signatures or observers need more than the delivery of frames."""

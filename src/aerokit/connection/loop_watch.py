@@ -55,7 +55,8 @@ class LoopWatch:
     Data may arrive during a pause and wait. Until all of this data has been read, its receive time is the time at which
     the loop last ran before the pause. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not detected, so
     ages may be too small by up to this time. ``on_blocked`` gets the length of pauses above ``BLOCKED_THRESHOLD_S``,
-    ``on_slept`` the time that the computer was suspended.
+    ``on_slept`` the time that the computer was suspended. ``on_caught_up`` gets the length of a pause once all waiting
+    data was read.
     """
 
     def __init__(
@@ -63,9 +64,11 @@ class LoopWatch:
         on_blocked: Callable[[float], None],
         on_slept: Callable[[float], None],
         suspended: Callable[[], float] = suspended_s,
+        *,
+        on_caught_up: Callable[[float], None] = lambda _: None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
-        self._on_blocked, self._on_slept = on_blocked, on_slept
+        self._on_blocked, self._on_slept, self._on_caught_up = on_blocked, on_slept, on_caught_up
         # The largest of three readings is used, because a single reading may be too small; see `_has_slept`.
         self._suspended, self._suspended_before = suspended, max(suspended() for _ in range(3))
         self.late_after: float = math.inf
@@ -163,7 +166,9 @@ class LoopWatch:
         if self._idle_iterations < IDLE_ITERATIONS:
             self._loop.call_soon(self._end_assumption_when_idle)
         else:
+            paused_s = self._loop.time() - self.oldest_arrival
             self.oldest_arrival = math.inf
+            self._on_caught_up(paused_s)
             self.late_after = self._ran_at + CHECK_INTERVAL_S / 2
 
 

@@ -116,10 +116,11 @@ EVERY_PEER: tuple[Peer, ...] = (None,)
 
 
 class _Route:
-    __slots__ = ("counters", "expected", "heartbeat_at", "peer", "rate", "sequence")
+    __slots__ = ("counters", "expected", "heartbeat_at", "peer", "rate", "sequence", "silent_since")
 
     peer: Peer
     heartbeat_at: float
+    silent_since: float  # `heartbeat_at`, or later if the event loop was blocked since then
     sequence: int  # sequence number of the last heartbeat
     expected: int  # `counters.expected` at the last heartbeat, from which `rate` is computed
 
@@ -136,8 +137,9 @@ class Routes:
 
     1. at once, if it is another port of the same host and continues the owner's stream: three frames continue the
        sequence numbers and, where known, the time since boot, while the owner is silent for the time of three frames;
-    2. after 3.5 s without a heartbeat, or when a TCP client has disconnected: if it is on the same host (a reboot or
-       restart, with new numbers), or continues the stream as above from any host, or signs with our key;
+    2. after 3.5 s without a heartbeat, not counting pauses of the event loop, or when a TCP client has disconnected: if
+       it is on the same host (a reboot or restart, with new numbers), or continues the stream as above from any host, or
+       signs with our key;
     3. in the same case from any host, if the system has no vehicle object or the program allows it (``may_move``).
 
     A peer refused by rule 2 (``RouteChangeRefused``) is judged again after the owner has sent again. The route of a
@@ -177,7 +179,8 @@ class Routes:
             if not is_first and frame.received_at > route.heartbeat_at:
                 route.rate = (counters.expected - route.expected) / (frame.received_at - route.heartbeat_at)
             route.counters, route.expected = counters, counters.expected
-        route.peer, route.heartbeat_at, route.sequence = peer, frame.received_at, frame.sequence
+        route.peer, route.sequence = peer, frame.sequence
+        route.heartbeat_at = route.silent_since = frame.received_at
         return True
 
     def has_route(self, source: ComponentId) -> bool:
@@ -214,7 +217,7 @@ class Routes:
         """Return True if ``peer`` takes over the route of this frame's sender; see the class for the rules."""
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
-        is_silent = now - route.heartbeat_at > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)
+        is_silent = now - route.silent_since > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)
         is_same_host = self._link.host_of(peer) == self._link.host_of(route.peer)
         needs_no_evidence = self._may_move or is_signed or is_same_host or frame.system_id not in self._attached
         claim = self._claim(source, peer)
@@ -225,6 +228,14 @@ class Routes:
             return True
         self._report(claim, frame, peer, is_silent=is_silent, is_same_host=is_same_host)
         return False
+
+    def exclude_pause(self, now: float, paused_s: float) -> None:
+        """Do not count the last ``paused_s`` seconds as silence, because the event loop was blocked, and nothing heard.
+
+        Otherwise a vehicle with the same ids could take over a route before the owner's next heartbeat.
+        """
+        for route in self._routes.values():
+            route.silent_since = min(now, route.silent_since + paused_s)
 
     def record_duplicate_sender(self, frame: Frame) -> None:
         """Record that a second sender behind the same peer uses the ids of this frame."""
@@ -297,7 +308,8 @@ class Routes:
         return expected, sequence_matches, clock_matches
 
     def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
-        before, route.peer, route.heartbeat_at = route.peer, peer, frame.received_at
+        before, route.peer = route.peer, peer
+        route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
         self._claims = {key: claim for key, claim in self._claims.items() if key[0] != source}

@@ -177,6 +177,10 @@ class MultiLinkRoutes:
     def record_duplicate_sender(self, frame: Frame) -> None:
         self._routes[0].record_duplicate_sender(frame)
 
+    def exclude_pause(self, now: float, paused_s: float) -> None:
+        for routes in self._routes:
+            routes.exclude_pause(now, paused_s)
+
     def evictable_peers(self, peers: Iterable[Peer], now: float) -> list[Peer]:
         for index, routes in enumerate(self._routes):
             evictable = routes.evictable_peers((peer for peer in peers if _link(peer) == index), now)
