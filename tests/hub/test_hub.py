@@ -112,6 +112,33 @@ async def test_commands_are_not_forwarded_after_blocked_loop() -> None:
 
 
 @virtual
+async def test_vehicle_with_same_ids_gets_no_commands_after_blocked_loop() -> None:
+    """The first frame after the pause is one of the other vehicle."""
+    copter, other, station = Program(1, 1), Program(1, 1), Program(255, 190)
+    other.encoder.sequence = 100
+    async with joined(copter, other, station) as hub:
+        events = list[HubEvent]()
+        for _ in range(8):
+            copter.send(COPTER)
+            other.send(COPTER)
+            station.send(STATION)
+            await anyio.sleep(0.5)
+        hub.on_event(events.append)
+        block_loop(6.0)
+        other.send(COPTER)
+        copter.send(COPTER)
+        await anyio.sleep(0.3)
+        other.send(COPTER)
+        await anyio.sleep(0.2)
+        copter.send(COPTER)
+        station.send(ORDER)
+        await settle()
+        assert "COMMAND_LONG" in copter.received
+        assert "COMMAND_LONG" not in other.received
+        assert not events
+
+
+@virtual
 async def test_queued_commands_are_dropped_when_computer_slept() -> None:
     link, station = SlowLink(), Program(255, 190)
     async with station, Hub([Endpoint(link, name="radio"), station.endpoint("b")]) as hub:

@@ -138,8 +138,8 @@ class Routes:
     1. at once, if it is another port of the same host and continues the owner's stream: three frames continue the
        sequence numbers and, where known, the time since boot, while the owner is silent for the time of three frames;
     2. after 3.5 s without a heartbeat, not counting pauses of the event loop, or when a TCP client has disconnected: if
-       it is on the same host (a reboot or restart, with new numbers), or continues the stream as above from any host, or
-       signs with our key;
+       it is on the same host (a reboot or restart, with new numbers), or continues the stream as above from any host,
+       or signs with our key;
     3. in the same case from any host, if the system has no vehicle object or the program allows it (``may_move``).
 
     A peer refused by rule 2 (``RouteChangeRefused``) is judged again after the owner has sent again. The route of a

@@ -151,22 +151,22 @@ class Attachment:
     def _receive(self, data: bytes, peer: Peer) -> None:
         try:
             now = self._now()
+            # Frames of our own program come without a socket, and therefore have not waited.
+            arrived_at = now if self._is_shared else self._switch.arrival(now)
             port_peer = None if self._is_single else peer
             framer = self._peers.framers.get(port_peer)
             is_whole = False  # True if the data consists of whole valid frames and nothing else
             if framer is not None:
                 waiting_before, bad_bytes_before = framer.waiting, framer.statistics.bad_bytes
-                frames = framer.receive(data, now)
+                frames = framer.receive(data, arrived_at)
                 has_partial_frame = bool(waiting_before or framer.waiting)
                 is_whole = not has_partial_frame and framer.statistics.bad_bytes == bad_bytes_before
             else:
-                framer, frames = self._peers.receive_unverified(port_peer, data, now)
+                framer, frames = self._peers.receive_unverified(port_peer, data, arrived_at)
                 self._report_full(framer, port_peer)
             if frames:
                 port = self._ports.get(port_peer) or self._add_port(port_peer)
-                # Frames of our own program come without a socket, and therefore are never late.
-                are_late = not self._is_shared and self._switch.may_be_late(now)
-                self._switch.receive(port, framer, frames, data if is_whole else None, now, are_late=are_late)
+                self._switch.receive(port, framer, frames, data if is_whole else None, now, arrived_at)
                 if port_peer != peer:  # A peer of a udpbcast link has answered the broadcast: send to this peer only.
                     self.link.keep_peer(peer)
         except Exception as error:

@@ -21,7 +21,7 @@ from aerokit.hub.senders import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from aerokit.hub.message_rules import TargetFields
     from aerokit.hub.values import HubEventKind
@@ -154,6 +154,15 @@ class Router(Generic[PortT]):
     def forget_plans(self) -> None:
         for node in self._nodes.values():
             node.forget_plans()
+
+    @property
+    def ports(self) -> Iterable[PortT]:
+        return (node.port for node in self._nodes.values())
+
+    def exclude_pause(self, now: float, paused_s: float) -> None:
+        """Do not count the last ``paused_s`` seconds as silence of any sender."""
+        for sender in self._senders.values():
+            sender.exclude_pause(now, paused_s)
 
     def senders_at(self, node: RouterPort[PortT]) -> list[tuple[int, int]]:
         return sorted(

@@ -97,6 +97,11 @@ class Sender:
             return True
         return is_new
 
+    def exclude_pause(self, now: float, paused_s: float) -> None:
+        """Do not count the last ``paused_s`` seconds as silence."""
+        self.received_at = min(now, self.received_at + paused_s)
+        self.ports = {number: min(now, at + paused_s) for number, at in self.ports.items()}
+
     def record_heartbeat(self, body: bytes) -> bool:
         """Record from a HEARTBEAT whether the sender is a vehicle or an autopilot. Return True if that has changed."""
         if len(body) <= _AUTOPILOT:  # The payload is too short for a HEARTBEAT.
@@ -167,6 +172,9 @@ class IdentityGuard:
             if is_autopilot(frame.body):
                 self._routes.record_heartbeat(frame, peer, framer.counters_of(frame))
         return True
+
+    def exclude_pause(self, now: float, paused_s: float) -> None:
+        self._routes.exclude_pause(now, paused_s)
 
     def evictable_peers(self, peers: Iterable[Peer], now: float) -> Iterable[Peer]:
         """Return the first peer without a heartbeat in the last 30 s, if any."""

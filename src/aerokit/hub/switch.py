@@ -52,7 +52,9 @@ class Switch:
         self.router: Router[Port] = Router(self._targets, period)
         self.router.on_vehicle = _write_single_frames
         self._on_error = on_error
-        self._loop_watch = LoopWatch(lambda _: None, lambda _: self._drop_queued_orders())
+        self._loop_watch = LoopWatch(
+            lambda _: None, lambda _: self._drop_queued_orders(), on_caught_up=self._exclude_pause
+        )
         self._loop_watch.start()
         self.recording: Recording | None = None
         """Recording of every forwarded frame."""
@@ -84,13 +86,20 @@ class Switch:
         self._ports_to_flush.clear()
         self._queueing_ports.clear()
 
-    def may_be_late(self, now: float) -> bool:
-        """Return True if commands that are read now may be too old, because the event loop was blocked.
+    def arrival(self, now: float) -> float:
+        """Return the earliest possible receive time of data that is read now.
 
-        They may have waited in a socket since the loop last ran, or the computer was suspended.
+        It may have waited in a socket since the loop last ran, or while the computer was suspended.
         """
         watch = self._loop_watch
-        return now > watch.late_after and now - watch.arrival(now) > ORDER_MAX_AGE_S
+        return watch.arrival(now) if now > watch.late_after else now
+
+    def _exclude_pause(self, paused_s: float) -> None:
+        """Do not count a pause of the event loop as a silence of senders, because nothing was heard."""
+        now = self._clock()
+        self.router.exclude_pause(now, paused_s)
+        for guard in {port.guard for port in self.router.ports if port.guard is not None}:
+            guard.exclude_pause(now, paused_s)
 
     def _drop_queued_orders(self) -> None:
         """Drop all commands that wait for full links, because they are too old after the computer was suspended."""
@@ -98,11 +107,11 @@ class Switch:
             port.drop_orders()
 
     def receive(
-        self, port: Port, framer: Framer, frames: list[Frame], data: bytes | None, now: float, *, are_late: bool = False
+        self, port: Port, framer: Framer, frames: list[Frame], data: bytes | None, now: float, arrived_at: float
     ) -> None:
         """Forward frames received at a port. ``data`` has their bytes; None if other bytes were between them.
 
-        With ``are_late``, commands among them are dropped.
+        Commands that may have waited since ``arrived_at`` are dropped if that is too long.
         """
         # Hot path: local variables are faster than attributes.
         node, guard, peer = port.node, port.guard, port.peer
@@ -121,9 +130,9 @@ class Switch:
             frames, late = self._admitted(port, framer, frames)
             if port.gateway is not None or len(frames) != received_count:
                 data = None  # The bytes as received are no longer those of the frames to forward.
-        if are_late:
-            frames, data = self._without_orders(port, frames, now), None
-        plans = self.router.route_all(node, frames, now, late)
+        if now - arrived_at > ORDER_MAX_AGE_S:
+            frames, data = self._without_orders(port, frames, arrived_at), None
+        plans = self.router.route_all(node, frames, arrived_at, late)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
             for frame, plan in zip(frames, plans, strict=True):
                 self._forward(port, frame.raw, plan, now)
@@ -166,13 +175,13 @@ class Switch:
                 late.append(frame)
         return admitted, late
 
-    def _without_orders(self, port: Port, frames: list[Frame], now: float) -> list[Frame]:
+    def _without_orders(self, port: Port, frames: list[Frame], arrived_at: float) -> list[Frame]:
         """Drop commands, and return the other frames."""
         remaining = []
         for frame in frames:
             target = self._targets.target_of(frame)
             if self._targets.is_order(frame.message_id):
-                port.drop_late(frame, target, self._loop_watch.arrival(now))
+                port.drop_late(frame, target, arrived_at)
             else:
                 remaining.append(frame)
         return remaining
