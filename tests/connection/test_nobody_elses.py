@@ -336,7 +336,7 @@ async def both_live(copter: Copter, other: Copter, times: int, interval_s: float
 
 @pytest.mark.parametrize("slept_s", [0.0, 600.0])
 @pytest.mark.parametrize("is_heard", [True, False])
-async def test_duplicate_vehicle_on_same_host_takes_no_route_after_blocked_loop(
+async def test_duplicate_vehicle_takes_no_route_after_blocked_loop(
     link: PeerKeepingLink, is_heard: bool, slept_s: float
 ) -> None:
     """Frames of both waited, or were lost. Then the first frame is one of the other vehicle."""
@@ -357,7 +357,7 @@ async def test_duplicate_vehicle_on_same_host_takes_no_route_after_blocked_loop(
         assert not [event for event in received if isinstance(event, (events.RouteChanged, events.ArmedChanged))]
 
 
-async def test_reboot_on_same_host_during_blocked_loop_takes_route_after_silence(link: PeerKeepingLink) -> None:
+async def test_reboot_during_blocked_loop_takes_route_after_silence(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, _):
         block_loop(6.0)
         rebooted = Copter(link, first=100, booted_at=vehicle.connection.now())
