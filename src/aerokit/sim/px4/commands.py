@@ -230,9 +230,13 @@ class _Flight:
         if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
             return MavResult.DENIED
-        # PX4 checks the index of the first item (param 1), but then continues at the current item.
         if not -1 <= command.param1 < px4.mission.count:
             return MavResult.DENIED
+        # PX4's navigator selects the item in param 1 by itself, even if the commander refuses the command
+        # (navigator_main.cpp). -1 continues at the current item.
+        first = whole(command.param1)
+        if first >= 0 and first != px4.mission.current:
+            px4.mission.set_current(first)
         result = self._change(modes.MISSION)
         if result == MavResult.ACCEPTED and not px4.arming.arm("mission start"):
             return MavResult.TEMPORARILY_REJECTED
