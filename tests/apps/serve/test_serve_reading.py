@@ -357,7 +357,8 @@ async def test_solved_reason_is_not_listed_when_checks_pass() -> None:
         faults.prearm_failures = ["AHRS: Not healthy"]
         await vehicle.sensors.wait_until(lambda sensors: sensors.prearm_checks_pass is False)
         await anyio.sleep(2)
-        assert "AHRS: Not healthy" in json.loads(stage.app._served.snapshot())["vehicles"][0]["missing_for_flight"]
+        missing = json.loads(stage.app._served.snapshot())["vehicles"][0]["missing_for_flight"]
+        assert missing[0] == "AHRS: Not healthy"
         faults.prearm_failures, faults.gps_lost = [], True
         await vehicle.estimator.wait_until(lambda estimator: bool(estimator.missing))
         assert vehicle.sensors.value.prearm_checks_pass is True
