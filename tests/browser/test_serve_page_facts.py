@@ -75,8 +75,7 @@ def test_dialogs_refuse_altitudes_below_ground(browser: Any) -> None:
     with page_of(browser) as (copter, page):
         order(page, "arm")
         wait_done(page, "arm")
-        returning = page.locator("button[data-order='return_to_launch']")
-        assert (returning.is_disabled(), returning.locator("small").inner_text()) == (True, "On the ground")
+        page.locator("button[data-order='return_to_launch'][disabled]", has_text="On the ground").wait_for()
         page.click("button[data-order='take_off']")
         problem, yes = page.locator("dialog .problem"), page.locator("dialog .yes")
         for value, text in (
