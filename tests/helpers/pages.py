@@ -21,8 +21,8 @@ import inspect
 import re
 import shutil
 import sys
-import threading
 import textwrap
+import threading
 from collections.abc import Coroutine, Iterator, Sequence
 from contextlib import AsyncExitStack, contextmanager
 from dataclasses import dataclass
