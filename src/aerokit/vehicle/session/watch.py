@@ -214,7 +214,7 @@ class VehicleWatch:
         """Return True if the vehicle has counted on from the decreased time for ``REBOOT_CONFIRM_S`` seconds."""
         now = self._connection.now()
         decreased_ms, decreased_at = self._decreased_times.setdefault(clock, (milliseconds, now))
-        if milliseconds < decreased_ms:  # The time has decreased further: the confirmation starts anew.
+        if milliseconds < decreased_ms:  # The time has decreased further: the confirmation starts again.
             self._decreased_times[clock] = (milliseconds, now)
             return False
         return milliseconds > decreased_ms and now - decreased_at >= REBOOT_CONFIRM_S
