@@ -176,8 +176,9 @@ def _conflicts(
     # Times are ignored here, so the paths can have any speed.
     paths = [Path.straight(route.name, route.start, route.target, 1.0) for route in routes]
     conflicts = list(find_conflicts(paths, min_distance_m))
+    resting_paths = _resting_paths(stationary)
     for path in paths:
-        for resting_path in _resting_paths(stationary):
+        for resting_path in resting_paths:
             approach = min_path_distance(path, resting_path, below_m=min_distance_m)
             if approach.distance_m < min_distance_m:
                 conflicts.append(Conflict(path.name, resting_path.name, approach.distance_m))
