@@ -34,11 +34,11 @@ class Readiness(NamedTuple):
 
 
 def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None) -> Readiness:
-    """Return what a vehicle lacks, grouped by whether it prevents arming.
+    """Return the requirements for a flight that a vehicle does not meet, grouped by whether they prevent arming.
 
     Args:
         vehicle: the vehicle, whose known state is used. Nothing is sent to it.
-        reasons: result of ``vehicle.why_not_armable()``; None: decide by what was received.
+        reasons: result of ``vehicle.why_not_armable()``; None: health flags of SYS_STATUS, mode and estimator decide.
     """
     missing, sensors = vehicle.missing_for_flight(), vehicle.sensors.latest
     checks_pass = sensors is not None and sensors.prearm_checks_pass is True

@@ -171,7 +171,7 @@ def _row(fields: list[str]) -> SimParameter:
 
 
 def _switch_of(line: str) -> str | None:
-    """Return the switch of a line, or None if it has none."""
+    """Return the name of the parameter that enables the parameter in this line; None without one."""
     if line.count(",") < 4 or line.endswith("," + _VOLATILE):
         return None
     return line.rpartition(",")[2]
@@ -189,7 +189,7 @@ def _lines_and_switches(
 
 
 def _select_lines(lines: list[str], used: frozenset[str], count: int) -> list[str]:
-    """Return up to ``count`` lines, with all parameters in ``used`` and the first others that have no switch."""
+    """Return up to ``count`` lines, with all parameters in ``used`` and the first others that are always enabled."""
     is_used = [line.partition(",")[0] in used for line in lines]
     others_left = max(0, count - sum(is_used))
     selected: list[str] = []

@@ -79,7 +79,7 @@ class VehicleWatch:
         # For each clock: a decreased time and when it was processed. Later messages may confirm that it shows a reboot.
         self._decreased_times: dict[str, tuple[int, float]] = {}
         self._expects_reboot = False
-        # When the last answer to our TIMESYNC requests was processed, and the vehicle's time in milliseconds in it.
+        # Our time when the last answer to a TIMESYNC request was processed, and the vehicle's time in it (ms).
         self._last_answer = (-math.inf, 0)
         attach = connection.bus.attach
         self._detach: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
