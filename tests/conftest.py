@@ -87,6 +87,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
+    """Collect garbage ten times less often than usual: the pauses were 8 % of the tests' processor time."""
+    gc.set_threshold(7_000, 10, 100)
     gc.enable()
 
 

@@ -253,7 +253,9 @@ def test_page_uploads_dropped_plan_after_confirmation(browser: Any, copters: tup
     with serving(address) as server, opened(browser, server["page"]) as page:
         page.locator(".vehicle", has_text="2 ArduCopter").click()
         page.evaluate(DROP, ["notes.plan", "no JSON"])
-        page.locator(".toast.failed", has_text="notes.plan: line 1, column 1: the text is not valid JSON: Expecting value").wait_for()
+        page.locator(
+            ".toast.failed", has_text="notes.plan: line 1, column 1: the text is not valid JSON: Expecting value"
+        ).wait_for()
         page.evaluate(DROP, ["field.plan", format_plan(plan)])
         text = page.locator("dialog[open]").inner_text()
         assert "Vehicle 2" in text

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from dronekit_reference import EXAMPLES
 from dronekit_scenarios_state import POSITION
-from dronekit_stage import Stage, on_stage
+from dronekit_stage import Stage, on_stage, until
 from dronekit_streams import READY, answer_streams
 from flight_controller import FlightController
 
@@ -20,6 +20,7 @@ import aerokit.dronekit as dronekit
 def stage() -> Iterator[Stage]:
     with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as opened:
         opened.settle()
+        until(lambda: opened.vehicle.home_location)  # requested by the library in the background
         yield opened
 
 

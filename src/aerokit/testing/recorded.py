@@ -105,8 +105,9 @@ class RecordedMissions(MissionServer):
         super().__init__(vehicle, capacity=_MAX_ITEMS)
         self._vehicle = vehicle
         self.requests_int: bool = vehicle.recording.uses_int
-        self._received: list[AnyItem] = []
-        self._written: dict[int, tuple[AnyItem, ...]] = {}
+        self._received: list[AnyItem] = []  # items of the upload in progress
+        self._written: dict[int, tuple[AnyItem, ...]] = {}  # uploaded plans by MAV_MISSION_TYPE
+        # How many recorded results were already sent, by operation and MAV_MISSION_TYPE.
         self._result_counts: dict[tuple[str, int], int] = {}
         self.listen()
 

@@ -14,17 +14,17 @@ from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 Run = Callable[..., tuple[int, str, str]]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def gimbal() -> SimulatedGimbal:
     return SimulatedGimbal()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def camera() -> SimulatedCamera:
     return SimulatedCamera(streams=["rtsp://127.0.0.1:8554/main"])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def address(camera: SimulatedCamera, gimbal: SimulatedGimbal) -> Iterator[str]:
     with served([SimulatedCopter(boot_time_s=0.0, components=[camera, gimbal])]) as address:
         yield address

@@ -45,6 +45,17 @@ def address(copter: SimulatedCopter) -> Iterator[str]:
 
 @pytest.fixture
 def run(address: str, capsys: pytest.CaptureFixture[str]) -> Run:
+    return run_at(address, capsys)
+
+
+@pytest.fixture
+def run_elsewhere(capsys: pytest.CaptureFixture[str]) -> Iterator[Run]:
+    """Run commands on a copter of this test."""
+    with served([SimulatedCopter(boot_time_s=0.0)]) as address:
+        yield run_at(address, capsys)
+
+
+def run_at(address: str, capsys: pytest.CaptureFixture[str]) -> Run:
     """Run a command on the copter; return exit code, stdout and stderr."""
 
     def run(*arguments: str) -> tuple[int, str, str]:
@@ -285,7 +296,8 @@ def test_logs_get_downloads_newest_log_without_flight(run: Run, capsys: pytest.C
     assert "is a sample of aerokit's simulator and contains no flight" in capsys.readouterr().err
 
 
-def test_logs_erase_without_yes_erases_nothing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_logs_erase_without_yes_erases_nothing(run_elsewhere: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = run_elsewhere
     before = run("logs", "list")[1]
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
     assert run("logs", "erase")[:2] == (1, "not confirmed; nothing was erased\n")
