@@ -204,17 +204,14 @@ class _Flight:
 
     def take_off(self, command: ReceivedCommand) -> int:
         """Take off to the altitude in param 7 (AMSL), or to MIS_TAKEOFF_ALT above home if param 7 is NaN."""
-        result = self._change(modes.TAKEOFF)
+        px4, result = self._px4, self._change(modes.TAKEOFF)
         if result == MavResult.ACCEPTED and math.isfinite(command.z):
-            self._plan_take_off(self._px4.frame.origin.altitude_m - command.z)
+            down = px4.frame.origin.altitude_m - command.z
+            if px4.is_armed and down > px4.motion.down and not px4.is_landed:
+                px4.send_text(MavSeverity.CRITICAL, "Already higher than takeoff altitude")
+                down = px4.motion.down
+            px4.flight.plan_take_off(down)
         return result
-
-    def _plan_take_off(self, down: float) -> None:
-        px4 = self._px4
-        if px4.is_armed and down > px4.motion.down and not px4.is_landed:
-            px4.send_text(MavSeverity.CRITICAL, "Already higher than takeoff altitude")
-            down = px4.motion.down
-        px4.flight.plan_take_off(down)
 
     def land(self, _: ReceivedCommand) -> int:
         return self._change(modes.LAND, "Landing at current position")
@@ -232,11 +229,8 @@ class _Flight:
             return MavResult.DENIED
         if not -1 <= command.param1 < px4.mission.count:
             return MavResult.DENIED
-        # PX4's navigator selects the item in param 1 by itself, even if the commander refuses the command
-        # (navigator_main.cpp). -1 continues at the current item.
-        first = whole(command.param1)
-        if first >= 0 and first != px4.mission.current:
-            px4.mission.set_current(first)
+        if command.param1 >= 0 and whole(command.param1) != px4.mission.current:
+            px4.mission.set_current(whole(command.param1))  # even if the mode is then refused (navigator_main.cpp)
         result = self._change(modes.MISSION)
         if result == MavResult.ACCEPTED and not px4.arming.arm("mission start"):
             return MavResult.TEMPORARILY_REJECTED
