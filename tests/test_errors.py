@@ -1,9 +1,15 @@
-"""The tree of errors in docs/how-to/errors.md equals the class hierarchy."""
+"""The tree of errors in docs/how-to/errors.md equals the class hierarchy, and its first example prints names."""
 
 from __future__ import annotations
 
+import ast
+import asyncio
 import builtins
 from pathlib import Path
+from typing import Any
+
+import pages
+import pytest
 
 from aerokit import errors
 
@@ -23,6 +29,16 @@ def test_error_tree_in_reference_matches_classes() -> None:
     tree = branch(errors.AerokitError)
     assert "\n".join(tree) in PAGE.read_text(encoding="utf-8")
     assert len(tree) == len(errors.__all__)
+
+
+def test_first_example_prints_name_of_result(capsys: pytest.CaptureFixture[str]) -> None:
+    class Vehicle:
+        async def arm(self) -> None:
+            raise errors.CommandRejected("refused", command=400, result=4, reasons=("Arm: Compass not healthy",))
+
+    code: Any = compile(pages.blocks(PAGE)[0].body, str(PAGE), "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
+    asyncio.run(eval(code, {"vehicle": Vehicle()}))
+    assert capsys.readouterr().out == "FAILED ('Arm: Compass not healthy',)\n"
 
 
 def test_file_and_stream_errors_have_own_bases() -> None:

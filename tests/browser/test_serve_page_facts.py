@@ -75,8 +75,7 @@ def test_dialogs_refuse_altitudes_below_ground(browser: Any) -> None:
     with page_of(browser) as (copter, page):
         order(page, "arm")
         wait_done(page, "arm")
-        returning = page.locator("button[data-order='return_to_launch']")
-        assert (returning.is_disabled(), returning.locator("small").inner_text()) == (True, "On the ground")
+        page.locator("button[data-order='return_to_launch'][disabled]", has_text="On the ground").wait_for()
         page.click("button[data-order='take_off']")
         problem, yes = page.locator("dialog .problem"), page.locator("dialog .yes")
         for value, text in (
@@ -218,6 +217,25 @@ def test_upload_dialog_previews_plan_on_map(browser: Any) -> None:
         cancel(page)
         page.locator("dialog[open]").wait_for(state="detached")
         assert not {"1", "2"} & set(page.evaluate(MAP_TEXTS))
+
+
+def test_orders_tell_when_mission_finished(browser: Any) -> None:
+    with page_of(browser) as (copter, page):
+        place = true_point(copter)
+        end = aerokit.Position(place.latitude_deg, place.longitude_deg).offset(north_m=5)
+        items = [take_off(altitude_relative_m=3), waypoint(end.latitude_deg, end.longitude_deg, altitude_relative_m=3)]
+        page.evaluate(DROP, ["short.plan", format_plan(Plan(Mission(items)))])
+        page.locator("dialog[open]", has_text="The map shows the plan.").wait_for()
+        page.click("dialog .yes")
+        wait_done(page, "upload short.plan")
+        order(page, "arm")
+        wait_done(page, "arm")
+        order(page, "mission/start")
+        for _ in range(2):
+            page.get_by_role("tab", name="Orders").click()
+            text = re.compile(r"mission started at item 0, finished at \d+:\d\d:\d\d")
+            page.locator("#panel .done", has_text=text).wait_for(timeout=60_000)
+            page.reload()
 
 
 def test_start_dialog_names_the_item(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:

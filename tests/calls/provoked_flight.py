@@ -386,6 +386,16 @@ async def _read_closed(stage: Stage) -> None:
     await subscription.get()
 
 
+async def _read_twice(stage: Stage) -> None:
+    with stage.vehicle.subscribe(messages.Ping) as subscription:
+        reader = asyncio.create_task(subscription.get())
+        await asyncio.sleep(0)
+        try:
+            await subscription.get()
+        finally:
+            reader.cancel()
+
+
 def _parts() -> Table:
     guided = {
         "velocity": (),
@@ -417,6 +427,7 @@ def _parts() -> Table:
             lambda s: s.vehicle.mode.wait_until(lambda _: False, timeout=1)
         ),
         ("Subscription.get", "OperationTimeout"): P(lambda s: _read(s, timeout=1)),
+        ("Subscription.get", "BusyError"): P(_read_twice),
         ("Subscription.get", "InvalidArgument"): P(_read_closed),
         ("Subscription.get", "ConnectionClosed"): later(_read, lambda s: s.vehicle.connection.close(), 0.1, alone=True),
         ("Subscription.get", "LinkLost"): later(_read, lost, 0.1, alone=True),

@@ -6,7 +6,7 @@ import anyio
 import pytest
 
 from aerokit.connection.bus import Detach, Overflow, Sink, Subscription
-from aerokit.errors import ConnectionClosed, InvalidArgument, OperationTimeout, SubscriptionOverflow
+from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, OperationTimeout, SubscriptionOverflow
 
 pytestmark = pytest.mark.anyio
 
@@ -119,7 +119,7 @@ async def test_second_reader_is_refused() -> None:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(numbers.get)
             await anyio.sleep(1)
-            with pytest.raises(InvalidArgument, match="only one reader"):
+            with pytest.raises(BusyError, match="another task already reads this subscription"):
                 await numbers.get()
             tasks.cancel_scope.cancel()
 

@@ -160,11 +160,11 @@ def test_gimbal_manager_denial_claims_control(stage: Stage) -> None:
     with stage.logged() as lines:
         sent = commands(stage, lambda: stage.vehicle.gimbal.rotate(-45, 0, 0))
     turn = (PITCHYAW, (-45, 0, None, None, 28))
-    assert sent == [turn, (CONFIGURE, (255,)), turn]
+    assert sent == [turn, (CONFIGURE, (255, 0, -1, -1)), turn]
     assert [line for line in lines if line.startswith("WARNING gimbal: MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW")]
     assert commands(stage, stage.vehicle.gimbal.release) == [
         (MOUNT_CONTROL, (0, 0, 0, 0, 0, 0, 3)),
-        (CONFIGURE, (-3, -3)),
+        (CONFIGURE, (-3, -3, -1, -1)),
     ]
     assert commands(stage, stage.vehicle.gimbal.release) == [(MOUNT_CONTROL, (0, 0, 0, 0, 0, 0, 3))]
 
@@ -194,7 +194,7 @@ def test_gimbal_fast_orders_use_answers_to_replaced_ones(stage: Stage) -> None:
     stage.settle()
     del stage.fc.results[PITCHYAW]
     assert commands(stage, lambda: gimbal.rotate(-46, 0, 0)) == [
-        (CONFIGURE, (255,)),
+        (CONFIGURE, (255, 0, -1, -1)),
         (PITCHYAW, (-46, 0, None, None, 28)),
     ]
     assert commands(stage, lambda: gimbal.rotate(-47, 0, 0)) == [(PITCHYAW, (-47, 0, None, None, 28))]

@@ -53,6 +53,19 @@ async def test_go_to_swapped_positions_flies_in_layers() -> None:
         assert not stage.events(TooClose)
 
 
+async def test_go_to_in_layers_lists_skipped_members() -> None:
+    async with open_stage(3, spacing_m=40, min_distance_m=5.0) as stage:
+        await stage.take_off()
+        here = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        stage.fleet.release("north/3", "it films")
+        targets = {"north/1": here["north/2"], "north/2": here["north/1"], "north/3": here["north/3"]}
+        result = await stage.fleet.go_to(lambda member: targets[member.name])
+        assert list(result) == ["north/1", "north/2"]
+        assert result.skipped == {"north/3": "released: it films"}
+        (received,) = stage.events(PathsCompared)
+        assert received.deconfliction.decision == "layers"
+
+
 async def test_go_to_refused_separation_sends_nothing() -> None:
     async with open_stage(2, spacing_m=40, min_distance_m=5.0) as stage:
         await stage.take_off()

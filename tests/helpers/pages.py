@@ -22,6 +22,7 @@ import re
 import shutil
 import sys
 import textwrap
+import threading
 from collections.abc import Coroutine, Iterator, Sequence
 from contextlib import AsyncExitStack, contextmanager
 from dataclasses import dataclass
@@ -232,7 +233,7 @@ async def _with_simulation(main: Coroutine[Any, Any, Any], chain: Chain) -> Any:
     pairs = [memory_link_pair() for _ in range(max(openings, 1) + needs_vehicle(chain))]
     nears = iter([near for near, _ in pairs])
     async with SimulatorServer(_simulated_vehicles(text), [far for _, far in pairs]):
-        with _address_opens(lambda: next(nears)), _web_server_stops():
+        with _address_opens(lambda: next(nears), thread=threading.get_ident()), _web_server_stops():
             return await main
 
 
@@ -256,12 +257,14 @@ def _simulated_vehicles(text: str) -> list[SimulatedCopter] | list[SimulatedPx4]
 
 
 @contextmanager
-def _address_opens(make: Any) -> Iterator[None]:
+def _address_opens(make: Any, thread: int | None = None) -> Iterator[None]:
+    """Let `ADDRESS` open links that ``make`` returns, in all threads or in one."""
     original = create._udp
 
     def udp(where: LinkAddress, peers: Any) -> Link:
         is_address = f"{where.kind}:{where.host}:{where.port}" == ADDRESS
-        link: Link = make() if is_address else original(where, peers)
+        is_here = thread in (None, threading.get_ident())
+        link: Link = make() if is_address and is_here else original(where, peers)
         return link
 
     with patch.object(create, "_udp", udp), patch.object(create, "_zenoh", lambda _: make()):

@@ -413,7 +413,7 @@ DAMAGES: list[tuple[tuple[str | int, ...], object, str]] = [
     (
         ("geoFence", "polygons", 0, "polygon"),
         [[1, 2], [3, 4]],
-        r"polygons\[0\].polygon = .* at least 3 places",
+        r"polygons\[0\].polygon = .* at least 3 positions",
     ),
     (("geoFence", "polygons", 0, "polygon", 2), [1], r"polygons\[0\].polygon\[2\] = .* array of 2 values"),
     (

@@ -202,6 +202,12 @@ def test_metadata_describes_values() -> None:
     assert metadata["RTL_CONE_SLOPE"].describe(3.0) == "Steep"
 
 
+def test_px4_boolean_parameter_has_integer_values() -> None:
+    xml = '<parameters><group name="G"><parameter name="A" boolean="true" type="INT32"/></group></parameters>'
+    values = parse_metadata(xml.encode())["A"].values
+    assert {str(value): text for value, text in values.items()} == {"0": "Disabled", "1": "Enabled"}
+
+
 def test_metadata_checks_ranges() -> None:
     metadata = parse_metadata(json.dumps(PX4_JSON).encode())
     for name, value in {

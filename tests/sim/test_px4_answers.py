@@ -374,3 +374,29 @@ def test_return_uses_nearest_rally_point(kind: int, north: float) -> None:
     assert f"RTL: start return at {above_sea} m (30 m above destination)\t" in "".join(client.texts)
     client.run_until(lambda: not px4.is_armed, 150.0)
     assert px4.motion.north == pytest.approx(north, abs=1.0)
+
+
+def test_mission_starts_at_the_item_in_param_1() -> None:
+    px4, client = flying()
+    places = [place(px4, north, 0.0) for north in (20.0, 40.0, 60.0)]
+    items = [MissionItem(MavCmd.NAV_WAYPOINT, 6, x=x, y=y, z=10.0) for x, y in places]
+    assert px4.missions.replace(0, items) == MavResult.ACCEPTED
+    assert client.command(MavCmd.MISSION_START, 3) == MavResult.DENIED
+    assert client.command(MavCmd.MISSION_START, 2) == MavResult.ACCEPTED
+    assert px4.mission.current == 2
+    client.run_until(lambda: px4.mission.is_finished, 60.0)
+    assert client.command(MavCmd.MISSION_START, 1) == MavResult.ACCEPTED
+    client.command(MavCmd.DO_SET_MODE, 1, *HOLD)
+    assert client.command(MavCmd.MISSION_START, -1) == MavResult.ACCEPTED
+    assert (px4.mission.current, px4.mission.is_finished) == (1, False)
+
+
+@pytest.mark.parametrize(("down", "limited"), [(-9.0, -2.5), (9.0, 1.25)])
+def test_offboard_limits_of_climb_and_descent(down: float, limited: float) -> None:
+    px4, client = flying()
+    px4.parameters.change({"MPC_Z_VEL_MAX_UP": 2.5, "MPC_Z_VEL_MAX_DN": 1.25, "MPC_Z_V_AUTO_UP": 4.0})
+    for _ in range(12):
+        client.send(m.SetPositionTargetLocalNed(0, 1, 1, 1, 0b110111000111, 0, 0, 0, 0, 0, down, *(0.0,) * 5))
+        client.command(MavCmd.DO_SET_MODE, 1, 6)
+        client.run(0.25)
+    assert px4.motion.velocity_down == pytest.approx(limited, abs=0.05)

@@ -213,6 +213,7 @@ def test_mount_command_supports_positions(client: Client) -> None:
     assert client.command(MavCmd.DO_MOUNT_CONTROL, *params) == ACCEPTED
     assert angles(client)[1:] == pytest.approx([20, 0], abs=2)  # 45 degrees up, limited.
     assert client.command(MavCmd.DO_MOUNT_CONTROL, -35, 149, 0, 0, 0, 0, MavMountMode.GPS_POINT) == FAILED
+    assert client.command(MavCmd.DO_MOUNT_CONTROL, -35, 0, 0, 0, 0, 0, MavMountMode.GPS_POINT) == ACCEPTED
     assert mount(client, MavMountMode.HOME_LOCATION) == ACCEPTED
     assert status(client).flags == LOCKS
 

@@ -275,6 +275,13 @@ def test_plane_sticks_move_surfaces_while_disarmed() -> None:
     assert outputs(client, 1500, 1500, 1900, 1500)[:4] == (1500, 1500, 1900, 1500)
 
 
+def test_plane_elevator_above_middle_raises_the_nose() -> None:
+    plane, client = booted("plane")
+    assert set_mode(client, PlaneMode.FLY_BY_WIRE_A) == MavResult.ACCEPTED
+    plane.motion.pitch_rate = 0.25
+    assert outputs(client)[1] == 1700
+
+
 def test_rover_sticks_move_steering_while_disarmed() -> None:
     _, client = booted("rover")
     assert outputs(client)[:5] == (1500, 0, 1500, 0, 0)

@@ -18,6 +18,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial, wraps
+from itertools import chain
 from numbers import Integral, Real
 from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin
@@ -110,17 +111,14 @@ class _Rules:
 
     def check(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
         rules = self._read() if self._by_name is None else self._by_name
-        arguments = [
-            *zip(self._positional, args),  # noqa: B905 - Python rejects surplus arguments itself
-            *((self._var_positional, value) for value in args[len(self._positional) :]),
-            *kwargs.items(),
-        ]
-        for name, value in arguments:
-            if name not in rules:
-                continue
-            is_allowed, _ = rules[name]
-            if not is_allowed(value):
-                raise _error(rules[name], name, value, vehicle_parameter=dict(arguments).get("name"))
+        names = self._positional
+        if self._var_positional:
+            names += (self._var_positional,) * (len(args) - len(names))
+        # Each message that a program sends or reads is checked here, so nothing is copied unless a value is wrong.
+        for name, value in chain(zip(names, args), kwargs.items()):  # noqa: B905 - Python rejects surplus arguments
+            if name in rules and not rules[name][0](value):
+                vehicle_parameter = {**dict(zip(names, args)), **kwargs}.get("name")  # noqa: B905 - as above
+                raise _error(rules[name], name, value, vehicle_parameter)
 
     def _read(self) -> dict[str, Rule]:
         """Compute the rules from the signature of the function."""

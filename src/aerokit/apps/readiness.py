@@ -34,19 +34,19 @@ class Readiness(NamedTuple):
 
 
 def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None) -> Readiness:
-    """Return what a vehicle lacks, grouped by whether it prevents arming.
+    """Return the requirements for a flight that a vehicle does not meet, grouped by whether they prevent arming.
 
     Args:
         vehicle: the vehicle, whose known state is used. Nothing is sent to it.
-        reasons: result of ``vehicle.why_not_armable()``; None: decide by SYS_STATUS.
+        reasons: result of ``vehicle.why_not_armable()``; None: health flags of SYS_STATUS, mode and estimator decide.
     """
     missing, sensors = vehicle.missing_for_flight(), vehicle.sensors.latest
     checks_pass = sensors is not None and sensors.prearm_checks_pass is True
-    only_estimates = all(_is_about_estimates(text) for text in (missing if reasons is None else reasons))
-    # For example, ArduCopter without a position arms in STABILIZE.
-    if checks_pass and only_estimates:
-        return Readiness((), tuple(dict.fromkeys([*(reasons or ()), *missing])))
     against = tuple(missing if reasons is None else reasons)
+    if checks_pass and all(map(_is_about_estimates, against)):
+        # For example, ArduCopter without a position arms in STABILIZE, but not in GUIDED.
+        refused = tuple(not_armable(vehicle, missing)) if reasons is None else ()
+        return Readiness(refused, () if refused else tuple(dict.fromkeys([*against, *missing])))
     is_known = not any(text.startswith(("heartbeats (", "sensors (")) for text in against)
     # The same reason may be in a status text of the autopilot, there with a prefix.
     without_prefix = {vehicle.autopilot.arming_reason(text) for text in against}
@@ -56,6 +56,44 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None) -> Readine
 
 def _is_about_estimates(text: str) -> bool:
     return text.startswith(("the estimator has no ", "no GPS receiver has ", "position (", "home ("))
+
+
+def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
+    """Return the known reasons why `Vehicle.arm` would fail; empty if none is known. Sends nothing.
+
+    ``missing`` are the missing conditions for flight. In modes without a position, ArduPilot arms without most of them.
+    """
+    autopilot, unarmable = vehicle.autopilot, unarmable_mode(vehicle)
+    if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False:
+        return []
+    if unarmable is not None and unarmable["arms_in"] is None:  # `arm` cannot change to a mode that allows arming
+        unless = f" unless {unarmable['unless']} allows it" if unarmable["unless"] else ""
+        return [f"{autopilot.firmware} cannot arm in {unarmable['mode']}{unless}", *missing]
+    sensors, estimator = vehicle.sensors.latest, vehicle.estimator.latest
+    if sensors is not None and sensors.prearm_checks_pass is False:
+        return missing
+    mode = vehicle.mode.latest
+    arms_in = None if mode is None else mode.name
+    if unarmable is not None:
+        arms_in = unarmable["arms_in"]
+    needs_position = bool(autopilot.modes_without_position) and arms_in not in (None, *autopilot.modes_without_position)
+    if needs_position and estimator is not None and estimator.missing:
+        change = "" if unarmable is None else ", to which arming would change the mode"
+        return [f"{autopilot.firmware} needs a position to arm in {arms_in}{change}", *missing]
+    return []
+
+
+def unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
+    """Return data about the current mode if the vehicle cannot arm in it; None if it can.
+
+    ``arms_in`` is the mode to which ``arm`` would change, or None. ``unless`` is the parameter that permits arming in
+    the current mode.
+    """
+    autopilot, mode = vehicle.autopilot, vehicle.mode.latest
+    if mode is None or mode.name not in autopilot.unarmable_modes.union(autopilot.armable_by_option):
+        return None
+    arming_mode, option = autopilot.mode_to_arm_in(), autopilot.armable_by_option.get(mode.name)
+    return {"mode": mode.name, "arms_in": None if arming_mode is None else arming_mode.name, "unless": option}
 
 
 def own_flight_modes(vehicle: Vehicle) -> str:
@@ -88,8 +126,7 @@ class ArmingCheckRequests:
 
     def __init__(self) -> None:
         self._failing: dict[Vehicle, tuple[str, ...]] = {}
-        self.requested_at: dict[Vehicle, float] = {}
-        """Time of the last request to each vehicle."""
+        self._requested_at: dict[Vehicle, float] = {}
 
     def are_due(self, vehicle: Vehicle) -> bool:
         """Return True if the caller should now call `run_arming_checks`."""
@@ -97,10 +134,10 @@ class ArmingCheckRequests:
         if failing is None:
             self._failing.pop(vehicle, None)
             return False
-        is_early = now - self.requested_at.get(vehicle, -math.inf) < MIN_CHECK_INTERVAL_S
+        is_early = now - self._requested_at.get(vehicle, -math.inf) < MIN_CHECK_INTERVAL_S
         if failing == self._failing.get(vehicle) or is_early:
             return False
-        self._failing[vehicle], self.requested_at[vehicle] = failing, now
+        self._failing[vehicle], self._requested_at[vehicle] = failing, now
         return True
 
 

@@ -375,6 +375,7 @@ class Subscription(Generic[ItemT]):
         Raises:
             OperationTimeout: no item arrived within ``timeout`` seconds.
             ConnectionClosed, LinkLost: the connection ended.
+            BusyError: another task already reads the subscription.
             InvalidArgument: the subscription is closed; read it inside its ``with`` block.
         """
         with anyio.move_on_after(timeout):
@@ -419,7 +420,7 @@ class Subscription(Generic[ItemT]):
 
     async def _wait(self) -> None:
         if self._has_reader:
-            raise InvalidArgument("a subscription can have only one reader: open a second one for another reader")
+            raise BusyError("another task already reads this subscription; open a second one for another reader")
         self._has_reader, self._waiter = True, asyncio.get_running_loop().create_future()
         try:
             await self._waiter

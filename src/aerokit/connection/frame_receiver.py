@@ -205,8 +205,8 @@ class FrameReceiver:
             is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
             if not gate.is_open and not self._is_admitted(frame, is_other_peer):
                 continue
-            # With one link, each frame with a valid signature is recorded here, even if a check below refuses it. With
-            # several links, frames are recorded further below, after `accepts` has removed the copies.
+            # With one link, each frame that the signature check admits is recorded here, even if a check below refuses
+            # it. With several links, frames are recorded further below, after `accepts` has removed the copies.
             if observers.recording is not None and multilink is None:
                 observers.recording.write(frame.raw, self._clock())
             if is_other_peer and not self._claims_route(framer, frame, peer):

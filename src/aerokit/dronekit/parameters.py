@@ -225,8 +225,8 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
 
     Names are converted to upper case; values are floats. All parameters are downloaded in the background after
     connecting. They are not downloaded again after a reboot or a lost link; changes that the vehicle reports are
-    included. Reading a missing value requests only
-    that value; iterating waits for the whole list. :func:`len` returns the number received so far.
+    included. Reading a missing value requests only that value; iterating waits for the whole list. :func:`len` returns
+    the number received so far.
 
     Old and new names of parameters that ArduPilot renamed both work; values are converted, and a warning is logged.
     Listeners are called as ``listener(parameters, name, value)`` when a value is new or has changed. Methods that wait

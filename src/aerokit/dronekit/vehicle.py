@@ -80,7 +80,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         self._channels = Channels(self, 8)
         self._gimbal = Gimbal(self)
         self._parameters = Parameters(self)
-        self._dk.ready.mark("commands")  # the empty sequence, which is valid until download() is called
+        self._dk.ready.mark("commands")  # An empty mission is their valid value until download() is called.
 
     # --------------------------------------------------------------------------------- parts
 
@@ -306,10 +306,13 @@ async def _connected(
     """Connect on the loop, and request streams. Does not refer to the classic vehicle."""
     async with connect_async(connection, timeout=timeout, rates={}) as aio:
         tasks = BackgroundTasks(connection.fail)
+        rate_hz: float | None = None
+        if rate is not None:
+            # DroneKit accepts a rate of 0 or less, but aio.streams() does not; 1 Hz is requested instead.
+            rate_hz = min(rate, MAX_STREAM_RATE_HZ) if rate > 0 else 1.0
         try:
             begin(aio, tasks)
-            # DroneKit accepts a rate of 0 or less, but aio.streams() does not; 1 Hz is requested instead.
-            with nullcontext() if rate is None else aio.streams(min(rate, MAX_STREAM_RATE_HZ) if rate > 0 else 1.0):
+            with nullcontext() if rate_hz is None else aio.streams(rate_hz):
                 yield aio
         finally:
             await tasks.aclose()

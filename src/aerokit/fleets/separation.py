@@ -181,8 +181,9 @@ def _conflicts(
     # Times are ignored here, so the paths can have any speed.
     paths = [Path.straight(route.name, route.start, route.target, 1.0) for route in routes]
     conflicts = list(find_conflicts(paths, min_distance_m))
+    resting_paths = _resting_paths(stationary)
     for path in paths:
-        for resting_path in _resting_paths(stationary):
+        for resting_path in resting_paths:
             approach = min_path_distance(path, resting_path, below_m=min_distance_m)
             if approach.distance_m < min_distance_m:
                 conflicts.append(Conflict(path.name, resting_path.name, approach.distance_m))
@@ -273,7 +274,7 @@ def _check_distance(min_distance_m: float) -> None:
 METRES_PER_DEGREE = 111_319.5
 
 # The steps to 13 of the 26 neighbours of a cube. With half of them, each pair of neighbouring cubes is compared once.
-NEIGHBOURS = tuple(step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0))
+HALF_OF_NEIGHBOURS = tuple(step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0))
 
 
 def pairs_within(points: Mapping[str, LocalPoint], max_distance_m: float) -> list[tuple[str, str, float]]:
@@ -290,7 +291,7 @@ def pairs_within(points: Mapping[str, LocalPoint], max_distance_m: float) -> lis
     near_pairs: list[tuple[str, str, float]] = []
     for (x, y, z), names in cubes.items():
         candidates = list(combinations(names, 2))
-        for dx, dy, dz in NEIGHBOURS:
+        for dx, dy, dz in HALF_OF_NEIGHBOURS:
             neighbours = cubes.get((x + dx, y + dy, z + dz))
             if neighbours is not None:
                 candidates += product(names, neighbours)

@@ -156,7 +156,14 @@ class Travel(SelectionBase):
             if stagger_s:
                 raise InvalidArgument(f"{action}: stagger_s would change the delays of corridors; nothing was sent")
             return await self._fly_to(action, targets, speed_m_s, timeout, max_distance_m, names, corridors=separation)
-        return await self._fly_in_layers(action, targets, speed_m_s, timeout, separation.heights_m, max_distance_m)
+        heights_m = separation.heights_m
+        result = await self._fly_in_layers(action, targets, speed_m_s, timeout, heights_m, max_distance_m)
+        without_layer = [self.members[name] for name in names or targets if name not in heights_m]
+        result.skipped |= {
+            member.name: "the separation was planned without it" if member.is_available else member.status
+            for member in without_layer
+        }
+        return result
 
     def _resolve_targets(
         self, targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home]

@@ -133,9 +133,10 @@ class Router(Generic[PortT]):
         self.on_vehicle: Callable[[PortT], object] | None = None
         """Called when an autopilot is received at a port for the first time."""
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
-        """Called with the kind of event, the sender, the port of the frame, and the sender's former or other port.
+        """Called with the kind of event, the sender, the port of the frame, and another port of this sender.
 
-        The last argument is None if that port was removed.
+        If the sender has moved, the other port is the one it came from; if it is received at two ports, the second one;
+        None if that port was removed since.
         """
 
     def add(self, port: PortT) -> RouterPort[PortT]:

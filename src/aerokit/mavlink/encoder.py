@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _HEADER_V2 = Struct("<BBBBBBHB").pack  # without the magic byte
 _MAGIC_V1, _MAGIC_V2 = bytes((MAGIC_V1,)), bytes((MAGIC_V2,))
-_BYTES = tuple(bytes((message_id,)) for message_id in range(256))
+_BYTES = tuple(bytes((byte,)) for byte in range(256))
 
 
 class FrameEncoder:

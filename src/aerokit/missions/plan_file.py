@@ -232,7 +232,7 @@ def _read_polygon(value: JsonValue) -> FencePolygon:
     corners = value["polygon"]
     places = [_required_place(corner) for corner in corners.elements()]
     if len(places) < 3:
-        raise corners.error(f"an array of at least 3 places; it has {len(places)}")
+        raise corners.error(f"an array of at least 3 positions; it has {len(places)}")
     return FencePolygon(places, value["inclusion"].boolean())
 
 

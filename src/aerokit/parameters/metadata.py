@@ -243,9 +243,11 @@ def _range(text: str) -> tuple[float | None, float | None]:
 def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
     for group in root.iter("group"):
         for param in group.iter("parameter"):
-            values = _names_by_number((value.get("code"), value.text) for value in param.iter("value"))
+            values: Mapping[float, str] = _names_by_number(
+                (value.get("code"), value.text) for value in param.iter("value")
+            )
             if not values and _is_true(param.get("boolean")):
-                values = {0.0: "Disabled", 1.0: "Enabled"}
+                values = {0: "Disabled", 1: "Enabled"}
             yield ParameterMetadata(
                 param.attrib["name"],
                 short_description=param.findtext("short_desc", ""),

@@ -338,9 +338,9 @@ class FtpDownload(FtpExchange[int]):
         return self._size if self._into.end is None else self._into.end
 
     def _end(self) -> None:
-        """Finish at the end of the file. Fail if the server reported another size, unless that was an estimate."""
+        """Process the end of the file. Fail if the server has announced a larger size when it opened the file."""
         end = self._into.position
-        if self._size is None:
+        if self._size is None:  # The size of a virtual file is known only now.
             self._finish(end)
         else:
             text = f"read {self._path}: the file ended after {end} bytes, but its size is {self._size}"

@@ -54,8 +54,10 @@ class RequestWindow(Generic[KeyT]):
         self._answered_at = self._silent_until = -math.inf
         self._silences = 0  # number of times since the last answer that the whole link was found silent
         self._waiting: dict[KeyT, None] = {}
-        self._in_flight: dict[KeyT, _Request] = {}  # in the order in which they were sent
-        self._requests: dict[KeyT, _Request] = {}  # sent at least once, but not yet answered
+        # Requests whose answer is awaited and not yet overdue, in the order in which they were sent.
+        self._in_flight: dict[KeyT, _Request] = {}
+        # All unanswered requests that were sent at least once, including overdue ones that wait to be sent again.
+        self._requests: dict[KeyT, _Request] = {}
         # For requests that were answered after a repetition: seconds from the first transmission to the answer. It is
         # ambiguous which transmission was answered, until a second answer arrives.
         self._ambiguous: dict[KeyT, float] = {}

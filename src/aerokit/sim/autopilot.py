@@ -84,7 +84,7 @@ class VehicleSigning:
     def _on_setup(self, message: SetupSigning, _channel: Channel) -> None:
         if not self.may_change():
             return
-        has_key = any(message.secret_key)  # A key of zero bytes turns signing off.
+        has_key = any(message.secret_key)  # A key whose bytes are all 0 turns signing off.
         self.key = SigningKey(message.secret_key) if has_key else None
         # The field has 64 bits, but the time stamp of a frame has only 48 bits.
         self.timestamp = message.initial_timestamp & LAST_TIMESTAMP

@@ -17,7 +17,11 @@ from aerokit.mavlink.signing import Signing
 
 MessageT = TypeVar("MessageT", bound=Message)
 _MAX_FLOAT32 = 3.4028234663852886e38
-_DUE_DECIMALS = 9
+DUE_DECIMALS = 9
+"""Due times in seconds are rounded to this many decimal places.
+
+Events with different intervals are then due at exactly the same instants.
+"""
 
 
 def fitted(message: MessageT) -> MessageT:
@@ -152,8 +156,7 @@ class Streams:
                 self.next_due = due
                 return ids
             ids.append(message_id)
-            # The due time is rounded, so that streams with different rates are due at exactly the same instants.
-            following = round(start + (count + 1) * interval, _DUE_DECIMALS)
+            following = round(start + (count + 1) * interval, DUE_DECIMALS)
             if following > now:
                 heapreplace(heap, (following, token, message_id, start, count + 1))
             else:  # The stream is late by more than an interval, so it starts again at the present time.

@@ -76,8 +76,8 @@ HOME = (-35.363261, 149.165230, 584.09)
 
 
 GRAVITY_M_S2 = 9.80665
-# Deceleration by drag, divided by the airspeed. With this value the copter leans 20 degrees at 10 m/s, as a quadrotor
-# of 450 mm does.
+# Deceleration by drag, divided by the airspeed. With this value the copter leans 19 degrees at 10 m/s, about as a
+# quadrotor of 450 mm does.
 _DRAG_PER_S = 0.33
 _VELOCITY_TIME_CONSTANT_S = 0.3
 # Fraction of a lean error that remains after a second, which is 50 steps of 0.02 s with a time constant of 0.15 s.
@@ -86,9 +86,9 @@ _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
 BRAKING_SHARE = 0.7  # A vehicle plans to brake with 70 % of the acceleration limit, and keeps the rest in reserve.
 _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
-# Motion within these limits counts as steady, and steps of 0.1 s suffice. In such a step, a constant jerk of 4 m/s³
-# changes the position by jerk · 0.1³ / 6, which is less than 1 mm. Motion near the ground is not steady, so that short
-# steps determine the time and speed of a touchdown.
+# Motion within these limits counts as steady, and steps of 0.12 s suffice. In such a step, a constant jerk of 4 m/s³
+# changes the position by jerk · 0.12³ / 6, which is 1.2 mm. Motion near the ground is not steady, so that short steps
+# determine the time and speed of a touchdown.
 _STEADY_JERK_M_S3 = 4.0
 _STEADY_LEAN_RATE_RAD_S = 0.6
 _STEADY_ABOVE_GROUND_S = 0.3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -69,14 +70,10 @@ class SimParameters:
 
         ``count`` limits the number of parameters. Those in ``used`` are always included.
         """
-        lines = text.split()
-        if count is not None:
-            lines = _select_lines(lines, frozenset(used), count)
         parameters = cls(())
-        parameters._rows = {line.partition(",")[0]: line for line in lines}
-        parameters._switches = {
-            line.partition(",")[0]: switch for line in lines if (switch := _switch_of(line)) is not None
-        }
+        lines, switches = _lines_and_switches(text, frozenset(used), count)
+        parameters._rows = dict(lines)
+        parameters._switches = dict(switches)
         return parameters
 
     def __getitem__(self, name: str) -> float:
@@ -174,14 +171,25 @@ def _row(fields: list[str]) -> SimParameter:
 
 
 def _switch_of(line: str) -> str | None:
-    """Return the switch of a line, or None if it has none."""
+    """Return the name of the parameter that enables the parameter in this line; None without one."""
     if line.count(",") < 4 or line.endswith("," + _VOLATILE):
         return None
     return line.rpartition(",")[2]
 
 
+@functools.lru_cache(maxsize=16)  # A test may create thousands of vehicles with the same table.
+def _lines_and_switches(
+    text: str, used: frozenset[str], count: int | None
+) -> tuple[dict[str, SimParameter | str], dict[str, str]]:
+    """Return the selected lines and their switches, both by parameter name."""
+    selected = text.split() if count is None else _select_lines(text.split(), used, count)
+    lines: dict[str, SimParameter | str] = {line.partition(",")[0]: line for line in selected}
+    switches = {name: _switch_of(str(line)) for name, line in lines.items()}
+    return lines, {name: switch for name, switch in switches.items() if switch is not None}
+
+
 def _select_lines(lines: list[str], used: frozenset[str], count: int) -> list[str]:
-    """Return up to ``count`` lines, with all parameters in ``used`` and the first others that have no switch."""
+    """Return up to ``count`` lines, with all parameters in ``used`` and the first others that are always enabled."""
     is_used = [line.partition(",")[0] in used for line in lines]
     others_left = max(0, count - sum(is_used))
     selected: list[str] = []

@@ -19,16 +19,15 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat, Statustext
 from aerokit.protocols.servers.host import ServerHost
 from aerokit.protocols.servers.host import sender_of as sender_of
-from aerokit.sim.channel import Channel
+from aerokit.sim.channel import DUE_DECIMALS, Channel
 from aerokit.sim.faults import Faults
 
 TICK_S = 0.02
 """Interval in which motion and modes are updated while the vehicle moves. In steady flight, a tick is longer."""
 
 _STEADY_TICKS = 6
-# Due times in seconds are rounded to this many decimal places, so that events with different intervals are due at
-# exactly the same instants.
-_DUE_DECIMALS = 9
+MAX_TICK_S = _STEADY_TICKS * TICK_S
+"""Duration of the longest tick, in steady flight."""
 
 _TEXT_SIZE = 50
 Handler = Callable[[Any, Channel], None]
@@ -269,13 +268,13 @@ class SimulatedVehicle:
             nonlocal count
             count += 1
             if booted_at == self.booted_at:  # The vehicle has not rebooted in the meantime.
-                self.call_at(round(start + count * interval, _DUE_DECIMALS), repeat)
+                self.call_at(round(start + count * interval, DUE_DECIMALS), repeat)
             action()
 
         self.call_at(start, repeat)
 
     def set_ticking(self, ticking: bool) -> None:
-        """Start or stop calling ``tick`` at 50 Hz, and in steady flight at about 10 Hz."""
+        """Start or stop calling ``tick`` at 50 Hz, and in steady flight at 8 Hz or more."""
         if ticking == (self._ticks_from != math.inf):
             return
         # Ticks are multiples of TICK_S since the boot, so that ticks, timers and streams are due at the same instants.
@@ -285,7 +284,7 @@ class SimulatedVehicle:
 
     def _schedule_tick(self, ticks: int) -> None:
         """Schedule the next tick after this many intervals of TICK_S. An event may cause an earlier tick."""
-        self._next_tick = round(self._ticks_from + (self._ticks_done + ticks) * TICK_S, _DUE_DECIMALS)
+        self._next_tick = round(self._ticks_from + (self._ticks_done + ticks) * TICK_S, DUE_DECIMALS)
 
     def _tick_until(self, now: float) -> None:
         """Advance to ``now`` by a single tick that stands for all ticks since the last one."""

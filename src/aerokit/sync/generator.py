@@ -323,7 +323,7 @@ def generate(name: str = "twins") -> str:
 
 
 def _class(page: Page, twin: Twin) -> str:
-    """Return the source of one twin class."""
+    """Return the source code of the blocking class that wraps one async class."""
     original = getattr(importlib.import_module(twin.module), twin.name)
     base = f"{twin.base}[{twin.parameter}]" if twin.parameter else twin.base
     if base in GENERIC_BASES:
@@ -337,7 +337,7 @@ def _class(page: Page, twin: Twin) -> str:
 
 
 def _opener(page: Page, path: str) -> str:
-    """Return the source of a function such as ``connect``, which opens the twin on a loop thread."""
+    """Return the source code of a blocking function such as ``connect``, which opens its object on a loop thread."""
     module, _, name = path.rpartition(".")
     node = function_node(module, name)
     for argument in (*node.args.args, *node.args.kwonlyargs, node.args.vararg):

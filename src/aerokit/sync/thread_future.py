@@ -39,7 +39,7 @@ class ThreadFuture(Generic[T]):
         self.finish()
 
     def finish(self) -> None:
-        """Mark the future as done, with or without a result. Idempotent on one thread."""
+        """Mark the future as done, with or without a result. Later calls do nothing; all must be made on one thread."""
         if not self.is_done:
             self.is_done = True
             self._gate.release()

@@ -352,6 +352,7 @@ class Subscription(SubscriptionTwin[ItemT]):
         Raises:
             OperationTimeout: no item arrived within ``timeout`` seconds.
             ConnectionClosed, LinkLost: the connection ended.
+            BusyError: another task already reads the subscription.
             InvalidArgument: the subscription is closed; read it inside its ``with`` block.
         """
         return self._loop.run(self.aio.get, timeout)

@@ -179,7 +179,8 @@ def split_frames(data: bytes) -> Sequence[bytes]:
 
 def _end_of_frame(data: bytes, begin: int) -> int | None:
     """Return the end of the frame that begins at ``begin``, according to its header; None if no frame begins there."""
-    has_length = len(data) >= begin + 3  # The header begins with the magic byte, the payload length and the flags.
+    # The header begins with the magic byte, the payload length and (in MAVLink 2) the flags.
+    has_length = len(data) >= begin + 3
     if not has_length or data[begin] not in (MAGIC_V1, MAGIC_V2):
         return None
     magic, payload_length, flags = data[begin : begin + 3]

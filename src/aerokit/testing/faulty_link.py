@@ -369,7 +369,7 @@ class _DeliveryQueue:
         return bool(self._waiting)
 
     def put(self, due: float, action: Callable[[], None]) -> None:
-        """Queue an action. If it is due and the queue is empty, run it at once, so that no faults add no delay."""
+        """Queue an action. Run it at once if it is due and the queue is empty: a link without faults adds no delay."""
         if due <= self.loop.time() and not self._waiting:
             action()
             return

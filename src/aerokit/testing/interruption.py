@@ -48,16 +48,17 @@ class Interruption:
 
     @contextlib.contextmanager
     def on_error(self) -> Iterator[None]:
-        """When an exception leaves this block, which runs on another thread, interrupt the main thread."""
+        """Block on another thread than the main one: an exception that leaves it interrupts the main thread."""
         try:
             yield
         except Exception:
+            # A signal that arrives in context-manager code is ignored (`_on_signal`), so it is repeated.
             while self._send_signal():
                 time.sleep(_RETRY_INTERVAL_S)
             raise
 
     def _send_signal(self) -> bool:
-        """Send the signal and return True. If it was delivered already, or the block has ended, return False."""
+        """Send SIGINT to the main thread; return False if it was already interrupted, or has left its block."""
         with self._lock:
             is_needed = self._is_allowed and not self._is_delivered
             if is_needed:

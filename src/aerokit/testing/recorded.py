@@ -49,7 +49,7 @@ class RecordedParameters(ParameterProtocolServer):
         for time, value in vehicle.recording.parameters:
             self._recorded.setdefault(value.param_id, []).append((time, value))
         values = [value for _, value in vehicle.recording.parameters]
-        # Only values of a list have an index. Values of reads and writes have UNKNOWN_INDEX.
+        # ArduPilot's answers to writes and to reads by name have UNKNOWN_INDEX instead of the index.
         indices = {value.param_id: value.param_index for value in values if value.param_index != UNKNOWN_INDEX}
         without_index = [name for name in self._recorded if name not in indices]
         is_complete = bool(indices) and len(indices) == max(value.param_count for value in values)
@@ -105,8 +105,9 @@ class RecordedMissions(MissionServer):
         super().__init__(vehicle, capacity=_MAX_ITEMS)
         self._vehicle = vehicle
         self.requests_int: bool = vehicle.recording.uses_int
-        self._received: list[AnyItem] = []
-        self._written: dict[int, tuple[AnyItem, ...]] = {}
+        self._received: list[AnyItem] = []  # items of the upload in progress
+        self._written: dict[int, tuple[AnyItem, ...]] = {}  # uploaded plans by MAV_MISSION_TYPE
+        # How many recorded results were already sent, by operation and MAV_MISSION_TYPE.
         self._result_counts: dict[tuple[str, int], int] = {}
         self.listen()
 

@@ -248,10 +248,11 @@ class BaseLink(Link):
 
     def _report_stalled(self, is_stalled: bool) -> None:
         """Notify the receiver when one of the link's transports stalls, and when none is stalled any more."""
-        now, stalled_at = asyncio.get_running_loop().time(), self._stalled_at
+        stalled_at = self._stalled_at
         was_stalled = stalled_at is not None
         if is_stalled == was_stalled:
             return
+        now = asyncio.get_running_loop().time()
         self._stalled_at = now if is_stalled else None
         receiver = self._receiver
         if not isinstance(receiver, DrainListener):

@@ -14,6 +14,7 @@ from exhaustive import exhaustive
 import aerokit
 from aerokit.apps.cli import fly, main
 from aerokit.apps.cli import fly as flown_plan
+from aerokit.apps.cli.mission import read_plan
 from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.sim import SimulatedCopter, SimulatedRover, SimulatedSub, SimulatorServer, simulated_link
 from aerokit.testing import run_virtual
@@ -44,6 +45,21 @@ def test_fly_flies_mission_to_end(copter: SimulatedCopter, capsys: pytest.Captur
     ):
         assert text in out
     assert (copter.is_armed, copter.is_landed) == (False, True)
+
+
+def test_fly_from_auto_shows_no_warning_about_mode(copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]) -> None:
+    async def scenario() -> int:
+        async with simulated_link(copter) as link, aerokit.connect(link) as pilot:
+            await pilot.wait_ready()
+            await pilot.mission.upload(read_plan("m.waypoints").mission)
+            await pilot.set_mode("AUTO")
+        async with simulated_link(copter) as link:
+            return await run_on(link, *FLY)
+
+    assert run_virtual(scenario()) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "AUTO mode not armable" in line]
+    assert lines
+    assert not any("!" in line for line in lines)
 
 
 def test_fly_sim_starts_at_planned_home(capsys: pytest.CaptureFixture[str]) -> None:

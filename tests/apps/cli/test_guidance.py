@@ -13,13 +13,14 @@ import time
 import warnings
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cli_harness import HOME, MISSION, run_on, run_with
 
 from aerokit import messages as m
 from aerokit.apps.cli import main
-from aerokit.apps.cli.main import COMMANDS, GROUPS, RUN
+from aerokit.apps.cli.main import COMMANDS, GROUPS, RUN, make_parser
 from aerokit.apps.cli.output import NotInstalled, import_extra, near_names, plain_warnings, suggestion
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.parameters.renames import ParameterRenamedWarning
@@ -204,6 +205,15 @@ def test_record_option_exists_where_something_flies(command: str, capsys: pytest
     with pytest.raises(SystemExit):
         main([command, "--help"])
     assert "--record FILE" in capsys.readouterr().out
+
+
+def test_page_of_serve_lists_its_options() -> None:
+    parser: Any = make_parser("serve")
+    (subparsers,) = parser._subparsers._group_actions
+    options = {name for action in subparsers.choices["serve"]._actions for name in action.option_strings}
+    page = (Path(__file__).parents[3] / "docs" / "serve.md").read_text(encoding="utf-8")
+    of_every_command = {"-h", "--help", "--baud", "--signing-key"}
+    assert {name for name in options - of_every_command if name not in page} == set()
 
 
 def test_fly_without_connection_leaves_no_recording() -> None:

@@ -14,7 +14,7 @@ from cli_harness import HOME, run_on, run_with
 
 from aerokit.apps.cli import main
 from aerokit.apps.cli import terminal as asking
-from aerokit.sim import SimulatedCopter
+from aerokit.sim import SimulatedCopter, SimulatedPx4
 from aerokit.testing import run_virtual
 from aerokit.transport.link import memory_link_pair
 
@@ -177,6 +177,13 @@ def test_mistyped_parameter_suggests_correction(
     assert run_with(SimulatedCopter(boot_time_s=0.0, home=HOME), arguments) == [code]
     printed = capsys.readouterr()
     assert "(did you mean 'RTL_ALT'?)" in printed.out + printed.err
+
+
+@pytest.mark.parametrize("arguments", [["params", "get", "MIS_TAKEOFF_AL"], ["params", "set", "MIS_TAKEOFF_AL=5"]])
+def test_name_refused_by_vehicle_gets_suggestion(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_with(SimulatedPx4(boot_time_s=0.0), arguments) == [5]
+    printed = capsys.readouterr()
+    assert "the vehicle has no such parameter (did you mean 'MIS_TAKEOFF_ALT'" in printed.out + printed.err
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,7 @@ from aerokit.events import (
 from aerokit.mavlink.enums import MavCmd, MavLandedState
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.vehicle.connect import vehicles_on
+from aerokit.vehicle.vehicle import Vehicle
 
 pytestmark = pytest.mark.anyio
 
@@ -272,6 +273,18 @@ async def test_state_lists_missing_reasons_where_room(size: tuple[int, int], sho
             patch.setattr(type(flight.vehicle), "missing_for_flight", lambda _: ["Compass", "RC", "Gyro"])
             rows = dict(VehicleText(flight.vehicle).rows(size=size))
         assert rows["missing"].plain.split("\n") == shown
+
+
+async def test_tall_wide_terminal_lists_all_missing_reasons() -> None:
+    names = ("horizontal velocity", "relative horizontal position", "absolute horizontal position", "vertical speed")
+    reasons = [f"the estimator has no {name} (EKF_STATUS_REPORT)" for name in names]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Vehicle, "missing_for_flight", lambda _: reasons)
+        async with stage(1, size=(130, 50)) as it:
+            it.app.update_view()
+            await it.wait_drawn("vertical speed")
+            assert all(name.split()[-1] in it.screen() for name in names)
+            assert "more)" not in it.app._state_rows()[1][1].plain
 
 
 async def test_vehicle_without_mission_shows_no_item() -> None:

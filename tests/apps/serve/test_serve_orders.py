@@ -79,6 +79,11 @@ async def test_command_without_token_is_refused(is_open: bool) -> None:
             {"latitude_deg": -35, "longitude_deg": 149, "altitude_relative_m": -20},
             "must be 0 or more",
         ),
+        (
+            "go_to",
+            {"latitude_deg": -35, "longitude_deg": 149, "altitude_relative_m": -(10**400)},
+            "must be 0 or more",
+        ),
         ("mode", {"mode": "GIUDED"}, "did you mean 'GUIDED'"),
         ("mode", {"mode": True}, "mode = True is no"),
         ("mission/start", {"item": -1}, "item"),

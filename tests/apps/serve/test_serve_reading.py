@@ -16,6 +16,7 @@ from starlette.applications import Starlette
 from starlette.routing import Mount, Route, WebSocketRoute
 
 import aerokit
+from aerokit.apps.readiness import readiness
 from aerokit.apps.serve import make_app
 from aerokit.apps.serve.app import STATIC
 from aerokit.apps.serve.failsafe import ground_station_failsafe
@@ -343,14 +344,33 @@ async def test_state_separates_not_armable_from_not_ready_to_fly() -> None:
         await stage.submit("disarm")
         await stage.flight.vehicle.set_mode("LAND")
         await anyio.sleep(1)
-        text = "ArduCopter needs a position to arm in GUIDED, to which Arm would change the mode"
+        text = "ArduCopter needs a position to arm in GUIDED, to which arming would change the mode"
         assert state()["not_armable"][0] == text  # type: ignore[index]
+        assert readiness(stage.flight.vehicle).against_arming == tuple(state()["not_armable"])  # type: ignore[arg-type]
         assert (await stage.submit("arm")).status_code == 409
+
+
+async def test_solved_reason_is_not_listed_when_checks_pass() -> None:
+    async with open_stage() as stage:
+        vehicle, faults = stage.flight.vehicle, stage.flight.copter.faults
+        await vehicle.set_mode("STABILIZE")
+        faults.prearm_failures = ["AHRS: Not healthy"]
+        await vehicle.sensors.wait_until(lambda sensors: sensors.prearm_checks_pass is False)
+        await anyio.sleep(2)
+        missing = json.loads(stage.app._served.snapshot())["vehicles"][0]["missing_for_flight"]
+        assert missing[0] == "AHRS: Not healthy"
+        faults.prearm_failures, faults.gps_lost = [], True
+        await vehicle.estimator.wait_until(lambda estimator: bool(estimator.missing))
+        assert vehicle.sensors.value.prearm_checks_pass is True
+        missing = json.loads(stage.app._served.snapshot())["vehicles"][0]["missing_for_flight"]
+        assert missing
+        assert "AHRS: Not healthy" not in missing
 
 
 @pytest.mark.parametrize(
     ("kind", "values", "action"),
     [
+        (SimulatedCopter, {"FS_GCS_ENABLE": 2}, "returns to launch"),
         (SimulatedCopter, {"FS_GCS_ENABLE": 5}, "lands"),
         (SimulatedPlane, {"FS_GCS_ENABL": 0}, "continues: the failsafe is off"),
         (SimulatedPlane, {"FS_GCS_ENABL": 1, "FS_LONG_ACTN": 1}, "returns to launch"),

@@ -25,6 +25,7 @@ from aerokit.logs.report import report_html
 from aerokit.logs.report.charts import points, rows_to_draw
 from aerokit.logs.report.formatting import clock, length, span
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.mavlink.tlog import TlogWriter
 from aerokit.position import Position
 from aerokit.testing import open_flight, run_virtual
@@ -405,6 +406,29 @@ def test_summary_of_unarmed_log_mentions_no_flight(tmp_path: Path) -> None:
     least, greatest = page.charts["map"]["layout"]["xaxis"]["range"]
     assert least <= -1
     assert 16.1 < greatest < 17  # 15.2 m of track, and 1 m
+
+
+@pytest.mark.parametrize(("autopilot", "labels"), [("ArduPilot", ["home", "0", "1"]), ("PX4", ["0", "1", "2"])])
+def test_mission_table_numbers_items_and_omits_unknown_altitudes(
+    autopilot: str, labels: list[str], tmp_path: Path
+) -> None:
+    nan = math.nan
+    flight = FlightLog(tmp_path / "flight.tlog", ends_at=4.0, autopilot=autopilot, home=Position(47.0, 8.0, 500.0))
+    flight.track.add(0.0, 47.0, 8.0, 500.0, 0.0)
+    flight.mission = [
+        Waypoint(0, MavCmd.NAV_WAYPOINT, 47.0, 8.0, 0.0, MavFrame.GLOBAL),
+        Waypoint(1, MavCmd.NAV_TAKEOFF, nan, nan, 10.0, MavFrame.GLOBAL_RELATIVE_ALT),
+        Waypoint(2, MavCmd.NAV_RETURN_TO_LAUNCH, nan, nan, 0.0, MavFrame.MISSION),
+    ]
+    target = tmp_path / "flight.html"
+    target.write_text(report_html(flight), encoding="utf-8")
+    page = Page(target)
+    take_off, back = f"{labels[1]}\nNAV_TAKEOFF\n10.0 m", f"{labels[2]}\nNAV_RETURN_TO_LAUNCH\n—"
+    assert f"{labels[0]}\nNAV_WAYPOINT\n47.000000, 8.000000\n0.0 m" in page.text
+    assert take_off in page.text
+    assert back in page.text
+    names = [trace["name"] for trace in page.charts["map"]["traces"]]
+    assert ("mission" in names) == (autopilot == "PX4"), "home is not an item on the map"
 
 
 def test_link_section_explains_lost_messages(tmp_path: Path, page: Page) -> None:

@@ -65,7 +65,7 @@ def test_silence_at_the_end_is_in_summary(silent: FlightLog) -> None:
     text = summary_of(silent)
     assert text.startswith("Nothing was received from the vehicle for ")
     assert "on, until the log ends; it was last 20.0 m above home in GUIDED." in text.splitlines()[0]
-    assert "if it lost the ground station too: FS_GCS_ENABLE = 5 (LAND)" in text
+    assert "if it lost the ground station too: FS_GCS_ENABLE = 5 (lands)" in text
     assert "20.0 m above home in GUIDED, " in text
     assert "s before its end: the rest of the flight, and with it a landing or a crash, was not recorded" in text
 
@@ -126,8 +126,9 @@ def test_recording_without_silence_mentions_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("vehicle", "name", "value", "text"),
     [
-        ("PX4 1.15", "NAV_DLL_ACT", 2, "NAV_DLL_ACT = 2 (Return)."),
+        ("PX4 1.15", "NAV_DLL_ACT", 2, "NAV_DLL_ACT = 2 (returns to launch)."),
         ("ArduPlane 4.6", "FS_GCS_ENABL", 1, "FS_GCS_ENABL = 1."),
+        ("ArduPlane 4.6", "FS_GCS_ENABL", 0, "FS_GCS_ENABL = 0 (continues: the failsafe is off)."),
         ("ArduPlane 4.6", "FS_LONG_ACTN", 1, "look at FS_GCS_ENABL, FS_LONG_ACTN, FS_LONG_TIMEOUT."),
         ("Autopilot", "FS_GCS_ENABLE", 1, "How the vehicle reacts to a lost ground station is unknown."),
     ],

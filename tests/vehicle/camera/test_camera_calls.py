@@ -21,6 +21,7 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import CameraCapFlags, MavCmd, MavResult
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 from aerokit.sim.components.captures import GREY_JPEG
+from aerokit.sim.faults import CommandFault
 from aerokit.vehicle.camera.controls import AutoFocus
 
 pytestmark = pytest.mark.anyio
@@ -210,6 +211,16 @@ async def test_format_storage_is_sent_once() -> None:
         with pytest.raises(CommandTimeout):
             await vehicle.camera.format_storage()
         assert len(commands) == 1
+
+
+async def test_format_storage_without_progress_waits_for_answer() -> None:
+    camera = SimulatedCamera()
+    command = int(MavCmd.STORAGE_FORMAT)
+    async with on_board(camera) as vehicle:
+        camera.faults.commands[command] = CommandFault(refuse_with=MavResult.ACCEPTED, delay_s=20.0)
+        await vehicle.camera.format_storage()
+        with pytest.raises(CommandTimeout):
+            await vehicle.camera.format_storage(timeout=10.0)
 
 
 async def test_reset_settings_restores_factory_values() -> None:

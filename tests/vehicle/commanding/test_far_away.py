@@ -27,6 +27,14 @@ async def test_go_to_far_target_sends_nothing(flying: Flight) -> None:
     assert flying.wire.sent == [] or all(m.NAME == "HEARTBEAT" for _, m in flying.wire.sent)
 
 
+async def test_error_of_far_place_names_the_argument(flying: Flight) -> None:
+    far = exchanged(flying)
+    with pytest.raises(InvalidArgument, match=r"^target = .* is not allowed: the place is"):
+        await flying.vehicle.loiter(far)
+    with pytest.raises(InvalidArgument, match=r"^center = .* is not allowed: the place is"):
+        await flying.vehicle.figure_eight(far, major_radius_m=20, minor_radius_m=8, axis_deg=90, speed_m_s=4)
+
+
 async def test_go_to_far_target_with_raised_limit_flies(flying: Flight) -> None:
     with anyio.move_on_after(3.0):
         await flying.vehicle.go_to(exchanged(flying), max_distance_m=2.1e7)

@@ -153,6 +153,13 @@ async def test_optical_flow_uses_message_of_firmware() -> None:
     assert (pixels.flow_x, pixels.flow_y) == (2, -1)
 
 
+async def test_optical_flow_beyond_message_names_argument() -> None:
+    async with open_flight(copter()) as flight, flight.vehicle.external.optical_flow() as stream:
+        stream.send(v.FlowMeasurement(327.67, -327.68, 0.1))
+        with pytest.raises(InvalidArgument, match=r"y_rad = -328\.0 is not allowed: it must be -327\.68 to 327\.67"):
+            stream.send(v.FlowMeasurement(0.0, -328.0, 0.1))
+
+
 async def test_landing_target_is_in_frame_of_firmware() -> None:
     value = v.TargetMeasurement(2.0, 1.0, 10.0, is_level=True)
     async with open_flight(copter()) as flight:

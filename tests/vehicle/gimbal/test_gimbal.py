@@ -111,15 +111,14 @@ async def test_denied_order_claims_control_until_release() -> None:
         with pytest.raises(CommandRejected):
             await flight.vehicle.gimbal.point(-45.0, 0.0, wait=False)
         assert [len(flight.wire.commands(command)) for command in (PITCHYAW, CONFIGURE)] == [2, 1]
-        assert params(flight.wire.commands(CONFIGURE)[0])[:2] == (
-            255,
-            flight.vehicle.connection.source_component,
-        )
+        # -1 leaves the secondary controller as it is; 0 would remove another station's secondary control.
+        own_ids = (255, flight.vehicle.connection.source_component)
+        assert params(flight.wire.commands(CONFIGURE)[0])[:3] == (*own_ids, -1)
         flight.copter.faults.refuse(MOUNT, MavResult.ACCEPTED)
         flight.copter.faults.refuse(CONFIGURE, MavResult.ACCEPTED)
         for _ in range(2):
             await flight.vehicle.gimbal.release()
-        assert [params(command)[:2] for command in flight.wire.commands(CONFIGURE)[1:]] == [(-3, -3)]
+        assert [params(command)[:3] for command in flight.wire.commands(CONFIGURE)[1:]] == [(-3, -3, -1)]
 
 
 async def test_old_firmware_gets_mount_messages() -> None:

@@ -262,9 +262,9 @@ async def _connect_and_fly(
                 if is_followed and options.record is not None and flights[-1].armed_by_us:
                     await record_to_end(vehicle, interrupts, report.print_line)
             except AerokitError:
-                if flights[-1].armed_by_us and options.record is not None:
-                    await record_to_end(vehicle, interrupts, report.print_line)
                 if flights[-1].armed_by_us:
+                    if options.record is not None:
+                        await record_to_end(vehicle, interrupts, report.print_line)
                     report.print_summary(options.record)
                 raise
         if flights[-1].armed_by_us:

@@ -28,6 +28,7 @@ from aerokit.apps.cli.params_metadata import (
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.apps.parameter_values import with_range_note
 from aerokit.errors import AerokitError, InvalidArgument, ParameterRejected, ParameterTimeout
+from aerokit.mavlink.enums import MavParamError
 from aerokit.parameters import checked_value
 from aerokit.vehicle.parameters.writing import resolve_known
 
@@ -218,15 +219,22 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
     try:
         return await vehicle.parameters.read(name, idle_timeout_s=options.patience)
     except (ParameterRejected, ParameterTimeout) as error:
-        known = await _known_names(vehicle) if isinstance(error, ParameterRejected) else ()
+        known = await _known_names(vehicle) if _is_unknown_name(error) else ()
         error.args = (f"{_with_hint(name, error, known)}",)
         raise
 
 
 async def _names_for_hints(vehicle: Vehicle, results: Iterable[ParameterWrite]) -> Collection[str]:
     """Return the names of the vehicle's parameters if a result needs suggestions, otherwise nothing."""
-    is_needed = any("has no parameter" in str(result.error) for result in results)
+    is_needed = any(_is_unknown_name(result.error) for result in results)
     return await _known_names(vehicle) if is_needed else ()
+
+
+def _is_unknown_name(error: Exception | None) -> bool:
+    """Return True if the vehicle does not have a parameter: it said so, or does not answer for this name only."""
+    if not isinstance(error, ParameterRejected):
+        return False
+    return error.code == MavParamError.DOES_NOT_EXIST or "has no parameter" in str(error)
 
 
 async def _known_names(vehicle: Vehicle) -> Collection[str]:
@@ -243,7 +251,7 @@ def _with_hint(name: str, error: Exception, known: Collection[str]) -> str:
     """
     text = str(error)
     # The texts with "replaced by" and "its name on" already contain the right name.
-    if "has no parameter" not in text or "replaced by" in text or "its name on" in text:
+    if not _is_unknown_name(error) or "replaced by" in text or "its name on" in text:
         return text
     bare = text.partition(" (did you mean")[0]  # the error suggests only parameters that were already read
     beginnings = [other for other in known if len(other) >= _MIN_BEGINNING and name.upper().startswith(other)]

@@ -313,8 +313,13 @@ class FlightReport:
                 if isinstance(event, events.ModeChanged):
                     self.print_line(f"  mode {event.after}")
                 elif isinstance(event, events.StatusTextReceived) and not MISSION_TEXT.match(event.text):
-                    mark = "! " if event.severity <= _WARNING_SEVERITY else ""
-                    self.print_line(f"  {mark}{event.text}")
+                    is_warning = event.severity <= _WARNING_SEVERITY and not self._is_about_mode(event.text)
+                    self.print_line(f"  {'! ' if is_warning else ''}{event.text}")
+
+    def _is_about_mode(self, text: str) -> bool:
+        """Return True for "Arm: AUTO mode not armable", after which `Vehicle.arm` changes the mode and arms there."""
+        autopilot, mode = self._vehicle.autopilot, self._vehicle.mode_name
+        return mode in autopilot.armable_by_option and autopilot.arming_reason(text) == f"{mode} mode not armable"
 
     async def _print_status(self) -> None:
         vehicle = self._vehicle

@@ -40,6 +40,8 @@ __all__ = ["ConfirmScreen", "Monitor", "run_monitor"]
 REFRESH_INTERVAL_S = 0.5
 WIDE_SIZE = 120, 30
 """Minimum columns and rows of a terminal in which less important values are displayed, too."""
+TALL_ROWS = 48
+"""Minimum rows of a wide terminal in which the state has more lines, for all reasons that prevent a flight."""
 ANSI_THEMES = ("ansi-dark", "textual-ansi", "textual-dark")
 """Names of the theme that uses the terminal's colours. The name depends on the version of Textual."""
 TRACK_STYLES = ("green", "magenta", "red", "blue", "cyan", "yellow")
@@ -160,11 +162,12 @@ class Monitor(App[None]):
 
     def on_resize(self, event: Resize) -> None:
         """Adapt the layout to the terminal: if it is wide, rates are below the state, and texts below the map."""
+        base = self.screen_stack[0]
+        base.set_class(event.size.height >= TALL_ROWS, "tall")
         is_wide = event.size.width >= WIDE_SIZE[0] and event.size.height >= WIDE_SIZE[1]
         if is_wide == self._is_wide:
             return
         self._is_wide = is_wide
-        base = self.screen_stack[0]
         base.set_class(is_wide, "wide")
         panels, rates, texts = (base.query_one(f"#{name}") for name in ("panels", "rates_box", "texts"))
         if is_wide:

@@ -7,6 +7,7 @@ Other colours have enough contrast to both white and black.
 from __future__ import annotations
 
 import math
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
@@ -33,8 +34,8 @@ ARROWS = "↑↗→↘↓↙←↖"
 # The bits of a Braille character (U+2800 plus bits) that show its dots, by row and column.
 _BRAILLE_BITS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
 _MIN_SPAN_M = 20.0
-# Number of columns between labels and values, and number of columns of the text " (and 10 more)".
-_LABEL_PADDING, _MORE_WIDTH = 2, 14
+# Number of columns between labels and values.
+_LABEL_PADDING = 2
 
 
 def number(value: float | None, digits: int = 1, unit: str = "", sign: str = "-") -> str:
@@ -170,20 +171,26 @@ class VehicleText:
         return text.append_text(self.cell(quality, lambda report: _milliseconds(report.round_trip_s)))
 
     def _missing(self, max_lines: int = 1, width: int = 0) -> Text:
-        """Return the first reason that prevents a flight, then as many others as fit into ``max_lines``."""
+        """Return the first reason that prevents a flight, and as many others as fit into ``max_lines``."""
         found = readiness(self._vehicle)
         missing = list(found.against_arming or found.against_flight)
         if not missing:
             return Text("nothing")
         if not self._vehicle.armed.latest:
             missing[0] = f"{found.prefix if found.against_arming else 'arms, cannot fly by itself'}: {missing[0]}"
-        shown, used_lines = 1, 0
-        for count, reason in enumerate(missing, 1):
-            used_lines += math.ceil((len(reason) + _MORE_WIDTH) / max(1, width))
-            if used_lines <= max_lines:
-                shown = count
-        more = f" (and {len(missing) - shown} more)" if len(missing) > shown else ""
-        return Text("\n".join(map(printable, missing[:shown])) + more, WARNING)
+        texts: list[str] = []
+        for shown in range(len(missing), 0, -1):
+            texts = _with_count(missing, shown)
+            if sum(len(textwrap.wrap(text, max(1, width), break_on_hyphens=False)) for text in texts) <= max_lines:
+                break
+        return Text("\n".join(texts), WARNING)
+
+
+def _with_count(reasons: Sequence[str], shown: int) -> list[str]:
+    """Return the first reasons. The last one says how many more there are."""
+    more = len(reasons) - shown
+    texts = [printable(reason) for reason in reasons[:shown]]
+    return [*texts[:-1], f"{texts[-1]} (and {more} more)"] if more else texts
 
 
 def cell_of_constant(cell: StateCell[Any]) -> Text:

@@ -43,7 +43,7 @@ class MonitorModel:
         self.lines: deque[Text] = deque(maxlen=MAX_LINES)
         """Texts and events that are not displayed yet, the oldest first."""
         self.slow_streams: str = ""
-        """One line about all events of slow streams: their number and the last event. ``lines`` omits these events."""
+        """One line about all `StreamSlow` events: their number and the last one. ``lines`` omits these events."""
         self._slow_count = 0
         self.tracks: dict[int, deque[tuple[float, float]]] = defaultdict(lambda: deque(maxlen=MAX_TRACK_POINTS))
         """Maps system ids to positions in metres north and east of ``reference``, the oldest first."""

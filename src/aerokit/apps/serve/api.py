@@ -301,9 +301,7 @@ class HttpApi:
             get(f"{path}/mission", "mission", "The mission of a vehicle", self._mission, query=refresh),
             get(f"{path}/fence", "fence", "The fence of a vehicle", self._fence, query=refresh),
             get(f"{path}/rally", "rally", "The rally points of a vehicle", self._rally, query=refresh),
-            get(
-                f"{path}/parameters", "parameters", "All parameters of a vehicle", self._parameters, query=("refresh",)
-            ),
+            get(f"{path}/parameters", "parameters", "All parameters of a vehicle", self._parameters, query=refresh),
             get(parameter_path, "parameter", "One parameter, read from the vehicle", self._parameter),
             get("/api/events", "events", "Recent events, the newest last", self._events),
             get(

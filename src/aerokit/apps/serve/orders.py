@@ -103,8 +103,8 @@ async def _go_to(vehicle: Vehicle, values: dict[str, Any]) -> None:
     is_below_home = isinstance(altitude_m, (int, float)) and altitude_m < 0
     if is_below_home and vehicle.autopilot.vehicle_type != MavType.SUBMARINE:
         raise InvalidArgument(
-            f"go_to: altitude_relative_m = {altitude_m:g} is not allowed: it must be 0 or more, except for submarines"
-            " (altitude_amsl_m is not limited); nothing was sent"
+            f"go_to: altitude_relative_m = {altitude_m!r:.40} is not allowed: it must be 0 or more, except for"
+            " submarines (altitude_amsl_m is not limited); nothing was sent"
         )
     position = {name: values.pop(name) for name in tuple(values) if name in _POSITION}
     await vehicle.go_to(Position(**position), **values)

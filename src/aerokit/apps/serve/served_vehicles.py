@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit._internal.formatting import to_jsonable
-from aerokit.apps.readiness import ArmingCheckRequests, run_arming_checks
+from aerokit.apps.readiness import ArmingCheckRequests, not_armable, run_arming_checks, unarmable_mode
 from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.flight_watch import FlightWatch
 from aerokit.apps.serve.requests import HttpProblem
@@ -42,9 +41,6 @@ the track still covers the whole flight."""
 TRACK_INTERVAL_S = 0.2
 MIN_TRACK_STEP_M = 0.5
 TRACK_GAP_S = 3.0
-PREARM_TEXT_MAX_AGE_S = 35.0
-"""Maximum age in seconds of a text about a failed arming check. ArduPilot repeats these texts every 30 s."""
-_CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
 
 
 class ServedVehicles:
@@ -61,7 +57,6 @@ class ServedVehicles:
         self.events: deque[dict[str, Any]] = deque(maxlen=MAX_EVENTS)
         self._texts: dict[int, deque[dict[str, Any]]] = {}
         self._tracks: dict[int, list[tuple[Position, bool]]] = {}  # True marks the first position after a gap
-        # For each vehicle, the failing sensors at the last request for arming checks, and the time of this request.
         self._arming_checks = ArmingCheckRequests()
         self._watches: dict[Vehicle, FlightWatch] = {}
         self._listeners: list[Listener] = []
@@ -213,7 +208,7 @@ class ServedVehicles:
         ``mission_item`` counts items without home, unlike the state ``mission_current``, which counts them as on the
         wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if ``arm`` does not change the mode.
         """
-        mission, watch, missing = vehicle.mission, self._watch(vehicle), self._missing_for_flight(vehicle)
+        mission, watch, missing = vehicle.mission, self._watch(vehicle), vehicle.missing_for_flight()
         is_connected = vehicle.link_state.latest is LinkState.CONNECTED
         return {
             **overview(vehicle),
@@ -227,47 +222,8 @@ class ServedVehicles:
             "mission_item": mission.current.latest,
             "mission_items": mission.count.latest,
             "is_flying_mission": _is_flying_mission(vehicle),
-            "unarmable_mode": _unarmable_mode(vehicle),
+            "unarmable_mode": unarmable_mode(vehicle),
         }
-
-    def _missing_for_flight(self, vehicle: Vehicle) -> list[str]:
-        missing = vehicle.missing_for_flight()
-        if not missing or vehicle.link_state.latest is not LinkState.CONNECTED:
-            return missing
-        # Texts that are older than the last request for checks may describe problems that are already solved.
-        age_s = min(
-            vehicle.connection.now() - self._arming_checks.requested_at.get(vehicle, -math.inf), PREARM_TEXT_MAX_AGE_S
-        )
-        oldest_unix_s = vehicle.connection.unix_time() - age_s
-        recent = [entry["text"] for entry in self.texts(vehicle.system_id) if entry["time_unix_s"] >= oldest_unix_s]
-        reasons = (vehicle.autopilot.arming_reason(text) for text in recent)
-        return list(dict.fromkeys([*filter(None, reasons), *missing]))
-
-
-def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
-    """Return the known reasons why the order ``arm`` would be refused; empty if none is known. Sends nothing.
-
-    ``missing`` are the missing conditions for flight. In modes without a position, ArduPilot arms without most of them.
-    """
-    autopilot, unarmable = vehicle.autopilot, _unarmable_mode(vehicle)
-    if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False:
-        return []
-    if unarmable is not None and unarmable["arms_in"] is None:  # `arm` cannot change to a mode that allows arming
-        unless = f" unless {unarmable['unless']} allows it" if unarmable["unless"] else ""
-        return [f"{autopilot.firmware} cannot arm in {unarmable['mode']}{unless}", *missing]
-    sensors, estimator = vehicle.sensors.latest, vehicle.estimator.latest
-    if missing and sensors is not None and sensors.prearm_checks_pass is False:
-        # The general reason is omitted if there are specific reasons.
-        return [reason for reason in missing if len(missing) == 1 or reason != _CHECKS_FAIL]
-    mode = vehicle.mode.latest
-    arms_in = None if mode is None else mode.name
-    if unarmable is not None:  # `arm` would change the mode before
-        arms_in = unarmable["arms_in"]
-    needs_position = bool(autopilot.modes_without_position) and arms_in not in (None, *autopilot.modes_without_position)
-    if needs_position and estimator is not None and estimator.missing:
-        change = "" if unarmable is None else ", to which Arm would change the mode"
-        return [f"{autopilot.firmware} needs a position to arm in {arms_in}{change}", *missing]
-    return []
 
 
 def _unread(vehicle: Vehicle, parameter: str | None) -> list[str]:
@@ -279,16 +235,3 @@ def _is_flying_mission(vehicle: Vehicle) -> bool:
     """Return True if the vehicle is armed and in its mission mode, which ``mission.pause`` requires."""
     mode = vehicle.autopilot.mode_for("mission", is_vtol=vehicle.telemetry.is_vtol)
     return mode is not None and vehicle.telemetry.is_in(mode) and not vehicle.telemetry.is_confirmed_disarmed
-
-
-def _unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
-    """Return data about the current mode if the vehicle cannot arm in it; None if it can.
-
-    ``arms_in`` is the mode to which ``arm`` would change, or None. ``unless`` is the parameter that permits arming in
-    the current mode.
-    """
-    autopilot, mode = vehicle.autopilot, vehicle.mode.latest
-    if mode is None or mode.name not in autopilot.unarmable_modes.union(autopilot.armable_by_option):
-        return None
-    arming_mode, option = autopilot.mode_to_arm_in(), autopilot.armable_by_option.get(mode.name)
-    return {"mode": mode.name, "arms_in": None if arming_mode is None else arming_mode.name, "unless": option}

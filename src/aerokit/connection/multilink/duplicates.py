@@ -170,7 +170,7 @@ class MergedStreams:
         return True
 
     def accepts(self, frame: Frame, link: int) -> bool:
-        """Return True if a frame is to be delivered, and record it as accepted. Call it for first copies only."""
+        """Return True if a frame is to be delivered, and record it as accepted. No copy of it was accepted before."""
         stream = self._stream(frame)
         stream.received_at[link] = frame.received_at
         choice = self._choices.get(frame.system_id)

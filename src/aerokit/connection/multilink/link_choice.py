@@ -340,12 +340,13 @@ class LinkChoice:
         return now - self._command_at <= transit_s and waited_s <= MAX_SWITCH_DELAY_S
 
     def _change(self, chosen: Candidate, reason: str, now: float) -> str:
-        """Use this link from now on. Return the reason."""
+        """Use this link from now on; return ``reason``."""
         former = self.used
         if former is not None:
+            # Frames that the new link delivers earlier may be older than the last one of the former link.
             extra_transit_s = ((chosen.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
             self.fresh_after = former.received_at + extra_transit_s + JITTER_S
-            # The new link is only used because it leads to the same vehicle, which proves the former link, too.
+            # The new link is used only because it leads to the same vehicle, so the former link leads there, too.
             former.is_proven = not former.is_other_hardware
         self.former, self.used, self.changed_at, self._better = former, chosen, now, None
         self._adopt_hardware(chosen)

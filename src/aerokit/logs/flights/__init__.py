@@ -98,7 +98,7 @@ def read_flight(
 
 
 def _complete(flight: FlightLog) -> None:
-    """Complete the flight after reading: close open time spans, and derive home, heights and failsafe evidence."""
+    """Complete the flight once the whole log is read: end open time spans, and compute home, heights and failsafes."""
     is_armed_at_end = bool(flight.armed) and math.isinf(flight.armed[-1][1])
     if is_armed_at_end:
         flight.armed[-1] = (flight.armed[-1][0], flight.duration_s)

@@ -165,6 +165,7 @@ class Waypoint(Snapshot):
     """A mission item."""
 
     number: int
+    """Number in the vehicle's own count, in which ArduPilot's item 0 is home."""
     command: int
     """Number of the command (MAV_CMD)."""
     latitude_deg: float
@@ -280,6 +281,12 @@ class FlightLog:
         """Return the mode at this time; empty if unknown."""
         index = bisect_right(self.modes, time_s, key=lambda change: change.time_s)
         return self.modes[index - 1].name if index else ""
+
+    def item_label(self, item: Waypoint) -> str:
+        """Return the number of a mission item, counted from 0 without home; "home" for home, ArduPilot's item 0."""
+        if self.autopilot != "ArduPilot":
+            return str(item.number)
+        return str(item.number - 1) if item.number else "home"
 
     def mode_spans(self) -> list[tuple[ModeChange, float]]:
         """Return each mode change, with the time at which the mode ends."""

@@ -137,7 +137,7 @@ class BinReader(_RowReader):
         count = 0
         while (message := self._next(reader)) is not None:
             count += 1
-            if count % 1024 == 0:
+            if count % 16_384 == 0:
                 on_bytes(reader.offset)
             table, fields = message.get_type(), message.to_dict()
             fields.pop("mavpackettype", None)

@@ -1,4 +1,4 @@
-"""The records of a log in sequence, as input for converters. Each record has the states that it changes."""
+"""The records of a log in order, as input for converters, each with the values of the states that it updates."""
 
 from __future__ import annotations
 

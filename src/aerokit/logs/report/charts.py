@@ -304,7 +304,7 @@ def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any
 
 
 def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
-    items = [item for item in flight.mission if not math.isnan(item.latitude_deg) and item.number > 0]
+    items = [item for item in flight.mission if not math.isnan(item.latitude_deg) and flight.item_label(item) != "home"]
     if not items:
         return []
     markers = _marker(
@@ -313,7 +313,7 @@ def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
         "diamond-open",
         "colour:mission",
         9,
-        [f"{item.number} {command_name(item.command)}" for item in items],
+        [f"{flight.item_label(item)} {command_name(item.command)}" for item in items],
     )
     return [{**markers, "mode": "markers+lines", "line": {"color": "colour:mission", "width": 1, "dash": "dash"}}]
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from aerokit.logs.flights.failsafes import Failsafe
-    from aerokit.logs.flights.flight import FlightLog, TimeSeries
+    from aerokit.logs.flights.flight import FlightLog, TimeSeries, Waypoint
     from aerokit.logs.report.page import Part
 
 _SEVERITIES = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
@@ -320,17 +320,27 @@ def _mission(flight: FlightLog) -> Section | None:
         return Section("Mission", [Paragraphs(["No mission: the only item is home, ArduPilot's item 0."])])
     rows = [
         (
-            str(item.number),
+            flight.item_label(item),
             command_name(item.command),
             "" if math.isnan(item.latitude_deg) else f"{item.latitude_deg:.6f}, {item.longitude_deg:.6f}",
-            f"{item.altitude_m:.1f} m",
+            f"{item.altitude_m:.1f} m" if _has_altitude(item) else "—",
         )
         for item in flight.mission
     ]
+    explanation = ""
+    if flight.autopilot == "ArduPilot":
+        explanation = "Items are numbered from 0, without home. The numbers in ArduPilot's texts are one higher."
     return Section(
         "Mission",
         [Table(("item", "command", "position", "altitude"), rows, f"{len(rows)} items")],
+        explanation,
     )
+
+
+def _has_altitude(item: Waypoint) -> bool:
+    """Return False for items such as RTL. An item without a position may have an altitude, such as a take-off."""
+    has_position = not math.isnan(item.latitude_deg)
+    return math.isfinite(item.altitude_m) and (has_position or item.altitude_m != 0)
 
 
 def _about(flight: FlightLog) -> Section:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from aerokit.autopilots.gcs_failsafe import GCS_FAILSAFE_ACTIONS, gcs_failsafe
 from aerokit.logs.report.formatting import clock, span
 
 if TYPE_CHECKING:
@@ -14,30 +15,13 @@ _MAX_LISTED = 3
 # After a silence, it takes at most this long until a HEARTBEAT reports the mode.
 _MODE_DELAY_S = 1.5
 
-# Maps firmwares to the parameters of their ground station failsafe. The first parameter selects the action.
-_PARAMETERS: dict[str, tuple[str, ...]] = {
-    "PX4": ("NAV_DLL_ACT", "COM_DL_LOSS_T"),
-    "ArduCopter": ("FS_GCS_ENABLE", "FS_GCS_TIMEOUT", "FS_OPTIONS"),
-    "ArduPlane": ("FS_GCS_ENABL", "FS_LONG_ACTN", "FS_LONG_TIMEOUT"),
-    "Rover": ("FS_GCS_ENABLE", "FS_GCS_TIMEOUT", "FS_ACTION"),
-    "ArduSub": ("FS_GCS_ENABLE", "FS_GCS_TIMEOUT"),
-}
-# Maps firmwares to the meanings of the first parameter's values.
-_ACTIONS: dict[str, dict[int, str]] = {
-    "PX4": {0: "no reaction", 1: "Hold", 2: "Return", 3: "Land", 5: "terminates the flight", 6: "disarms"},
-    "ArduCopter": {
-        0: "no reaction",
-        1: "RTL",
-        2: "RTL",
-        3: "SMART_RTL or RTL",
-        4: "SMART_RTL or LAND",
-        5: "LAND",
-        6: "the mission's landing sequence or RTL",
-        7: "BRAKE or LAND",
-    },
-    "ArduPlane": {0: "no reaction"},
-    "Rover": {0: "no reaction"},
-    "ArduSub": {0: "no reaction", 1: "warning only", 2: "disarms", 3: "ALT_HOLD", 4: "SURFACE"},
+# Maps firmwares to the parameters of their ground station failsafe that do not select the action.
+_OTHER_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "PX4": ("COM_DL_LOSS_T",),
+    "ArduCopter": ("FS_GCS_TIMEOUT", "FS_OPTIONS"),
+    "ArduPlane": ("FS_LONG_TIMEOUT",),
+    "Rover": ("FS_GCS_TIMEOUT",),
+    "ArduSub": ("FS_GCS_TIMEOUT",),
 }
 
 
@@ -88,17 +72,18 @@ def _state(flight: FlightLog, time_s: float) -> str:
 
 def ground_station_failsafe(flight: FlightLog, time_s: float) -> str:
     """Return a sentence about the vehicle's configured reaction to a lost ground station, also if it is unknown."""
-    firmware = next((name for name in _PARAMETERS if name in flight.vehicle), "")
+    firmware = next((name for name in GCS_FAILSAFE_ACTIONS if name in flight.vehicle), "")
     if not firmware:
         return "How the vehicle reacts to a lost ground station is unknown."
-    names = _PARAMETERS[firmware]
-    values = {name: flight.parameter_at(name, time_s) for name in names}
-    if math.isnan(values[names[0]]):
+    names = (*GCS_FAILSAFE_ACTIONS[firmware], *_OTHER_PARAMETERS[firmware])
+    values = {name: value for name in names if not math.isnan(value := flight.parameter_at(name, time_s))}
+    if names[0] not in values:
         return (
             f"How the vehicle reacts to a lost ground station is unknown, because the log does not contain {names[0]};"
             f" look at {', '.join(names)}."
         )
-    action = _ACTIONS[firmware].get(int(values[names[0]]), "")
-    known = [f"{name} = {value:g}" for name, value in values.items() if value == value]
-    known[0] += f" ({action})" if action else ""
-    return f"The vehicle's reaction, if it lost the ground station too: {', '.join(known)}."
+    decisive, action = gcs_failsafe(firmware, values.get)
+    texts = {name: f"{name} = {value:g}" for name, value in values.items()}
+    if decisive is not None and action is not None:
+        texts[decisive] += f" ({action})"
+    return f"The vehicle's reaction, if it lost the ground station too: {', '.join(texts.values())}."

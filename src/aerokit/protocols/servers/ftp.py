@@ -244,8 +244,8 @@ class SessionFtpServer(Generic[FilesT]):
         size = self._size(path, reading=is_reading)
         if size > _MAX_SIZE:
             raise FileFault(EFBIG)
-        is_new_file = not is_reading and self.creates_missing and path not in self.files
-        create = request.opcode == Op.CREATEFILE or is_new_file
+        may_create = not is_reading and self.creates_missing
+        create = request.opcode == Op.CREATEFILE or (may_create and path not in self.files)
         file = self.files.open(path, writing=not is_reading, create=create)
         number = self._new_number(peer, request)
         session = peer.sessions[number] = FtpSession(number, file, size, not is_reading)

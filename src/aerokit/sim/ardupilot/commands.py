@@ -347,7 +347,7 @@ class GimbalCommands:
             gimbal.point(roll, pitch, yaw, from_north=False)
             return Result.ACCEPTED
         # Params 1 and 2 held the position until AP 4.2. Newer firmware refuses such a command (AP_Mount_Backend.cpp).
-        has_place_in_params = command.param1 and not command.x and not command.y
+        has_place_in_params = command.param1 and command.param2 and not command.x and not command.y
         if mode == MavMountMode.GPS_POINT and not has_place_in_params:
             place = (whole(command.x), whole(command.y), float(whole(command.param4)))
             gimbal.look_at(self._vehicle.world_point(*place, MavFrame.GLOBAL_RELATIVE_ALT))

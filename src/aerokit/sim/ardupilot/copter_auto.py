@@ -63,8 +63,7 @@ class _CircleLeg:
         self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
         north, east = motion.north - centre[0], motion.east - centre[1]
         self._angle = math.atan2(east, north)
-        self._turned_rad = 0.0
-        self._reported_turns = -1
+        self._turned_rad, self._reported_turns = 0.0, -1
         self._approach: _FlyLeg | None = None
         distance_to_circle = abs(math.hypot(north, east) - self._radius)
         if distance_to_circle > _ON_CIRCLE_M or abs(motion.down - centre[2]) > _ON_CIRCLE_M:
@@ -88,8 +87,7 @@ class _CircleLeg:
         self._turned_rad += abs(rate) * dt
         self._report_new_turn()
         # Follow a point that moves along the circle: command its velocity, plus 1 m/s for each metre of distance.
-        north, east, down = self._point()
-        speed = rate * self._radius
+        (north, east, down), speed = self._point(), rate * self._radius
         velocity_north, velocity_east = -speed * math.sin(self._angle), speed * math.cos(self._angle)
         motion.seek_velocity(
             north - motion.north + velocity_north, east - motion.east + velocity_east, down - motion.down
@@ -247,8 +245,7 @@ class CopterAuto(MissionMode):
     def update(self, dt: float) -> None:
         self.start_if_waiting()
         if not self.is_waiting:
-            has_upload_changed_mission = self._check_upcoming()
-            if has_upload_changed_mission and isinstance(self._leg, _FlyLeg):
+            if self._check_upcoming() and isinstance(self._leg, _FlyLeg):
                 self._restart_command()
             self.vehicle.mission.update()
             self._check_upcoming()  # `mission.update` may have started the next command
@@ -346,18 +343,16 @@ class CopterAuto(MissionMode):
             return False
         if not self._is_leg_complete:
             return False
-        continues = int(copter.parameters["MIS_OPTIONS"]) & _CONTINUE_AFTER_LAND
-        if continues and copter.mission.is_take_off(index + 1):
+        if int(copter.parameters["MIS_OPTIONS"]) & _CONTINUE_AFTER_LAND and copter.mission.is_take_off(index + 1):
             return True
         copter.arming.disarm()
         return False
 
     def _place(self, item: MissionItem) -> Ned:
         """Return the place of an item. Zero latitude and longitude, or a zero altitude, keep the current values."""
-        leg = self._leg
         current: Ned = self.vehicle.motion.place
-        if isinstance(leg, _FlyLeg) and leg.is_complete:
-            current = leg.destination  # more exact than the copter's position, which differs a little
+        if isinstance(self._leg, _FlyLeg) and self._leg.is_complete:
+            current = self._leg.destination  # more exact than the copter's position, which differs a little
         point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
         if point is None:
             return current
@@ -419,15 +414,14 @@ class CopterAuto(MissionMode):
         self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)
 
     def _change_speed(self, item: MissionItem) -> None:
-        speed_type, speed = item.param1, item.param2
-        if speed <= 0:  # A value of -1 means no change.
+        if item.param2 <= 0:  # A value of -1 means no change.
             return
-        if speed_type == SpeedType.CLIMB_SPEED:
-            self.climb = speed
-        elif speed_type == SpeedType.DESCENT_SPEED:
-            self.descent = speed
+        if item.param1 == SpeedType.CLIMB_SPEED:
+            self.climb = item.param2
+        elif item.param1 == SpeedType.DESCENT_SPEED:
+            self.descent = item.param2
         else:
-            self.speed: float = speed
+            self.speed: float = item.param2
 
     def _look_at(self, item: MissionItem) -> None:
         is_none = (item.x, item.y, item.z) == (0, 0, 0)

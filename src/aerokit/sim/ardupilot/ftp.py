@@ -169,7 +169,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         if peer.sessions:
             raise Refused(MavFtpErr.FAIL)
         answer = super()._open(peer, request)
-        # The banner follows a download of the parameters, as in the older protocol (GCS_FTP.cpp).
+        # As in the older protocol, a client that reads the parameters also gets the banner (GCS_FTP.cpp).
         self._is_banner_due = is_reading and self._path(request).startswith("@PARAM/param.pck")
         return answer
 

@@ -23,6 +23,8 @@ from aerokit.sim.parameters import SimParameters
 
 RC_ROLL, RC_PITCH, RC_THROTTLE, RC_YAW = range(4)
 """Indices of the RC channels of the sticks, in ArduPilot's default RCMAP."""
+SUB_PITCH, SUB_ROLL, SUB_FORWARD, SUB_LATERAL = 0, 1, 4, 5
+"""Indices of the RC channels of ArduSub that have another meaning than in other firmwares."""
 
 HostT = TypeVar("HostT", bound="ArduPilotHost")
 

@@ -136,19 +136,19 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if command == Cmd.NAV_TAKEOFF:
             assert self._place is not None
             is_altitude_reached = plane.wing.down <= self._place[2]
-            return self._report_if(is_altitude_reached, f"Takeoff complete at {plane.altitude_m:.2f}m")
+            return is_altitude_reached and self._report(f"Takeoff complete at {plane.altitude_m:.2f}m")
         if command in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT):
             return self._has_passed(index)
         if command == Cmd.NAV_LOITER_TIME:
             # Before the plane has reached the circle, the time is NaN, and the comparison is false.
             time_on_circle_s = plane.now - self._on_circle_since
-            return self._report_if(time_on_circle_s >= item.param1, "Loiter time complete")
+            return time_on_circle_s >= item.param1 and self._report("Loiter time complete")
         if command == Cmd.NAV_LOITER_TURNS:
-            return self._report_if(self._turned_rad >= 2 * math.pi * item.param1, "Loiter orbits complete")
+            return self._turned_rad >= 2 * math.pi * item.param1 and self._report("Loiter orbits complete")
         if command == Cmd.NAV_LOITER_TO_ALT:
             assert self._place is not None
             is_at_height = abs(plane.wing.down - self._place[2]) < _REACHED_HEIGHT_M
-            return self._report_if(is_at_height and self._is_on_circle, "Loiter to alt complete")
+            return is_at_height and self._is_on_circle and self._report("Loiter to alt complete")
         if command == Cmd.CONDITION_DELAY:
             return plane.now - self._condition_started_at > max(0.0, item.param1)
         if command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH):
@@ -156,11 +156,10 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self.warn_if_unknown(item)
         return True
 
-    def _report_if(self, is_done: bool, text: str) -> bool:
-        """Send the text if ``is_done``, and return ``is_done``."""
-        if is_done:
-            self.vehicle.info(text)
-        return is_done
+    def _report(self, text: str) -> bool:
+        """Send the text about a completed command, and return True."""
+        self.vehicle.info(text)
+        return True
 
     def _has_passed(self, index: int) -> bool:
         """Return True if the plane is within WP_RADIUS of the waypoint or has passed the waypoint."""
@@ -168,11 +167,10 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         wing, (north, east, _), start = self.vehicle.wing, self._place, self._leg_start
         distance = horizontal_distance(self.vehicle, self._place)
         if distance <= self.vehicle.parameters["WP_RADIUS"]:
-            self.vehicle.info(f"Reached waypoint #{index} dist {int(distance)}m")
-            return True
+            return self._report(f"Reached waypoint #{index} dist {int(distance)}m")
         # The plane has passed the waypoint if its offset from the waypoint points along the leg.
         dot_product = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
-        return self._report_if(dot_product > 0, f"Passed waypoint #{index} dist {int(distance)}m")
+        return dot_product > 0 and self._report(f"Passed waypoint #{index} dist {int(distance)}m")
 
     def _go(self, item: MissionItem, manoeuvre: int) -> None:
         """Start a leg. Zero coordinates mean the plane's coordinates, a zero altitude that of the previous leg."""

@@ -7,7 +7,17 @@ from collections.abc import Iterator, Mapping
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavResult
-from aerokit.sim.ardupilot.host import ArduPilotHost
+from aerokit.sim.ardupilot.host import (
+    RC_PITCH,
+    RC_ROLL,
+    RC_THROTTLE,
+    RC_YAW,
+    SUB_FORWARD,
+    SUB_LATERAL,
+    SUB_PITCH,
+    SUB_ROLL,
+    ArduPilotHost,
+)
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import ReceivedCommand, whole
@@ -20,8 +30,6 @@ _NO_PULSES, _LOW_THROTTLE = 1, 2
 _LOW_THROTTLE_PWM = 950
 # Special values of channels in RC_CHANNELS_OVERRIDE. `_RELEASE_UPPER` releases one of the channels 9 to 18.
 _UNCHANGED, _RELEASE_UPPER = 0xFFFF, 0xFFFE
-_ROLL, _PITCH, _THROTTLE, _YAW, _FORWARD, _LATERAL = range(6)
-_SUB_PITCH, _SUB_ROLL = 0, 1
 
 
 class ArduPilotRadio:
@@ -43,7 +51,7 @@ class ArduPilotRadio:
             value, since = self._overrides[index]  # The value 0 means that the channel is released.
             if value and self._vehicle.now - since < self._override_time():
                 return value
-        if index == _THROTTLE and self._failure == _LOW_THROTTLE:  # SIM_RC_FAIL simulates a receiver without signal.
+        if index == RC_THROTTLE and self._failure == _LOW_THROTTLE:  # SIM_RC_FAIL simulates a receiver without signal.
             return _LOW_THROTTLE_PWM
         return self._sticks[index] if index < len(self._sticks) else 0
 
@@ -133,10 +141,10 @@ class ArduPilotJoystick:
         if axes.z < 0:  # Copter ignores a message with negative thrust (GCS_MAVLink_Copter.cpp).
             return {}
         return {
-            _ROLL: self.pulse(_ROLL, axes.y),
-            _PITCH: self.pulse(_PITCH, axes.x, reverse=True),
-            _THROTTLE: self.pulse(_THROTTLE, axes.z, lowest=0),
-            _YAW: self.pulse(_YAW, axes.r),
+            RC_ROLL: self.pulse(RC_ROLL, axes.y),
+            RC_PITCH: self.pulse(RC_PITCH, axes.x, reverse=True),
+            RC_THROTTLE: self.pulse(RC_THROTTLE, axes.z, lowest=0),
+            RC_YAW: self.pulse(RC_YAW, axes.r),
         }
 
     def pulse(self, channel: int, value: int, *, lowest: int = -1000, reverse: bool = False) -> int:
@@ -159,7 +167,7 @@ class RoverJoystick(ArduPilotJoystick):
     """MANUAL_CONTROL of Rover: y is the steering and z the throttle, both from -1000 to 1000."""
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
-        return {_ROLL: self.pulse(_ROLL, axes.y), _THROTTLE: self.pulse(_THROTTLE, axes.z)}
+        return {RC_ROLL: self.pulse(RC_ROLL, axes.y), RC_THROTTLE: self.pulse(RC_THROTTLE, axes.z)}
 
 
 class SubJoystick(ArduPilotJoystick):
@@ -175,10 +183,10 @@ class SubJoystick(ArduPilotJoystick):
         throttle = axes.z * throttle_scale + _CENTRE - 500 * throttle_scale  # 500 is the middle of the axis z.
         # Like the firmware, do not scale pitch and roll (joystick.cpp).
         offsets = {
-            _SUB_PITCH: axes.s, _SUB_ROLL: axes.t, _YAW: axes.r * scale, _FORWARD: axes.x * scale,
-            _LATERAL: axes.y * scale,
+            SUB_PITCH: axes.s, SUB_ROLL: axes.t, RC_YAW: axes.r * scale, SUB_FORWARD: axes.x * scale,
+            SUB_LATERAL: axes.y * scale,
         }  # fmt: skip
-        pulses = {channel: _CENTRE + offset for channel, offset in offsets.items()} | {_THROTTLE: throttle}
+        pulses = {channel: _CENTRE + offset for channel, offset in offsets.items()} | {RC_THROTTLE: throttle}
         return {channel: int(max(_SUB_MIN_PWM, min(_SUB_MAX_PWM, pulse))) for channel, pulse in pulses.items()}
 
 

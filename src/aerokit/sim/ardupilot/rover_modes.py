@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from aerokit.mavlink.enums import MavSeverity, RoverMode
 from aerokit.mavlink.messages import MissionItemReached
-from aerokit.sim.ardupilot.host import ArduPilotMode, variant
+from aerokit.sim.ardupilot.host import RC_ROLL, RC_THROTTLE, ArduPilotMode, variant
 from aerokit.sim.ardupilot.navigation import SmartPath, best_return_place
 from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, RoverSubAuto, RoverSubVehicle
 from aerokit.sim.motion import Ned, wrap_pi
@@ -15,7 +15,6 @@ from aerokit.sim.vehicle_motion import GroundMotion
 
 _ARRIVED_M, _STANDING_M_S = 0.3, 0.1
 _FULL_STEERING_RAD_S = math.radians(90.0)
-_STEERING, _THROTTLE = 0, 2
 
 
 class RoverHost(RoverSubVehicle):
@@ -24,7 +23,7 @@ class RoverHost(RoverSubVehicle):
     motion: GroundMotion  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def reset_controllers(self) -> None:
-        self.rc[_THROTTLE] = 1500
+        self.rc[RC_THROTTLE] = 1500
         self.path: SmartPath = SmartPath(self, only_armed=False)
 
     def _become_ready(self) -> None:
@@ -68,7 +67,7 @@ class _Manual(_Mode):
     has_manual_throttle = True
 
     def update(self, dt: float) -> None:
-        throttle, steering = self.vehicle.stick(_THROTTLE), self.vehicle.stick(_STEERING)
+        throttle, steering = self.vehicle.stick(RC_THROTTLE), self.vehicle.stick(RC_ROLL)  # The roll stick steers.
         self.vehicle.motion.drive(throttle * self.vehicle.top_speed, steering * _FULL_STEERING_RAD_S)
 
 

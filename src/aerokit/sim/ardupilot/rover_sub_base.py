@@ -34,7 +34,7 @@ class GuidedTarget:
     position: Ned | None = None
     velocity: Ned | None = None
     backwards: bool = False
-    """True to drive backwards: the message has a negative vx, and a heading or a turn rate."""
+    """True to drive backwards: the message has a negative vx (or thrust), and a heading or a turn rate."""
     yaw: float | None = None
     yaw_rate: float | None = None
     timeout_s: float = 3.0

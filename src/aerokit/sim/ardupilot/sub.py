@@ -228,7 +228,6 @@ class SubSetpoints(GuidedSetpoints):
 
 _HOLDING_THROTTLE, _THROTTLE_PER_CLIMB_M_S = 0.45, 0.44
 _AMPERES_AT_FULL = 26.3
-_THROTTLE = 2
 
 
 class SubMotors(ArduPilotMotors):
@@ -243,7 +242,7 @@ class SubMotors(ArduPilotMotors):
     def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
         throttle = _HOLDING_THROTTLE - _THROTTLE_PER_CLIMB_M_S * motion.velocity_down
         if self.vehicle.mode.has_manual_throttle:
-            throttle = (self.vehicle.rc[_THROTTLE] - 1000) / 1000.0
+            throttle = (self.vehicle.rc[RC_THROTTLE] - 1000) / 1000.0
         self.throttle: float = max(0.0, min(1.0, throttle)) if self.is_armed else 0.0
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from itertools import cycle
 
 from aerokit.mavlink.enums import SubMode
-from aerokit.sim.ardupilot.host import ArduPilotMode, variant
+from aerokit.sim.ardupilot.host import RC_THROTTLE, RC_YAW, SUB_FORWARD, SUB_LATERAL, ArduPilotMode, variant
 from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, RoverSubAuto, RoverSubVehicle
 from aerokit.sim.commands import rotated
 from aerokit.sim.motion import Ned, wrap_pi
@@ -17,7 +17,6 @@ _MIN_LOOK_AHEAD_M, _MIN_TRAVEL_M_S = 1.0, 0.05
 _DEADZONE = 0.06
 _FULL_STICK_M_S = 1.0
 _FULL_STICK_TURN_RAD_S = math.radians(90.0)
-_THROTTLE, _YAW, _FORWARD, _LATERAL = 2, 3, 4, 5
 
 
 class SubHost(RoverSubVehicle):
@@ -70,14 +69,14 @@ class _Mode(ArduPilotMode):
     def horizontal_velocity_from_sticks(self) -> tuple[float, float]:
         """Turn as the yaw stick commands, and return the velocity north and east (m/s) that the sticks command."""
         motion = self.vehicle.motion
-        motion.turn(self.stick(_YAW) * _FULL_STICK_TURN_RAD_S)
-        forward, right = self.stick(_FORWARD) * _FULL_STICK_M_S, self.stick(_LATERAL) * _FULL_STICK_M_S
+        motion.turn(self.stick(RC_YAW) * _FULL_STICK_TURN_RAD_S)
+        forward, right = self.stick(SUB_FORWARD) * _FULL_STICK_M_S, self.stick(SUB_LATERAL) * _FULL_STICK_M_S
         north, east, _ = rotated((forward, right, 0.0), motion.yaw)
         return north, east
 
     def climb(self) -> float:
         """Return the climb rate that the throttle stick commands, in m/s."""
-        return self.stick(_THROTTLE) * (self.vehicle.parameters["PILOT_SPEED_UP"] / 100.0)
+        return self.stick(RC_THROTTLE) * (self.vehicle.parameters["PILOT_SPEED_UP"] / 100.0)
 
 
 class _Manual(_Mode):

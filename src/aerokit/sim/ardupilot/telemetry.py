@@ -23,7 +23,7 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 from aerokit.mavlink.message import Message
-from aerokit.sim.ardupilot.host import RC_PITCH, RC_ROLL, RC_THROTTLE, RC_YAW
+from aerokit.sim.ardupilot.host import RC_PITCH, RC_ROLL, RC_THROTTLE, RC_YAW, SUB_FORWARD, SUB_LATERAL, SUB_ROLL
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.plane_modes import PlaneHost
 from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
@@ -290,8 +290,6 @@ _SURFACE_RANGE = 400
 _ROVER_DEADZONE = 30
 _OUTPUTS = 16
 _FULL_ROLL_RATE, _FULL_PITCH_RATE = 1.5, 0.5
-# Indices of the RC channels of ArduSub that have another meaning than in other firmwares.
-_SUB_ROLL, _SUB_FORWARD, _SUB_LATERAL = 1, 4, 5
 
 
 def _copter_outputs(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
@@ -309,7 +307,7 @@ def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
         # The motion model has no surfaces. The deflections are derived from the rates of the plane.
         roll_share = wing.roll_rate / _FULL_ROLL_RATE
         aileron, rudder = _pulse(roll_share), _pulse(0.5 * roll_share)
-        elevator = _pulse(-wing.pitch_rate / _FULL_PITCH_RATE)  # A pulse below the middle raises the nose.
+        elevator = _pulse(wing.pitch_rate / _FULL_PITCH_RATE)  # As in MANUAL, a pulse above the middle raises the nose.
     return _servo_outputs(plane, aileron, elevator, throttle, rudder)
 
 
@@ -331,7 +329,7 @@ def _sub_outputs(sub: SubHost) -> m.ServoOutputRaw:
     thrusters = [_MIDDLE] * 6
     if sub.motors.is_armed:
         yaw, forward, lateral, roll = (
-            _stick(sub.rc[channel]) for channel in (RC_YAW, _SUB_FORWARD, _SUB_LATERAL, _SUB_ROLL)
+            _stick(sub.rc[channel]) for channel in (RC_YAW, SUB_FORWARD, SUB_LATERAL, SUB_ROLL)
         )
         # The signs are the motor factors of the frame VECTORED (AP_Motors6DOF.cpp). The vertical thrusters have the
         # throttle factor -1: their pulses fall below the middle for a throttle above one half.

@@ -204,17 +204,14 @@ class _Flight:
 
     def take_off(self, command: ReceivedCommand) -> int:
         """Take off to the altitude in param 7 (AMSL), or to MIS_TAKEOFF_ALT above home if param 7 is NaN."""
-        result = self._change(modes.TAKEOFF)
+        px4, result = self._px4, self._change(modes.TAKEOFF)
         if result == MavResult.ACCEPTED and math.isfinite(command.z):
-            self._plan_take_off(self._px4.frame.origin.altitude_m - command.z)
+            down = px4.frame.origin.altitude_m - command.z
+            if px4.is_armed and down > px4.motion.down and not px4.is_landed:
+                px4.send_text(MavSeverity.CRITICAL, "Already higher than takeoff altitude")
+                down = px4.motion.down
+            px4.flight.plan_take_off(down)
         return result
-
-    def _plan_take_off(self, down: float) -> None:
-        px4 = self._px4
-        if px4.is_armed and down > px4.motion.down and not px4.is_landed:
-            px4.send_text(MavSeverity.CRITICAL, "Already higher than takeoff altitude")
-            down = px4.motion.down
-        px4.flight.plan_take_off(down)
 
     def land(self, _: ReceivedCommand) -> int:
         return self._change(modes.LAND, "Landing at current position")
@@ -230,9 +227,10 @@ class _Flight:
         if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
             return MavResult.DENIED
-        # PX4 checks the index of the first item (param 1), but then continues at the current item.
         if not -1 <= command.param1 < px4.mission.count:
             return MavResult.DENIED
+        if command.param1 >= 0 and whole(command.param1) != px4.mission.current:
+            px4.mission.set_current(whole(command.param1))  # even if the mode is then refused (navigator_main.cpp)
         result = self._change(modes.MISSION)
         if result == MavResult.ACCEPTED and not px4.arming.arm("mission start"):
             return MavResult.TEMPORARILY_REJECTED

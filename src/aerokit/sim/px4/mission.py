@@ -54,9 +54,9 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
 def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     """Return PX4's text about a missing take-off or landing, or None.
 
-    MIS_TKO_LAND_REQ is 1 to require a take-off, 2 (the default) a landing, 3 both, 4 both or none.
+    MIS_TKO_LAND_REQ is 0 to require nothing, 1 a take-off, 2 (the default of planes) a landing, 3 both, 4 both or none.
     """
-    if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # Only planes have this parameter.
+    if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # The table of the multicopter lacks it.
         return None
     takes_off = any(item.command in _TAKE_OFFS for item in items)
     lands = any(item.command in _LANDINGS for item in items)
@@ -220,13 +220,14 @@ class Px4Mission:
             self._begin_item()
 
     def enter(self) -> None:
-        """Enter mission mode. A finished mission starts again."""
+        """Enter mission mode. A finished mission starts again, unless another item was selected in the meantime."""
         if not self.is_valid:
             return
-        if self.is_finished or self.current >= self.count:
-            self.current, self.is_finished = 0, False
+        if self.current >= self.count or (self.is_finished and self.current == self.count - 1):
+            self.current = 0
             self.forget_reached()
             self._jumps.clear()
+        self.is_finished = False
         if self._px4.is_armed:
             self._px4.info("Executing Mission")
         self._begin_item()

@@ -21,6 +21,7 @@ from aerokit.sim.motion import Ned, euler_from_quaternion
 from aerokit.sim.px4.flight import velocity_towards
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import OFFBOARD, POSITION, RTL
+from aerokit.sim.vehicle import MAX_TICK_S
 
 _NAN3: Ned = (math.nan, math.nan, math.nan)
 # The simulated ground is level, so altitudes above terrain are treated as altitudes above home.
@@ -28,7 +29,6 @@ _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFram
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
 _VERSION_1_14 = 1 << 24 | 14 << 16  # One byte each for the major and the minor version.
 _FLIGHT_CONTROL_GROUP, _THRUST_CONTROL = 0, 3
-_MAX_TICK_S = 0.1
 
 
 def _vector(components: Iterable[float]) -> Ned:
@@ -149,8 +149,8 @@ class Px4Offboard:
 
     def fly(self) -> None:
         motion = self._vehicle.motion
-        # After another mode, the last call may be long ago, so the elapsed time is limited to that of a tick.
-        elapsed, self._flown_at = min(_MAX_TICK_S, self._vehicle.now - self._flown_at), self._vehicle.now
+        # After another mode, the last call may be long ago, so the elapsed time is limited to that of a long tick.
+        elapsed, self._flown_at = min(MAX_TICK_S, self._vehicle.now - self._flown_at), self._vehicle.now
         if self._attitude is not None:
             self._fly_attitude(self._attitude, elapsed)
             return
@@ -178,13 +178,17 @@ class Px4Offboard:
         """Return the target velocity. On axes with a target position, add the velocity towards that position."""
         motion, limits = self._vehicle.motion, self._vehicle.parameters
         place = motion.place
-        max_speeds = (limits["MPC_XY_VEL_MAX"],) * 2 + (limits["MPC_Z_V_AUTO_UP"],)
+        max_horizontal = limits["MPC_XY_VEL_MAX"]
+        # In OFFBOARD, the limits of automatic flight (MPC_Z_V_AUTO_UP) do not apply (MulticopterPositionControl.cpp).
+        max_climb, max_descent = limits["MPC_Z_VEL_MAX_UP"], limits["MPC_Z_VEL_MAX_DN"]
+        lows, highs = (-max_horizontal, -max_horizontal, -max_climb), (max_horizontal, max_horizontal, max_descent)
         accelerations = (motion.limits.acceleration_m_s2,) * 2 + (motion.limits.vertical_acceleration_m_s2,)
         velocity = []
         for axis in range(3):
             speed = 0.0 if math.isnan(self._velocity[axis]) else self._velocity[axis]
             if math.isfinite(self._position[axis]):
                 offset = self._position[axis] - place[axis]
-                speed += velocity_towards(offset, max_speeds[axis], accelerations[axis])
-            velocity.append(max(-max_speeds[axis], min(max_speeds[axis], speed)))
+                limit = highs[axis] if offset > 0 else -lows[axis]
+                speed += velocity_towards(offset, limit, accelerations[axis])
+            velocity.append(max(lows[axis], min(highs[axis], speed)))
         return _vector(velocity)

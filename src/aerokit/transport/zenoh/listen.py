@@ -169,7 +169,7 @@ class ZenohListen(NetworkLink):
         self._clients.clear()
         if session is not None and self._is_serving:
             self._is_serving = False
-            # Deleting the beacon tells clients that we have closed.
+            # The deletion of the beacon, with a sending time of 0, tells clients that we have closed.
             goodbye = encode_sent_at(self._freshness.epoch, 0.0)
             drop = self._zenoh.CongestionControl.DROP
             with contextlib.suppress(Exception):

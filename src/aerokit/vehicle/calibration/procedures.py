@@ -50,7 +50,8 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
-    calibrating_at = math.inf  # when the vehicle last reported that it calibrates; infinite if it never did
+    # When the vehicle last reported that it calibrates. Infinite until the first report, so that no time is later.
+    calibrating_at = math.inf
     with ExitStack() as cleanup:
 
         def on_text(text: str) -> None:

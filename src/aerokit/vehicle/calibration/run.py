@@ -212,7 +212,7 @@ class CalibrationRun:
         if self._has_rebooted:
             return True
         assert self._cancel_sent_at is not None
-        # PX4's cancel command is PREFLIGHT_CALIBRATION with zeros. ArduPilot has other cancel commands.
+        # PREFLIGHT_CALIBRATION with zeros cancels every calibration of PX4, and ArduPilot's radio calibration.
         if cancel_command != MavCmd.PREFLIGHT_CALIBRATION:
             return self.session.commands.accepted_at(int(cancel_command)) >= self._cancel_sent_at
         status = self.session.telemetry.system_status

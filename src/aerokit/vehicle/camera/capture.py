@@ -349,7 +349,7 @@ def _gps_tags(capture: Capture) -> dict[int, Any]:
 
 def _sexagesimal(degrees: float) -> tuple[float, float, float]:
     """Convert to degrees, minutes and seconds, rounded to 0.0001 seconds (some millimetres)."""
-    ten_thousandths = round(abs(degrees) * 3600 * 10_000)  # the angle in units of 1/10,000 arc second
+    ten_thousandths = round(abs(degrees) * 36_000_000)  # the angle in units of 1/10,000 arc second
     total_minutes, rest = divmod(ten_thousandths, 60 * 10_000)
     whole_degrees, minutes = divmod(total_minutes, 60)
     return float(whole_degrees), float(minutes), rest / 10_000

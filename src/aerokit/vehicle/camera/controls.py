@@ -367,7 +367,14 @@ class StorageMixin(CameraMixin):
         await self._link.identify()
         # param2 = 1 formats the medium, param3 = 1 also resets the image log of the camera.
         await self._link.command(
-            MavCmd.STORAGE_FORMAT, number, 1, 1, attempts=1, progress_timeout=timeout, on_progress=on_progress
+            MavCmd.STORAGE_FORMAT,
+            number,
+            1,
+            1,
+            attempts=1,
+            attempt_timeout=timeout,
+            progress_timeout=timeout,
+            on_progress=on_progress,
         )
         for callback in self._link.on_cleared:  # The captures on the medium are lost.
             callback()
@@ -394,8 +401,8 @@ class StorageMixin(CameraMixin):
 
     def _on_storage(self, message: m.StorageInformation) -> None:
         medium = storage_of(message)
-        for number in range(medium.count + 1, max(self._media, default=0) + 1):
-            self._media.pop(number, None)  # This medium was removed.
+        # Media with a number above the reported count were removed.
+        self._media = {number: known for number, known in self._media.items() if number <= medium.count}
         self._media[medium.number] = medium
         media = tuple(self._media[number] for number in sorted(self._media))
         self._link.set_cell(self.storage, media, message)

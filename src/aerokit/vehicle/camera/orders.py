@@ -128,7 +128,7 @@ class CameraOrders:
             order.may_move = True  # From here on, the camera may execute the order.
         session, started_at = self._session, self._session.connection.now()
         arbiter = self._context.arbiter
-        # The arbiter sets `sent.end` when the command must no longer be repeated.
+        # `sent.end` gives the reason once the command must no longer be repeated.
         with arbiter.auxiliary_order(order) as sent_order, arbiter.sending(sent_order) as sent:
             try:
                 await session.commands.send_long(

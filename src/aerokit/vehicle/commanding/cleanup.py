@@ -326,7 +326,7 @@ class ArmCleanup:
         finally:
             detach()
         if has_armed:
-            await self._disarm_again(order, arming_orders_before, last_disarmed_at)
+            await self._undo_late_arming(order, arming_orders_before, last_disarmed_at)
 
     async def _wait_until_armed(self, was_armed: bool) -> bool:
         """Return True once the vehicle arms; False if the link ends first.
@@ -343,8 +343,8 @@ class ArmCleanup:
             return False
         return True
 
-    async def _disarm_again(self, order: Order, arming_orders_before: int, disarmed_at: float) -> None:
-        """Disarm the vehicle, unless another party armed it."""
+    async def _undo_late_arming(self, order: Order, arming_orders_before: int, disarmed_at: float) -> None:
+        """Disarm the vehicle, which has armed after its arm order was abandoned, unless another party armed it."""
         if self._arbiter.arming_orders != arming_orders_before:  # The program has sent a newer arm or disarm command.
             return
         if not await self._was_armed_by(order, disarmed_at):

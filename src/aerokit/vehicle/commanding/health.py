@@ -48,7 +48,7 @@ class Health:
             if not cell.is_known
         ]
         texts = self._recent_texts()
-        reasons = [*missing, *self._out_of_date(), *texts, *self._failing()]
+        reasons = [*texts, *missing, *self._out_of_date(), *self._failing()]
         explains = texts or self._failing_sensors() or (self._needs_position() and self._missing_estimates())
         return [*reasons, *([CHECKS_FAIL] if self._checks_fail() and not explains else [])]
 

@@ -12,6 +12,7 @@ from aerokit.position import travel_target
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.follow_target import FollowTarget
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, POSITION_MAX_AGE_S, await_progress
+from aerokit.vehicle.commanding.travel import KEEP_THROTTLE
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
@@ -31,8 +32,6 @@ YAW_BEHAVIOURS: dict[str, OrbitYawBehaviour] = {
 VTOL_STATES: dict[str, MavVtolState] = {"fixed_wing": MavVtolState.FW, "multicopter": MavVtolState.MC}
 MAX_RADIUS_M, MAX_SPEED_M_S, MAX_ROUNDS = 10_000, 50, 1000
 MAX_SET_SPEED_M_S = 1000
-KEEP_THROTTLE = -1.0
-"""param3 of DO_CHANGE_SPEED that leaves the throttle unchanged."""
 
 
 @checks_arguments
@@ -220,7 +219,7 @@ class ManeuverActions(VehicleBase):
             counter = TurnCounter(radius_m, clockwise=clockwise)
             command, params, mode = self._circle_command("loiter", radius_m, math.nan, "free", clockwise=clockwise)
         limits = (max_distance_m, timeout, max_silence_s)
-        flight = RoundFlight(self._context, "loiter", center, counter, turns or 0.0, limits)
+        flight = RoundFlight(self._context, "loiter", center, counter, turns or 0.0, limits, center_name="target")
         stay_s, circle_m = duration_s or 0.0, radius_m or 0.0
         await flight.fly_by_command(command, params, mode, is_held=False, stay_s=stay_s, circle_m=circle_m)
 

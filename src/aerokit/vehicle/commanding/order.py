@@ -53,7 +53,7 @@ CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
     MavCmd.DO_PAUSE_CONTINUE: _MOTION,
     MavCmd.COMPONENT_ARM_DISARM: ARM_ALONE,
 }
-"""Maps MAV_CMD to the subjects that it changes. A raw command supersedes actions about these subjects."""
+"""Maps MAV_CMD to what it changes (mode, motion, arming). A raw command supersedes actions that change the same."""
 CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
     "SET_MODE": _MODE,
     "SET_ATTITUDE_TARGET": _MOTION,
@@ -61,7 +61,7 @@ CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
     "SET_POSITION_TARGET_GLOBAL_INT": _MOTION,
     "MISSION_SET_CURRENT": _MOTION,
 }
-"""Maps the name of a message to the subjects that it changes. Commands and mission items are not in this table."""
+"""Maps the name of a message to what it changes. Commands and mission items are not in this table."""
 FAILSAFE_STATES = (MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMINATION)
 """Values of HEARTBEAT.system_status while a failsafe is active.
 

@@ -320,11 +320,11 @@ class VehiclePosition:
         """Return the altitude of home above mean sea level in metres; raise ValueUnknownError while it is unknown."""
         return self._telemetry.home.value.altitude_amsl_m
 
-    def global_target(self, target: Position) -> tuple[int, int, float, MavFrame]:
+    def global_target(self, target: Position, name: str = "target") -> tuple[int, int, float, MavFrame]:
         """Return latitude and longitude in 1e-7 degrees, the altitude in metres, and the frame of the altitude.
 
         The frame is MAV_FRAME_GLOBAL_RELATIVE_ALT_INT or MAV_FRAME_GLOBAL_INT. A target without an altitude gets the
-        vehicle's present one.
+        vehicle's present one. ``name`` is the caller's argument, for error texts.
 
         PX4 accepts only altitudes above mean sea level, so an altitude relative to home requires a known home.
         """
@@ -335,8 +335,8 @@ class VehiclePosition:
         altitude = relative_m if relative_m is not None else amsl_m
         if altitude is None:
             raise InvalidArgument(
-                f"target = {target} is not allowed: the target has no altitude, and the vehicle's own altitude is"
-                " unknown; give the target altitude_relative_m or altitude_amsl_m"
+                f"{name} = {target} is not allowed: the {name} has no altitude, and the vehicle's own altitude is"
+                f" unknown; give the {name} altitude_relative_m or altitude_amsl_m"
             )
         check_range("altitude", altitude, -12_000, 100_000)
         if is_relative and not self.accepts_relative_altitude:
@@ -344,9 +344,9 @@ class VehiclePosition:
         frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
         return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, frame
 
-    def command_place(self, target: Position) -> dict[str, Any]:
+    def command_place(self, target: Position, name: str = "target") -> dict[str, Any]:
         """Return the place as arguments of a COMMAND_INT; see :meth:`global_target`."""
-        latitude, longitude, altitude, frame = self.global_target(target)
+        latitude, longitude, altitude, frame = self.global_target(target, name)
         return {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
 
     def is_on_ground(self) -> bool:

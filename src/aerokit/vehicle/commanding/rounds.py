@@ -43,8 +43,8 @@ FRAME_TIMEOUT_S = 5.0
 class RoundFlight:
     """One flight around a place, or to the place if there is no ``counter``.
 
-    Without ``rounds``, the flight lasts until cancelled. ``limits`` are max_distance_m, timeout and max_silence_s. The
-    constructor raises if the vehicle cannot fly there.
+    Without ``rounds``, the flight lasts until cancelled. ``limits`` are max_distance_m, timeout and max_silence_s.
+    ``center_name`` is the argument of the public method. The constructor raises if the vehicle cannot fly there.
     """
 
     def __init__(
@@ -55,6 +55,8 @@ class RoundFlight:
         counter: TurnCounter | LobeCounter | None,
         rounds: float | None,
         limits: tuple[float, float | None, float | None],
+        *,
+        center_name: str = "center",
     ) -> None:
         self._context, self._session, self._telemetry = context, context.session, context.session.telemetry
         self._operation, self._center, self._counter = operation, center, counter
@@ -63,8 +65,8 @@ class RoundFlight:
         # Why the vehicle does not fly the ordered circle; empty if it does. Such a vehicle is ordered to hold.
         self._circle_problem = ""
         position = context.vehicle_position
-        self._place = position.command_place(center)
-        position.check_reach("center", [center], max_distance_m)
+        self._place = position.command_place(center, center_name)
+        position.check_reach(center_name, [center], max_distance_m)
         position.check_flying(operation)
 
     @property

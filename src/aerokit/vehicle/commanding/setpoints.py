@@ -221,7 +221,7 @@ class SetpointEncoder:
         """
         mask, yaw, yaw_rate = _yaw(setpoint.yaw_deg, setpoint.yaw_rate_deg_s)
         mask |= IGNORE_ACCELERATION | (IGNORE_VELOCITY if velocity is None else 0)
-        latitude, longitude, altitude, frame = self._position.global_target(setpoint.position)
+        latitude, longitude, altitude, frame = self._position.global_target(setpoint.position, "position")
         now, speeds = self._time_ms(), velocity or ZERO
         return SetPositionTargetGlobalInt(
             now, *self._address, frame, mask, latitude, longitude, altitude, *speeds, *ZERO, yaw, yaw_rate

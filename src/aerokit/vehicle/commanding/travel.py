@@ -17,7 +17,7 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavProtocolCapability, MavResult
+from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavProtocolCapability, MavResult, SpeedType
 from aerokit.mavlink.messages import HomePosition, SetPositionTargetGlobalInt
 from aerokit.position import Home, Position, point_at, travel_target
 from aerokit.vehicle.commanding.context import VehicleBase
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 # Bits of POSITION_TARGET_TYPEMASK that make the vehicle ignore all fields but the position.
 POSITION_ONLY = 0x0DF8
 
-# Values of param1 (type of speed) and param3 (throttle) of DO_CHANGE_SPEED.
-GROUND_SPEED, KEEP_THROTTLE = 1, -1
+KEEP_THROTTLE = -1
+"""param3 of DO_CHANGE_SPEED that leaves the throttle unchanged."""
 
 # A target that is sent without an acknowledgement is repeated at this interval in seconds.
 RESEND_S = 1.0
@@ -99,7 +99,8 @@ class TravelActions(VehicleBase):
             is_under_way = True
             if speed_m_s is not None and not self._speeds_by_reposition:
                 # ArduPilot applies the speed only once the vehicle is on its way.
-                await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, GROUND_SPEED, speed_m_s, KEEP_THROTTLE)
+                change = (SpeedType.GROUNDSPEED, speed_m_s, KEEP_THROTTLE)
+                await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, *change)
             if heading_deg is not None and math.isnan(yaw):  # MAV_CMD_DO_REPOSITION cannot set the heading.
                 await self._sender.send_long(order, MavCmd.CONDITION_YAW, heading_deg % 360)
             with self._flight_cleanup.flying(order):
@@ -193,7 +194,8 @@ class TravelActions(VehicleBase):
             CommandRejected: the vehicle refused.
         """
         check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
-        await self._sender.auxiliary_command(MavCmd.DO_CHANGE_SPEED, GROUND_SPEED, speed_m_s, KEEP_THROTTLE)
+        change = (SpeedType.GROUNDSPEED, speed_m_s, KEEP_THROTTLE)
+        await self._sender.auxiliary_command(MavCmd.DO_CHANGE_SPEED, *change)
 
     async def set_heading(
         self,

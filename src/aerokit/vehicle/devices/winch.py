@@ -88,15 +88,12 @@ class Winch(ReadOnly):
         # The order begins before the wait for a status, so that a newer order given during this wait ends it.
         order = self._context.arbiter.device_order(self._topic)
         start = await receive_once(self._context, m.WinchStatus, self._component_id)
-
-        def has_reached_length(status: m.WinchStatus) -> bool:
-            return start is not None and abs(status.line_length - start.line_length - length_m) <= LENGTH_TOLERANCE_M
-
+        goal_m = None if start is None else start.line_length + length_m
         await self._send(
             WinchActions.RELATIVE_LENGTH_CONTROL,
             length_m,
             rate_m_s,
-            None if start is None else has_reached_length,
+            None if goal_m is None else lambda status: abs(status.line_length - goal_m) <= LENGTH_TOLERANCE_M,
             timeout=timeout,
             order=order,
         )

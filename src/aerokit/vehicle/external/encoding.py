@@ -271,10 +271,11 @@ class MeasurementEncoder:
             flow = (value.x_rad, value.y_rad, *gyro)
             return (m.OpticalFlowRad(time_us, 0, interval_us, *flow, 0, value.quality, 0, distance_m),)
         # ArduPilot takes flow_x times the interval between messages as the rate in rad/s (AP_OpticalFlow_MAV.cpp). The
-        # angle is therefore divided by the interval twice.
-        flow_x, flow_y = (round(angle / value.interval_s**2) for angle in (value.x_rad, value.y_rad))
-        for name, flow_field in (("x_rad", flow_x), ("y_rad", flow_y)):
-            check_range(name, flow_field, -0x8000, 0x7FFF)
+        # angle is therefore divided by the interval twice. The result must fit into 16 bits.
+        unit_rad = value.interval_s**2
+        for name, angle in (("x_rad", value.x_rad), ("y_rad", value.y_rad)):
+            check_range(name, angle, -0x8000 * unit_rad, 0x7FFF * unit_rad)
+        flow_x, flow_y = round(value.x_rad / unit_rad), round(value.y_rad / unit_rad)
         rates = (value.x_rad / value.interval_s, value.y_rad / value.interval_s)
         return (m.OpticalFlow(time_us, 0, flow_x, flow_y, 0.0, 0.0, value.quality, distance_m, *rates),)
 

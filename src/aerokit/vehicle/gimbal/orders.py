@@ -260,8 +260,7 @@ class GimbalOrders:
         if self.device.control_blocks or commands.last_result(command, manager_id) != MavResult.DENIED:
             return False
         commands.forget_result(command, manager_id)  # One denial must not lead to a second claim.
-        params = self._primary_params(self.own_ids)
-        commands.send_unconfirmed(CONFIGURE, *params, component_id=manager_id)
+        commands.send_unconfirmed(CONFIGURE, *self.control_params(is_primary=True), component_id=manager_id)
         self._claimed = manager_id
         return True
 
@@ -269,16 +268,7 @@ class GimbalOrders:
         """Release control that was claimed outside of a control block."""
         if self._claimed == self.manager_id:
             self._claimed = None
-            await self.send(order, CONFIGURE, *self._primary_params((RELEASE, RELEASE)))
-
-    def _primary_params(self, controller: tuple[int, int]) -> tuple[float, ...]:
-        """Return the parameters that set the primary controller.
-
-        For the first gimbal of an autopilot, only two are returned, so that all others are sent as 0.
-        """
-        if self.gimbal_id_param == 0:
-            return controller
-        return (*controller, UNCHANGED, UNCHANGED, 0, 0, self.gimbal_id_param)
+            await self.send(order, CONFIGURE, *self.control_params(is_primary=True, release=True))
 
     def raise_if_taken(self) -> None:
         """Raise GimbalTaken if an open control block has lost control and no other open block is in control."""

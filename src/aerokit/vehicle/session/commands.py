@@ -149,7 +149,7 @@ class CommandSender:
         self._expect_acks((target, command), self._acks_of(command))
 
     def is_for_us(self, ack: CommandAck) -> bool:
-        """Return True if the ack is addressed to us, or to nobody (target 0), as in MAVLink 1 and old firmware."""
+        """Return True if the ack is addressed to us, or has no target (0), as in MAVLink 1 and old firmware."""
         is_for_our_system = ack.target_system in (0, self._connection.source_system)
         return is_for_our_system and ack.target_component in (0, self._connection.source_component)
 

@@ -218,7 +218,7 @@ class MessageRates:
                 stream.failures += 1
                 stream.next_attempt_at = self._connection.now() + min(2.0**stream.failures, MAX_RETRY_INTERVAL_S)
             return
-        # A refusal is an answer, too: the request is not repeated until a caller requests the stream again.
+        # A refusal is an answer, too: the request is repeated only when the stream is requested again.
         stream.failures = 0
         stream.mark_requested(self._connection.now(), hz)
 

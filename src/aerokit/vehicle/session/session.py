@@ -208,7 +208,7 @@ class VehicleSession:
             cell.close(self._ended_by)
 
     def add_timeout_hint(self, *cells: StateCell[Any]) -> None:
-        """Let the time-out texts of these cells mention rejected signatures, which are a likely cause of time-outs."""
+        """Make time-out errors of these state cells mention rejected signatures, which are a likely cause."""
         for cell in cells:
             cell._explain_timeout = self._describe_signatures
 

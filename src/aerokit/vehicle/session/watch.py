@@ -79,7 +79,7 @@ class VehicleWatch:
         # For each clock: a decreased time and when it was processed. Later messages may confirm that it shows a reboot.
         self._decreased_times: dict[str, tuple[int, float]] = {}
         self._expects_reboot = False
-        # When the last answer to our TIMESYNC requests was processed, and the vehicle's time in milliseconds in it.
+        # Our time when the last answer to a TIMESYNC request was processed, and the vehicle's time in it (ms).
         self._last_answer = (-math.inf, 0)
         attach = connection.bus.attach
         self._detach: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
@@ -214,7 +214,7 @@ class VehicleWatch:
         """Return True if the vehicle has counted on from the decreased time for ``REBOOT_CONFIRM_S`` seconds."""
         now = self._connection.now()
         decreased_ms, decreased_at = self._decreased_times.setdefault(clock, (milliseconds, now))
-        if milliseconds < decreased_ms:  # The time has decreased further: the confirmation starts anew.
+        if milliseconds < decreased_ms:  # The time has decreased further: the confirmation starts again.
             self._decreased_times[clock] = (milliseconds, now)
             return False
         return milliseconds > decreased_ms and now - decreased_at >= REBOOT_CONFIRM_S

@@ -259,9 +259,7 @@ def rc_channels(message: messages.RcChannels) -> RcChannels:
     """Return the pulse widths of the channels that the RC receiver has."""
     count = min(message.chancount, 18)
     channels = _CHANNELS(message)[:count]
-    return RcChannels(
-        tuple([known(channel_us, unknown=U16) for channel_us in channels]), known(message.rssi, unknown=U8)
-    )
+    return RcChannels(tuple([None if us == U16 else us for us in channels]), known(message.rssi, unknown=U8))
 
 
 def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOutputs:

@@ -265,6 +265,11 @@ function disarmedAt(before, now) {
   return hasDisarmed ? performance.now() : before?.disarmedAt;
 }
 
+function onEvent(event) {
+  texts.add(event);
+  if (event.event === "MissionFinished") orderList.finishMission(event.system_id, event.time_unix_s);
+}
+
 function onMessage(message) {
   if (message.type === "state") {
     page.receivedAt = performance.now();
@@ -281,13 +286,13 @@ function onMessage(message) {
     if (page.selected === undefined && page.vehicles.size) choose(Math.min(...page.vehicles.keys()));
     else if (selected() && page.modesOf !== page.selected) loadModes(page.selected);
   } else if (message.type === "event") {
-    texts.add(message);
+    onEvent(message);
     if (message.event === "ParameterChanged") parameters.changed(message.system_id, message.name, message.after);
   } else if (message.type === "order") record(message);
   else if (message.type === "hello") {
     page.isReadOnly = message.read_only;
-    message.events.forEach((each) => texts.add(each));
     message.orders.forEach((each) => record(each, false));
+    message.events.forEach(onEvent);
   }
   draw();
 }

@@ -314,8 +314,17 @@ export class OrderPanel {
     return [...this.records.values()].filter((each) => each.state === "running" && each.system_id === id);
   }
 
+  // The vehicle finished its mission: the last order that started or resumed it says so.
+  finishMission(id, unixSeconds) {
+    const isBefore = (each) => each.system_id === id && BEGUN[each.order] && each.given_unix_s <= unixSeconds;
+    const order = [...this.records.values()].filter(isBefore).pop();
+    if (order) order.finishedAt ??= unixSeconds;
+    this.drawn = undefined;
+  }
+
   // An order and its state, in words.
   outcome(record) {
+    if (record.finishedAt) return `${outcome(record)}, finished at ${clock(record.finishedAt)}`;
     if (!record.replaced_by) return outcome(record);
     const newer = this.records.get(record.replaced_by);
     return `${orderText(record)}: replaced by ${newer ? orderTitle(newer) : "a newer order"}`;

@@ -63,7 +63,7 @@ export function obstacle(order, vehicle, page) {
 const EKF_POS_HORIZ = 8 + 16, EKF_CONST_POS_MODE = 128; // bits of EKF_STATUS_REPORT: relative or absolute position
 
 // ArduCopter, armed, changes to GUIDED and AUTO only with a horizontal position (system.cpp, position_ok).
-export function lacksPosition(vehicle) {
+function lacksPosition(vehicle) {
   const estimator = vehicle.states.estimator;
   if (vehicle.firmware !== "ArduCopter" || estimator?.value?.message !== "EKF_STATUS_REPORT" || estimator.age_s > 5) return false;
   return !(estimator.value.flags & EKF_POS_HORIZ) || Boolean(estimator.value.flags & EKF_CONST_POS_MODE);

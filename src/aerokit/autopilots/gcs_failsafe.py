@@ -1,0 +1,74 @@
+"""Ground station failsafes: the action that a vehicle takes according to its parameters."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+_OFF = "continues: the failsafe is off"
+_RETURN, _SMART, _HOLD, _TERMINATE = (
+    "returns to launch",
+    "returns on its own track",
+    "holds",
+    "stops its motors",
+)
+GCS_FAILSAFE_ACTIONS: Mapping[str, Mapping[str, Mapping[float, str]]] = {
+    "ArduCopter": {
+        "FS_GCS_ENABLE": {
+            0: _OFF,
+            1: _RETURN,
+            2: _RETURN,  # since 4.0; before, a mission continued (ArduCopter/events.cpp, failsafe_gcs_on_event)
+            3: f"{_SMART}, otherwise {_RETURN}",
+            4: f"{_SMART}, otherwise lands",
+            5: "lands",
+            6: f"flies its landing sequence, otherwise {_RETURN}",
+            7: "brakes, otherwise lands",
+        }
+    },
+    "ArduPlane": {
+        "FS_GCS_ENABL": {0: _OFF},
+        "FS_LONG_ACTN": {
+            0: f"continues in AUTO and GUIDED, otherwise {_RETURN}",
+            1: _RETURN,
+            2: "glides",
+            3: "opens its parachute",
+            4: "flies its mission",
+            5: f"lands (AUTOLAND), otherwise {_RETURN}",
+        },
+    },
+    "Rover": {
+        "FS_GCS_ENABLE": {0: _OFF},
+        "FS_ACTION": {
+            0: "continues",
+            1: _RETURN,
+            2: _HOLD,
+            3: f"{_SMART}, otherwise {_RETURN}",
+            4: f"{_SMART}, otherwise {_HOLD}",
+            5: _TERMINATE,
+            6: _HOLD,
+        },
+    },
+    "ArduSub": {"FS_GCS_ENABLE": {0: _OFF, 1: "continues", 2: _TERMINATE, 3: "holds its depth", 4: "surfaces"}},
+    "PX4": {"NAV_DLL_ACT": {0: _OFF, 1: _HOLD, 2: _RETURN, 3: "lands", 5: _TERMINATE, 6: _TERMINATE}},
+}
+"""Maps firmwares to the parameters that determine the action, the most important parameter first, and to the actions of
+their values. If a value is not listed, the next parameter decides. Sources: Parameters.cpp of ArduPilot's firmwares,
+navigator parameters of PX4.
+"""
+
+
+def gcs_failsafe(firmware: str, value_of: Callable[[str], float | None]) -> tuple[str | None, str | None]:
+    """Return the parameter that decides on the action after the loss of the ground station, and the action as a clause.
+
+    ``value_of`` returns the value of a parameter, or None if it is unknown. The action is None if it is unknown; the
+    parameter is then the one whose value is needed, or None if no value would help.
+    """
+    for name, actions in GCS_FAILSAFE_ACTIONS.get(firmware, {}).items():
+        value = value_of(name)
+        if value is None:
+            return name, None
+        if value in actions:
+            return name, actions[value]
+    return None, None
