@@ -69,7 +69,7 @@ class RecordedModeCommands:
         ]
 
     def _command_age_s(self, change: ModeChange, name: str) -> float:
-        """Return the recorded seconds from the last command to this mode to a mode change; infinity if there is none."""
+        """Return the recorded seconds between a mode change and the last command to this mode; infinity without one."""
         times = self._command_times.get(name, [])
         index = bisect_right(times, change.time_s)
         return change.time_s - times[index - 1] if index else math.inf
