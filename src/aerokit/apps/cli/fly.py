@@ -154,7 +154,7 @@ class PlanFlight(SupervisedFlight):
                 async for event in changes:
                     if isinstance(event, events.ModeChanged):
                         group.start_soon(self._explain_wait, event.after)
-                    elif event.after is not None:
+                    elif isinstance(event, events.MissionCurrentChanged) and event.after is not None:
                         self._print(f"to item {event.after}{self._name_of(event.after)}")
                 group.cancel_scope.cancel()
 

@@ -10,6 +10,7 @@ import sys
 from abc import ABC, abstractmethod
 from contextlib import asynccontextmanager, suppress
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import anyio
@@ -311,7 +312,9 @@ class FlightReport:
         ]
         frames = f"{received} frames received, {lost} lost"
         if recorded_in:
-            lines += [f"{frames}; recorded in {recorded_in}", f"next: aerokit report {shlex.quote(recorded_in)}"]
+            force = "--force " if Path(recorded_in).with_suffix(".html").exists() else ""  # of an earlier flight
+            lines.append(f"{frames}; recorded in {recorded_in}")
+            lines.append(f"next: aerokit report {force}{shlex.quote(recorded_in)}")
         else:
             lines += [frames, "next time: --record FILE.tlog records the flight for `aerokit report FILE.tlog`"]
         self._emit("flight_summary", record, "\n".join(lines))
