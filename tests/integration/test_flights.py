@@ -65,7 +65,7 @@ async def served(kind: str) -> AsyncIterator[str]:
         yield address.replace("tcpin", "tcp").replace("udpin", "udpout")
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("kind", ["udp", "udp6", "tcp", "tcp6", "serial"])
 async def test_whole_flight(kind: str) -> None:
     async with served(kind) as address, connect(address, timeout=100) as vehicle:

@@ -123,6 +123,7 @@ def test_json_of_fly_matches_documentation(capsys: pytest.CaptureFixture[str]) -
     assert_all_printed("fly", printed)
 
 
+@pytest.mark.exhaustive
 def test_json_of_demo_matches_documentation(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--altitude", "3", "--side", "3", "--speedup", "50", "--json"]) == 0
     printed = records(capsys.readouterr().out)
