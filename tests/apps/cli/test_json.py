@@ -17,7 +17,7 @@ from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 
 PRINTED = {
     "params": "comparison error parameter parameter_difference parameter_write saved",
-    "mission": "error plan_item plan_part saved warning",
+    "mission": "error note plan_item plan_part saved warning",
     "files and logs": "crc declined done fetched fetched_log file log sent",
     "camera and gimbal": "camera card declined done fetched_picture gimbal gimbal_attitude picture stream",
     "calibration": "calibration_result calibration_step",
