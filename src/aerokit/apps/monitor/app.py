@@ -276,7 +276,9 @@ class Monitor(App[None]):
         except AerokitError as error:
             add_line(f"{command} failed: {error}", "bold red")
         else:
-            add_line(f"{command}: done", "bold green")
+            # A hold has ended when its mode is reported. PX4 then still moves.
+            done = f"in {vehicle.mode_name}, may still be stopping" if method == "hold" else "done"
+            add_line(f"{command}: {done}", "bold green")
 
     def _update_list(self, options: OptionList) -> None:
         vehicles = self._model.vehicles
