@@ -119,6 +119,7 @@ async def test_command_goes_to_vehicle_in_question_despite_selection() -> None:
         assert it.app.selected is not None
         assert it.app.selected.system_id == 2
         assert set(it.mode_commands()) == {1}
+        await it.wait_drawn("hold: in BRAKE, may still be stopping")
 
 
 async def test_refusal_and_old_values_are_shown() -> None:
