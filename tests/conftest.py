@@ -27,7 +27,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a background job of a s
 if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # nohup: programs inherit it
     signal.signal(signal.SIGHUP, lambda *_: None)
 gc.disable()  # until all tests are collected: nothing of them is garbage, and each worker collects all
-settings.register_profile("aerokit", deadline=None, max_examples=40, derandomize=True)
+# `nox -s exhaustive` loads the profile "thorough".
+settings.register_profile("aerokit", deadline=None, max_examples=20, derandomize=True)
+settings.register_profile("thorough", settings.get_profile("aerokit"), max_examples=100)
 settings.load_profile("aerokit")
 
 

@@ -44,6 +44,7 @@ def declared(path: Path) -> Iterator[tuple[str, int]]:
                 yield name.id, number.value
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("package", sorted(path.name for path in SOURCE.iterdir() if path.is_dir()))
 def test_standard_numbers_are_not_redeclared(package: str) -> None:
     files = [

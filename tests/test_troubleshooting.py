@@ -98,6 +98,7 @@ def test_page_has_headings_and_provoked_blocks() -> None:
     assert len(BLOCKS) == len(provoked_errors())
 
 
+@pytest.mark.exhaustive
 @for_each("text", quoted_texts())
 def test_quoted_text_occurs_in_sources(text: str) -> None:
     pieces = [piece.strip(" ") for part in text.split("…") for piece in pieces_of(part)]

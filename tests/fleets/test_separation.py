@@ -6,7 +6,7 @@ import math
 from itertools import accumulate, combinations, pairwise
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit.errors import InvalidArgument
@@ -129,7 +129,6 @@ def test_layers_keep_min_distance_at_any_speed(routes: list[Route], rest: list[L
                 assert min_path_distance(one, other).distance_m >= least - 1e-6
 
 
-@settings(max_examples=25)
 @given(routes_of, st.floats(1, 8))
 def test_corridors_keep_min_distance_within_slack(routes: list[Route], least: float) -> None:
     plan = separate_by_time(routes, {}, least, 5.0, slack_s=2.0, max_delay_s=60.0)

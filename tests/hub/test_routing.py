@@ -7,7 +7,7 @@ import random
 from collections import Counter, defaultdict
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit.connection.routes import MAX_ROUTES, ROUTE_TIMEOUT_S
@@ -294,7 +294,6 @@ def networks(draw: st.DrawFn, slowest_s: float = 0.2) -> Network:
     return Network(hubs, tree + draw(st.lists(pairs, max_size=6)), draw(st.integers(0, 2**32)), slowest_s)
 
 
-@settings(max_examples=60, deadline=None)
 @given(networks(), st.booleans(), st.data())
 def test_each_target_receives_once_on_any_network(network: Network, vehicles: bool, data: st.DataObject) -> None:
     hubs = range(len(network.routers))

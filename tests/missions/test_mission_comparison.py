@@ -8,7 +8,7 @@ import struct
 
 import pytest
 from for_each import for_each
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit.missions import (
@@ -210,7 +210,6 @@ items = st.builds(
 
 
 @given(items, items, st.sampled_from(list(ItemStorage)))
-@settings(max_examples=60)
 def test_comparison_accepts_any_items(one: MissionItem, other: MissionItem, storage: ItemStorage) -> None:
     assert item_differences(one, one, storage) == ()
     texts = item_differences(one, other.replace(command=one.command), storage)

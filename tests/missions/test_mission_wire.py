@@ -6,7 +6,7 @@ import math
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega
 
@@ -77,7 +77,6 @@ def test_float_form_scales_x(item: MissionItem, x: float) -> None:
 
 
 @given(float32, float32)
-@settings(max_examples=50)
 def test_float_form_decodes_any_numbers(x: float, y: float) -> None:
     from_wire(messages.MissionItem(1, 1, 0, 3, 16, 0, 1, 0, 0, 0, 0, x, y, 0, 0))
 
@@ -88,7 +87,6 @@ def test_integer_form_rejects_fraction() -> None:
 
 
 @given(st.lists(items, max_size=5), st.integers(0, 2))
-@settings(max_examples=50)
 def test_packed_plan_round_trip(plan: list[MissionItem], mission_type: int) -> None:
     data = pack_items(plan, mission_type)
     assert len(data) == 10 + 38 * len(plan)
@@ -127,7 +125,6 @@ def test_damaged_packed_plan_is_rejected(data: bytes, message: str) -> None:
 
 
 @given(st.binary(max_size=200))
-@settings(max_examples=50)
 def test_unpack_accepts_any_bytes_or_raises(data: bytes) -> None:
     for content in (data, HEADER.pack(MAGIC, 0, 0, 0, 2) + data):
         try:
@@ -142,7 +139,6 @@ def test_pack_rejects_too_many_items() -> None:
 
 
 @given(st.lists(items, max_size=6), st.booleans())
-@settings(max_examples=60)
 def test_vehicle_item_indices_round_trip(plan: list[MissionItem], home_is_item_0: bool) -> None:
     mission = Mission([item.replace(param1=1.0) for item in plan])
     listed = mission.to_items(home_is_item_0=home_is_item_0)
@@ -151,7 +147,6 @@ def test_vehicle_item_indices_round_trip(plan: list[MissionItem], home_is_item_0
 
 
 @given(st.lists(items, max_size=6))
-@settings(max_examples=60)
 def test_fence_from_any_items_or_error(plan: list[MissionItem]) -> None:
     for command in (5000, 5001, 5003, None):
         try:

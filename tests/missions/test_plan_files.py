@@ -12,7 +12,7 @@ from typing import Any
 
 import plan_samples as samples
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit.errors import FileFormatError, InvalidArgument
@@ -332,7 +332,6 @@ plans = st.builds(
 
 
 @given(plans)
-@settings(max_examples=40, deadline=None)
 def test_plan_file_round_trip(plan: Plan) -> None:
     text = format_plan(plan)
     assert parse_plan(text) == plan
@@ -340,7 +339,6 @@ def test_plan_file_round_trip(plan: Plan) -> None:
 
 
 @given(plans, missions)
-@settings(max_examples=25, deadline=None)
 def test_changed_plan_file_round_trip(plan: Plan, mission: Mission) -> None:
     read_plan = read(samples.full_document())
     for changed in (read_plan.replace(mission=mission), plan.replace(source=read_plan.source)):
@@ -538,7 +536,6 @@ def damaged(value: Any, rng: random.Random, junk: Callable[[], Any]) -> Any:
     | st.text()
     | st.just([]),
 )
-@settings(max_examples=40, deadline=None)
 def test_damaged_plan_file_raises_only_our_errors(seed: int, junk: object) -> None:
     document = damaged(samples.full_document(), random.Random(seed), lambda: junk)
     try:

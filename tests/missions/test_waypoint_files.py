@@ -126,7 +126,6 @@ missions = st.builds(Mission, st.lists(items, max_size=6), homes)
 
 
 @given(missions)
-@settings(max_examples=60, deadline=None)
 def test_waypoint_file_round_trip(mission: Mission) -> None:
     text = format_waypoints(mission)
     assert "nan" not in text

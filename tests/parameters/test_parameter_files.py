@@ -72,7 +72,6 @@ def test_parse_number_rejects_other_text(text: str) -> None:
         parse_number(text)
 
 
-@settings(max_examples=40)
 @given(tables(), st.sampled_from(FORMATS))
 def test_parameter_file_round_trip(table: ParameterTable, format_: FileFormat) -> None:
     if format_ != "qgroundcontrol":  # QGroundControl writes 32-bit numbers only
@@ -94,7 +93,6 @@ def test_parameter_file_round_trip(table: ParameterTable, format_: FileFormat) -
         assert again == parameter_file_text(table, format_)
 
 
-@settings(max_examples=20)
 @given(values=st.dictionaries(NAMES, FLOATS, min_size=1, max_size=10))
 @pytest.mark.parametrize("format_", ["missionplanner", "mavproxy"])
 def test_mavproxy_reads_our_parameter_file(
@@ -246,7 +244,6 @@ def test_parameter_diff() -> None:
     assert str(diff({"A": float("nan")}, {"A": 1e300})[0]) == "A: nan → 1e+300"
 
 
-@settings(max_examples=20)
 @given(tables())
 def test_written_file_has_no_differences(table: ParameterTable) -> None:
     read = parse_parameter_file(parameter_file_text(table, "qgroundcontrol"))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit.errors import FileFormatError, InvalidArgument
@@ -279,7 +279,6 @@ def crc32part(data: bytes, crc: int) -> int:
     return crc
 
 
-@settings(max_examples=20)
 @given(st.dictionaries(st.text("ABC_", min_size=1, max_size=16), st.integers(-(2**31), 2**31 - 1)))
 def test_px4_hash_is_crc_of_parameters(values: dict[str, int]) -> None:
     table = ParameterTable.from_values(values, dict.fromkeys(values, ParameterType.INT32))

@@ -6,7 +6,7 @@ import contextlib
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.mavftp import MAVFTP
 
@@ -44,7 +44,6 @@ def as_served(upload: bytes) -> bytes:
     return struct.pack("<HHH", magic, count, count) + upload[6:]
 
 
-@settings(max_examples=40)
 @given(tables(least=1), st.integers(6, 239))
 def test_downloaded_pack_round_trip(table: ParameterTable, block_size: int) -> None:
     assert unpack_parameters(pack_for_download(table, block_size=block_size)) == undefaulted(table)
@@ -57,7 +56,6 @@ def test_downloaded_pack_round_trip(table: ParameterTable, block_size: int) -> N
     assert [(n.decode(), v) for n, v, _ in oracle.defaults] == [(p.name, p.default) for p in table.values()]
 
 
-@settings(max_examples=25)
 @given(tables())
 def test_uploaded_pack_round_trip(table: ParameterTable) -> None:
     data = pack_parameters(table)
@@ -70,7 +68,6 @@ def test_uploaded_pack_round_trip(table: ParameterTable) -> None:
     assert [(n.decode(), v) for n, v, _ in oracle.params] == [(p.name, p.value) for p in table.values()]
 
 
-@settings(max_examples=25)
 @given(tables(least=3), st.data())
 def test_partial_pack_round_trip(table: ParameterTable, data: st.DataObject) -> None:
     start = data.draw(st.integers(0, len(table) - 1))
@@ -80,7 +77,6 @@ def test_partial_pack_round_trip(table: ParameterTable, data: st.DataObject) -> 
     assert unpack_parameters(served, start=start) == ParameterTable(part)
 
 
-@settings(max_examples=25)
 @given(tables(least=1), st.sampled_from([20, 100, 239]), st.data())
 def test_pack_values_do_not_cross_blocks(table: ParameterTable, block_size: int, data: st.DataObject) -> None:
     later = ParameterTable(p.replace(value=data.draw(values_of(p.type))) for p in table.values())
@@ -90,7 +86,6 @@ def test_pack_values_do_not_cross_blocks(table: ParameterTable, block_size: int,
     assert all(p.value in (table[p.name].value, later[p.name].value) for p in mixed.values())
 
 
-@settings(max_examples=50)
 @given(tables(least=2), st.data())
 def test_damaged_pack_raises_only_protocol_error(table: ParameterTable, data: st.DataObject) -> None:
     whole = pack_for_download(table, with_defaults=data.draw(st.booleans()))

@@ -8,7 +8,7 @@ from fractions import Fraction
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit.errors import InvalidArgument, ValueUnknownError
@@ -75,7 +75,6 @@ def test_checked_value_converts_valid_values() -> None:
     assert type(checked_value("X", 7, REAL32)) is float
 
 
-@settings(max_examples=50)
 @given(st.floats(width=32), st.floats(width=32))
 def test_same_value_compares_as_float32(one: float, other: float) -> None:
     assert same_value(one, other) == (one == other or (one != one and other != other))

@@ -69,11 +69,14 @@ class FileServer:
             if len(self._waiting) >= self.queue:
                 return []
             self._waiting.append(request)
-            return [(self._busy_until, reply) for reply in self._answer(request)]
+            return self._answers(request, self._busy_until)
         self._waiting.clear()
+        return self._answers(request, now)
+
+    def _answers(self, request: FtpMessage, at: float) -> list[tuple[float, FtpMessage]]:
         if request.opcode == MavFtpOpcode.BURSTREADFILE and self.is_open and self.has_burst:
-            return self._burst(request, now)
-        return [(now, reply) for reply in self._answer(request)]
+            return self._burst(request, at)
+        return [(at, reply) for reply in self._answer(request)]
 
     def _answer(self, request: FtpMessage) -> list[FtpMessage]:
         if not self.is_open:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from parameter_channel import Channel, FakeVehicle
 
@@ -178,7 +178,6 @@ def test_setting_list_reloads_shifted_settings() -> None:
     assert set(found) == set(camera.table)
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
     loss=st.sampled_from([0.0, 0.1, 0.3, 0.5]),
@@ -231,7 +230,6 @@ def test_setting_read_of_silent_component_times_out() -> None:
     assert len(channel.sent) < 60
 
 
-@settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.1, 0.3, 0.5]), count=st.integers(1, 30))
 def test_setting_reads_are_exact_despite_losses(seed: int, loss: float, count: int) -> None:
     table = table_of(30)
@@ -406,7 +404,6 @@ def test_setting_write_ignores_early_refusals() -> None:
     assert channel.run(write(9)).value == 9
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
     loss=st.sampled_from([0.0, 0.1, 0.3, 0.5]),

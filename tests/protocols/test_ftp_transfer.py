@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from ftp_server import FileServer, as_message, make_client, reply_to, requests_in, run
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit.errors import FileError, FileTimeout
@@ -89,7 +89,6 @@ def test_download_resumes() -> None:
     st.sampled_from(["/a", "@SYS/a"]),
     st.integers(0, 2**32),
 )
-@settings(max_examples=60, deadline=None)
 def test_download_arrives_despite_losses(
     size: int,
     loss: float,
@@ -281,7 +280,6 @@ def test_download_reports_progress() -> None:
     st.sampled_from([0.0, 0.06]),
     st.integers(0, 2**32),
 )
-@settings(max_examples=40, deadline=None)
 def test_upload_arrives_despite_losses(size: int, loss: float, duplicates: float, jitter_s: float, seed: int) -> None:
     server = FileServer(bytearray())
     upload = FtpUpload(make_client(65530), "/a", content(size), session=1, round_trip=RoundTrip(0.1))

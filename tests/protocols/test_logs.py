@@ -6,7 +6,7 @@ import tracemalloc
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from log_vehicle import LogVehicle, content, run
 from parameter_channel import framed
@@ -38,7 +38,6 @@ def make_download(size: int, log_id: int = 1, *, start: int = 0, **options: Any)
     st.sampled_from([0.0, 0.1, 0.3]),
     st.integers(0, 99),
 )
-@settings(max_examples=40, deadline=None)
 def test_log_list_is_complete(count: int, first_id: int, latest_wins: bool, loss: float, seed: int) -> None:
     vehicle = LogVehicle([content(number) for number in range(count)], first_id, latest_wins)
     exchange = make_list(first_id)
@@ -104,7 +103,6 @@ def test_empty_log_sends_only_end() -> None:
 
 
 @given(st.integers(1, 90_000), st.booleans(), st.sampled_from([0.0, 0.05, 0.3]), st.integers(0, 99))
-@settings(max_examples=25, deadline=None)
 def test_log_download_arrives_despite_losses(size: int, latest_wins: bool, loss: float, seed: int) -> None:
     exchange, written = make_download(size)
     sent = run(exchange, LogVehicle([content(size)], latest_wins=latest_wins), loss=loss, seed=seed)

@@ -79,7 +79,6 @@ def test_mission_download_restart_keeps_items(window: int, opaque_id: int, asked
     assert exchange.result().opaque_id == opaque_id
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     model_and_window=st.sampled_from(WINDOWS),
     seed=st.integers(0, 1 << 30),

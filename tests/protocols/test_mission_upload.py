@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mission_vehicles import GCS, ArduPilotModel, Px4Model, Radio, Run, Store, items, run
 
@@ -41,7 +41,6 @@ def test_mission_upload_sends_once(model: type[Store], window: int) -> None:
     assert result.seconds <= (2 + len(NEW) / window) * 0.1 + 0.01
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     model=st.sampled_from(MODELS),
     window=st.sampled_from([1, 6]),
@@ -66,7 +65,6 @@ def test_confirmed_upload_is_stored(
     assert len(result.sent) <= 60 + 25 * number
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     model=st.sampled_from(MODELS),
     seed=st.integers(0, 1 << 30),

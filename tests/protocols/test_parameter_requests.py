@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from parameter_channel import Channel, FakeVehicle, framed, table_of
 
@@ -126,7 +126,6 @@ def test_possibly_stale_value_is_accepted_second_time() -> None:
     assert channel.kinds() == {"PARAM_REQUEST_READ": 2}
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.05, 0.1, 0.2, 0.3]), count=st.integers(1, 60))
 def test_parameter_reads_are_exact_despite_losses(seed: int, loss: float, count: int) -> None:
     table = table_of(60)
@@ -291,7 +290,6 @@ def test_write_ignores_values_of_other_components() -> None:
     assert isinstance(answer, ParameterTimeout)
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.05, 0.1, 0.2, 0.3]), count=st.integers(1, 40))
 def test_parameter_writes_arrive_despite_losses(seed: int, loss: float, count: int) -> None:
     table = table_of(count)
@@ -304,7 +302,6 @@ def test_parameter_writes_arrive_despite_losses(seed: int, loss: float, count: i
     assert len(channel.sent) < 50 + 6 * count
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.1, 0.3]))
 def test_clamping_is_reported_despite_losses(seed: int, loss: float) -> None:
     channel = Channel(Clamping([Parameter("A", 0, INT32)]), loss=loss, seed=seed)

@@ -5,7 +5,7 @@ import zlib
 
 import pytest
 from ftp_client import BLOCK, Err, FtpClient, Op
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from simulated_client import Client
 
@@ -135,7 +135,6 @@ requests: st.SearchStrategy[Request] = st.tuples(
 
 
 @both
-@settings(max_examples=30, deadline=None)
 @given(asked=st.lists(requests, max_size=25), sizes=st.lists(st.none() | st.integers(0, 255), min_size=25))
 def test_random_requests_leave_no_session_open(kind: str, asked: list[Request], sizes: list[int | None]) -> None:
     vehicle, ftp = either(kind)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mission_client import (
     CIRCLE,
@@ -570,7 +570,6 @@ def hold(vehicle: Vehicle, client: Client, talk: Sequence[tuple[Message, bool, f
     client.run(9.0)
 
 
-@settings(max_examples=25)
 @given(conversation)
 def test_ardupilot_handles_random_messages_without_open_transfers(
     talk: list[tuple[Message, bool, float]],
@@ -581,7 +580,6 @@ def test_ardupilot_handles_random_messages_without_open_transfers(
     assert len(copter.missions.items(0)) <= 650
 
 
-@settings(max_examples=25)
 @given(conversation)
 def test_px4_handles_random_messages_without_open_transfers(
     talk: list[tuple[Message, bool, float]],

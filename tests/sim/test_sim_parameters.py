@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import pytest
 from ftp_client import Err, FtpClient, Op
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from simulated_client import Client
 
@@ -228,7 +228,6 @@ def test_uploaded_pack_is_applied_on_close() -> None:
     assert copter.parameters["RTL_ALT"] == 1
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.binary(max_size=200), st.integers(0, 5))
 def test_random_uploads_are_handled(noise: bytes, count: int) -> None:
     copter = SimulatedCopter(parameter_count=70)

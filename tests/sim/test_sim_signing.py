@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as peer
 
@@ -239,7 +239,6 @@ def test_pymavlink_sets_up_a_key() -> None:
     assert copter.parameters["RTL_ALT"] == 1234.0
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.lists(st.integers(0, 5), max_size=12))
 def test_replayed_setup_changes_nothing(order: list[int]) -> None:
     copter, _, radio = copter_on_two_ports(signing_key=KEY, parameter_count=20)

@@ -219,7 +219,6 @@ def test_delayed_and_progressing_answers() -> None:
 # -------------------------------------------------------------------------------------- robustness
 
 
-@settings(max_examples=30)
 @given(st.binary(max_size=400))
 def test_random_bytes_are_handled(data: bytes) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
@@ -231,7 +230,6 @@ def test_random_bytes_are_handled(data: bytes) -> None:
 FLOATS = st.floats(width=32)
 
 
-@settings(max_examples=60)
 @given(
     command=st.sampled_from([int(c) for c in MavCmd]),
     numbers=st.tuples(*(FLOATS,) * 7),
@@ -248,7 +246,6 @@ def test_any_command_is_answered_once(command: int, numbers: tuple[float, ...], 
 
 
 @pytest.mark.exhaustive
-@settings(max_examples=40)
 @given(
     mask=st.integers(0, 0xFFF),
     frame=st.integers(0, 21),

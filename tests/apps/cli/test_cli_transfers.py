@@ -17,7 +17,8 @@ from aerokit.apps.cli import main
 from aerokit.apps.cli.mission import upload_parts
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.errors import InvalidArgument
-from aerokit.missions import Mission, Plan, take_off, waypoint
+from aerokit.mavlink.enums import MavAutopilot
+from aerokit.missions import Mission, Plan, return_to_launch, take_off, waypoint, write_plan_file
 from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter
 from aerokit.testing import run_virtual
@@ -121,7 +122,8 @@ def test_params_set_and_get_round_trip(run: Run) -> None:
 def test_params_set_with_unknown_name_sets_the_others(run: Run) -> None:
     code, out, _ = run("params", "set", "WPNAV_ACCEL=210", "NO_SUCH=1")
     assert code == 5
-    assert "WPNAV_ACCEL      250 → 210    set range not checked (--metadata FILE checks it)" in out
+    assert "WPNAV_ACCEL      250 → 210    set\n" in out
+    assert out.count("not checked") == 1
     assert "NO_SUCH          not set: " in out
 
 
@@ -223,6 +225,19 @@ def test_mission_check_of_plan_without_problems_has_no_warnings(capsys: pytest.C
     Path("m.waypoints").write_text(WAYPOINTS)
     assert main(["mission", "check", "m.waypoints"]) == 0
     assert capsys.readouterr().out.endswith("m.waypoints has no errors\n")
+
+
+@pytest.mark.parametrize(("firmware", "has_note"), [(0, True), (MavAutopilot.ARDUPILOTMEGA, False)])
+def test_mission_check_notes_items_for_ardupilot_only(
+    firmware: int, has_note: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    items = take_off(15), return_to_launch()
+    write_plan_file("m.plan", Plan(Mission(items), firmware_type=firmware))
+    assert main(["mission", "check", "m.plan"]) == 0
+    note = "note: for vehicles other than ArduPilot: item 0 (NAV_TAKEOFF): x, y = 0, 0 is not allowed"
+    out = capsys.readouterr().out
+    assert (note in out) is has_note
+    assert out.endswith("m.plan has no errors\n")
 
 
 def test_mission_upload_of_far_item_names_item_and_option() -> None:

@@ -19,6 +19,8 @@ from aerokit.apps.cli import fly, main
 from aerokit.apps.cli import fly as flown_plan
 from aerokit.apps.cli.output import TIMED_OUT, emit, emit_error
 from aerokit.errors import OperationRejected
+from aerokit.logs.flights import read_flight
+from aerokit.logs.report.statistics import statistics_of, summary
 from aerokit.mavlink.enums import CopterMode
 from aerokit.mavlink.messages import ParamValue
 from aerokit.mavlink.tlog import read_tlog
@@ -40,6 +42,7 @@ def copter() -> SimulatedCopter:
     return SimulatedCopter(boot_time_s=0.0, home=HOME)
 
 
+SURVEY = str(Path(__file__).parents[3] / "examples" / "survey.plan")
 FLIGHTS = pytest.mark.parametrize("command", [("fly", "m.waypoints", "--yes"), ("demo",)], ids=lambda each: each[0])
 
 
@@ -258,3 +261,62 @@ def test_fault_of_real_vehicle_is_refused(capsys: pytest.CaptureFixture[str]) ->
     assert main(["fly", "m.waypoints", "--yes", "--fault", "gps_lost"]) == 2
     assert main(["demo", "--connect", "tcp:127.0.0.1:1", "--fault", "gps_lost"]) == 2
     assert "--fault needs --sim" in capsys.readouterr().err
+
+
+def test_fly_explains_wait_after_failsafe_mode(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_virtual(run_on(None, "fly", SURVEY, "--sim", "--fault", "gps_lost@25")) == 5
+    texts = [line.split(" m  ", 1)[-1].strip() for line in capsys.readouterr().out.splitlines()]
+    changed, waiting, failed = (
+        texts.index(text)
+        for text in (
+            "mode LAND",
+            "waiting 15 s for the end of LAND or a report that the mission has ended",
+            "failed: flying the mission: the mode changed to LAND, at item 3 of 9",
+        )
+    )
+    assert changed < waiting < failed
+
+
+def test_crash_in_fast_simulation_is_recorded_for_twenty_seconds(capsys: pytest.CaptureFixture[str]) -> None:
+    """The seconds are those of the flight: two of the recording, at ten times real speed."""
+    options = ("--fault", "motor_failed@25", "--record", "x.tlog")
+    assert run_virtual(run_on(None, "fly", SURVEY, "--sim", *options)) == 5
+    out = capsys.readouterr().out
+    failed_s, ended_s = (
+        float(line.split()[0])
+        for line in out.splitlines()
+        if "m  failed:" in line or "m  end of the recording: " in line
+    )
+    assert "end of the recording: on the ground in AUTO, still armed" in out
+    assert ended_s - failed_s == pytest.approx(20, abs=2.5)
+    assert re.search(r"armed for 4\d s \(2[45] s until the impact[;)]", out)
+    assert re.search(r"4\d s armed \(2[45] s until the impact\), ", report_of(Path("x.tlog")))
+
+
+def report_of(path: Path) -> str:
+    flight = read_flight(path)
+    return "\n".join(summary(flight, statistics_of(flight)))
+
+
+def test_summaries_of_fly_and_report_agree(capsys: pytest.CaptureFixture[str]) -> None:
+    """PX4's position is noisy on the ground, which is no flown distance."""
+    assert run_virtual(run_on(None, "fly", SURVEY, "--sim", "--vehicle", "px4", "--record", "x.tlog")) == 0
+    flown = re.search(r"flown (\d+) m", capsys.readouterr().out)
+    reported = re.search(r"(\d+) m flown over ground", report_of(Path("x.tlog")))
+    assert flown is not None
+    assert reported is not None
+    assert int(flown[1]) == pytest.approx(int(reported[1]), abs=1)
+
+
+def test_fly_in_unknown_simulation_counts_its_seconds(
+    copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Like ``fly`` on a vehicle of ``aerokit sim --speedup 5``, whose speed no message contains."""
+
+    async def scenario() -> int:
+        async with simulated_link(copter, speedup=5) as link:
+            return await run_on(link, "fly", "m.waypoints", "--yes")
+
+    assert run_virtual(scenario()) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"armed for 1 min 0\d s \(a simulation at 5 times real speed: 1\d s on this clock\)", out)

@@ -189,6 +189,13 @@ def test_fly_prints_four_words_for_each_item(capsys: pytest.CaptureFixture[str])
     assert not any("Reached command" in line or "Mission: " in line for line in lines)
 
 
+def test_next_command_replaces_report_of_earlier_flight(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("x.html").touch()
+    copter = SimulatedCopter(boot_time_s=0.0, home=HOME)
+    assert run_with(copter, ["fly", "m.waypoints", "--yes", "--record", "x.tlog"]) == [0]
+    assert capsys.readouterr().out.endswith("\nnext: aerokit report --force x.tlog\n")
+
+
 def test_fly_records_and_names_next_command(capsys: pytest.CaptureFixture[str]) -> None:
     copter = SimulatedCopter(boot_time_s=0.0, home=HOME)
     Path("my flight.tlog").write_text("earlier")

@@ -17,7 +17,7 @@ from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 
 PRINTED = {
     "params": "comparison error parameter parameter_difference parameter_write saved",
-    "mission": "error plan_item plan_part saved warning",
+    "mission": "error note plan_item plan_part saved warning",
     "files and logs": "crc declined done fetched fetched_log file log sent",
     "camera and gimbal": "camera card declined done fetched_picture gimbal gimbal_attitude picture stream",
     "calibration": "calibration_result calibration_step",
@@ -123,6 +123,7 @@ def test_json_of_fly_matches_documentation(capsys: pytest.CaptureFixture[str]) -
     assert_all_printed("fly", printed)
 
 
+@pytest.mark.exhaustive
 def test_json_of_demo_matches_documentation(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--altitude", "3", "--side", "3", "--speedup", "50", "--json"]) == 0
     printed = records(capsys.readouterr().out)

@@ -55,7 +55,7 @@ def test_set_outside_range_with_force_is_set(metadata: str, capsys: pytest.Captu
         (
             "RTL_ALT=-99999",
             (),
-            "RTL_ALT          1500 → -99999 set range not checked (--metadata FILE checks it)\nranges were not",
+            "RTL_ALT          1500 → -99999 set\nranges were not",
         ),
         ("LOG_BITMASK=1", ("--metadata",), "set range not checked (the metadata does not have this parameter)\n"),
         ("RTL_ALT=2000", ("--metadata",), "RTL_ALT          1500 → 2000  set\n"),
@@ -138,3 +138,27 @@ def test_get_unknown_name_prints_one_error(capsys: pytest.CaptureFixture[str]) -
     (line,) = capsys.readouterr().err.splitlines()
     assert "NOSUCH" in line
     assert "`aerokit params list` shows all names" in line
+
+
+def test_changed_without_reported_defaults_uses_metadata(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """PX4 does not report defaults, but its metadata has them."""
+    file, vehicle = tmp_path / "parameters.json", SimulatedPx4(boot_time_s=0.0)
+    defaults = {"RTL_RETURN_ALT": 12.5, "RTL_DESCEND_ALT": vehicle.parameters["RTL_DESCEND_ALT"]}
+    entries = [{"name": name, "type": "Float", "default": value} for name, value in defaults.items()]
+    file.write_text(json.dumps({"version": 1, "parameters": entries}))
+    assert run_with(vehicle, ["params", "list", "--changed", "--metadata", str(file)]) == [0]
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("RTL_RETURN_ALT")
+    assert "(default 12.5)" in line
+
+
+def test_changed_without_any_defaults_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_with(SimulatedPx4(boot_time_s=0.0), ["params", "list", "--changed"]) != [0]
+    err = capsys.readouterr().err
+    assert "PX4 does not report the defaults of its parameters: --metadata FILE has them" in err
+    assert "aerokit params diff FILE" in err
+
+
+def test_set_of_misspelt_name_on_px4_suggests_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_with(SimulatedPx4(boot_time_s=0.0), ["params", "set", "RTL_RETRUN_ALT=40"]) == [5]
+    assert "(did you mean 'RTL_RETURN_ALT'?)" in capsys.readouterr().out

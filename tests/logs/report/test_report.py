@@ -24,6 +24,7 @@ from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, ModeChange
 from aerokit.logs.report import report_html
 from aerokit.logs.report.charts import points, rows_to_draw
 from aerokit.logs.report.formatting import clock, length, span
+from aerokit.logs.report.statistics import statistics_of, summary
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.mavlink.tlog import TlogWriter
@@ -439,3 +440,10 @@ def test_link_section_explains_lost_messages(tmp_path: Path, page: Page) -> None
     explanation = "Messages that the autopilot did not receive, by its own count"
     assert explanation in Page(target).text
     assert explanation not in page.text
+
+
+def test_modes_of_less_than_half_a_second_are_not_listed() -> None:
+    flight = FlightLog(Path("x.tlog"), ends_at=60.0, armed=[(10.0, 50.0)])
+    flight.modes = [ModeChange(0.0, "STABILIZE"), ModeChange(10.3, "AUTO"), ModeChange(40.0, "RTL")]
+    sentences = "\n".join(summary(flight, statistics_of(flight)))
+    assert "Flown in AUTO (30 s), RTL (10 s)." in sentences

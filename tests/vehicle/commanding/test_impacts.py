@@ -174,6 +174,7 @@ async def test_texts_about_progress_are_no_reasons_of_impact() -> None:
 # ------------------------------------------------------------------------------- false alarms
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("speedup", [1.0, 20.0])
 @pytest.mark.parametrize(
     "simulated_vehicle",

@@ -181,7 +181,6 @@ async def nothing_remains_of(steps: list[tuple[int, float | None]], airborne: bo
 
 @pytest.mark.exhaustive
 @given(steps=steps, airborne=st.booleans(), latency_s=st.sampled_from([0.0, 0.12]))
-@settings(max_examples=25)
 def test_any_sequence_with_any_cancellation(
     steps: list[tuple[int, float | None]], airborne: bool, latency_s: float
 ) -> None:

@@ -38,10 +38,13 @@ async def record_parameters(vehicle: Vehicle, print_line: Callable[[str], None])
         print_line(f"  {len(table)} parameters recorded")
 
 
-async def record_to_end(vehicle: Vehicle, interrupts: InterruptStack, print_line: Callable[[str], None]) -> None:
+async def record_to_end(
+    vehicle: Vehicle, interrupts: InterruptStack, print_line: Callable[[str], None], speedup: float = 1.0
+) -> None:
     """Stay connected to an armed vehicle until it is disarmed or silent for 10 s, or until Ctrl-C.
 
-    A crashed vehicle may stay armed. Near the ground, the recording therefore also ends after 20 s without motion.
+    A crashed vehicle may stay armed. Near the ground, the recording therefore also ends after 20 s without motion, in
+    the seconds of a simulation with this ``speedup``.
     """
     if not vehicle.is_armed or not vehicle.connection.is_open:
         return
@@ -49,10 +52,11 @@ async def record_to_end(vehicle: Vehicle, interrupts: InterruptStack, print_line
         print_line(f"the recording ends with the vehicle armed, because it was silent for {MAX_SILENCE_S:g} s")
         return
     print_line(
-        f"still armed: the recording goes on until the vehicle disarms, is silent for {MAX_SILENCE_S:g} s, or Ctrl-C"
+        f"still armed: the recording goes on until the vehicle disarms, lies still for {_MAX_STILL_S:g} s,"
+        f" is silent for {MAX_SILENCE_S:g} s, or Ctrl-C"
     )
 
-    still = _StillNearGround(vehicle)
+    still = _StillNearGround(vehicle, _MAX_STILL_S / speedup)
 
     async def wait() -> int:
         while vehicle.is_armed and vehicle.connection.is_open and vehicle.heartbeat_age < MAX_SILENCE_S:
@@ -66,10 +70,10 @@ async def record_to_end(vehicle: Vehicle, interrupts: InterruptStack, print_line
 
 
 class _StillNearGround:
-    """Detects that a vehicle has not moved for 20 s at the height of its home or a little above."""
+    """Detects that a vehicle has not moved for a time at the height of its home or a little above."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
+    def __init__(self, vehicle: Vehicle, max_still_s: float) -> None:
+        self._vehicle, self._max_still_s = vehicle, max_still_s
         self._place, self._since = vehicle.position.latest, vehicle.connection.now()
 
     def has_lasted(self) -> bool:
@@ -79,4 +83,4 @@ class _StillNearGround:
         moved = self._place is None or here.distance_to(self._place) > _MAX_DRIFT_M
         if moved or abs(here.altitude_relative_m or 0.0) > _MAX_HEIGHT_M:
             self._place, self._since = here, now
-        return now - self._since >= _MAX_STILL_S
+        return now - self._since >= self._max_still_s

@@ -6,6 +6,8 @@ import asyncio
 from contextlib import AsyncExitStack, suppress
 from typing import TYPE_CHECKING, cast
 
+import anyio
+
 from aerokit import events
 from aerokit.apps.cli.arguments import add_faults, add_record, number, vehicle_kind
 from aerokit.apps.cli.completion import kinds, offer
@@ -23,6 +25,7 @@ from aerokit.apps.cli.output import (
 from aerokit.apps.cli.supervised_flight import INTERRUPT_ACTIONS, FlightReport, SupervisedFlight
 from aerokit.apps.cli.terminal import InterruptStack, confirm, is_interactive, on_interrupt
 from aerokit.errors import AerokitError, InvalidArgument, NotSupported, OperationRejected
+from aerokit.vehicle.missions.mission import END_GRACE_S
 
 if TYPE_CHECKING:
     import argparse
@@ -144,12 +147,28 @@ class PlanFlight(SupervisedFlight):
 
     async def _print_progress(self) -> None:
         with (
-            self._vehicle.subscribe(events.MissionCurrentChanged, capacity=100) as changes,
+            self._vehicle.subscribe(events.MissionCurrentChanged, events.ModeChanged, capacity=100) as changes,
             suppress(AerokitError),
         ):
-            async for event in changes:
-                if event.after is not None:
-                    self._print(f"to item {event.after}{self._name_of(event.after)}")
+            async with anyio.create_task_group() as group:
+                async for event in changes:
+                    if isinstance(event, events.ModeChanged):
+                        group.start_soon(self._explain_wait, event.after)
+                    elif isinstance(event, events.MissionCurrentChanged) and event.after is not None:
+                        self._print(f"to item {event.after}{self._name_of(event.after)}")
+                group.cancel_scope.cancel()
+
+    async def _explain_wait(self, mode: str) -> None:
+        """Print why the flight does not fail at once when the mode changes.
+
+        Nothing is printed in the first moment, in which the end of the mission may explain the mode.
+        """
+        await anyio.sleep(END_GRACE_S / 4)
+        vehicle = self._vehicle
+        is_unexplained = vehicle.mode_name == mode and not self._is_in_our_mode and not vehicle.mission.explains_mode
+        if self._has_started and is_unexplained:
+            seconds = self._report.speedup * END_GRACE_S * 3 / 4
+            self._print(f"waiting {seconds:.2g} s for the end of {mode} or a report that the mission has ended")
 
     def _name_of(self, index: int) -> str:
         items = self._plan.mission.items
@@ -260,11 +279,11 @@ async def _connect_and_fly(
                 # A simulated vehicle is not followed: if its mission ended in the air, no pilot would land it.
                 is_followed = code == DONE and not options.sim
                 if is_followed and options.record is not None and flights[-1].armed_by_us:
-                    await record_to_end(vehicle, interrupts, report.print_line)
+                    await record_to_end(vehicle, interrupts, report.print_line, report.speedup)
             except AerokitError:
                 if flights[-1].armed_by_us:
                     if options.record is not None:
-                        await record_to_end(vehicle, interrupts, report.print_line)
+                        await record_to_end(vehicle, interrupts, report.print_line, report.speedup)
                     report.print_summary(options.record)
                 raise
         if flights[-1].armed_by_us:

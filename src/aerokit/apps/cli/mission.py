@@ -232,6 +232,8 @@ async def _check(options: argparse.Namespace) -> int:
     if not any(getattr(plan, part).to_items() for part in PARTS) and not options.json:
         print(f"{options.file} has no items")
     warnings = _emit_warnings(plan, options)
+    for note in _notes(plan):
+        emit(options, "note", {"text": note}, f"note: {note}")
     if not options.json:
         warning_count = f", but {len(warnings)} warning{'' if len(warnings) == 1 else 's'}" if warnings else ""
         print(f"{options.file} has no errors{warning_count}")
@@ -243,6 +245,17 @@ def _emit_warnings(plan: Plan, options: argparse.Namespace) -> list[str]:
     for warning in warnings:
         emit(options, "warning", {"text": warning}, f"warning: {warning}")
     return warnings
+
+
+def _notes(plan: Plan) -> list[str]:
+    """Return a note on the items that only ArduPilot accepts, unless the plan is for ArduPilot."""
+    if plan.firmware_type == MavAutopilot.ARDUPILOTMEGA:
+        return []
+    try:
+        plan.mission.check(home_is_item_0=False)
+    except InvalidArgument as error:
+        return [f"for vehicles other than ArduPilot: {error}"]
+    return []
 
 
 async def _clear(options: argparse.Namespace) -> int:

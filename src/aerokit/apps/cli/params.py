@@ -18,6 +18,7 @@ from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing,
 from aerokit.apps.cli.params_metadata import (
     add_metadata,
     check_allowed,
+    defaults_source,
     load_metadata_option,
     metadata_facts,
     metadata_for_check,
@@ -27,7 +28,7 @@ from aerokit.apps.cli.params_metadata import (
 )
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.apps.parameter_values import with_range_note
-from aerokit.errors import AerokitError, InvalidArgument, ParameterRejected, ParameterTimeout
+from aerokit.errors import AerokitError, InvalidArgument, ParameterRejected, ParameterTimeout, ValueUnknownError
 from aerokit.mavlink.enums import MavParamError
 from aerokit.parameters import checked_value
 from aerokit.vehicle.parameters.writing import resolve_known
@@ -60,7 +61,11 @@ def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
     )
     offer(pattern, parameter_names)
     add_metadata(listing)
-    listing.add_argument("--changed", action="store_true", help="only those that differ from their default")
+    listing.add_argument(
+        "--changed",
+        action="store_true",
+        help="only those that differ from their default (on PX4: from that in --metadata FILE)",
+    )
     get = add_action(actions, "get", _get, "Read single parameters.")
     offer(get.add_argument("names", nargs="+", metavar="NAME"), parameter_names)
     add_metadata(get)
@@ -94,7 +99,7 @@ async def _list(options: argparse.Namespace) -> int:
     async with connected(options) as vehicle:
         table = await _download(vehicle, options)
     if options.changed:
-        table = table.changed_from_default()
+        table = _changed(table, metadata, vehicle)
     pattern = options.pattern.upper()
     if not any(wildcard in pattern for wildcard in "*?["):
         pattern = f"*{pattern}*"
@@ -105,6 +110,24 @@ async def _list(options: argparse.Namespace) -> int:
         print(f"aerokit: none of {len(table)} parameters matches {options.pattern!r}{hint}", file=sys.stderr)
         return FAILED
     return DONE
+
+
+def _changed(table: ParameterTable, metadata: Metadata | None, vehicle: Vehicle) -> ParameterTable:
+    """Return the parameters that differ from their default, which is that of the metadata if the vehicle reports none.
+
+    Raises:
+        ValueUnknownError: no default is known; the text names the options that help.
+    """
+    if metadata is not None:
+        table = table.updated_with(
+            parameter.replace(default=metadata[name].default)
+            for name, parameter in table.items()
+            if parameter.default is None and name in metadata
+        )
+    try:
+        return table.changed_from_default()
+    except ValueUnknownError:
+        raise ValueUnknownError(defaults_source(vehicle)) from None
 
 
 async def _get(options: argparse.Namespace) -> int:
@@ -152,11 +175,11 @@ async def _set(options: argparse.Namespace) -> int:
             check_allowed(metadata, dict(options.values))
         results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
         known = await _names_for_hints(vehicle, results.values())
-    if not options.force:
+    if not options.force and (metadata is not None or options.json):  # without metadata, one line says it for all
         results = {name: with_range_note(metadata, result, "--metadata FILE") for name, result in results.items()}
     code = _emit_results(options, results.values(), known, metadata)
     was_set = any(result.error is None and result.outcome != "unchanged" for result in results.values())
-    if was_set and metadata is None and not options.force and not options.json:
+    if was_set and metadata is None and not (options.force or options.json):
         print(metadata_source(vehicle))
     return code
 

@@ -25,13 +25,29 @@ _SYSTEM_ID_NAMES = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
 _READ_TIMEOUT_S = 10.0
 
 
+_PX4_PLACE = "is parameters.json, which `make parameters_metadata` writes in PX4's sources"
+
+
 def metadata_source(vehicle: Vehicle) -> str:
     """Return one sentence that says where the file of ``--metadata`` comes from."""
     if vehicle.autopilot.name == "PX4":
-        place = "is parameters.json, which `make parameters_metadata` writes in PX4's sources"
+        place = _PX4_PLACE
     else:
         place = f"is https://autotest.ardupilot.org/Parameters/{vehicle.autopilot.firmware}/apm.pdef.xml"
     return f"ranges were not checked: --metadata FILE checks them; FILE {place} (docs/how-to/parameters.md)"
+
+
+def defaults_source(vehicle: Vehicle) -> str:
+    """Return one sentence that says why the vehicle's defaults are unknown, and what to do instead."""
+    if vehicle.autopilot.name == "PX4":
+        return (
+            f"PX4 does not report the defaults of its parameters: --metadata FILE has them; FILE {_PX4_PLACE}. To"
+            " compare with a file of `aerokit params save` instead: aerokit params diff FILE"
+        )
+    return (
+        "the vehicle reported no defaults: ArduPilot reports them only by MAVFTP. To compare with a file of"
+        " `aerokit params save` instead: aerokit params diff FILE"
+    )
 
 
 def add_metadata(command: argparse.ArgumentParser, *, checks: bool = False) -> None:

@@ -10,6 +10,7 @@ import sys
 from abc import ABC, abstractmethod
 from contextlib import asynccontextmanager, suppress
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import anyio
@@ -25,7 +26,10 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.events import SILENT_AFTER_S
+from aerokit.logs.flights.recording import ClockComparison, is_real_time
+from aerokit.mavlink.messages import GlobalPositionInt
 from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
+from aerokit.vehicle.commanding.progress import HIT_GROUND
 from aerokit.vehicle.state.telemetry import is_reported_on_ground
 
 if TYPE_CHECKING:
@@ -50,6 +54,7 @@ _AUTO_DISARM_TIMEOUT_S = 30.0
 _WARNING_SEVERITY = 4
 # If nothing was printed for this time, a status line is printed.
 _STATUS_INTERVAL_S = 5.0
+_MIN_STEP_M = 1.0
 
 
 class SupervisedFlight(ABC):
@@ -62,6 +67,7 @@ class SupervisedFlight(ABC):
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack, on_interrupt: str) -> None:
         self._vehicle, self._print, self._interrupts = vehicle, report.print_line, interrupts
+        self._report = report
         self._on_interrupt = on_interrupt
         self.armed_by_us: bool = False
         """True once this program has sent an arm command."""
@@ -79,6 +85,8 @@ class SupervisedFlight(ABC):
             if not self._prints_reasons:
                 text = text.partition("\n")[0].removesuffix("; still missing:")
             self._print(f"failed: {text}")
+            if HIT_GROUND in text:
+                self._report.record_impact()
             if self.armed_by_us:
                 await self._make_safe(partial(self._after_failure, error))
             raise
@@ -215,9 +223,13 @@ class FlightReport:
     """
 
     def __init__(self, vehicle: Vehicle, options: argparse.Namespace, speedup: float) -> None:
-        self._vehicle, self._options, self._speedup = vehicle, options, speedup
+        self._vehicle, self._options = vehicle, options
+        self.speedup: float = speedup
+        self._clocks = ClockComparison()
+        # Seconds of this computer's clock, not of the vehicle's, which a simulation may speed up.
         self._armed_at: float | None = None
         self._armed_s = 0.0
+        self._impact_s: float | None = None  # armed until an impact on the ground
         self._started_at = self._last_line_at = vehicle.connection.now()
         self._highest_m = self._fastest_m_s = self._flown_m = 0.0
         self._previous_position: Position | None = None
@@ -230,7 +242,7 @@ class FlightReport:
         altitude = None if position is None else position.altitude_relative_m
         height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"  # + 0.0 converts -0.0 to 0.0
         self._last_line_at = self._vehicle.connection.now()
-        seconds = self._speedup * (self._last_line_at - self._started_at)
+        seconds = self.speedup * (self._last_line_at - self._started_at)
         record = {"seconds": seconds, "altitude_relative_m": altitude, "text": text.strip()}
         self._emit("flight", record, f"{seconds:6.1f} s {height} m  {text}")
 
@@ -241,7 +253,10 @@ class FlightReport:
             self._vehicle.position.observe(self._on_position),
             self._vehicle.armed.observe(self._on_armed),
         ]
-        tasks = [asyncio.create_task(coroutine) for coroutine in (self._print_events(), self._print_status())]
+        tasks = [
+            asyncio.create_task(coroutine)
+            for coroutine in (self._print_events(), self._print_status(), self._compare_clocks())
+        ]
         try:
             yield
         finally:
@@ -252,11 +267,19 @@ class FlightReport:
             with anyio.CancelScope(shield=True):
                 await asyncio.gather(*tasks, return_exceptions=True)
 
+    def record_impact(self) -> None:
+        """Record that the vehicle has just hit the ground, so that the summary distinguishes the time before."""
+        if self._impact_s is None and self._armed_at is not None:
+            self._impact_s = self._armed_s + self._vehicle.connection.now() - self._armed_at
+
     def print_summary(self, recorded_in: str | None = None) -> None:
         """Print the statistics of the flight, the link and the batteries."""
         vehicle = self._vehicle
         received, lost = vehicle.connection.counts(vehicle.system_id)
-        seconds = self._speedup * (vehicle.connection.now() - self._started_at)
+        measured = self._clocks.speed
+        is_unknown_simulation = self.speedup == 1.0 and not is_real_time(measured)
+        speed = measured if is_unknown_simulation else self.speedup
+        seconds = speed * (vehicle.connection.now() - self._started_at)
         self._on_armed(None, False)  # if the vehicle is still armed, adds the time since arming
         version = vehicle.version.latest
         batteries = vehicle.batteries.latest or ()
@@ -265,7 +288,7 @@ class FlightReport:
             "firmware": vehicle.autopilot.firmware,
             "version": None if version is None else str(version),
             "seconds": seconds,
-            "armed_seconds": self._armed_s,
+            "armed_seconds": speed * self._armed_s,
             "flown_m": self._flown_m,
             "highest_m": self._highest_m,
             "fastest_m_s": self._fastest_m_s,
@@ -278,7 +301,7 @@ class FlightReport:
         }
         lines = [
             f"\n{vehicle.autopilot.firmware} {version or '(unknown version)'},"
-            f" armed for {_duration(self._armed_s)}{self._simulation_note()}:"
+            f" {self._describe_armed(speed)}:"
             f" flown {self._flown_m:.0f} m, max height {self._highest_m:.1f} m,"
             f" max ground speed {self._fastest_m_s:.1f} m/s",
             *(
@@ -289,20 +312,34 @@ class FlightReport:
         ]
         frames = f"{received} frames received, {lost} lost"
         if recorded_in:
-            lines += [f"{frames}; recorded in {recorded_in}", f"next: aerokit report {shlex.quote(recorded_in)}"]
+            force = "--force " if Path(recorded_in).with_suffix(".html").exists() else ""  # of an earlier flight
+            lines.append(f"{frames}; recorded in {recorded_in}")
+            lines.append(f"next: aerokit report {force}{shlex.quote(recorded_in)}")
         else:
             lines += [frames, "next time: --record FILE.tlog records the flight for `aerokit report FILE.tlog`"]
         self._emit("flight_summary", record, "\n".join(lines))
 
-    def _simulation_note(self) -> str:
-        real_s = self._armed_s / self._speedup
-        return "" if self._speedup == 1.0 else f" (simulated in {_duration(real_s)}, {self._speedup:g}x)"
+    def _describe_armed(self, speed: float) -> str:
+        """Return a clause such as "armed for 47 s", with the time until an impact, and with that of a simulation."""
+        notes = []
+        if self._impact_s is not None:
+            notes.append(f"{_duration(speed * self._impact_s)} until the impact")
+        if self.speedup != 1.0:
+            notes.append(f"simulated in {_duration(self._armed_s)}, {speed:g}x")
+        elif speed != 1.0:
+            notes.append(f"a simulation at {speed:.2g} times real speed: {_duration(self._armed_s)} on this clock")
+        return f"armed for {_duration(speed * self._armed_s)}" + (f" ({'; '.join(notes)})" if notes else "")
 
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:
         now = self._vehicle.connection.now()
         if self._armed_at is not None:
-            self._armed_s += self._speedup * (now - self._armed_at)
+            self._armed_s += now - self._armed_at
         self._armed_at = now if is_armed else None
+
+    async def _compare_clocks(self) -> None:
+        with self._vehicle.subscribe(GlobalPositionInt, capacity=100) as messages, contextlib.suppress(AerokitError):
+            async for message in messages:
+                self._clocks.compare(self._vehicle.connection.now(), message.time_boot_ms)
 
     async def _print_events(self) -> None:
         with (
@@ -330,7 +367,7 @@ class FlightReport:
             if vehicle.heartbeat_age > SILENT_AFTER_S:
                 height = vehicle.position.latest and vehicle.position.latest.altitude_relative_m
                 last = "" if height is None else f" at {height:.1f} m"
-                seconds = self._speedup * vehicle.heartbeat_age
+                seconds = self.speedup * vehicle.heartbeat_age
                 self.print_line(f"  silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}")
                 continue
             found = Readiness((), ()) if vehicle.is_armed else readiness(vehicle)
@@ -343,9 +380,13 @@ class FlightReport:
                 self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
 
     def _on_position(self, _: Position | None, position: Position) -> None:
-        if self._previous_position is not None:
-            self._flown_m += position.distance_to(self._previous_position)
-        self._previous_position = position
+        """Measure the track while the vehicle is armed. Like reports on recordings, ignore steps below a metre."""
+        if not self._vehicle.is_armed:
+            self._previous_position = None
+            return
+        step_m = 0.0 if self._previous_position is None else position.distance_to(self._previous_position)
+        if self._previous_position is None or step_m >= _MIN_STEP_M:
+            self._flown_m, self._previous_position = self._flown_m + step_m, position
         self._highest_m = max(self._highest_m, position.altitude_relative_m or 0.0)
         self._fastest_m_s = max(self._fastest_m_s, self._vehicle.ground_speed_m_s.latest or 0.0)
 

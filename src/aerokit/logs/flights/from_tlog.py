@@ -12,9 +12,10 @@ from aerokit.logs.flights.codes import clean_text
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TimeSeries
 from aerokit.logs.flights.recording import MIN_SILENCE_S, ClockComparison, LinkCounter, use_simulated_time
 from aerokit.logs.flights.tlog_missions import RecordedMission
+from aerokit.logs.flights.tlog_modes import RecordedModeCommands
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavState, MavType
+from aerokit.mavlink.enums import MavFrame, MavState, MavType
 from aerokit.mavlink.frame import MAGIC_V2, Frame, x25
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.parameters.encoding import value_of
@@ -33,21 +34,8 @@ _U16, _E7, _METRES_PER_DEGREE = 0xFFFF, 1e7, 111_319.5
 # A position closer to 0° N 0° E means that the estimator has no position yet.
 _NULL_ISLAND_E7 = 100_000
 _HEARTBEAT_ID = b"\0\0\0"
-# A mode change counts as commanded if it happens within this time after a command that changes the mode.
-_COMMAND_MAX_AGE_S = 5.0
 # Bits of a set-point's type mask. If they are set, the position, velocity or attitude is ignored.
 _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
-_MODE_COMMANDS = frozenset(
-    (
-        MavCmd.DO_SET_MODE,
-        MavCmd.NAV_RETURN_TO_LAUNCH,
-        MavCmd.NAV_LAND,
-        MavCmd.NAV_TAKEOFF,
-        MavCmd.MISSION_START,
-        MavCmd.DO_REPOSITION,
-        MavCmd.NAV_LOITER_UNLIM,
-    )
-)
 _ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
 
@@ -94,7 +82,7 @@ class _Reader:
         self._texts = StatusTextAssembler()
         self._other_vehicles: set[int] = set()
         self._capabilities: int | None = None
-        self._mode_commanded_at, self._has_commands = -math.inf, False
+        self._mode_commands = RecordedModeCommands(flight, self._autopilot)
         self._system_status = 0
         self._has_battery_status = False
         self._position = (NAN, NAN, NAN)  # latitude, longitude and altitude above sea level
@@ -106,9 +94,9 @@ class _Reader:
         self._link = LinkCounter(flight)
         self._mission = RecordedMission(flight)
         handlers: dict[type[Message], Callable[[float, Any], None]] = {
-            m.CommandLong: self._on_command,
-            m.CommandInt: self._on_command,
-            m.SetMode: self._on_set_mode,
+            m.CommandLong: self._mode_commands.on_command,
+            m.CommandInt: self._mode_commands.on_command,
+            m.SetMode: self._mode_commands.on_set_mode,
             m.MissionItemInt: self._mission.on_item,
             m.MissionItem: self._mission.on_item,
             m.MissionCount: self._mission.on_count,
@@ -179,10 +167,11 @@ class _Reader:
             flight.notes.append(
                 f"this is system {flight.system_id}; the log contains other vehicles too: system {others}"
             )
-        if not self._has_commands:
+        if not self._mode_commands.has_commands:
             flight.notes.append(
                 "the log contains no commands to the vehicle, so the causes of mode changes are unknown"
             )
+        self._mode_commands.attribute_modes(self._clocks.speed)
         use_simulated_time(flight, self._clocks.speed)
 
     def _add_destinations(self) -> None:
@@ -257,13 +246,7 @@ class _Reader:
 
     def _on_heartbeat(self, time_s: float, message: m.Heartbeat) -> None:
         flight = self._flight
-        was_commanded = time_s - self._mode_commanded_at < _COMMAND_MAX_AGE_S
-        flight.add_mode(
-            time_s,
-            self._autopilot.mode_of(message).name,
-            reason="ordered" if was_commanded else "",
-            by_autopilot=False if was_commanded else None,
-        )
+        flight.add_mode(time_s, self._autopilot.mode_of(message).name)
         armed = is_armed(message.base_mode)
         flight.set_armed(time_s, armed)
         status = message.system_status
@@ -283,19 +266,6 @@ class _Reader:
             frame = Frame.parse(raw)
             if is_autopilot(m.Heartbeat.decode_body(frame.body, frame)):
                 self._other_vehicles.add(system_id)
-
-    def _on_command(self, time_s: float, message: m.CommandLong | m.CommandInt) -> None:
-        if message.target_system in (0, self._flight.system_id):
-            self._has_commands = True
-            if message.command in _MODE_COMMANDS:
-                self._record_mode_command(time_s)
-
-    def _on_set_mode(self, time_s: float, message: m.SetMode) -> None:
-        if message.target_system in (0, self._flight.system_id):
-            self._record_mode_command(time_s)
-
-    def _record_mode_command(self, time_s: float) -> None:
-        self._mode_commanded_at, self._has_commands = time_s, True
 
     def _add_texts(self, time_s: float, texts: list[Any]) -> None:
         self._flight.texts += [LoggedText(time_s, text.severity, clean_text(text.text)) for text in texts]

@@ -95,12 +95,17 @@ class LinkCounter:
         self._second, self._received, self._lost = second, 0, 0
 
 
+def is_real_time(speed: float) -> bool:
+    """Return True if this speed of the vehicle's clock is that of a real vehicle, or of a simulation in real time."""
+    return abs(math.log(speed)) <= _MAX_CLOCK_DRIFT
+
+
 def use_simulated_time(flight: FlightLog, speed: float) -> None:
     """Convert all times of a recording to the vehicle's seconds, if the vehicle is a simulation at another speed.
 
     Recorded speeds and turn rates refer to the vehicle's seconds, so they fit the converted times only.
     """
-    if abs(math.log(speed)) <= _MAX_CLOCK_DRIFT:
+    if is_real_time(speed):
         return
     recorded_s, flight.speed = flight.duration_s, speed
     flight.notes.append(

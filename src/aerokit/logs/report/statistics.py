@@ -336,7 +336,7 @@ def summary(flight: FlightLog, statistics: FlightStatistics) -> list[str]:
 def _flight_sentence(flight: FlightLog, statistics: FlightStatistics) -> str:
     if statistics.armed_s is None:
         return f"Never armed: {span(flight.duration_s)} on the ground."
-    parts = [f"{span(statistics.armed_s)} armed"]
+    parts = [f"{span(statistics.armed_s)} armed{_until_impact(flight, statistics.armed_s)}"]
     if statistics.distance_m is not None:
         parts.append(f"{length(statistics.distance_m)} flown over ground")
     if statistics.max_height_m is not None:
@@ -350,8 +350,17 @@ def _flight_sentence(flight: FlightLog, statistics: FlightStatistics) -> str:
     return ", ".join(parts) + "."
 
 
+def _until_impact(flight: FlightLog, armed_s: float) -> str:
+    """Return a note on the armed time until the first fall, if the vehicle was armed for a while after it."""
+    impact_s = next((fall.time_s for fall in falls(flight) if fall.has_impact and not fall.is_hard_landing), math.inf)
+    until_s = sum(max(min(end, impact_s) - begin, 0.0) for begin, end in flight.armed)
+    return f" ({span(until_s)} until the impact)" if armed_s - until_s >= 1.0 else ""
+
+
 def _modes_sentence(flight: FlightLog) -> str:
-    modes = [f"{name} ({span(seconds)})" for name, seconds in time_in_modes(flight).items()]
+    seconds_by_mode = time_in_modes(flight)
+    modes = [f"{name} ({span(seconds)})" for name, seconds in seconds_by_mode.items() if seconds >= 0.5]
+    modes = modes or [f"{name} ({span(seconds)})" for name, seconds in seconds_by_mode.items()]
     if not modes:
         return ""
     return f"{'Flown in' if flight.armed else 'In'} {', '.join(modes)}."

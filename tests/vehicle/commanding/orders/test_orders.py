@@ -51,7 +51,7 @@ def test_order_table_two_links_no_rule_is_broken(row: Row, autopilot: str, seed:
     assert faults(fly(case)) == [], case
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(9)
 @pytest.mark.parametrize("seed", range(SEEDS))
 @pytest.mark.parametrize(("row", "autopilot"), DEFAULT_ROWS)
 def test_order_table_no_rule_is_broken(row: Row, autopilot: str, seed: int) -> None:

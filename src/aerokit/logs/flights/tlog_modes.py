@@ -1,0 +1,75 @@
+"""Attributes the mode changes of a recording to the commands that it contains."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections import defaultdict
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd
+
+if TYPE_CHECKING:
+    from aerokit.autopilots import Autopilot
+    from aerokit.logs.flights.flight import FlightLog, ModeChange
+
+# A mode change counts as commanded if it happens within this time after a command that changes to the mode.
+_COMMAND_MAX_AGE_S = 5.0
+_MODE_COMMANDS = frozenset(
+    (
+        MavCmd.DO_SET_MODE,
+        MavCmd.NAV_RETURN_TO_LAUNCH,
+        MavCmd.NAV_LAND,
+        MavCmd.NAV_TAKEOFF,
+        MavCmd.MISSION_START,
+        MavCmd.DO_REPOSITION,
+        MavCmd.NAV_LOITER_UNLIM,
+    )
+)
+
+
+class RecordedModeCommands:
+    """The commands of a recording that change the vehicle's mode."""
+
+    def __init__(self, flight: FlightLog, autopilot: Autopilot) -> None:
+        self._flight, self._autopilot = flight, autopilot
+        # Maps modes to the times of commands that may change to them; "" to those that may change to any mode.
+        self._command_times: dict[str, list[float]] = defaultdict(list)
+        self.has_commands: bool = False
+        """True if the recording contains any command to the vehicle."""
+
+    def on_command(self, time_s: float, message: m.CommandLong | m.CommandInt) -> None:
+        if message.target_system in (0, self._flight.system_id):
+            self.has_commands = True
+            if message.command in _MODE_COMMANDS:
+                params = (message.param1, message.param2, message.param3, message.param4)
+                modes = self._autopilot.modes_of_command(message.command, params)
+                for name in [mode.name for mode in modes] or [""]:
+                    self._command_times[name].append(time_s)
+
+    def on_set_mode(self, time_s: float, message: m.SetMode) -> None:
+        if message.target_system in (0, self._flight.system_id):
+            self.has_commands = True
+            self._command_times[self._autopilot.mode(message.custom_mode, message.base_mode).name].append(time_s)
+
+    def attribute_modes(self, speed: float) -> None:
+        """Mark the mode changes that were commanded. ``speed`` is that of a simulation, 1.0 for a real vehicle.
+
+        Ages of commands are compared in the vehicle's seconds. A failsafe of a fast simulation may follow a command
+        within a second of the recording.
+        """
+        for times in self._command_times.values():
+            times.sort()
+        self._flight.modes = [
+            change.replace(reason="ordered", by_autopilot=False)
+            if min(self._command_age_s(change, name) for name in ("", change.name)) * speed < _COMMAND_MAX_AGE_S
+            else change
+            for change in self._flight.modes
+        ]
+
+    def _command_age_s(self, change: ModeChange, name: str) -> float:
+        """Return the recorded seconds between a mode change and the last command to this mode; infinity without one."""
+        times = self._command_times.get(name, [])
+        index = bisect_right(times, change.time_s)
+        return change.time_s - times[index - 1] if index else math.inf
