@@ -179,7 +179,7 @@ def test_readiness_shows_all_reasons_and_notes(browser: Any, copters: tuple[list
         after_mission = {"mode": "AUTO", "arms_in": "GUIDED", "unless": "AUTO_OPTIONS"}
         assert page.evaluate(READINESS, {"unarmable_mode": after_mission}) == [
             "Ready to arm",
-            "Arm changes the mode to GUIDED first: ArduCopter cannot arm in AUTO unless AUTO_OPTIONS allows it",
+            "If the vehicle refuses to arm in AUTO (AUTO_OPTIONS), Arm changes the mode to GUIDED and arms there",
         ]
         sensors = {"sensors": {"value": {}, "age_s": 0}}
         for vehicle_type, title in ((2, "Arms, but is not ready to fly"), (10, "Arms, but cannot drive by itself yet")):
@@ -190,7 +190,8 @@ def test_readiness_shows_all_reasons_and_notes(browser: Any, copters: tuple[list
         assert page.evaluate(READINESS, {"disarming": disarming}) == ["Ready to arm", text]
         assert page.evaluate(READINESS, {"disarming": {**disarming, "age_s": 61}}) == ["Ready to arm"]
         refused = {"missing_for_flight": ["compass", "home"], "not_armable": ["compass"]}
-        assert page.evaluate(READINESS, refused) == ["Cannot arm", "compass"]
+        rows = page.evaluate(READINESS, refused)
+        assert rows == ["Cannot arm", "compass", "and 2 more", "Also missing for flight:", "home", "A seventh"]
 
 
 OBSTACLE = """async ([order, landed, age, type, link]) => {

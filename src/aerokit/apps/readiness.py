@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from aerokit.errors import AerokitError
 from aerokit.events import LinkState
+from aerokit.vehicle.commanding.health import REPORTS_ABOUT_ARMING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,12 +43,12 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None) -> Readine
     """
     missing, sensors = vehicle.missing_for_flight(), vehicle.sensors.latest
     checks_pass = sensors is not None and sensors.prearm_checks_pass is True
-    against = tuple(missing if reasons is None else reasons)
+    against = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)
     if checks_pass and all(map(_is_about_estimates, against)):
         # For example, ArduCopter without a position arms in STABILIZE, but not in GUIDED.
         refused = tuple(not_armable(vehicle, missing)) if reasons is None else ()
-        return Readiness(refused, () if refused else tuple(dict.fromkeys([*against, *missing])))
-    is_known = not any(text.startswith(("heartbeats (", "sensors (")) for text in against)
+        return Readiness(refused, tuple(text for text in dict.fromkeys([*missing, *against]) if text not in refused))
+    is_known = not any(text.startswith(REPORTS_ABOUT_ARMING) for text in against)
     # The same reason may be in a status text of the autopilot, there with a prefix.
     without_prefix = {vehicle.autopilot.arming_reason(text) for text in against}
     others = tuple(text for text in missing if text not in against and text not in without_prefix)
@@ -56,6 +57,19 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None) -> Readine
 
 def _is_about_estimates(text: str) -> bool:
     return text.startswith(("the estimator has no ", "no GPS receiver has ", "position (", "home ("))
+
+
+def _needed_to_arm(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
+    """Return the missing conditions that prevent arming in the present mode, as `Vehicle.why_not_armable` does."""
+    mode = vehicle.mode.latest
+    needs_position = mode is None or mode.name not in vehicle.autopilot.modes_without_position
+    flight_only = () if needs_position else ("the estimator has no ", "no GPS receiver has ")
+    return [
+        text
+        for text in missing
+        if not text.startswith(flight_only)
+        and not (text.startswith(("estimator (", "position (", "home (")) and text.endswith(" not received)"))
+    ]
 
 
 def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
@@ -68,10 +82,10 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
         return []
     if unarmable is not None and unarmable["arms_in"] is None:  # `arm` cannot change to a mode that allows arming
         unless = f" unless {unarmable['unless']} allows it" if unarmable["unless"] else ""
-        return [f"{autopilot.firmware} cannot arm in {unarmable['mode']}{unless}", *missing]
+        return [f"{autopilot.firmware} cannot arm in {unarmable['mode']}{unless}", *_needed_to_arm(vehicle, missing)]
     sensors, estimator = vehicle.sensors.latest, vehicle.estimator.latest
     if sensors is not None and sensors.prearm_checks_pass is False:
-        return missing
+        return _needed_to_arm(vehicle, missing)
     mode = vehicle.mode.latest
     arms_in = None if mode is None else mode.name
     if unarmable is not None:
@@ -79,7 +93,8 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
     needs_position = bool(autopilot.modes_without_position) and arms_in not in (None, *autopilot.modes_without_position)
     if needs_position and estimator is not None and estimator.missing:
         change = "" if unarmable is None else ", to which arming would change the mode"
-        return [f"{autopilot.firmware} needs a position to arm in {arms_in}{change}", *missing]
+        headline = f"{autopilot.firmware} needs a position to arm in {arms_in}{change}"
+        return [headline, *(text for text in missing if not text.endswith(" not received)"))]
     return []
 
 

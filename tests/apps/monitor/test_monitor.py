@@ -119,6 +119,7 @@ async def test_command_goes_to_vehicle_in_question_despite_selection() -> None:
         assert it.app.selected is not None
         assert it.app.selected.system_id == 2
         assert set(it.mode_commands()) == {1}
+        await it.wait_drawn("hold: in BRAKE, may still be stopping")
 
 
 async def test_refusal_and_old_values_are_shown() -> None:
@@ -285,6 +286,22 @@ async def test_tall_wide_terminal_lists_all_missing_reasons() -> None:
             await it.wait_drawn("vertical speed")
             assert all(name.split()[-1] in it.screen() for name in names)
             assert "more)" not in it.app._state_rows()[1][1].plain
+
+
+async def test_key_shows_all_missing_reasons_in_small_terminal() -> None:
+    reasons = [*(f"reason {number}" for number in range(1, 10)), "home (HOME_POSITION not received)"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Vehicle, "missing_for_flight", lambda _: reasons)
+        async with stage(1, size=(80, 24)) as it:
+            await it.press("m")
+            await it.wait_drawn("also missing for flight: home")
+            assert all(f"reason {number}" in it.screen() for number in range(1, 10))
+            reasons.insert(0, "a new one")
+            await it.wait_drawn("cannot arm: a new one")
+            await it.press("m")
+            await it.press("m", "escape")
+            assert len(it.app.screen_stack) == 1
+            assert it.app.is_running
 
 
 async def test_vehicle_without_mission_shows_no_item() -> None:

@@ -135,6 +135,19 @@ async def test_idle_anonymous_connections_do_not_block_command() -> None:
         assert server.open_connections() <= MAX_ANONYMOUS_CONNECTIONS + 2
 
 
+async def test_page_with_old_token_is_refused_without_an_error(caplog: pytest.LogCaptureFixture) -> None:
+    """After a restart, pages that are still open reconnect with the token of the previous server."""
+    async with open_server() as server:
+        protocols = [Subprotocol("aerokit.v1"), Subprotocol("bearer.of-the-previous-server")]
+        with pytest.raises(websockets.InvalidStatus) as refused:
+            await websockets.connect(f"ws://127.0.0.1:{server.port}/api/stream", subprotocols=protocols)
+        assert refused.value.response.status_code == 401
+        with anyio.fail_after(100):
+            while server.open_connections():  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
+
+
 async def test_flood_from_one_address_keeps_connection_of_another() -> None:
     async with open_server() as server:
         page = await server.connect(host="127.0.0.2")

@@ -310,7 +310,8 @@ async def test_newer_command_overrules_older_one() -> None:
         place = {"latitude_deg": there.latitude_deg, "longitude_deg": there.longitude_deg}
         started = await stage.submit("go_to?wait=false", place, Idempotency_Key="older-one")
         assert (started.status_code, started.json()["state"]) == (202, "running")
-        assert (await stage.submit("hold")).status_code == 200
+        held = await stage.submit("hold")
+        assert (held.status_code, held.json()["result"]) == (200, {"mode": "BRAKE"})
         older = (await stage.client.get("/api/orders/older-one", headers=BEARER)).json()
         assert (older["state"], older["problem"]["status"]) == ("failed", 409)
 

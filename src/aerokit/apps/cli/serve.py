@@ -124,6 +124,7 @@ def _is_loopback(host: str) -> bool:
 
 def config_of(uvicorn: Any, app: ServeApp, host: str, port: int) -> Any:
     """Return the uvicorn configuration, with limits on what clients may send and hold open."""
+    guard = import_extra("aerokit.apps.serve.guard", "serve")
     return uvicorn.Config(
         app,
         host=host,
@@ -133,10 +134,10 @@ def config_of(uvicorn: Any, app: ServeApp, host: str, port: int) -> Any:
         access_log=False,
         server_header=False,
         proxy_headers=False,
-        ws="websockets-sansio",
+        ws=guard.WebSocketConnection,
         ws_max_size=1024,
         ws_max_queue=4,
-        http=import_extra("aerokit.apps.serve.guard", "serve").http_protocol(app.has_token),
+        http=guard.http_protocol(app.has_token),
         timeout_keep_alive=20,
         timeout_graceful_shutdown=2,
     )

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 from textual.app import App
 from textual.binding import Binding
-from textual.containers import Container, Horizontal, Vertical
+from textual.containers import Container, Horizontal, Vertical, VerticalScroll
 from textual.screen import ModalScreen
 from textual.widget import Widget
 from textual.widgets import Button, Footer, Label, OptionList, RichLog
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["ConfirmScreen", "Monitor", "run_monitor"]
+__all__ = ["ConfirmScreen", "MissingScreen", "Monitor", "run_monitor"]
 
 REFRESH_INTERVAL_S = 0.5
 WIDE_SIZE = 120, 30
@@ -95,6 +95,36 @@ class ConfirmScreen(ModalScreen[bool]):
         self.dismiss(yes)
 
 
+class MissingScreen(ModalScreen[None]):
+    """All reasons that prevent a flight of one vehicle, updated like the state. Any of its keys closes it."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [("m,escape,q,enter", "dismiss", "Close")]
+    CSS: ClassVar[str] = """
+    MissingScreen { align: center middle; background: transparent; }
+    MissingScreen VerticalScroll { width: 90%; max-width: 100; height: auto; max-height: 90%; border: heavy; }
+    MissingScreen Label { width: 100%; }
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        super().__init__()
+        self._vehicle = vehicle
+
+    def compose(self) -> ComposeResult:
+        """Yield the reasons in a frame that can be scrolled."""
+        frame = VerticalScroll(Label(markup=False))
+        frame.border_title = f"vehicle {self._vehicle.system_id}: missing"
+        yield frame
+
+    def on_mount(self) -> None:
+        """Show the reasons, and update them periodically."""
+        self.update_reasons()
+        self.set_interval(REFRESH_INTERVAL_S, self.update_reasons)
+
+    def update_reasons(self) -> None:
+        """Show the present reasons."""
+        self.query_one(Label).update(VehicleText(self._vehicle).all_missing())
+
+
 class Panel(Widget):
     """A widget that shows a text or a table. New content changes the layout only if its height differs."""
 
@@ -124,6 +154,7 @@ class Monitor(App[None]):
         ("h", "command('hold')", "Hold"),
         ("l", "command('land')", "Land"),
         ("r", "command('return_to_launch')", "Return"),
+        ("m", "missing", "Missing"),
         ("q", "quit", "Quit"),
         Binding("ctrl+c", "quit", "Quit", show=False, priority=True),
     ]
@@ -229,6 +260,14 @@ class Monitor(App[None]):
 
         self.push_screen(ConfirmScreen(f"{KEY_COMMANDS[method]}: vehicle {vehicle.system_id}?"), on_answer)
 
+    def action_missing(self) -> None:
+        """Show everything that is missing for a flight of the selected vehicle."""
+        vehicle = self.selected
+        if vehicle is None:
+            self.bell()
+        elif len(self.screen_stack) == 1:
+            self.push_screen(MissingScreen(vehicle))
+
     async def _run_command(self, vehicle: Vehicle, method: str) -> None:
         command, add_line = KEY_COMMANDS[method].lower(), partial(self._model.add_line, vehicle.system_id)
         add_line(f"{command}: command sent", "bold")
@@ -237,7 +276,9 @@ class Monitor(App[None]):
         except AerokitError as error:
             add_line(f"{command} failed: {error}", "bold red")
         else:
-            add_line(f"{command}: done", "bold green")
+            # A hold has ended when its mode is reported. PX4 then still moves.
+            done = f"in {vehicle.mode_name}, may still be stopping" if method == "hold" else "done"
+            add_line(f"{command}: {done}", "bold green")
 
     def _update_list(self, options: OptionList) -> None:
         vehicles = self._model.vehicles

@@ -170,14 +170,30 @@ class VehicleText:
         text.append("  round trip ")
         return text.append_text(self.cell(quality, lambda report: _milliseconds(report.round_trip_s)))
 
+    def all_missing(self) -> str:
+        """Return all reasons that prevent a flight as lines, or a sentence if there are none."""
+        reasons = "\n".join(map(printable, self._reasons())) or "Nothing is missing."
+        silence = self.silence().plain
+        return f"{silence}\n{reasons}" if silence else reasons
+
+    def _reasons(self) -> list[str]:
+        """Return the reasons that prevent a flight: those against arming, then the others. Each group has a prefix."""
+        found = readiness(self._vehicle)
+        if self._vehicle.armed.latest:
+            return [*found.against_arming, *found.against_flight]
+        flight_prefix = "also missing for flight" if found.against_arming else "arms, cannot fly by itself"
+        groups = ((found.prefix, found.against_arming), (flight_prefix, found.against_flight))
+        return [
+            f"{prefix}: {reason}" if place == 0 else reason
+            for prefix, reasons in groups
+            for place, reason in enumerate(reasons)
+        ]
+
     def _missing(self, max_lines: int = 1, width: int = 0) -> Text:
         """Return the first reason that prevents a flight, and as many others as fit into ``max_lines``."""
-        found = readiness(self._vehicle)
-        missing = list(found.against_arming or found.against_flight)
+        missing = self._reasons()
         if not missing:
             return Text("nothing")
-        if not self._vehicle.armed.latest:
-            missing[0] = f"{found.prefix if found.against_arming else 'arms, cannot fly by itself'}: {missing[0]}"
         texts: list[str] = []
         for shown in range(len(missing), 0, -1):
             texts = _with_count(missing, shown)

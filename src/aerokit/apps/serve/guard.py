@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from aerokit.apps.serve.requests import HttpProblem, problem_response
 from aerokit.errors import InvalidArgument
@@ -234,6 +235,19 @@ class _HttpConnection(H11Protocol):
     def _abort(connection: _HttpConnection) -> None:
         connection._remove_from_anonymous()
         connection.transport.abort()
+
+
+class WebSocketConnection(WebSocketsSansIOProtocol):
+    """The ``ws`` class for `uvicorn.Config`.
+
+    uvicorn 0.35 to 0.54 log a refused handshake as an error ("ASGI callable returned without completing handshake"),
+    because they do not record that the response to it completes the handshake.
+    """
+
+    async def send(self, message: Any) -> None:
+        await super().send(message)
+        if message["type"] == "websocket.http.response.body" and not message.get("more_body", False):
+            self.handshake_complete = True
 
 
 def _oldest_of_busiest_host(connections: Iterable[_HttpConnection]) -> _HttpConnection:

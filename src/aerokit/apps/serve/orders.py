@@ -110,6 +110,16 @@ async def _go_to(vehicle: Vehicle, values: dict[str, Any]) -> None:
     await vehicle.go_to(Position(**position), **values)
 
 
+async def _hold(vehicle: Vehicle, _: dict[str, Any]) -> object:
+    await vehicle.hold()
+    return {"mode": vehicle.mode_name}
+
+
+async def _pause(vehicle: Vehicle, _: dict[str, Any]) -> object:
+    await vehicle.mission.pause()
+    return {"mode": vehicle.mode_name}
+
+
 async def _resume(vehicle: Vehicle, values: dict[str, Any]) -> None:
     # After a finished mission, an ArduCopter on the ground would take off and fly from the first item.
     landed = vehicle.landed_state
@@ -220,7 +230,7 @@ ORDERS = (
     OrderType("disarm", "Stop the motors, on the ground", _disarm, _DISARM, is_safe=True),
     OrderType("take_off", "Take off and climb", lambda vehicle, values: vehicle.take_off(**values), _ALTITUDE),
     OrderType("go_to", "Go to a position", _go_to, _GO_TO),
-    OrderType("hold", "Stop and hold position", lambda vehicle, _: vehicle.hold(), is_safe=True),
+    OrderType("hold", "Stop and hold position", _hold, is_safe=True),
     OrderType("land", "Land at the current position", lambda vehicle, _: vehicle.land(), is_safe=True),
     OrderType(
         "return_to_launch",
@@ -231,7 +241,7 @@ ORDERS = (
     OrderType("mode", "Change the flight mode", lambda vehicle, values: vehicle.set_mode(values["mode"]), _MODE),
     UPLOAD,
     OrderType("mission/start", "Fly the mission", lambda vehicle, values: vehicle.mission.start(**values), _ITEM),
-    OrderType("mission/pause", "Pause the mission", lambda vehicle, _: vehicle.mission.pause(), is_safe=True),
+    OrderType("mission/pause", "Pause the mission", _pause, is_safe=True),
     OrderType("mission/resume", "Resume the mission, in the air", _resume),
 )
 SET_PARAMETER = OrderType("set_parameter", "Set a parameter", _set_parameter, _VALUE)

@@ -24,7 +24,19 @@ PREARM_REPORT_INTERVAL_S = 35.0
 """ArduPilot repeats its pre-arm failures every 30 s, so each one is reported within this many seconds."""
 CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
 """The reason for a refusal to arm if no other reason is known."""
+REPORTS_ABOUT_ARMING = ("heartbeats (", "sensors (")
+"""How reasons begin that are about reports without which it is unknown whether the vehicle arms."""
 RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
+
+
+def in_order(reports: list[str], known: list[str]) -> list[str]:
+    """Return reasons in the order in which all programs list them, the plainest first.
+
+    ``reports`` are missing or old reports. Those without which it is unknown whether the vehicle arms come first, the
+    others after ``known``: the vehicle's own texts, its mode, failing sensors, a missing GPS fix and estimates.
+    """
+    needed = [report for report in reports if report.startswith(REPORTS_ABOUT_ARMING)]
+    return [*needed, *known, *(report for report in reports if report not in needed)]
 
 
 class Health:
@@ -40,7 +52,10 @@ class Health:
         self._restored_at = event.at
 
     def missing_for_flight(self) -> list[str]:
-        """Return what is still missing before the vehicle can fly, from the state received so far. Sends nothing."""
+        """Return what is still missing before the vehicle can fly, from the state received so far. Sends nothing.
+
+        The order is that of :func:`in_order`.
+        """
         telemetry = self._telemetry
         missing = [
             f"{cell.name} ({cell.waits_for} not received)"
@@ -48,9 +63,9 @@ class Health:
             if not cell.is_known
         ]
         texts = self._recent_texts()
-        reasons = [*texts, *missing, *self._out_of_date(), *self._failing()]
         explains = texts or self._failing_sensors() or (self._needs_position() and self._missing_estimates())
-        return [*reasons, *([CHECKS_FAIL] if self._checks_fail() and not explains else [])]
+        unexplained = [CHECKS_FAIL] if self._checks_fail() and not explains else []
+        return in_order([*missing, *self._out_of_date()], [*texts, *self._failing(), *unexplained])
 
     def _recent_texts(self) -> list[str]:
         """Return the vehicle's texts about its failing checks, since it was last requested to run them."""
@@ -97,8 +112,8 @@ class Health:
             await self._request_texts(since)
             await self._refresh()
         failing = self._failing() if self._needs_position() else self._failing_sensors()
-        found = (self.arming_texts(since), self.unarmable_mode(), self._out_of_date(), failing)
-        reasons = self._session.deduplicate_reasons(*(reason for reasons in found for reason in reasons))
+        known = [*self.arming_texts(since), *self.unarmable_mode(), *failing]
+        reasons = self._session.deduplicate_reasons(*in_order(self._out_of_date(), known))
         return reasons or ((CHECKS_FAIL,) if self._checks_fail() else ())
 
     def _needs_position(self) -> bool:
@@ -162,11 +177,10 @@ class Health:
         estimator = self._telemetry.estimator.latest
         if estimator is None or not estimator.missing:
             return []
-        missing = [f"the estimator has no {name} ({estimator.message})" for name in estimator.missing]
         receivers = self._telemetry.gps.latest or ()
-        if receivers and not any(receiver.has_3d_fix for receiver in receivers):
-            missing.append("no GPS receiver has a 3D fix (GPS_RAW_INT)")
-        return missing
+        has_no_fix = receivers and not any(receiver.has_3d_fix for receiver in receivers)
+        causes = ["no GPS receiver has a 3D fix (GPS_RAW_INT)"] if has_no_fix else []
+        return [*causes, *(f"the estimator has no {name} ({estimator.message})" for name in estimator.missing)]
 
     def _checks_fail(self) -> bool:
         """Return True if the vehicle reports that its pre-arm checks do not pass.

@@ -2,7 +2,7 @@
 
 import { clock, number, spelled, UNKNOWN } from "./dom.js";
 import { orderTitle } from "./panels.js";
-import { crashText, flightGap, withoutSource } from "./readiness.js";
+import { crashText, flightGap, modeChange, withoutSource } from "./readiness.js";
 
 // Orders that replace a running one of this set.
 const MOTION = new Set(["take_off", "go_to", "hold", "land", "return_to_launch", "mode", "mission/start", "mission/pause", "mission/resume"]);
@@ -45,11 +45,10 @@ const itemText = ({ mission_item: item, mission_items: count }) =>
 export const needsForce = (vehicle) => Boolean(vehicle.crash) && vehicle.states.landed_state?.value !== "ON_GROUND";
 
 function armFacts(vehicle) {
-  const { unarmable_mode: mode, missing_for_flight: missing, crash } = vehicle;
-  const change = mode?.unless ? `If the vehicle refuses to arm in ${mode.mode}, changes the mode to ${mode.arms_in}.` : `Changes the mode from ${mode?.mode} to ${mode?.arms_in} first.`;
+  const { missing_for_flight: missing, crash } = vehicle, change = modeChange(vehicle);
   return [
     crash ? `${crashText(vehicle)}.` : "",
-    mode?.arms_in ? change : "",
+    change && `${change}.`,
     missing.length ? `${flightGap(vehicle)}: ${missing.map(withoutSource).join("; ")}.` : "",
   ].filter(Boolean);
 }

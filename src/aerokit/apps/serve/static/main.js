@@ -1,12 +1,12 @@
 // The page: stores the messages of the stream, and shows them.
 
 import { drawAttitude } from "./attitude.js";
-import { age, byId, element, number, show } from "./dom.js";
+import { age, byId, element, number, show, unbroken } from "./dom.js";
 import { colourOf, MapView } from "./map.js";
 import { Orders } from "./orders.js";
 import { targetAltitude } from "./facts.js";
 import { currentItem, MissionPanel, OrderPanel, ParameterPanel, shownState, TextPanel } from "./panels.js";
-import { disarmText, inWords, isConnected, showCrashes, showReadiness, showSilences } from "./readiness.js";
+import { disarmText, inWords, isConnected, light, showCrashes, showReadiness, showSilences } from "./readiness.js";
 import { ask, hasToken, openStream, useToken } from "./server.js";
 import { ageOf, BigValues, bitNames, StateTable } from "./state.js";
 
@@ -76,8 +76,9 @@ function showVehicles() {
     const state = page.isOpen ? vehicle.link.state : "lost";
     show(button.children[1], `${vehicle.system_id} ${vehicle.firmware}`);
     show(button.children[2], summary(vehicle, state));
-    if (button.children[0].className !== `dot ${state}`) button.children[0].className = `dot ${state}`;
-    button.title = `link ${state}`;
+    const [kind, title] = light(vehicle, page), dot = `dot ${state === "connected" ? kind : state}`; // as the readiness
+    if (button.children[0].className !== dot) button.children[0].className = dot;
+    button.title = `${title} · link ${state}`;
     button.setAttribute("aria-pressed", String(vehicle.system_id === page.selected));
   }
 }
@@ -218,7 +219,7 @@ function drawNow() {
 
 // A newer toast with the same key replaces the older one.
 function toast(text, kind, key) {
-  const made = element("button", { type: "button", class: `toast ${kind}`, title: "close", onclick: () => made.remove() }, text);
+  const made = element("button", { type: "button", class: `toast ${kind}`, title: "close", onclick: () => made.remove() }, ...unbroken(text));
   if (key !== undefined) {
     made.dataset.key = key;
     byId("toasts").querySelector(`[data-key="${CSS.escape(key)}"]`)?.remove();

@@ -7,6 +7,7 @@ export const colourOf = (id) => colour(`vehicle-${(id - 1) % 8}`);
 const METRES_PER_DEGREE = 111195;
 const MAX_POINTS = 5000;
 const MAX_AGE_S = 3;
+const BUTTONS_WIDTH = 52, BUTTONS_HEIGHT = 170; // pixels of the buttons at the top right
 
 const DIRECTIONS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
 
@@ -96,7 +97,8 @@ export class MapView {
     const [low, high] = [Math.min(...known.map((p) => p.y)), Math.max(...known.map((p) => p.y))];
     this.centre = { x: (left + right) / 2, y: (low + high) / 2 };
     const [wide, tall] = [Math.max(30, right - left), Math.max(30, high - low)];
-    this.scale = 0.72 * Math.min(this.width / wide, this.height / tall);
+    this.scale = 0.72 * Math.min((this.width - BUTTONS_WIDTH) / wide, this.height / tall);
+    this.centre.x += BUTTONS_WIDTH / 2 / this.scale; // everything is to the left of the buttons
   }
 
   // Fits everything into the map until `showBefore`.
@@ -169,7 +171,7 @@ export class MapView {
     const places = [...vehicles.flatMap((each) => [each.position, each.home]), ...items.map((item) => item.position),
       ...fence.polygons.flatMap((each) => each.vertices), ...fence.rally].filter(Boolean);
     // What labels must not cover, as [left, top, right, bottom]: the buttons and the scale, then what is drawn.
-    this.taken = [[this.width - 52, 0, this.width, 170], [0, this.height - 40, 40 + this.step() * this.scale, this.height]];
+    this.taken = [[this.width - BUTTONS_WIDTH, 0, this.width, BUTTONS_HEIGHT], [0, this.height - 40, 40 + this.step() * this.scale, this.height]];
     if (!places.length) return this.drawNothing();
     const followed = vehicles.find((each) => each.id === this.follows && each.position);
     if (followed) this.centre = this.toPlane(followed.position.latitude_deg, followed.position.longitude_deg);

@@ -3,7 +3,7 @@
 import { age, byId, element, show } from "./dom.js";
 import { needsForce, orderFacts, valueProblem } from "./facts.js";
 import { distanceText } from "./map.js";
-import { aboutParameter, parameterProblem } from "./panels.js";
+import { aboutParameter, parameterProblem, typeProblem } from "./panels.js";
 import { capitalized, dialogObstacle, inWords, obstacle } from "./readiness.js";
 import { ask, hasToken, newKey, Refusal, useToken } from "./server.js";
 import { ageOf } from "./state.js";
@@ -121,6 +121,7 @@ export class Orders {
 
   setParameter(id, parameter) {
     this.confirm({
+      impossible: ({ value }) => (value === undefined ? "" : typeProblem(parameter, value)),
       problem: ({ value }) => (value === undefined ? "" : parameterProblem(parameter, value)),
       vehicle: id, title: `Set ${parameter.name}`, text: `set ${parameter.name}, currently ${parameter.value} ${parameter.unit ?? ""}`.trim(), about: aboutParameter(parameter),
       fields: [["value", "New value", parameter.value, "any"]], order: "parameter", parameter: parameter.name,
@@ -156,11 +157,12 @@ export class Orders {
       enable();
     };
     const check = () => {
-      const text = wanted.problem?.(values()) || valueProblem(wanted.order, values(), vehicle);
+      const impossible = wanted.impossible?.(values()) || valueProblem(wanted.order, values(), vehicle);
+      const text = impossible || wanted.problem?.(values()) || "";
       show(problem, text);
       problem.hidden = !text;
-      forced.hidden = !text || wanted.order !== "parameter";
-      show(will, typeof wanted.text === "function" ? wanted.text(values()) : wanted.text);
+      forced.hidden = !text || Boolean(impossible) || wanted.order !== "parameter";
+      show(will, ` (${vehicle.firmware}) will ${typeof wanted.text === "function" ? wanted.text(values()) : wanted.text}.`);
       force.checked = false;
       enable();
     };
@@ -176,7 +178,7 @@ export class Orders {
     dialog.className = wanted.place ?? "";
     dialog.replaceChildren(element("form", { onsubmit: give, oninput: (event) => { if (event.target !== force) check(); } },
       element("h2", {}, `${wanted.title}?`),
-      element("p", {}, element("span", { class: "target" }, `Vehicle ${id}`), ` (${vehicle.firmware}) will `, will, "."),
+      element("p", {}, element("span", { class: "target" }, `Vehicle ${id}`), will),
       wanted.target ? element("p", { class: "where" }) : null,
       ...(wanted.about ?? []).map((line) => element("p", { class: "detail" }, line)),
       facts, ...inputs.map(([, , label]) => label), blocked, problem, forced,

@@ -1,6 +1,6 @@
 // The panels: mission, parameters, texts and events, orders.
 
-import { clock, element, number, SEVERITIES, show, spelled, UNKNOWN, unitOf } from "./dom.js";
+import { clock, element, number, SEVERITIES, show, spelled, unbroken, UNKNOWN, unitOf } from "./dom.js";
 import { inWords } from "./readiness.js";
 import { ask } from "./server.js";
 
@@ -73,7 +73,7 @@ export class MissionPanel {
     this.drawn = drawn;
     this.body.replaceChildren(...mission.items.map((item) => {
       const place = item.position ? `${item.position.latitude_deg.toFixed(6)}, ${item.position.longitude_deg.toFixed(6)}` : "";
-      const height = item.position || item.z ? number(item.z, 1, "m") : "";
+      const height = item.position || item.z ? number(item.z, 1, "m") : itemValue(item);
       const name = spelled(item.name.replace(/^(NAV|DO)_/, ""));
       return element("tr", item.index === current ? { class: "current" } : {},
         element("td", { class: "number" }, String(item.index)), element("td", {}, name),
@@ -84,6 +84,12 @@ export class MissionPanel {
 
 // Numbered like the mission. The state mission_current counts home too, if the autopilot does.
 export const currentItem = (vehicle) => vehicle.mission_item ?? null;
+
+// The value of an item without a place: -1 and -2 stand for "unchanged" and "the vehicle's own".
+function itemValue({ name, param1, param2, param3 }) {
+  if (name === "DO_CHANGE_SPEED") return [param2 > 0 ? number(param2, 1, "m/s") : "", param3 > 0 ? number(param3, 0, "%") : ""].filter(Boolean).join(" · ");
+  return ["NAV_DELAY", "CONDITION_DELAY"].includes(name) && param1 > 0 ? number(param1, 0, "s") : "";
+}
 
 export class ParameterPanel {
   constructor(setParameter, isSettable) {
@@ -193,6 +199,17 @@ function changedFrom(each) {
 function range(each) {
   if (!isKnown(each.minimum) && !isKnown(each.maximum)) return "";
   return `${bound(each.minimum)} … ${bound(each.maximum)}`;
+}
+
+const MAX_REAL32 = 3.4028234663852886e38;
+
+// Why the type of a parameter cannot hold a value, like checked_value in parameter.py; "" if it can.
+export function typeProblem({ name, type }, value) {
+  const [, sign, bits] = /^(U?)INT(8|16|32|64)$/.exec(type) ?? [];
+  if (!bits) return type === "REAL32" && Math.abs(value) > MAX_REAL32 ? `${name} = ${value} is too large (it is a REAL32).` : "";
+  const size = 2 ** (bits - (sign ? 0 : 1)), minimum = sign ? 0 : -size;
+  if (!Number.isInteger(value)) return `${name} = ${value} must be a whole number (it is an ${type}).`;
+  return value < minimum || value >= size ? `${name} = ${value} must be in ${minimum}..${size - 1} (it is an ${type}).` : "";
 }
 
 // Why the metadata does not allow a value, like ParameterMetadata.problem in metadata.py; "" if it does.
@@ -316,7 +333,7 @@ export class OrderPanel {
 
   // The vehicle finished its mission: the last order that started or resumed it says so.
   finishMission(id, unixSeconds) {
-    const isBefore = (each) => each.system_id === id && BEGUN[each.order] && each.given_unix_s <= unixSeconds;
+    const isBefore = (each) => each.system_id === id && /^mission\/(start|resume)$/.test(each.order) && each.given_unix_s <= unixSeconds;
     const order = [...this.records.values()].filter(isBefore).pop();
     if (order) order.finishedAt ??= unixSeconds;
     this.drawn = undefined;
@@ -336,7 +353,7 @@ export class OrderPanel {
     const shown = [...this.records.values()].reverse();
     this.node.replaceChildren(...shown.map((each) => element("div", { class: "text" },
       element("time", {}, clock(each.given_unix_s)),
-      element("span", {}, `vehicle ${each.system_id}: `, element("span", { class: shownState(each) }, this.outcome(each)),
+      element("span", {}, `vehicle ${each.system_id}: `, element("span", { class: shownState(each) }, ...unbroken(this.outcome(each))),
         each.problem && !each.replaced_by ? element("div", { class: "detail" }, inWords(each.problem)) : null))));
     if (!shown.length) this.node.replaceChildren(element("p", { class: "note" }, "no orders yet"));
   }
@@ -354,15 +371,20 @@ const ORDER_TEXTS = {
   set_parameter: ({ name, value }) => ` ${name} to ${+value.toPrecision(7)}`,
 };
 
+// Done when the vehicle reports its hold mode. PX4 then still moves.
+const holds = (title) => (_, result) => `${title}: in ${result?.mode ?? "its hold mode"}, may still be stopping`;
+
 // Orders that only begin something: "done" would read like its end.
 const BEGUN = {
   "mission/start": ({ item }) => `mission started at item ${item ?? 0}`,
   "mission/resume": () => "mission resumed",
+  hold: holds("hold"),
+  "mission/pause": holds("mission pause"),
 };
 
 function outcome(record) {
   const text = record.state === "done" && BEGUN[record.order];
-  if (text) return text(record.arguments);
+  if (text) return text(record.arguments, record.result);
   const note = record.order === "set_parameter" && record.result?.note;
   return `${orderText(record)}: ${record.state === "running" ? "ordered" : record.state}${note ? `; ${note}` : ""}`;
 }

@@ -122,7 +122,17 @@ export function inWords(problem, vehicle) {
 
 export const capitalized = (text) => text.replace(/^[a-z](?=[a-z]* )/, (letter) => letter.toUpperCase()); // not file names
 
-// [class of the light, title, reasons]
+// What arming in a mode that does not allow it does; "" if arming leaves the mode as it is.
+export function modeChange({ firmware, unarmable_mode: mode }) {
+  if (!mode?.arms_in) return "";
+  if (mode.unless) return `If the vehicle refuses to arm in ${mode.mode} (${mode.unless}), Arm changes the mode to ${mode.arms_in} and arms there`;
+  return `Arm changes the mode to ${mode.arms_in} first: ${firmware} cannot arm in ${mode.mode}`;
+}
+
+// Class of the light of a vehicle, and its title.
+export const light = (vehicle, page) => readiness(vehicle, page, heartbeatAge(vehicle, page));
+
+// [class of the light, title, reasons, what is missing for a flight only]
 function readiness(vehicle, page, heartbeatAge) {
   if (!vehicle) return ["unknown", "No vehicle yet", []];
   if (!page.isOpen) return ["unknown", "Readiness unknown", ["No connection to the server"]];
@@ -136,21 +146,23 @@ function readiness(vehicle, page, heartbeatAge) {
     const title = landed === "ON_GROUND" ? "Armed: propellers may turn" : FLYING.has(landed) ? "Flying" : "Armed";
     return [missing.length || landed === "ON_GROUND" ? "warn" : "good", title, missing];
   }
-  const mode = vehicle.unarmable_mode, unless = mode?.unless ? ` unless ${mode.unless} allows it` : "";
-  const cannot = mode && `${vehicle.firmware} cannot arm in ${mode.mode}${unless}`;
-  const notes = [disarmed, cannot && mode.arms_in ? `Arm changes the mode to ${mode.arms_in} first: ${cannot}` : ""].filter(Boolean);
-  if (vehicle.not_armable.length) return ["warn", "Cannot arm", [...vehicle.not_armable, ...(disarmed ? [disarmed] : [])]];
+  const notes = [disarmed, modeChange(vehicle)].filter(Boolean), against = vehicle.not_armable;
+  if (against.length) {
+    const forFlight = missing.filter((reason) => !against.includes(reason));
+    return ["warn", "Cannot arm", [...against, ...(disarmed ? [disarmed] : [])], forFlight];
+  }
   return missing.length ? ["warn", flightGap(vehicle), [...missing, ...notes]] : ["good", "Ready to arm", notes];
 }
 
 export function showReadiness(box, vehicle, page) {
-  const [kind, title, reasons] = readiness(vehicle, page, vehicle && heartbeatAge(vehicle, page));
-  const drawn = [kind, title, ...reasons].join("\n");
+  const [kind, title, reasons, forFlight = []] = readiness(vehicle, page, vehicle && heartbeatAge(vehicle, page));
+  const drawn = [kind, title, ...reasons, "", ...forFlight].join("\n");
   if (box.dataset.drawn === drawn) return;
   box.dataset.drawn = drawn;
-  const items = reasons.map((reason) => element("li", {}, capitalized(withoutSource(reason))));
-  const more = items.splice(MAX_REASONS), isOpen = box.querySelector("details")?.open ?? false;
-  const rest = more.length ? element("details", { open: isOpen }, element("summary", {}, `and ${more.length} more`), element("ul", {}, ...more)) : null;
+  const [items, others] = [reasons, forFlight].map((texts) => texts.map((text) => element("li", {}, capitalized(withoutSource(text)))));
+  const more = items.splice(MAX_REASONS), isOpen = box.querySelector("details")?.open ?? false, count = more.length + others.length;
+  const flight = others.length ? [element("div", {}, "Also missing for flight:"), element("ul", {}, ...others)] : [];
+  const rest = count ? element("details", { open: isOpen }, element("summary", {}, `and ${count} more`), element("ul", {}, ...more), ...flight) : null;
   box.className = kind;
   box.replaceChildren(...[element("span", { class: "light" }), element("strong", {}, title), element("ul", {}, ...items), rest].filter(Boolean));
 }
