@@ -31,6 +31,7 @@ def notified() -> Iterator[Stage]:
     """A vehicle with all values; tests only read it."""
     with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as stage:
         stage.vehicle.wait_ready("ekf_ok", "capabilities", timeout=100)
+        until(lambda: stage.vehicle.home_location)  # requested by the library in the background
         stage.settle()
         yield stage
 
