@@ -61,14 +61,16 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_collection(session: pytest.Session) -> None:
     """Import a share of the test modules before the others, different ones in each worker.
 
-    pytest rewrites the assertions of a module when it is first imported, and caches the result. Workers that import
-    all modules in the same order would all rewrite all of them.
+    pytest rewrites the assertions of a module when it is first imported, and caches the result, as Python does with
+    compiled modules. Workers that import all modules in the same order would all rewrite and compile all of them. The
+    share is consecutive, because the tests of a folder import the same packages.
     """
     worker, count = os.environ.get("PYTEST_XDIST_WORKER"), os.environ.get("PYTEST_XDIST_WORKER_COUNT")
     if worker is None or count is None:
         return
+    number, workers = int(worker.removeprefix("gw")), int(count)
     modules = [file for folder in session.config.args for file in sorted(Path(folder).rglob("test_*.py"))]
-    for file in modules[int(worker.removeprefix("gw")) :: int(count)]:
+    for file in modules[len(modules) * number // workers : len(modules) * (number + 1) // workers]:
         if str(file.parent) not in sys.path:
             sys.path.insert(0, str(file.parent))  # as pytest does
         with contextlib.suppress(Exception, pytest.skip.Exception):  # the collection reports it

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from dronekit_reference import ATTRIBUTES, MODULE_NAMES, OTHER_NAMES, SIGNATURES, SUBCLASSES
 from dronekit_scenarios_state import POSITION
-from dronekit_stage import Stage, caught, on_stage
+from dronekit_stage import Stage, caught, on_stage, until
 from dronekit_streams import READY, answer_streams
 from for_each import for_each
 
