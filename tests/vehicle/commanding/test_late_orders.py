@@ -224,7 +224,7 @@ async def test_take_off_command_after_blocked_loop_needs_heartbeat(blocked_s: fl
         await anyio.sleep(1.5)
         assert bool(flight.wire.commands(C.NAV_TAKEOFF)) is is_sent
         if not is_sent:
-            with pytest.raises(HeartbeatTimeout, match="the rest of the order was not sent"):
+            with pytest.raises(OperationTimeout, match=r"set_mode\(GUIDED\): not done"):
                 await going
         going.cancel()
 
@@ -245,6 +245,21 @@ async def test_arm_after_blocked_loop_needs_heartbeat() -> None:
             await arming
 
 
+async def test_mode_after_blocked_loop_needs_recent_report() -> None:
+    """A pilot may have changed the mode again during the pause."""
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle._session.wait_for_heartbeat()
+        heartbeats = HeldHeartbeats(flight.wire)
+        changing = asyncio.ensure_future(flight.vehicle.set_mode("GUIDED"))
+        await anyio.sleep(1.2)
+        assert flight.copter.set_mode(CopterMode.ALT_HOLD)
+        heartbeats.release_first_after(14.0)
+        assert flight.vehicle.mode_name == "GUIDED"
+        with pytest.raises(OperationTimeout, match=r"set_mode\(GUIDED\): not done"):
+            await changing
+
+
 async def test_setpoints_after_blocked_loop_need_heartbeat() -> None:
     async with in_the_air() as flight:
         await flight.vehicle.set_mode("LOITER")
@@ -257,7 +272,7 @@ async def test_setpoints_after_blocked_loop_need_heartbeat() -> None:
         flying = asyncio.ensure_future(fly())
         await anyio.sleep(1.2)
         heartbeats.release_first_after(14.0)
-        with pytest.raises(HeartbeatTimeout):
+        with pytest.raises(OperationTimeout, match=r"set_mode\(GUIDED\): not done"):
             await flying
         assert not flight.wire.setpoints()
 

@@ -185,12 +185,17 @@ class OrderSender:
     async def await_mode(
         self, mode: Mode, order: Order, refusals: list[CommandAck], timeout: float, reported_since: float
     ) -> None:
-        """Wait until a message received after ``reported_since`` reports the mode."""
+        """Wait until a message received after ``reported_since``, and recently, reports the mode."""
         telemetry = self._session.telemetry
+
+        def is_reported() -> bool:
+            is_recent = telemetry.mode.updated_at > reported_since and telemetry.mode.age <= MODE_MAX_AGE_S
+            return telemetry.is_in(mode) and is_recent
+
         await self.await_effect(
             f"set_mode({mode.name})",
             refusals,
-            is_done=lambda: telemetry.is_in(mode) and telemetry.mode.updated_at > reported_since,
+            is_done=is_reported,
             failure_reason=lambda: order.end or None,
             timeout=max(0.1, timeout),
         )
