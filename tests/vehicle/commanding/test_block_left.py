@@ -195,3 +195,10 @@ async def test_block_exit_waits_briefly_for_unanswered_hold() -> None:
             await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
         left_at = anyio.current_time()
     assert 1.0 < anyio.current_time() - left_at < 3.0
+
+
+async def test_old_height_is_described_with_its_age() -> None:
+    async with in_the_air() as flight:
+        flight.copter.faults.drop_outgoing = 100_000
+        await anyio.sleep(20.0)
+        assert " 10.0 m above home 20 s ago," in flight.vehicle._context.describe_now()

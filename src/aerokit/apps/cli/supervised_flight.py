@@ -238,7 +238,8 @@ class FlightReport:
 
     def print_line(self, text: str) -> None:
         """Print a line with time and altitude. If printing fails, as after a closed pipe, the flight continues."""
-        position = None if self._vehicle.heartbeat_age > SILENT_AFTER_S else self._vehicle.position.latest
+        here = self._vehicle.position
+        position = None if max(self._vehicle.heartbeat_age, here.age) > SILENT_AFTER_S else here.latest
         altitude = None if position is None else position.altitude_relative_m
         height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"  # + 0.0 converts -0.0 to 0.0
         self._last_line_at = self._vehicle.connection.now()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.vehicle.commanding.arbiter import CommandArbiter
 from aerokit.vehicle.commanding.cleanup import ArmCleanup, FlightCleanup
 from aerokit.vehicle.commanding.health import Health
-from aerokit.vehicle.commanding.progress import VehiclePosition
+from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S, VehiclePosition
 from aerokit.vehicle.commanding.sender import OrderSender
 from aerokit.vehicle.state.states import States
 from aerokit.vehicle.state.telemetry import height_above_home, is_reported_on_ground
@@ -67,7 +67,9 @@ class VehicleContext:
         else:
             armed = "disarmed" if telemetry.is_confirmed_disarmed else "possibly armed"
         height_m = height_above_home(telemetry)
-        height = "" if height_m is None else f" {height_m:.1f} m above home,"
+        age_s = telemetry.position.age
+        when = f" {age_s:.0f} s ago" if age_s > POSITION_MAX_AGE_S else ""  # The vehicle may have lost its position.
+        height = "" if height_m is None else f" {height_m:.1f} m above home{when},"
         return f"{where} {telemetry.mode_name}, {armed},{height} last heartbeat {self.session.heartbeat_age:.1f} s ago"
 
 
