@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -60,7 +61,7 @@ def test_set_current_retries_then_times_out() -> None:
 @pytest.mark.parametrize(("now", "attempts"), [(3.0, 2), (9.0, 1)])
 def test_item_is_not_set_again_after_old_heartbeat(now: float, attempts: int) -> None:
     """The event loop was blocked, and the HEARTBEAT arrived at its beginning."""
-    status = SimpleNamespace(end="", heartbeat_at=0.8)
+    status: Any = SimpleNamespace(end="", heartbeat_at=0.8)
     exchange = SetCurrentItem(1, 1, 2, order_status=status, idle_timeout_s=20.0)
     exchange.start(0.0)
     exchange.expire(now)
