@@ -230,7 +230,7 @@ class Routes:
         return False
 
     def exclude_pause(self, now: float, paused_s: float) -> None:
-        """Do not count the last ``paused_s`` seconds as silence, because the event loop was blocked, and nothing heard.
+        """Do not count the last ``paused_s`` seconds as silence, because the event loop was blocked and read nothing.
 
         Otherwise a vehicle with the same ids could take over a route before the owner's next heartbeat.
         """

@@ -95,7 +95,7 @@ class Switch:
         return watch.arrival(now) if now > watch.late_after else now
 
     def _exclude_pause(self, paused_s: float) -> None:
-        """Do not count a pause of the event loop as a silence of senders, because nothing was heard."""
+        """Do not count a pause of the event loop as a silence of senders, because nothing was read."""
         now = self._clock()
         self.router.exclude_pause(now, paused_s)
         for guard in {port.guard for port in self.router.ports if port.guard is not None}:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.mavlink.enums import MavLandedState, MavType
 from aerokit.vehicle.commanding.ground import IMPACT_M_S, STILL_M_S, ImpactDetector
-from aerokit.vehicle.state.telemetry import height_above_home
+from aerokit.vehicle.state.telemetry import height_above_home, is_reported_on_ground
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,7 +44,7 @@ example after a reboot."""
 MOVING_M_S = 2.0
 """An armed vehicle that moves at this speed after a crash flies again. At a lower speed, it must move for
 ``CRASH_STILL_S``."""
-LANDED_STATE_MAX_AGE_S = 3.0
+CRASH_LANDED_MAX_AGE_S = 3.0
 """Maximum age in seconds of a landed state that counts as evidence of a crash."""
 _IN_AIR = (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING)
 
@@ -196,8 +196,7 @@ class FlightWatch:
         if at - self._still_since < CRASH_STILL_S or self._still_samples < CRASH_STILL_SAMPLES:
             return False
         vehicle, height_m = self._vehicle, height_above_home(self._vehicle.telemetry)
-        landed = vehicle.landed_state
-        is_on_ground = landed.latest == MavLandedState.ON_GROUND and landed.age <= LANDED_STATE_MAX_AGE_S
+        is_on_ground = is_reported_on_ground(vehicle, max_age_s=CRASH_LANDED_MAX_AGE_S)
         if vehicle.armed.latest is False or is_on_ground:
             return True
         return self._was_sudden_stop and height_m is not None and abs(height_m) < CRASH_HEIGHT_M

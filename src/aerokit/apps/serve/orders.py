@@ -21,9 +21,10 @@ from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE, HttpProble
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import BusyError, HeartbeatTimeout, InvalidArgument, OperationRejected
 from aerokit.events import LinkState
-from aerokit.mavlink.enums import MavLandedState, MavType
+from aerokit.mavlink.enums import MavType
 from aerokit.position import Position
 from aerokit.vehicle.commanding.order import SUPERSEDED
+from aerokit.vehicle.state.telemetry import is_reported_on_ground
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -122,8 +123,7 @@ async def _pause(vehicle: Vehicle, _: dict[str, Any]) -> object:
 
 async def _resume(vehicle: Vehicle, values: dict[str, Any]) -> None:
     # After a finished mission, an ArduCopter on the ground would take off and fly from the first item.
-    landed = vehicle.landed_state
-    is_on_ground = landed.latest == MavLandedState.ON_GROUND and landed.age <= _LANDED_STATE_MAX_AGE_S
+    is_on_ground = is_reported_on_ground(vehicle, max_age_s=_LANDED_STATE_MAX_AGE_S)
     if vehicle.is_armed and is_on_ground and vehicle.autopilot.vehicle_type not in SURFACE_TYPES:
         raise OperationRejected(
             "mission/resume: the vehicle is on the ground and would take off; use mission/start to take off;"

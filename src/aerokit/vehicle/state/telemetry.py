@@ -305,10 +305,10 @@ class Telemetry(States):
             self.status_text.set(text, source)
 
 
-def is_reported_on_ground(telemetry: Telemetry) -> bool:
+def is_reported_on_ground(vehicle: States, *, max_age_s: float = LANDED_STATE_MAX_AGE_S) -> bool:
     """Return True if the vehicle reports that it is on the ground. An old report may be from before its take-off."""
-    landed = telemetry.landed_state
-    return landed.latest == MavLandedState.ON_GROUND and landed.age <= LANDED_STATE_MAX_AGE_S
+    landed = vehicle.landed_state
+    return landed.latest == MavLandedState.ON_GROUND and landed.age <= max_age_s
 
 
 def height_above_home(telemetry: Telemetry) -> float | None:
