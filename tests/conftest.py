@@ -38,14 +38,8 @@ def anyio_backend() -> tuple[str, dict[str, Any]]:
     return "asyncio", {"loop_factory": LateLoop}
 
 
-@pytest.fixture(scope="session", autouse=True)
-def hypothesis_started() -> None:
-    """Warm up hypothesis before objects are frozen: its first example looks up the referrers of its generators."""
-    given(strategies.none())(lambda _: None)()
-
-
 @pytest.fixture(scope="module", autouse=True)
-def freeze_existing_objects(hypothesis_started: None) -> None:
+def freeze_existing_objects() -> None:
     """Garbage collections over the objects of ten thousand tests would block all threads, including the simulator's."""
     gc.collect()
     gc.freeze()
@@ -66,6 +60,9 @@ def pytest_collection(session: pytest.Session) -> None:
     share is consecutive, because the tests of a folder import the same packages.
     """
     worker, count = os.environ.get("PYTEST_XDIST_WORKER"), os.environ.get("PYTEST_XDIST_WORKER_COUNT")
+    # The first example of hypothesis collects garbage and looks up the referrers of its generators, which takes long
+    # with the objects of all tests, and finds no frozen ones.
+    given(strategies.none())(lambda _: None)()
     if worker is None or count is None:
         return
     number, workers = int(worker.removeprefix("gw")), int(count)
@@ -92,6 +89,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     """Collect garbage ten times less often than usual: the pauses were 8 % of the tests' processor time."""
+    gc.freeze()  # Nothing of the collected tests is garbage.
     gc.set_threshold(7_000, 10, 100)
     gc.enable()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -16,6 +15,7 @@ from typing import Any
 import anyio
 import numpy as np
 import pytest
+from free_ports import free_port
 
 import aerokit
 from aerokit.errors import BusyError, InvalidArgument, LinkLost, LinkOpenError, NotSupported
@@ -67,12 +67,6 @@ def streamed(port: int) -> Iterator[threading.Event]:
     finally:
         is_over.set()
         thread.join()
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 async def test_live_video_frames_have_vehicle_state() -> None:

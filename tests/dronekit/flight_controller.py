@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flight_controller_services import MissionService, ParameterService
+from free_ports import free_port
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 __all__ = ["FlightController", "Received", "message_of"]
@@ -240,7 +241,7 @@ class FlightController:
         else:
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self._socket.bind(("127.0.0.1", 0))
-            self._remote = ("127.0.0.1", port or _free_port())
+            self._remote = ("127.0.0.1", port or free_port())
             self.address = f"udpin:127.0.0.1:{self._remote[1]}"
 
     def _serve(self) -> None:
@@ -372,13 +373,6 @@ def _new_parser() -> Any:
     parser = mavlink.MAVLink(None)
     parser.robust_parsing = True
     return parser
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def _brief(frames: Iterable[Received]) -> str:

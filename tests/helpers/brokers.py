@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from zenoh_network import eventually, free_port
+from free_ports import free_port
+from zenoh_network import eventually
 
 __all__ = ["PASSWORD", "USER", "Broker", "needs_a_broker"]
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 
 import anyio
+from free_ports import free_port
 
-__all__ = ["VEHICLE_SIDE", "HoldingProxy", "eventually", "free_port", "process", "router"]
+__all__ = ["VEHICLE_SIDE", "HoldingProxy", "eventually", "process", "router"]
 
 ROUTER = """
 import json, sys, zenoh
@@ -49,14 +49,6 @@ async def eventually(condition: Callable[[], bool]) -> None:
     with anyio.fail_after(100):
         while not condition():  # noqa: ASYNC110
             await asyncio.sleep(0.005)
-
-
-def free_port() -> int:
-    """Return a port on which nothing listens."""
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
 
 
 @contextlib.contextmanager

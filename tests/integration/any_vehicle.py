@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import tempfile
 from collections.abc import AsyncIterator, Sequence
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from free_ports import free_port
 from vehicle_kinds import KINDS, Kind
 
 from aerokit import Vehicle, connect
@@ -95,7 +95,7 @@ async def served_on_two(choice: Choice) -> AsyncIterator[list[Link]]:
         return
     if not choice.is_binary:
         pytest.skip("one address is one link")
-    second = 14550 if not choice.kind.is_ardupilot else _free_port()
+    second = 14550 if not choice.kind.is_ardupilot else free_port()
     more = ["--serial1", f"udpclient:127.0.0.1:{second}"] if choice.kind.is_ardupilot else []
     async with _binary(choice, more) as first:
         yield [create_link(first), create_link(f"udpin:127.0.0.1:{second}")]
@@ -129,7 +129,7 @@ async def _binary(choice: Choice, more: Sequence[str] = ()) -> AsyncIterator[str
     """Start the binary in an empty directory, and terminate it afterwards."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         is_px4 = not choice.kind.is_ardupilot
-        port = 14540 + min(INSTANCE, 9) if is_px4 else _free_port()
+        port = 14540 + min(INSTANCE, 9) if is_px4 else free_port()
         command, environment = _px4(choice) if is_px4 else _ardupilot(choice, port, Path(folder))
         with subprocess.Popen(  # noqa: ASYNC220 - it takes milliseconds
             [*command, *more], cwd=folder, env=environment, stdin=subprocess.DEVNULL,
@@ -176,9 +176,3 @@ def _px4(choice: Choice) -> tuple[list[str], dict[str, str]]:
         ".",
         str(binary.parents[1] / "etc"),
     ], environment
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

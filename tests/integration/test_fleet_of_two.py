@@ -17,6 +17,7 @@ from pathlib import Path
 import anyio
 import pytest
 from any_vehicle import INSTANCE
+from free_ports import free_port
 
 import aerokit
 from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
@@ -35,12 +36,6 @@ PX4_INSTANCE = 1  # its system id is one more
 @pytest.fixture
 def anyio_backend() -> str:
     return "asyncio"
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def is_listening(port: int) -> bool:
@@ -64,7 +59,7 @@ async def two_vehicles() -> AsyncIterator[list[str]]:
     """Addresses that a hub opens to reach them."""
     async with contextlib.AsyncExitStack() as stack:
         if ARDUCOPTER and PX4:
-            port = free_port(socket.SOCK_DGRAM)
+            port = free_port()
             folders = [stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)) for _ in "12"]
             stack.enter_context(
                 running(

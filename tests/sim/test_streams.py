@@ -55,6 +55,27 @@ def test_streams_have_their_own_rates(requests: list[tuple[int, float]]) -> None
         assert abs(sent.count(message_id) - 10.0 / interval) <= 1
 
 
+@given(st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0.0, 0.25, 0.5]), st.sampled_from([0.0, 0.125, 0.75]))))
+def test_changed_streams_are_sent_at_the_times_of_separate_streams(
+    requests: list[tuple[int, float, float]],
+) -> None:
+    """Streams that started together are one entry of the schedule; a change of one must not affect the others."""
+    streams, now = Streams(), 0.0
+    intervals: dict[int, float] = {}
+    dues: dict[int, float] = {}
+    for message_id, interval, delay in [*requests, (9, 0.5, 5.0)]:
+        streams.set_interval(message_id, interval, now)
+        intervals[message_id], dues[message_id] = interval, now if interval else math.inf
+        until = now + delay
+        while (due := streams.next_due) <= until:
+            expected = [id_ for id_, next_due in dues.items() if next_due == due]
+            assert sorted(streams.take_due(due)) == sorted(expected)
+            dues.update({id_: due + intervals[id_] for id_ in expected})
+        assert min(dues.values()) > until
+        now = until
+    assert streams.ids() == {id_ for id_, interval in intervals.items() if interval}
+
+
 def test_streams_of_different_rates_share_their_instants() -> None:
     """Sums of 0.1 and of 0.2 differ in their last bits; these do not."""
     streams, instants, start = Streams(), 0, 12.34

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from free_ports import free_port
 from link_harness import Recorder, each_loop
 from zenoh_harness import RefusalRecorder, client, reconnecting, serving, until_open_error
-from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, free_port, process, router
+from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, process, router
 
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkOpenError
 from aerokit.mavlink.encoder import FrameEncoder

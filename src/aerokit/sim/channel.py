@@ -17,10 +17,10 @@ from aerokit.mavlink.signing import Signing
 
 MessageT = TypeVar("MessageT", bound=Message)
 _MAX_FLOAT32 = 3.4028234663852886e38
-DUE_DECIMALS = 9
-"""Due times in seconds are rounded to this many decimal places.
+NS_PER_S = 1e9
+"""Due times in seconds are rounded to nanoseconds: events with different intervals are then due at the same instants.
 
-Events with different intervals are then due at exactly the same instants.
+``round(seconds * NS_PER_S) / NS_PER_S`` takes half the time of ``round(seconds, 9)``.
 """
 
 
@@ -98,45 +98,63 @@ class SharedMessageReader(MessageReader):
         self._cached = None
 
 
+class _StreamGroup:
+    """Streams with the same interval that were started at the same time. Each has sent ``count`` messages."""
+
+    __slots__ = ("count", "ids", "interval_s", "start")
+
+    def __init__(self, interval_s: float, start: float) -> None:
+        self.interval_s, self.start, self.count = interval_s, start, 0
+        self.ids: list[int] = []
+
+
 class Streams:
     """Schedule of the messages that a port streams. A late stream skips messages instead of sending a burst."""
 
-    __slots__ = ("_heap", "_intervals", "_token", "next_due")
+    __slots__ = ("_group_count", "_groups", "_heap", "next_due")
 
     def __init__(self) -> None:
         self.next_due: float = math.inf
         """Time of the next message; infinity if no message is streamed."""
-        # Interval and token of each stream, by message id. Every change of an interval creates a new token, so that
-        # heap entries with an older token are recognised as obsolete.
-        self._intervals: dict[int, tuple[float, int]] = {}
-        # Heap entries: (due time, token, message id, time of the first message, number of messages since then).
-        self._heap: list[tuple[float, int, int, float, int]] = []
-        self._token = 0
+        self._groups: dict[int, _StreamGroup] = {}  # by message id
+        # Heap entries: (due time, number of the group, group). The group is empty if its streams have stopped.
+        self._heap: list[tuple[float, int, _StreamGroup]] = []
+        self._group_count = 0
 
     def set_interval(self, message_id: int, interval_s: float, now: float) -> None:
         """Stream a message every ``interval_s`` seconds from now on. 0 stops the stream."""
-        self._token += 1
-        if interval_s <= 0.0:
-            self._intervals.pop(message_id, None)
-        else:
-            self._intervals[message_id] = (interval_s, self._token)
-            heappush(self._heap, (now, self._token, message_id, now, 0))
+        previous = self._groups.pop(message_id, None)
+        if previous is not None:
+            previous.ids.remove(message_id)
+        if interval_s > 0.0:
+            self._groups[message_id] = group = self._new_group(interval_s, now)
+            group.ids.append(message_id)
         self._update_next_due()
+
+    def _new_group(self, interval_s: float, now: float) -> _StreamGroup:
+        """Return the group of streams that start now with this interval, which may exist already."""
+        for group in self._groups.values():
+            if group.start == now and group.interval_s == interval_s and group.count == 0:
+                return group
+        group = _StreamGroup(interval_s, now)
+        self._group_count += 1
+        heappush(self._heap, (now, self._group_count, group))
+        return group
 
     def interval(self, message_id: int) -> float:
         """Return the interval in seconds; 0 if the message is not streamed."""
-        return self._intervals.get(message_id, (0.0, 0))[0]
+        group = self._groups.get(message_id)
+        return 0.0 if group is None else group.interval_s
 
     def ids(self) -> frozenset[int]:
         """Return the ids of all streamed messages."""
-        return frozenset(self._intervals)
+        return frozenset(self._groups)
 
     def postpone(self, seconds: float) -> None:
         """Delay all streams by this time."""
-        self._heap = [
-            (due + seconds, token, message_id, start + seconds, count)
-            for due, token, message_id, start, count in self._heap
-        ]
+        for _, _, group in self._heap:
+            group.start += seconds
+        self._heap = [(due + seconds, number, group) for due, number, group in self._heap]
         self._update_next_due()
 
     def _update_next_due(self) -> None:
@@ -145,22 +163,21 @@ class Streams:
     def take_due(self, now: float) -> list[int]:
         """Return the ids of the messages that are due, and schedule the next message of each stream."""
         ids: list[int] = []
-        heap, intervals = self._heap, self._intervals
+        heap = self._heap
         while heap:
-            due, token, message_id, start, count = heap[0]
-            interval, current_token = intervals.get(message_id, (0.0, None))
-            if token != current_token:  # The stream was stopped or replaced.
+            due, number, group = heap[0]
+            if not group.ids:  # All streams of the group were stopped or replaced.
                 heappop(heap)
                 continue
             if due > now:
                 self.next_due = due
                 return ids
-            ids.append(message_id)
-            following = round(start + (count + 1) * interval, DUE_DECIMALS)
-            if following > now:
-                heapreplace(heap, (following, token, message_id, start, count + 1))
-            else:  # The stream is late by more than an interval, so it starts again at the present time.
-                heapreplace(heap, (now + interval, token, message_id, now, 1))
+            ids += group.ids
+            group.count += 1
+            following = round((group.start + group.count * group.interval_s) * NS_PER_S) / NS_PER_S
+            if following <= now:  # The streams are late by more than an interval, so they start again now.
+                following, group.start, group.count = now + group.interval_s, now, 1
+            heapreplace(heap, (following, number, group))
         self.next_due = math.inf
         return ids
 
@@ -250,6 +267,9 @@ class Channel:
 
 def datagrams(pieces: Iterable[bytes]) -> list[bytes]:
     """Join the pieces, in their order, into as few datagrams as possible."""
+    pieces = list(pieces)
+    if sum(map(len, pieces)) <= _DATAGRAM_SIZE:
+        return [b"".join(pieces)] if pieces else []
     joined: list[bytes] = []
     datagram = b""
     for piece in pieces:

@@ -19,7 +19,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat, Statustext
 from aerokit.protocols.servers.host import ServerHost
 from aerokit.protocols.servers.host import sender_of as sender_of
-from aerokit.sim.channel import DUE_DECIMALS, Channel
+from aerokit.sim.channel import NS_PER_S, Channel
 from aerokit.sim.faults import Faults
 
 TICK_S = 0.02
@@ -268,7 +268,7 @@ class SimulatedVehicle:
             nonlocal count
             count += 1
             if booted_at == self.booted_at:  # The vehicle has not rebooted in the meantime.
-                self.call_at(round(start + count * interval, DUE_DECIMALS), repeat)
+                self.call_at(round((start + count * interval) * NS_PER_S) / NS_PER_S, repeat)
             action()
 
         self.call_at(start, repeat)
@@ -284,7 +284,8 @@ class SimulatedVehicle:
 
     def _schedule_tick(self, ticks: int) -> None:
         """Schedule the next tick after this many intervals of TICK_S. An event may cause an earlier tick."""
-        self._next_tick = round(self._ticks_from + (self._ticks_done + ticks) * TICK_S, DUE_DECIMALS)
+        next_tick = self._ticks_from + (self._ticks_done + ticks) * TICK_S
+        self._next_tick = round(next_tick * NS_PER_S) / NS_PER_S if next_tick < math.inf else math.inf
 
     def _tick_until(self, now: float) -> None:
         """Advance to ``now`` by a single tick that stands for all ticks since the last one."""

@@ -9,7 +9,8 @@ import signal
 from typing import Any
 
 import pytest
-from zenoh_network import eventually, free_port, router
+from free_ports import free_port
+from zenoh_network import eventually, router
 
 from aerokit.apps.cli.main import make_parser
 from aerokit.sim import SimulatedCopter, SimulatedPlane, simulated_link

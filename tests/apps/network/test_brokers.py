@@ -16,8 +16,9 @@ from urllib.parse import quote
 
 import pytest
 from brokers import PASSWORD, USER, Broker, needs_a_broker
+from free_ports import free_port
 from test_state_schema import SCHEMA, faults
-from zenoh_network import HoldingProxy, eventually, free_port
+from zenoh_network import HoldingProxy, eventually
 
 import aerokit
 from aerokit.apps.cli.main import make_parser

@@ -9,7 +9,8 @@ import sys
 from collections.abc import Iterator
 
 import pytest
-from zenoh_network import free_port, router
+from free_ports import free_port
+from zenoh_network import router
 
 import aerokit
 from aerokit import events

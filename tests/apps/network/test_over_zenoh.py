@@ -8,7 +8,8 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
-from zenoh_network import HoldingProxy, eventually, free_port, router
+from free_ports import free_port
+from zenoh_network import HoldingProxy, eventually, router
 
 import aerokit
 from aerokit import VelocitySetpoint, events
