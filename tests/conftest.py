@@ -28,9 +28,21 @@ if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_I
     signal.signal(signal.SIGHUP, lambda *_: None)
 gc.disable()  # until all tests are collected: nothing of them is garbage, and each worker collects all
 # `nox -s exhaustive` loads the profile "thorough".
-settings.register_profile("aerokit", deadline=None, max_examples=20, derandomize=True)
+settings.register_profile("aerokit", deadline=None, max_examples=15, derandomize=True)
 settings.register_profile("thorough", settings.get_profile("aerokit"), max_examples=100)
 settings.load_profile("aerokit")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Use no constants of this project as examples, unless the profile is "thorough".
+
+    Hypothesis reads them from the source of all imported modules, which takes two seconds in each worker of a new
+    clone. The examples would also depend on the modules that other tests have imported.
+    """
+    if config.getoption("--hypothesis-profile", None) != "thorough":
+        with contextlib.suppress(ImportError):  # an old version has no such constants
+            providers: Any = importlib.import_module("hypothesis.internal.conjecture.providers")
+            providers._get_local_constants = lambda: providers._local_constants
 
 
 @pytest.fixture
