@@ -73,8 +73,9 @@ def pytest_collection(session: pytest.Session) -> None:
     """
     worker, count = os.environ.get("PYTEST_XDIST_WORKER"), os.environ.get("PYTEST_XDIST_WORKER_COUNT")
     # The first example of hypothesis collects garbage and looks up the referrers of its generators, which takes long
-    # with the objects of all tests, and finds no frozen ones.
-    given(strategies.none())(lambda _: None)()
+    # with the objects of all tests, and finds no frozen ones. The first text makes a table of characters, which
+    # hypothesis keeps in a file; one worker makes it for all.
+    given(strategies.text() if worker == "gw0" else strategies.none())(lambda _: None)()
     if worker is None or count is None:
         return
     number, workers = int(worker.removeprefix("gw")), int(count)
