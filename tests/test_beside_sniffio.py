@@ -72,6 +72,7 @@ loop.close()
 """
 
 
+@pytest.mark.exhaustive
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "program",

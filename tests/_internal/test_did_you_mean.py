@@ -12,6 +12,7 @@ from aerokit.sim.kinds import kind_class
 from aerokit.transport import parse_address
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(
     ("arguments", "meant"),
     [

@@ -316,6 +316,7 @@ def test_is_mode_available(vehicle: dronekit.Vehicle) -> None:
     assert not vehicle._is_mode_available(222)
 
 
+@pytest.mark.exhaustive
 def test_subclass_attributes_do_not_collide(address: str) -> None:
     class Own(dronekit.Vehicle):
         def __init__(self, *args: Any) -> None:

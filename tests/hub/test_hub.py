@@ -588,6 +588,7 @@ class ManyPeersLink(SlowLink):
         self.forgotten += 1
 
 
+@pytest.mark.exhaustive
 @virtual
 async def test_many_peers_are_bounded_and_silent_ones_evicted() -> None:
     link, station = ManyPeersLink(), Program(255, 190)

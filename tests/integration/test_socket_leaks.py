@@ -74,6 +74,7 @@ each_kind = pytest.mark.parametrize("kind", ["tcp", "udpin", "udpout", "serial"]
 
 
 @pytest.mark.sampled(2)
+@pytest.mark.sampled(2)
 @each_kind
 def test_cancelled_at_any_iteration_leaves_no_socket(kind: str) -> None:
     for turns in range(32):

@@ -19,12 +19,14 @@ from aerokit.mavlink.generator import read_additions, with_added_enums, with_add
 PACKAGES = {"messages": messages, "enums": enums}
 
 
+@pytest.mark.exhaustive
 def test_generated_modules_are_up_to_date() -> None:
     if generator.fingerprint() != generator.generated_fingerprint():
         pytest.skip("the XML of the installed pymavlink differs from that of the committed modules")
     assert generator.differences() == []
 
 
+@pytest.mark.exhaustive
 def test_fingerprint_depends_on_xml(tmp_path: Path) -> None:
     for stem in ("minimal", "standard", "common", "development", *generator.MODULES["ardupilotmega"]):
         (tmp_path / f"{stem}.xml").write_bytes((generator.xml_folder() / f"{stem}.xml").read_bytes())

@@ -107,6 +107,7 @@ def test_mission_download_is_exact_despite_losses(
     assert len(result.sent) <= 60 + 30 * number
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(("model", "window"), WINDOWS)
 @pytest.mark.parametrize(("loss", "times"), [(0.05, 2.0), (0.2, 4.0)])
 def test_mission_download_time_over_bad_radio(model: type[Store], window: int, loss: float, times: float) -> None:

@@ -115,6 +115,7 @@ def test_every_member_has_a_twin(original: type, twin: type, name: str) -> None:
         ]
 
 
+@pytest.mark.exhaustive
 def test_twins_match_generator_output() -> None:
     assert generate() == FILE.read_text(encoding="utf-8"), "python -m aerokit.sync.generator writes it"
 
@@ -498,6 +499,7 @@ def test_parts_first_read_after_close_are_empty(copter: SimulatedCopter) -> None
         vehicle.fence.download()
 
 
+@pytest.mark.exhaustive
 def test_gimbals_are_found_and_controlled() -> None:
     gimbal = SimulatedGimbal(171)
     with (

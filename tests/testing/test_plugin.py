@@ -120,6 +120,7 @@ async def test_that_fails(flight):
 """
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("mode", ["auto", "strict"])
 def test_pytest_asyncio_tests_run_on_virtual_time(pytester: pytest.Pytester, mode: str) -> None:
     pytest.importorskip("pytest_asyncio")

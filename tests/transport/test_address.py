@@ -219,6 +219,7 @@ def addresses(draw: st.DrawFn) -> LinkAddress:
     return LinkAddress(kind, host=host, port=draw(st.integers(1, 65535)))
 
 
+@pytest.mark.exhaustive
 @settings(max_examples=100)
 @given(addresses())
 def test_canonical_string_parses_to_the_same(address: LinkAddress) -> None:

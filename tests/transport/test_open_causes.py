@@ -118,7 +118,7 @@ asyncio.run(main())
 FOREIGN = re.compile(rf'  File "{re.escape(os.path.dirname(asyncio.__file__))}.*\n.*\n( +\^+\n)?')
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(9)
 @pytest.mark.parametrize("address", ["udpin:127.0.0.1:{udp}", "/dev/no-such-device", "no/such/file.tlog"])
 @pytest.mark.parametrize("program", PROGRAMS.values(), ids=PROGRAMS)
 def test_traceback_of_failed_open_is_short(program: str, address: str, taken: dict[str, int], tmp_path: Path) -> None:

@@ -166,6 +166,7 @@ def test_sim_on_two_ports_prints_vehicle_once_and_programs(capsys: pytest.Captur
 # -------------------------------------------------------------------------------------------- flying
 
 
+@pytest.mark.exhaustive
 def test_fly_rehearsal_reports_duration_of_real_flight(capsys: pytest.CaptureFixture[str]) -> None:
     lines = {}
     for speedup in ("1", "10"):

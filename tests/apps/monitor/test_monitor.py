@@ -322,6 +322,7 @@ async def test_slow_streams_are_one_line_with_count() -> None:
         assert str(texts.border_subtitle).endswith(" 1 MESSAGE_39 0.5 of 2 Hz")
 
 
+@pytest.mark.exhaustive
 async def test_idle_monitor_draws_only_changed_rates(monkeypatch: pytest.MonkeyPatch) -> None:
     async with stage(2) as it:
         await anyio.sleep(10)

@@ -111,6 +111,7 @@ def flight_of(places: Sequence[Place], tmp_path: Path, changes: int = 0) -> Flig
     return flight
 
 
+@pytest.mark.exhaustive
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("changes", [0, 200])
 def test_square_flown_619_times_stays_square(changes: int, tmp_path: Path) -> None:

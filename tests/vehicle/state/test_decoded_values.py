@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator
 
+import pytest
 from any_message import anything
 
 from aerokit.autopilots import autopilot_for
@@ -21,6 +22,7 @@ HEARTBEATS = {
 }
 
 
+@pytest.mark.exhaustive
 def test_message_updates_only_declared_states() -> None:
     faults = [fault for name in sorted(SOURCES) for vehicle in HEARTBEATS for fault in faults_of(name, vehicle)]
     assert not faults, "\n".join(faults)
