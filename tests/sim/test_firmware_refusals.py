@@ -117,6 +117,18 @@ def test_px4_queues_eight_texts_for_five_seconds() -> None:
     assert port.texts() == []
 
 
+def test_px4_in_fast_simulation_keeps_texts_for_slow_station() -> None:
+    """At ten times real speed, the heartbeats of a station are ten simulated seconds apart."""
+    px4 = SimulatedPx4(boot_time_s=0.0, parameter_count=100)
+    scale_timeouts([px4], 10.0)
+    port = Port(px4, is_first=True)
+    port.send(STATION)
+    px4.step(9.0)
+    px4.info("a text")
+    px4.step(9.1)
+    assert port.texts()[-1] == "a text"
+
+
 @pytest.mark.parametrize("action", range(5))
 def test_px4_storage_is_refused_while_armed(action: int) -> None:
     _, client = ready_px4()

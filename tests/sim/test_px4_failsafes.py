@@ -207,3 +207,39 @@ def test_polygon_and_circle_fences() -> None:
 def fence_item(px4: SimulatedPx4, command: int, param1: float, north: float, east: float) -> MissionItem:
     place = px4.frame.to_global(north, east, 0.0)
     return MissionItem(command, 3, param1, 0, 0, 0, place.latitude_e7, place.longitude_e7, 0)
+
+
+# ---------------------------------------------------------------------------------------- position
+
+
+def test_lost_position_ends_mode_after_five_seconds() -> None:
+    """Flown by real PX4 in SIH without satellites: no hold before the descent, and dead-reckoned positions go on."""
+    px4, station = flying()
+    px4.faults.gps_lost = True
+    station.run(4.5)
+    assert px4.mode == HOLD
+    station.clear()
+    station.run(1.0)
+    assert px4.mode == LAND
+    assert [text.strip() for text in station.texts] == ["Failsafe activated"]
+    station.run(5.0)
+    assert station.last(m.Heartbeat).system_status == MavState.CRITICAL
+    assert len(station.all(m.GlobalPositionInt)) >= 4
+
+
+def test_lost_position_returns_nowhere() -> None:
+    """A return needs a position, so the action of another failsafe is a landing."""
+    px4, station = flying()
+    px4.faults.gps_lost = True
+    px4.battery.percent = 6.0
+    station.run(1.0)
+    assert px4.mode == LAND
+
+
+def test_lost_position_does_not_matter_to_mode_without_position() -> None:
+    px4, station = flying()
+    set_mode(station, 6)
+    station.clear()
+    px4.faults.gps_lost = True
+    station.run(10.0)
+    assert station.texts == []

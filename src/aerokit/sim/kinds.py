@@ -65,7 +65,8 @@ def scale_timeouts(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leav
 
     A client times its heartbeats and set-points by its own clock. With a ``speedup`` of ten, five simulated seconds
     last only half a second for the client. PX4's simulation scales COM_DL_LOSS_T in the same way. The type of
-    ArduPilot's DISARM_DELAY limits this parameter to 127 s. A ``speedup`` of 1 or less changes nothing.
+    ArduPilot's DISARM_DELAY limits this parameter to 127 s. The time for which PX4 keeps texts for a silent ground
+    station is multiplied, too. A ``speedup`` of 1 or less changes nothing.
     """
     if speedup <= 1.0:
         return
@@ -73,6 +74,9 @@ def scale_timeouts(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leav
         parameters = getattr(vehicle, "parameters", None)
         if isinstance(parameters, SimParameters):
             _scale(parameters, speedup, leave)
+        text_links = getattr(vehicle, "text_links", None)  # PX4 only
+        if text_links is not None:
+            text_links.speedup = speedup
 
 
 def _scale(parameters: SimParameters, speedup: float, leave: Collection[str]) -> None:

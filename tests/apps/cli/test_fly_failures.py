@@ -277,6 +277,24 @@ def test_fly_explains_wait_after_failsafe_mode(capsys: pytest.CaptureFixture[str
     assert changed < waiting < failed
 
 
+def test_px4_without_position_ends_fly_with_failsafe(capsys: pytest.CaptureFixture[str]) -> None:
+    options = ("--vehicle", "px4", "--fault", "gps_lost@25", "--record", "x.tlog")
+    assert run_virtual(run_on(None, "fly", SURVEY, "--sim", *options)) == 5
+    out, err = capsys.readouterr()
+    assert "mode LAND" in out
+    assert "Failsafe activated" in err
+    assert "1 failsafe: Satellite receiver at 0:2" in report_of(Path("x.tlog"))
+
+
+def test_conditions_of_simulated_vehicle(capsys: pytest.CaptureFixture[str]) -> None:
+    conditions = ("--battery", "17", "--parameter", "BATT_LOW_MAH=600", "--parameter", "BATT_FS_LOW_ACT=2")
+    assert run_virtual(run_on(None, "fly", SURVEY, "--sim", *conditions)) == 5
+    assert "Battery Failsafe" in capsys.readouterr().err
+    for condition in (conditions[:2], conditions[2:4], ("--wind", "1,2")):
+        assert main(["fly", SURVEY, "--yes", *condition]) == 2
+        assert f"{condition[0]} needs --sim" in capsys.readouterr().err
+
+
 def test_crash_in_fast_simulation_is_recorded_for_twenty_seconds(capsys: pytest.CaptureFixture[str]) -> None:
     """The seconds are those of the flight: two of the recording, at ten times real speed."""
     options = ("--fault", "motor_failed@25", "--record", "x.tlog")

@@ -152,6 +152,25 @@ def test_folder_has_table_per_message_type(tmp_path: Path, kind: str) -> None:
         assert int(row["system_id"]) == 1
 
 
+def test_integer_parameters_of_px4_are_written_as_numbers(tmp_path: Path) -> None:
+    """PX4 sends the bits of an integer in the float field. A parameter of another system stays as it is."""
+    bits_of_2 = struct.unpack("<f", struct.pack("<i", 2))[0]
+    encoders = {system_id: FrameEncoder(system_id, 1) for system_id in (1, 9, 255)}
+    with TlogWriter(tmp_path / "log.tlog") as writer:
+        for system_id, message in (
+            (1, m.Heartbeat(2, 12, 0, 0, 4, 3)),
+            (1, m.ParamValue("NAV_RCL_ACT", bits_of_2, 6, 2, 0)),
+            (1, m.ParamValue("BAT_LOW_THR", 0.25, 9, 2, 1)),
+            (255, m.ParamSet(1, 1, "NAV_RCL_ACT", bits_of_2, 6)),
+            (9, m.ParamValue("NAV_RCL_ACT", bits_of_2, 6, 2, 0)),
+        ):
+            writer.write(encoders[system_id].encode(message), 1.7e9)
+    convert(tmp_path / "log.tlog", tmp_path / "all")
+    values = [float(row["param_value"]) for row in read_table(tmp_path / "all" / "PARAM_VALUE.csv")]
+    assert values == [2.0, 0.25, bits_of_2]
+    assert [float(row["param_value"]) for row in read_table(tmp_path / "all" / "PARAM_SET.csv")] == [2.0]
+
+
 @pytest.mark.parametrize("unix_s", [0.0, 1.0000005, 1764115200.9999998, 1764115200.25, -1.25])
 def test_csv_times_have_rounded_microseconds(unix_s: float, tmp_path: Path) -> None:
     table = CsvTable(tmp_path / "times.csv", [])

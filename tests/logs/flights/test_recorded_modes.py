@@ -56,3 +56,59 @@ def test_commanded_mode_is_no_reaction(tmp_path: Path, speed: float) -> None:
     flight = recorded(tmp_path / "log.tlog", SET_LAND, landing_s=12.0, speed=speed)
     (failsafe,) = failsafes(flight)
     assert (flight.modes[-1].reason, failsafe.reaction) == ("ordered", "no mode change followed")
+
+
+PX4_MISSION, PX4_RTL, PX4_LAND = 4 << 16 | 4 << 24, 4 << 16 | 5 << 24, 4 << 16 | 6 << 24
+
+
+def written(path: Path, rows: list[tuple[float, Message]]) -> FlightLog:
+    """A recording of these messages of one vehicle."""
+    encoder = FrameEncoder(1, 1)
+    with TlogWriter(path) as writer:
+        for time_s, message in sorted(rows, key=lambda row: row[0]):
+            writer.write(encoder.encode(message), 1.7e9 + time_s)
+    return read_flight(path)
+
+
+def px4_heartbeat(mode: int) -> Message:
+    return m.Heartbeat(2, 12, 0x80 | 0x5D, mode, 4, 3)
+
+
+def fix(fix_type: int, satellites: int) -> Message:
+    return m.GpsRawInt(0, fix_type, 0, 0, 0, eph=100, epv=100, vel=0, cog=0, satellites_visible=satellites)
+
+
+def test_lost_fix_explains_later_failsafe(tmp_path: Path) -> None:
+    """PX4 does not name the cause, and continues with dead reckoning for five seconds."""
+    flight = written(tmp_path / "log.tlog", [
+        *((float(second), px4_heartbeat(PX4_MISSION if second < 25 else PX4_LAND)) for second in range(60)),
+        *((float(second), fix(3, 10) if second < 20 else fix(1, 0)) for second in range(60)),
+        (25.0, m.Statustext(2, "Failsafe activated")),
+    ])  # fmt: skip
+    (failsafe,) = failsafes(flight)
+    assert (failsafe.kind, failsafe.time_s, failsafe.acted) == ("gps", 20.0, True)
+    assert failsafe.evidence[0].text == "receiver 1 has no 3D fix any more, 0 satellites instead of 10"
+    assert failsafe.reaction == "mode MISSION → LAND 5.0 s later"
+
+
+def test_receiver_without_any_fix_has_lost_none(tmp_path: Path) -> None:
+    rows = [(float(second), message) for second in range(30) for message in (px4_heartbeat(PX4_MISSION), fix(1, 0))]
+    assert failsafes(written(tmp_path / "log.tlog", rows)) == []
+
+
+def test_charge_state_names_cause_without_texts(tmp_path: Path) -> None:
+    """The return is PX4's own decision, although it sends a command, which informs its components."""
+
+    def battery(state: int) -> Message:
+        return m.BatteryStatus(0, 0, 0, 32767, (13000, *(65535,) * 9), -1, 0, -1, 6, charge_state=state)
+
+    flight = written(tmp_path / "log.tlog", [
+        *((float(second), px4_heartbeat(PX4_MISSION if second < 25 else PX4_RTL)) for second in range(60)),
+        *((float(second), battery(1 if second < 25 else 3)) for second in range(60)),
+        (24.9, m.CommandLong(1, 0, MavCmd.NAV_RETURN_TO_LAUNCH, 0, 0, 0, 0, 0, 0, 0, 0)),
+    ])  # fmt: skip
+    (failsafe,) = failsafes(flight)
+    assert (failsafe.kind, failsafe.acted) == ("battery", True)
+    assert failsafe.evidence[0].text == "charge state critical (BATTERY_STATUS)"
+    assert failsafe.reaction == "mode MISSION → RTL immediately"
+    assert "mAh" not in " ".join(failsafe.context)

@@ -7,11 +7,11 @@ import math
 import re
 from argparse import ArgumentTypeError
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from aerokit._internal import geo
+from aerokit.apps.cli.completion import assignments, offer
 from aerokit.apps.cli.completion import kinds as kind_names
-from aerokit.apps.cli.completion import offer
 from aerokit.apps.cli.misplaced import is_address, misplaced_file
 from aerokit.apps.cli.output import suggestion
 from aerokit.errors import AerokitError, InvalidArgument
@@ -257,3 +257,37 @@ def add_faults(command: argparse._ActionsContainer) -> None:
         f" {', '.join(FAULTS)}; loss=0.2 loses a share, 'prearm_failures=TEXT' refuses to arm",
     )
     offer(faults, lambda: FAULTS)
+
+
+def add_conditions(command: argparse._ActionsContainer) -> None:
+    """Add the parameters, wind, battery and faults of simulated vehicles."""
+    parameters = command.add_argument(
+        "--parameter",
+        action="append",
+        type=parameter,
+        default=[],
+        dest="parameters",
+        metavar="NAME=VALUE",
+        help="parameter value instead of its default (repeatable): MNT1_TYPE=1 gives the copter's autopilot a gimbal",
+    )
+    offer(parameters, assignments)
+    command.add_argument(
+        "--wind",
+        type=wind,
+        metavar="NORTH,EAST[,GUSTS]",
+        help="velocity of the air and of gusts in m/s: -3,0 (default: no wind)",
+    )
+    command.add_argument("--battery", type=number(0, 100), metavar="PERCENT", help="charge at the start (default: 100)")
+    add_faults(command)
+
+
+def conditions(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the conditions as arguments of a simulated vehicle, which `add_conditions` has added."""
+    from aerokit.sim import SimulatedWind
+
+    optional = {
+        "battery_percent": options.battery,
+        "wind": None if options.wind is None else SimulatedWind(*options.wind),
+        "parameters": dict(options.parameters) or None,
+    }
+    return {name: value for name, value in optional.items() if value is not None}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 import anyio
 
 from aerokit import events
-from aerokit.apps.cli.arguments import add_faults, add_record, number, vehicle_kind
+from aerokit.apps.cli.arguments import add_conditions, add_record, conditions, number, vehicle_kind
 from aerokit.apps.cli.completion import kinds, offer
 from aerokit.apps.cli.connecting import add_vehicle, connect_to, default_address, signing_of
 from aerokit.apps.cli.flight_recording import record_parameters, record_to_end
@@ -215,7 +215,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     simulated.add_argument(
         "--speedup", type=number(0.1, 100), default=10.0, metavar="X", help="simulation speed factor (default: 10)"
     )
-    add_faults(simulated)
+    add_conditions(simulated)
     add_record(command)
     add_vehicle(command)
     add_json(command)
@@ -247,8 +247,15 @@ def _check_arguments(options: argparse.Namespace, plan: Plan) -> None:
         raise InvalidArgument(f"{options.file} has no mission items, so there is nothing to fly")
     if options.sim and options.connect is not None:
         raise InvalidArgument("--sim and --connect cannot be used together")
-    for given, name in ((options.vehicle is not None, "--vehicle"), (bool(options.faults), "--fault")):
-        if given and not options.sim:
+    simulated = {
+        "--vehicle": options.vehicle,
+        "--parameter": options.parameters or None,
+        "--wind": options.wind,
+        "--battery": options.battery,
+        "--fault": options.faults or None,
+    }
+    for name, value in simulated.items():
+        if value is not None and not options.sim:
             raise InvalidArgument(f"{name} needs --sim")
     if not (options.sim or options.yes or is_interactive()):
         raise InvalidArgument(
@@ -304,8 +311,8 @@ async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: Asyn
     home = HOME
     if start is not None:
         home = (start.latitude_deg, start.longitude_deg, start.altitude_amsl_m or HOME[2])
-    vehicle = simulated_vehicle(kind, home=home, boot_time_s=_SIM_BOOT_TIME_S)
-    scale_timeouts([vehicle], options.speedup)
+    vehicle = simulated_vehicle(kind, home=home, boot_time_s=_SIM_BOOT_TIME_S, **conditions(options))
+    scale_timeouts([vehicle], options.speedup, leave=dict(options.parameters))
     link = await stack.enter_async_context(simulated_link(vehicle, speedup=options.speedup))
     await stack.enter_async_context(faults_begin([vehicle], options))
     record = {"system_ids": [vehicle.system_id], "address": link.address, "speedup": options.speedup}

@@ -10,20 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.apps.cli.arguments import (
     DEFAULT_SIM_ADDRESS,
-    add_faults,
+    add_conditions,
     add_vehicle_kind,
     address_or_template,
+    conditions,
     count,
     expand_address,
     home,
     is_address_template,
     number,
-    parameter,
     picture,
     system_id,
-    wind,
 )
-from aerokit.apps.cli.completion import assignments, offer
 from aerokit.apps.cli.connecting import add_signing_key
 from aerokit.apps.cli.output import add_json, emit
 from aerokit.apps.cli.terminal import on_interrupt
@@ -34,7 +32,6 @@ from aerokit.sim import (
     SimulatedCamera,
     SimulatedGimbal,
     SimulatedVehicle,
-    SimulatedWind,
     SimulatorServer,
 )
 from aerokit.sim.kinds import scale_timeouts
@@ -180,7 +177,24 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("--seed", type=int, default=0, help="random seed of the first vehicle (default: 0)")
     _add_devices(command)
-    _add_conditions(command)
+    add_conditions(command)
+    command.add_argument(
+        "--boot-time",
+        type=number(0, 600),
+        metavar="S",
+        help="simulated seconds until the vehicle is ready to arm",
+    )
+    add_signing_key(command, "signing key of the vehicles; ArduPilot's first port accepts unsigned messages too")
+    command.add_argument(
+        "--duration", type=number(0.1, 1e6), metavar="S", help="stop after S simulated seconds (default: at Ctrl-C)"
+    )
+    command.add_argument(
+        "--picture",
+        type=picture,
+        metavar="FILE",
+        help="image of the true tracks, written at the end: .svg, or .png with Pillow",
+    )
+    add_json(command)
 
 
 # Maps options to the maximum number of devices, the function that makes a device from its number (from 0), and a
@@ -218,44 +232,6 @@ def _devices(options: argparse.Namespace) -> list[AttachableComponent]:
             raise InvalidArgument(f"--{name} is given {count} times, but a vehicle has at most {max_count}")
         components += [make_device(number) for number in range(count)]
     return components
-
-
-def _add_conditions(command: argparse.ArgumentParser) -> None:
-    parameters = command.add_argument(
-        "--parameter",
-        action="append",
-        type=parameter,
-        default=[],
-        dest="parameters",
-        metavar="NAME=VALUE",
-        help="parameter value instead of its default (repeatable): MNT1_TYPE=1 gives the copter's autopilot a gimbal",
-    )
-    offer(parameters, assignments)
-    command.add_argument(
-        "--wind",
-        type=wind,
-        metavar="NORTH,EAST[,GUSTS]",
-        help="velocity of the air and of gusts in m/s: -3,0 (default: no wind)",
-    )
-    command.add_argument("--battery", type=number(0, 100), metavar="PERCENT", help="charge at the start (default: 100)")
-    command.add_argument(
-        "--boot-time",
-        type=number(0, 600),
-        metavar="S",
-        help="simulated seconds until the vehicle is ready to arm",
-    )
-    add_faults(command)
-    add_signing_key(command, "signing key of the vehicles; ArduPilot's first port accepts unsigned messages too")
-    command.add_argument(
-        "--duration", type=number(0.1, 1e6), metavar="S", help="stop after S simulated seconds (default: at Ctrl-C)"
-    )
-    command.add_argument(
-        "--picture",
-        type=picture,
-        metavar="FILE",
-        help="image of the true tracks, written at the end: .svg, or .png with Pillow",
-    )
-    add_json(command)
 
 
 async def run_sim(options: argparse.Namespace) -> int:
@@ -308,10 +284,8 @@ async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namesp
 
 def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:
     optional: dict[str, Any] = {
-        "battery_percent": options.battery,
         "boot_time_s": options.boot_time,
         "signing_key": options.signing_key,
-        "wind": None if options.wind is None else SimulatedWind(*options.wind),
     }
     return simulated_fleet(
         options.vehicle,
@@ -321,8 +295,8 @@ def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:
         spacing_m=options.spacing,
         seed=options.seed,
         boot_text=True,
-        parameters=dict(options.parameters),
         components=lambda: _devices(options),
+        **conditions(options),
         **{name: value for name, value in optional.items() if value is not None},
     )
 

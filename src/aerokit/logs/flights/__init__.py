@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit.errors import FileFormatError
-from aerokit.logs.flights.failsafes import Failsafe, evidence_in_texts, failsafes
+from aerokit.logs.flights.failsafes import Failsafe, evidence_in_fixes, evidence_in_texts, failsafes
 from aerokit.logs.flights.falls import Fall, falls
 from aerokit.logs.flights.flight import (
     FailsafeEvidence,
@@ -110,7 +110,7 @@ def _complete(flight: FlightLog) -> None:
     _complete_altitudes(flight)
     if is_armed_at_end:
         flight.notes.append(_armed_at_end(flight))
-    flight.failsafe_evidence += evidence_in_texts(flight.texts)
+    flight.failsafe_evidence += evidence_in_texts(flight.texts) + evidence_in_fixes(flight)
     flight.failsafe_evidence.sort(key=lambda evidence: evidence.time_s)
 
 

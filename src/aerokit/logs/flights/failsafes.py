@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
 from aerokit.logs.flights.flight import FailsafeEvidence, TangentPlane, battery_name
+from aerokit.mavlink.enums import GpsFixType
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -16,8 +17,10 @@ if TYPE_CHECKING:
 
 # Pieces of evidence of the same kind belong to one failsafe if they are at most this time apart.
 _SAME_KIND_GAP_S = 8.0
-# Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart.
+# Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart. Without
+# satellites, autopilots continue with dead reckoning for several seconds (PX4 for five) before they react.
 _GENERAL_GAP_S = 3.0
+_GENERAL_GAP_AFTER_GPS_S = 10.0
 _REACTION_TIMEOUT_S = 12.0
 # Values measured at most this time before a failsafe are shown with it.
 _BEFORE_S = 10.0
@@ -143,6 +146,23 @@ def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
     return evidence
 
 
+def evidence_in_fixes(flight: FlightLog) -> list[FailsafeEvidence]:
+    """Return the times at which a satellite receiver lost its 3D fix."""
+    evidence = []
+    for number, gps in flight.gps.items():
+        had_fix, had_satellites = False, math.nan
+        for time_s, fix_type, satellites in zip(gps.times, gps["fix_type"], gps["satellites"], strict=True):
+            has_fix = fix_type >= GpsFixType.TYPE_3D_FIX
+            if had_fix and fix_type < GpsFixType.TYPE_3D_FIX:
+                counts = "" if math.isnan(satellites) else f", {satellites:.0f} satellites"
+                counts += "" if math.isnan(had_satellites) or not counts else f" instead of {had_satellites:.0f}"
+                text = f"receiver {number + 1} has no 3D fix any more{counts}"
+                evidence.append(FailsafeEvidence(time_s, "gps", text))
+            if not math.isnan(fix_type):
+                had_fix, had_satellites = has_fix, satellites
+    return evidence
+
+
 def failsafes(flight: FlightLog) -> list[Failsafe]:
     """Return the failsafes and problems that began while the vehicle was armed, the oldest first."""
     groups: list[list[FailsafeEvidence]] = []
@@ -151,7 +171,9 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
         was_armed = any(begin - 1 <= evidence.time_s <= end + 2 for begin, end in flight.armed)
         if not was_armed:
             continue
-        recent_groups = [group for group in recent_groups if evidence.time_s - group[-1].time_s <= _SAME_KIND_GAP_S]
+        recent_groups = [
+            group for group in recent_groups if evidence.time_s - group[-1].time_s <= _GENERAL_GAP_AFTER_GPS_S
+        ]
         group = next((group for group in reversed(recent_groups) if _belongs_to(evidence, group)), None)
         if group is None:
             groups.append([evidence])
@@ -168,7 +190,7 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
 def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -> bool:
     kind, gap_s = _kind_of(group), evidence.time_s - group[-1].time_s
     if "general" in (kind, evidence.kind):
-        return gap_s <= _GENERAL_GAP_S
+        return gap_s <= (_GENERAL_GAP_AFTER_GPS_S if kind == "gps" else _GENERAL_GAP_S)
     return kind == evidence.kind and gap_s <= _SAME_KIND_GAP_S
 
 

@@ -15,7 +15,7 @@ from aerokit.logs.flights.tlog_missions import RecordedMission
 from aerokit.logs.flights.tlog_modes import RecordedModeCommands
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
-from aerokit.mavlink.enums import MavFrame, MavState, MavType
+from aerokit.mavlink.enums import MavBatteryChargeState, MavFrame, MavState, MavType
 from aerokit.mavlink.frame import MAGIC_V2, Frame, x25
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.parameters.encoding import value_of
@@ -36,6 +36,11 @@ _NULL_ISLAND_E7 = 100_000
 _HEARTBEAT_ID = b"\0\0\0"
 # Bits of a set-point's type mask. If they are set, the position, velocity or attitude is ignored.
 _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
+_CHARGE_STATE_NAMES = {
+    MavBatteryChargeState.LOW: "low",
+    MavBatteryChargeState.CRITICAL: "critical",
+    MavBatteryChargeState.EMERGENCY: "emergency",
+}
 _ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
 
@@ -85,6 +90,7 @@ class _Reader:
         self._mode_commands = RecordedModeCommands(flight, self._autopilot)
         self._system_status = 0
         self._has_battery_status = False
+        self._charge_states: dict[int, int] = {}  # by battery
         self._position = (NAN, NAN, NAN)  # latitude, longitude and altitude above sea level
         self._local_position = (NAN, NAN, NAN)  # metres north, east and down of the estimator's origin
         self._relative_m = NAN
@@ -93,16 +99,21 @@ class _Reader:
         self._destinations = TimeSeries(*flight.position_target.names)
         self._link = LinkCounter(flight)
         self._mission = RecordedMission(flight)
-        handlers: dict[type[Message], Callable[[float, Any], None]] = {
+        # The vehicle's own commands are for its components: PX4 informs them about a return that it has decided itself.
+        commands: dict[type[Message], Callable[[float, Any], None]] = {
             m.CommandLong: self._mode_commands.on_command,
             m.CommandInt: self._mode_commands.on_command,
             m.SetMode: self._mode_commands.on_set_mode,
+        }
+        handlers: dict[type[Message], Callable[[float, Any], None]] = {
             m.MissionItemInt: self._mission.on_item,
             m.MissionItem: self._mission.on_item,
             m.MissionCount: self._mission.on_count,
             m.FileTransferProtocol: self._mission.on_file_transfer,
         }
-        self._handlers_of_any_sender = {_message_id_bytes(kind): handler for kind, handler in handlers.items()}
+        self._handlers_of_any_sender = {
+            _message_id_bytes(kind): call for kind, call in {**commands, **handlers}.items()
+        }
         handlers.update(self._vehicle_handlers())
         self._handlers_of_vehicle = {_message_id_bytes(kind): handler for kind, handler in handlers.items()}
 
@@ -375,12 +386,19 @@ class _Reader:
         cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]  # 0: the cell does not exist
         if message.id == 0 and cells_mv:
             self._has_battery_status = True
+        state = message.charge_state
+        if state in _CHARGE_STATE_NAMES and state > self._charge_states.get(message.id, 0):
+            text = f"charge state {_CHARGE_STATE_NAMES[MavBatteryChargeState(state)]} (BATTERY_STATUS)"
+            self._flight.failsafe_evidence.append(FailsafeEvidence(time_s, "battery", text))
+        self._charge_states[message.id] = state
         current_a = current(message.current_battery, self._autopilot)
+        # PX4 without a current sensor sends a consumed charge of 0.
+        is_charge_unknown = message.current_consumed < 0 or (message.current_consumed == 0 and current_a is None)
         self._flight.battery(message.id).add(
             time_s,
             sum(cells_mv) / 1e3 if cells_mv else NAN,
             NAN if current_a is None else current_a,
-            message.current_consumed if message.current_consumed >= 0 else NAN,
+            NAN if is_charge_unknown else message.current_consumed,
             message.battery_remaining if message.battery_remaining >= 0 else NAN,
         )
 

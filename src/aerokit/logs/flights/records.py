@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.values import Snapshot
+from aerokit.autopilots import autopilot_for
 from aerokit.connection.heartbeats import is_autopilot
 from aerokit.errors import FileFormatError
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.framer import Framer
-from aerokit.mavlink.messages import Heartbeat
+from aerokit.mavlink.messages import AutopilotVersion, Heartbeat, ParamSet, ParamValue
 from aerokit.mavlink.tlog import read_tlog
+from aerokit.parameters.encoding import value_of
 from aerokit.vehicle.state.states import SOURCES
 from aerokit.vehicle.state.telemetry import Telemetry
 
@@ -18,8 +20,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
+    from aerokit.autopilots import Autopilot
     from aerokit.mavlink.message import Message
 
+_PARAMETER_IDS = frozenset((Heartbeat.ID, AutopilotVersion.ID, ParamSet.ID, ParamValue.ID))
 
 _COLUMN_KINDS = {"float": "float", "double": "float", "uint64_t": "uint"}
 _UNITS = {"%": "percent", "c%": "centipercent", "d%": "decipercent", "m/s/s": "m_s2", "m/s^2": "m_s2"}
@@ -83,9 +87,15 @@ class TlogReader(LogReader):
         super().__init__(path)
         self._vehicles: dict[int, _VehicleStates] = {}
         self._framer = Framer()
+        # By system id: the autopilot and its capabilities, which tell how it encodes parameters.
+        self._autopilots: dict[int, Autopilot] = {}
+        self._capabilities: dict[int, int] = {}
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield all messages of the standard dialect that have a valid checksum."""
+        """Yield all messages of the standard dialect that have a valid checksum.
+
+        ``param_value`` of PARAM_VALUE and PARAM_SET is the value of the parameter, also if PX4 sends its bits.
+        """
         framer, decode, count = self._framer, STANDARD.decode, 0
         states: tuple[tuple[str, Any], ...] = ()
         with self.path.open("rb") as file:
@@ -95,11 +105,31 @@ class TlogReader(LogReader):
                     on_bytes(file.tell())
                 for frame in framer.receive(raw, unix_s):
                     message = decode(frame)
+                    if frame.message_id in _PARAMETER_IDS:
+                        message = self._decode_parameter(message, frame.system_id)
                     if self.needs_states:
                         states = self._states(frame.system_id, frame.component_id, unix_s, message)
                     yield LogRecord(unix_s, frame.system_id, frame.component_id, message.NAME, {}, states, message)
             on_bytes(file.tell())
         self._check_and_note(count)
+
+    def _decode_parameter(self, message: Message, system_id: int) -> Message:
+        """Return the message, in PARAM_VALUE and PARAM_SET with the decoded value.
+
+        HEARTBEAT and AUTOPILOT_VERSION show how a vehicle encodes integer parameters.
+        """
+        if isinstance(message, Heartbeat):
+            if system_id not in self._autopilots and is_autopilot(message):
+                self._autopilots[system_id] = autopilot_for(message)
+        elif isinstance(message, AutopilotVersion):
+            self._capabilities[system_id] = message.capabilities
+        elif isinstance(message, (ParamValue, ParamSet)):
+            owner = message.target_system if isinstance(message, ParamSet) else system_id
+            autopilot = self._autopilots.get(owner)
+            if autopilot is not None:
+                value = value_of(message, autopilot.encodes_parameters_bytewise(self._capabilities.get(owner)))
+                return type(message)(**{**message.to_dict(), "param_value": float(value)})
+        return message
 
     def columns(self, entry: LogRecord) -> list[TableColumn]:
         """Return a column for each field, in the standard's order and units. Arrays have a column for each element."""

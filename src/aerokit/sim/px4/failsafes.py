@@ -1,4 +1,4 @@
-"""Failsafes of a simulated PX4: battery, ground station, manual control, geofence.
+"""Failsafes of a simulated PX4: battery, ground station, manual control, position, geofence.
 
 https://docs.px4.io/main/en/config/safety.html. The most severe action is executed. Before RETURN or LAND the vehicle
 holds for COM_FAIL_ACT_T seconds. A mode change by the user overrides the action until another failure occurs.
@@ -20,7 +20,7 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.motion import Ned
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.links import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
-from aerokit.sim.px4.modes import AUTO, HOLD, LAND, MISSION, OFFBOARD, ORBIT, RTL, Px4Mode
+from aerokit.sim.px4.modes import AUTO, HOLD, LAND, MISSION, MODES, OFFBOARD, ORBIT, RTL, Px4Mode
 
 _POLYGONS = {Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: True, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False}
 _CIRCLES = {Cmd.NAV_FENCE_CIRCLE_INCLUSION: True, Cmd.NAV_FENCE_CIRCLE_EXCLUSION: False}
@@ -142,6 +142,8 @@ Action = FailsafeAction
 _LINK_ACTIONS = {1: Action.HOLD, 2: Action.RETURN, 3: Action.LAND, 5: Action.TERMINATE, 6: Action.DISARM}
 _FENCE_ACTIONS = {1: Action.WARN, 2: Action.HOLD, 3: Action.RETURN, 4: Action.TERMINATE, 5: Action.LAND}
 _MODES: dict[FailsafeAction, Px4Mode] = {Action.HOLD: HOLD, Action.RETURN: RTL, Action.LAND: LAND}
+# After this time without a position, PX4 1.17 (SIH, satellites switched off) ends a mode that needs a position.
+_POSITION_TIMEOUT_S = 5.0
 _BATTERY_TEXTS = {
     MavBatteryChargeState.LOW: (MavSeverity.CRITICAL, "Low battery"),
     MavBatteryChargeState.CRITICAL: (MavSeverity.CRITICAL, "Critical battery"),
@@ -163,6 +165,7 @@ class Px4Failsafes:
         self.has_station: bool = False  # True while heartbeats of a ground station are received.
         self._station_at = -math.inf
         self._had_manual_control = False
+        self._position_at = -math.inf  # Time at which the estimator had a position last.
         self._battery_at_arming = MavBatteryChargeState.OK
         self._reported_battery_level = MavBatteryChargeState.OK
         self._breaches: list[str] = []
@@ -241,7 +244,7 @@ class Px4Failsafes:
 
     def on_armed(self) -> None:
         """Reset all actions. A failure that exists at arming does not trigger a failsafe."""
-        self._had_manual_control = self._px4.sticks.are_fresh
+        self._had_manual_control, self._position_at = self._px4.sticks.are_fresh, self._px4.now
         self._battery_at_arming = self._reported_battery_level = self.battery_state = self._battery_level()
         self._reset()
 
@@ -254,6 +257,7 @@ class Px4Failsafes:
             "battery": self._battery_action(),
             "station": self._station_action(),
             "sticks": self._sticks_action(),
+            "position": self._position_action(),
             "fence": self._fence_action(),
         }
         return {cause: action for cause, action in actions.items() if action != Action.NONE}
@@ -271,6 +275,14 @@ class Px4Failsafes:
         if not is_lost or not sticks.are_wanted or self._is_excepted("COM_RCL_EXCEPT"):
             return Action.NONE
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_RCL_ACT"]), Action.NONE)
+
+    def _position_action(self) -> FailsafeAction:
+        """Return LAND, which descends without a position, if a mode that needs a position was without for 5 s."""
+        px4 = self._px4
+        if px4.has_position:
+            self._position_at = px4.now
+        is_lost = px4.now - self._position_at > _POSITION_TIMEOUT_S
+        return Action.LAND if is_lost and MODES[px4.intended_mode].needs_position else Action.NONE
 
     def can_be_overridden(self, moved: float) -> bool:
         """Return True if a stick movement ends the current mode. ``moved`` is its size: 2 is from end to end."""
@@ -342,6 +354,9 @@ class Px4Failsafes:
         The action is reduced while the user has overridden it, while it is under way already, and during its delay.
         """
         worst = max(self._active.values(), default=Action.NONE)
+        can_hold = self._px4.has_position
+        if worst in (Action.HOLD, Action.RETURN) and not can_hold:
+            worst = Action.LAND
         intended = self._px4.intended_mode
         if self._is_overridden and worst < Action.DISARM:  # The user cannot override disarming and termination.
             return min(worst, Action.WARN)
@@ -349,7 +364,7 @@ class Px4Failsafes:
         if worst == Action.RETURN and is_returning_already:
             return Action.WARN
         is_delay_running = self.action <= Action.HOLD and self._px4.now < self._holds_until
-        if worst in (Action.RETURN, Action.LAND) and is_delay_running:
+        if worst in (Action.RETURN, Action.LAND) and is_delay_running and can_hold:
             return Action.HOLD
         return worst
 

@@ -101,6 +101,8 @@ class Px4TextLinks:
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
+        self.speedup: float = 1.0
+        """Simulated seconds per second of the clients, whose heartbeats are then this much less frequent."""
         self._station_at: dict[Channel, float] = {}
         self._waiting: dict[Channel, deque[tuple[float, list[Statustext]]]] = {}
 
@@ -108,14 +110,14 @@ class Px4TextLinks:
         """Handle the HEARTBEAT of a ground station: send the texts that were queued in the last 5 s."""
         self._station_at[channel] = self._px4.now
         for sent_at, chunks in self._waiting.pop(channel, ()):
-            if self._px4.now - sent_at < _MAX_AGE_S:
+            if self._px4.now - sent_at < _MAX_AGE_S * self.speedup:
                 self._send(chunks, channel)
 
     def send(self, chunks: list[Statustext]) -> None:
         """Send a text on the links with a ground station, and queue the text on the other links."""
-        now = self._px4.now
+        now, timeout_s = self._px4.now, _STATION_TIMEOUT_S * self.speedup
         for channel in self._px4.channels:
-            if now - self._station_at.get(channel, -math.inf) <= _STATION_TIMEOUT_S:
+            if now - self._station_at.get(channel, -math.inf) <= timeout_s:
                 self._send(chunks, channel)
             else:
                 self._waiting.setdefault(channel, deque(maxlen=_MAX_QUEUED)).append((now, chunks))

@@ -172,8 +172,11 @@ def _attitude_target(px4: Px4Vehicle) -> m.AttitudeTarget:
 
 
 def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
-    """Build GLOBAL_POSITION_INT. Without a position, PX4 does not send the message, whereas ArduPilot sends zeros."""
-    if not px4.has_position:
+    """Build GLOBAL_POSITION_INT. Without a position, PX4 does not send the message, whereas ArduPilot sends zeros.
+
+    If the position is lost in flight, PX4 continues with dead reckoning.
+    """
+    if not px4.has_position and not px4.is_armed:
         return None
     motion = px4.motion
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
