@@ -285,7 +285,8 @@ class _Search:
         frame = heartbeat.received_frame
         if frame is None or self._ended.is_set() or not self._is_wanted(frame, heartbeat):
             return
-        if frame.component_id != MavComponent.AUTOPILOT1 and not self._has_sent_enough(frame):
+        has_usual_id = frame.component_id == MavComponent.AUTOPILOT1
+        if not has_usual_id and not self._has_sent_enough(frame):  # Component 1 takes precedence.
             return
         try:
             if frame.system_id in self._connection.attached:

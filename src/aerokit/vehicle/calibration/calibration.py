@@ -192,7 +192,9 @@ class CalibrationControl:
         run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
         is_px4 = self._context.session.autopilot.calibration_protocol == "texts"
         procedure = px4 if is_px4 else ardupilot
-        params = (0,) * (command_param - 1) + (param_value,) if command_param else ()
+        params: tuple[float, ...] = ()
+        if command_param:
+            params = (*(0,) * (command_param - 1), param_value)
         return Calibration(run, procedure(run, *params))
 
 

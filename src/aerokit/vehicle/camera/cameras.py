@@ -138,8 +138,9 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
                 raise self._link.timeout_error("did not report how many pictures it has taken")
             count = status.image_count
             consecutive_missing = 0
-            available = 1 if self._link.is_autopilot_attached else MAX_CAPTURES
-            for index in range(max(0, count - available), count):
+            # The autopilot stores only its newest capture.
+            max_stored = 1 if self._link.is_autopilot_attached else MAX_CAPTURES
+            for index in range(max(0, count - max_stored), count):
                 capture = await self._log.fetch(index)
                 consecutive_missing = consecutive_missing + 1 if capture is None else 0
                 if consecutive_missing == MAX_CONSECUTIVE_MISSING:
@@ -185,7 +186,7 @@ class Cameras:
             "cameras", "HEARTBEAT or CAMERA_INFORMATION of a camera"
         )
         # Captures of cameras attached to the autopilot, kept until it is known which camera is the first.
-        self._early: list[tuple[int, Any]] = []
+        self._early_captures: list[tuple[int, Any]] = []
         self._first_link = CameraLink(context, components.component, None, on_bound=self._on_first_bound)
         self._first = Camera(self._first_link)
         # True once `first` has returned `_first`. From then on, `first` always returns this object.
@@ -249,21 +250,24 @@ class Cameras:
     def _on_capture(self, message: Any, device_id: int) -> None:
         """Create the camera object if needed, so that its capture log also gets this first capture."""
         number = self._record(message, device_id)
-        if number in (0, self._first_link.number, *self._cameras):
-            return  # The sender is not a camera, or the camera's object receives this message itself.
+        is_camera = number != 0
+        has_object = number == self._first_link.number or number in self._cameras
+        if not is_camera or has_object:  # An existing object receives this message itself.
+            return
         if self._first_link.number is None:
-            if not self._early:
+            if not self._early_captures:
                 self._first_link.call_later(DISCOVERY_TIMEOUT_S, self._process_early)
-            del self._early[MAX_EARLY_CAPTURES:]  # Beyond the limit, a new capture replaces the last one.
-            self._early.append((number, message))
+            del self._early_captures[MAX_EARLY_CAPTURES:]  # Beyond the limit, a new capture replaces the last one.
+            self._early_captures.append((number, message))
         else:
             self.at(number)._log.record(message)
 
     def _process_early(self) -> None:
         # No camera with its own component id was discovered, so the first camera is attached to the autopilot.
-        early, self._early = self._early, []
-        self._first_link.bind(early[0][0])
-        for number, message in early:
+        captures, self._early_captures = self._early_captures, []
+        first_number, _ = captures[0]
+        self._first_link.bind(first_number)
+        for number, message in captures:
             self.at(number)._log.record(message)
 
     def _record(self, message: Any, device_id: int) -> int:
@@ -277,13 +281,14 @@ class Cameras:
         is_from_autopilot = frame.component_id == self._session.component_id
         number = device_id if is_from_autopilot else frame.component_id
         # Cameras of the autopilot have the numbers 1 to 6; all other cameras have their component ids.
-        if (number in AUTOPILOT_CAMERA_IDS) != is_from_autopilot or number == 0:
+        has_autopilot_number = number in AUTOPILOT_CAMERA_IDS
+        if has_autopilot_number != is_from_autopilot or number == 0:
             return 0
         numbers = self.cell.latest or ()
         if number not in numbers:
             source = Source(self._session.system_id, frame.component_id, message.NAME)
             self.cell.set(tuple(sorted((*numbers, number), key=_sort_key)), source)
-        if number not in AUTOPILOT_CAMERA_IDS and self._first_link.number is None:
+        if not has_autopilot_number and self._first_link.number is None:
             self._first_link.bind(number)
         return int(number)
 

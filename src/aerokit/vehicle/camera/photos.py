@@ -76,7 +76,8 @@ class Shutter:
             known_indices = {capture.index for capture in self.log.captures()}
             error: CommandTimeout | None = None
             with CaptureQueue(self.log.cell) as new_captures, anyio.move_on_after(timeout):
-                attempts, error = 1, await self.order_photo(before)
+                attempts = 1
+                error = await self.order_photo(before)
                 while True:
                     while capture := new_captures.pop():
                         # An unknown low index belongs to a new picture: indices of failed pictures may be used again.
@@ -97,7 +98,8 @@ class Shutter:
                     is_series_unchanged = self.link.latest_order("series") is series
                     was_lost = error is not None and is_series_unchanged and _has_taken_none(before, status)
                     if was_lost and attempts < MAX_ORDER_ATTEMPTS:
-                        attempts, error = attempts + 1, await self.order_photo(before, is_repeated=True)
+                        attempts += 1
+                        error = await self.order_photo(before, is_repeated=True)
             # `error` is set if the last order was not acknowledged.
             raise error or self.link.timeout_error(
                 f"accepted the order, but reported no picture within {timeout:g} s; it may have taken one"
@@ -307,8 +309,9 @@ class PhotoInterval:
                 self._waiting = {first.index: first}
             # Without a status, the first capture determines the start, unless a later one shows that it was corrupt.
             if self._next_index is None or self._contradicts_guess(capture.index):
-                self._next_index, self._is_start_guessed = capture.index, self._next_index is None
-                self._newest_index = capture.index - 1
+                self._is_start_guessed = self._next_index is None
+                self._next_index = capture.index
+                self._newest_index = capture.index - 1  # so that this capture counts as the newest one below
             if not self._is_plausible(capture.index):
                 continue
             if capture.success is False:  # Not stored by index, because a later picture may have the same index.
@@ -316,7 +319,8 @@ class PhotoInterval:
             elif capture.index >= self._next_index:
                 self._waiting[capture.index] = capture
                 if capture.index > self._newest_index:
-                    self._is_start_guessed = self._is_start_guessed and not self._delivered
+                    if self._delivered:  # The start cannot be corrected once a capture was delivered.
+                        self._is_start_guessed = False
                     self._newest_index, self._newest_at = capture.index, self._link.now()
 
     def _max_new_captures(self) -> float:
@@ -354,9 +358,11 @@ class PhotoInterval:
         elif self._next_index not in self._waiting:
             self._unanswered += 1
             can_fetch = not self._link.is_trigger and self._unanswered <= MAX_UNANSWERED
-            following = self._next_index + 1 if can_fetch or not self._waiting else min(self._waiting)
-            self._missed += following - self._next_index
-            self._next_index = following
+            following_index = self._next_index + 1
+            if not can_fetch and self._waiting:  # Skip to the next capture that was received.
+                following_index = min(self._waiting)
+            self._missed += following_index - self._next_index
+            self._next_index = following_index
 
     async def _check_silence(self, silent_checks: int) -> None:
         """Request missed captures, or raise the error if the camera has ended the series or reports nothing more."""

@@ -87,7 +87,7 @@ class VideoMixin(CameraMixin):
         await self._link.order_once(
             order, lambda: self._link.command(*command, order=order, attempts=1), self._is_recording
         )
-        await self._wait_recording(timeout, starts=True)
+        await self._wait_recording(timeout, expected=True)
 
     async def stop_video(self, *, timeout: float = 5.0) -> None:
         """Stop recording (MAV_CMD_VIDEO_STOP_CAPTURE); returns when the camera reports that it has stopped.
@@ -102,7 +102,7 @@ class VideoMixin(CameraMixin):
         command, *params = self._stop_command()
         with self._link.new_order("video") as order:
             await self._link.command(int(command), *params, order=order)
-            await self._wait_recording(timeout, starts=False)
+            await self._wait_recording(timeout, expected=False)
 
     def video(self, *, status_hz: float = 1.0) -> CameraBlock:
         """Record for the duration of an ``async with`` block. The end of the block stops recording, also under
@@ -131,17 +131,18 @@ class VideoMixin(CameraMixin):
         message = await self._link.request(m.CameraCaptureStatus, timeout=1.0)
         return None if message is None else message.video_status == 1
 
-    async def _wait_recording(self, timeout: float, *, starts: bool) -> None:
+    async def _wait_recording(self, timeout: float, *, expected: bool) -> None:
         """Wait until the camera reports that recording has started or stopped.
 
         Returns at once if the camera does not report its status.
         """
         with anyio.move_on_after(timeout):
             is_recording = await self._is_recording()
-            if is_recording is not None and is_recording is not starts:
-                await self.status.wait_until(lambda status: status.is_recording is starts)
+            is_reported = is_recording is not None
+            if is_reported and is_recording is not expected:
+                await self.status.wait_until(lambda status: status.is_recording is expected)
             return
-        outcome = "does not record" if starts else "still records"
+        outcome = "does not record" if expected else "still records"
         raise self._link.timeout_error(f"accepted the order, but {outcome} after {timeout:g} s")
 
     async def load_streams(self) -> tuple[CameraStream, ...]:

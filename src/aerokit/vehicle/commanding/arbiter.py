@@ -191,7 +191,8 @@ class CommandArbiter:
         A newer order about the first subject ends it. The posted order itself ends earlier posted orders about any of
         its subjects and, if it steers, the action in progress.
         """
-        is_steering = subjects[0] != "arm"
+        first_subject = subjects[0]
+        is_steering, disarms = first_subject != "arm", armed is False
         if is_steering:
             self._notify_steering()
             if self.newest is not None:  # A change to a mode of the posted order is not a takeover.
@@ -202,13 +203,13 @@ class CommandArbiter:
         self._ordered_modes.extend((now, mode.custom_mode) for mode in modes)
         order = self._build_order(
             modes,
-            subjects[:1],
+            (first_subject,),
             recent_modes,
             armed=armed,
             # An order to disarm stays valid in every mode and during a failsafe.
-            ends_flight=self._all_end_flight(modes) or armed is False,
-            ends_on_mode_change=armed is not False,
-            ends_on_disarm=subjects[0] == "motion",
+            ends_flight=self._all_end_flight(modes) or disarms,
+            ends_on_mode_change=not disarms,
+            ends_on_disarm=first_subject == "motion",
             requires_mode_change=True,
         )
         self._register(order, (*subjects, STEERING) if is_steering else subjects)
@@ -319,7 +320,8 @@ class CommandArbiter:
         After a cancellation or a time-out, the mode stays in doubt. After a refusal, the mode is in doubt only if an
         earlier order may still change it.
         """
-        was_in_doubt, self.mode_is_in_doubt = self.mode_is_in_doubt, True
+        was_in_doubt = self.mode_is_in_doubt
+        self.mode_is_in_doubt = True
         try:
             yield
         except CommandRejected:
@@ -339,14 +341,14 @@ class CommandArbiter:
 
     def _create_order(self, modes: Collection[Mode], ended_by: Sequence[Topic], ends_flight: bool = False) -> Order:
         """Create an order that also accepts the modes that earlier orders may still lead to."""
-        newest, mode = self.newest, self._telemetry.mode.latest
-        is_under_way = newest is not None and mode is not None and newest.is_own(mode)
+        newest, present_mode = self.newest, self._telemetry.mode.latest
+        is_under_way = newest is not None and present_mode is not None and newest.is_own(present_mode)
         is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at
-        expected = newest.modes if is_unsettled and newest is not None else ()
+        newest_modes = newest.modes if is_unsettled and newest is not None else ()
         return self._build_order(
             modes,
             ended_by,
-            {mode.custom_mode for mode in (*expected, *self._posted_modes())},
+            {mode.custom_mode for mode in (*newest_modes, *self._posted_modes())},
             settles_at=self.mode_settles_at,
             any_until=self._any_mode_until,
             ends_flight=ends_flight,
@@ -414,12 +416,15 @@ class CommandArbiter:
     def _on_arming(self) -> None:
         """Decide whether the program or another party has armed the vehicle."""
         self._armed_at = self._telemetry.armed.updated_at
-        is_being_armed = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
+        is_unanswered = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
         was_accepted = math.isfinite(self._arming_accepted_at)
         is_effect = was_accepted and was_armed_by_order(self._disarmed_at, self._arming_accepted_at)
+        if not is_unanswered and not is_effect:  # Another party has armed the vehicle.
+            self._armed_by_program = None
+            return
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
-        self._armed_by_program = self._create_order(modes, ()) if is_being_armed or is_effect else None
+        self._armed_by_program = self._create_order(modes, ())
 
     def _active_orders(self) -> tuple[Order, ...]:
         """Orders that process the reports of the vehicle."""

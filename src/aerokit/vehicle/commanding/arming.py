@@ -88,20 +88,21 @@ class ArmingActions(VehicleBase):
             ChangeSignal(self._session, *cells, every_arrival=True) as changes,
             anyio.move_on_after(timeout),
         ):
-            request_at = self.connection.now() + timeout - REASONS_S
+            # Shortly before the time-out, ask the vehicle once for the reasons, so that the error can contain them.
+            ask_at = self.connection.now() + timeout - REASONS_S
             while self._health.missing_for_flight():
                 self.connection.raise_if_ended()
-                if self.connection.now() >= request_at:
-                    request_at = math.inf
+                if self.connection.now() >= ask_at:
+                    ask_at = math.inf
                     await self._health.request_reasons(self.connection.now() - PREARM_REPORT_INTERVAL_S)
                 else:
-                    await changes.next(min(timeout, request_at - self.connection.now()))
+                    await changes.next(min(timeout, ask_at - self.connection.now()))
             return
         recent_texts = self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S)
         missing_now = self._health.missing_for_flight()
         # Nothing is missing if the vehicle became ready just after the last check.
-        still = self._session.deduplicate_reasons(*recent_texts, *missing_now) or ("nothing",)
-        missing = "\n  - ".join([*still, *self._health.unarmable_mode()])
+        reasons = self._session.deduplicate_reasons(*recent_texts, *missing_now) or ("nothing",)
+        missing = "\n  - ".join([*reasons, *self._health.unarmable_mode()])
         raise OperationTimeout(
             f"the vehicle was not ready within {timeout:g} s ({self._session.describe_link()}); still missing:\n"
             f"  - {missing}"
@@ -162,7 +163,8 @@ class ArmingActions(VehicleBase):
             self.connection.send(Statustext(MavSeverity.INFO, reason, 0, 0))
         started = self.connection.now()
         try:
-            await self._arm_with_fallback_mode(mode is None, force, timeout, max_silence_s)
+            may_change_mode = mode is None
+            await self._arm_with_fallback_mode(may_change_mode, force, timeout, max_silence_s)
         except CommandRejected as error:
             reasons = await self._health.arming_reasons(started)
             raise self._session.with_reasons(error, started, reasons) from None
@@ -175,8 +177,8 @@ class ArmingActions(VehicleBase):
         try:
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
-            has_slept = self._arbiter.slept_since(began_at) > 0
-            may_be_forbidden = may_change_mode and not has_slept and self._is_in_optional_mode()
+            has_computer_slept = self._arbiter.slept_since(began_at) > 0
+            may_be_forbidden = may_change_mode and not has_computer_slept and self._is_in_optional_mode()
             other_mode = self.autopilot.mode_to_arm_in() if may_be_forbidden else None
             if other_mode is None:
                 raise

@@ -102,8 +102,9 @@ class PathFlight:
         return self._advance_on_path(seconds) if self.is_on_path else self._advance_to_path(seconds)
 
     def _advance_to_path(self, seconds: float) -> TrajectorySetpoint:
-        (north, east), _, _ = self._path.at(self._path.first_phase)
-        to_path = (north - self._start[0], east - self._start[1], -self._start[2])
+        (path_north, path_east), _, _ = self._path.at(self._path.first_phase)
+        start_north, start_east, start_down = self._start
+        to_path = (path_north - start_north, path_east - start_east, -start_down)  # The path is at down = 0.
         length_m = math.hypot(*to_path)
         self._change_speed(seconds, length_m - self._flown_m)
         self._flown_m += self._present_speed_m_s * seconds
@@ -111,7 +112,7 @@ class PathFlight:
             self.is_on_path, self._present_speed_m_s, self._flown_m = True, 0.0, length_m
         fraction = self._flown_m / length_m if length_m else 1.0
         north, east, down = (
-            begin + fraction * component for begin, component in zip(self._start, to_path, strict=True)
+            coordinate + fraction * component for coordinate, component in zip(self._start, to_path, strict=True)
         )
         speed = self._present_speed_m_s
         north_m_s, east_m_s, down_m_s = (speed * component / length_m if length_m else 0.0 for component in to_path)

@@ -112,9 +112,11 @@ class FlightActions(VehicleBase):
         """Add the landed state to the error of a refused take-off, because the vehicle does not give this reason."""
         state = IN_THE_AIR.get(self.telemetry.landed_state.latest)
         altitude_m = self._position.altitude_relative()
-        if state is None and not altitude_m > MIN_FLYING_HEIGHT_M:
+        is_high = altitude_m > MIN_FLYING_HEIGHT_M
+        if state is None and not is_high:
             return error
-        height = f", {altitude_m:.1f} m above home" if altitude_m > -math.inf else ""
+        is_altitude_known = altitude_m > -math.inf
+        height = f", {altitude_m:.1f} m above home" if is_altitude_known else ""
         reason = (
             f"the vehicle is {state or 'probably in the air'}{height} and can only take off from the ground;"
             " go_to() climbs"
@@ -233,11 +235,13 @@ class FlightActions(VehicleBase):
         """
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
+        landing_failure, ground = self._sender.landing_failure(order), GroundCheck(self._session)
 
         def is_down() -> bool:
             is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
             is_landed = is_reported_on_ground(self.telemetry) and landed.updated_at > order.given_at
-            return ground.confirms(is_disarmed or is_landed or (has_left_surfacing_mode() and not is_deep()))
+            has_surfaced = has_left_surfacing_mode() and not is_deep()  # A submarine "lands" by going to the surface.
+            return ground.confirms(is_disarmed or is_landed or has_surfaced)
 
         def has_left_surfacing_mode() -> bool:
             return self.telemetry.mode_name == self.autopilot.mode_when_landed and mode.updated_at > accepted_at
@@ -247,8 +251,6 @@ class FlightActions(VehicleBase):
                 self._position.is_known_since(order.given_at)
                 and self._position.altitude_relative() < -MAX_SURFACE_DEPTH_M
             )
-
-        landing_failure, ground = self._sender.landing_failure(order), GroundCheck(self._session)
 
         def failure_reason() -> str | None:
             if has_left_surfacing_mode() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:

@@ -118,8 +118,9 @@ class FollowedTarget:
         if latest is None:
             self.latest = TargetState(position, ZERO, now, now)
         elif position == latest.position:
-            is_moving = now - latest.first_reported_at <= OVERDUE_INTERVALS * self._interval_s
-            self.latest = TargetState(position, latest.velocity if is_moving else ZERO, now, latest.first_reported_at)
+            is_change_overdue = now - latest.first_reported_at > OVERDUE_INTERVALS * self._interval_s
+            velocity = ZERO if is_change_overdue else latest.velocity  # The target has stopped if a change is overdue.
+            self.latest = TargetState(position, velocity, now, latest.first_reported_at)
         else:
             self._interval_s = now - latest.first_reported_at
             velocity = _mean_velocity(latest.position, position, self._interval_s)
@@ -299,7 +300,8 @@ class FollowStream(SteeringStream[TargetState]):
         north_m_s, east_m_s, down_m_s = state.velocity
         if math.hypot(north_m_s, east_m_s) >= MIN_COURSE_SPEED_M_S:
             self._course_deg = math.degrees(math.atan2(east_m_s, north_m_s))
-        bearing = math.radians(self._bearing_deg + (self._course_deg if self._place.from_course else 0.0))
+        reference_deg = self._course_deg if self._place.from_course else 0.0  # 0 is north.
+        bearing = math.radians(reference_deg + self._bearing_deg)
         distance_m = self._place.distance_m
         place = state.position.offset(
             north_m=distance_m * math.cos(bearing) + north_m_s * moved_for_s,

@@ -86,17 +86,18 @@ class ImpactDetector:
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = cell.updated_at
         height_m = self._current_height()
+        has_just_sunk_fast = cell.updated_at - self._sank_fast_at <= max_stop_s
         if velocity.down_m_s >= IMPACT_M_S:  # The vehicle sinks as fast as before an impact.
-            is_new_descent = cell.updated_at - self._sank_fast_at > max_stop_s
-            self._max_sink_m_s = velocity.down_m_s if is_new_descent else max(self._max_sink_m_s, velocity.down_m_s)
+            max_sink_before_m_s = self._max_sink_m_s if has_just_sunk_fast else 0.0
+            self._max_sink_m_s = max(max_sink_before_m_s, velocity.down_m_s)
             self._sank_fast_at = cell.updated_at
-        elif abs(velocity.down_m_s) < STILL_M_S and cell.updated_at - self._sank_fast_at <= max_stop_s:
+        elif abs(velocity.down_m_s) < STILL_M_S and has_just_sunk_fast:
             # The vehicle has suddenly stopped. If it has lost no height, only its reported velocity has jumped.
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
                 self._impact_m_s, self._impact_height_m = self._max_sink_m_s, height_above_home(self._telemetry)
         elif _has_changed(self._impact_height_m, height_above_home(self._telemetry), IMPACT_HEIGHT_M):
             self._impact_m_s = self._impact_height_m = None  # The vehicle flies on, so it did not hit the ground.
-        if velocity.down_m_s < STILL_M_S and cell.updated_at - self._sank_fast_at > max_stop_s:
+        if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:  # A descent may begin at this height.
             self._top_m = height_m
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S
         self._has_stopped = self._impact_m_s is not None and (self._has_stopped or is_slow)

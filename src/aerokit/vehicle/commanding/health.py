@@ -63,8 +63,8 @@ class Health:
             if not cell.is_known
         ]
         texts = self._recent_texts()
-        explains = texts or self._failing_sensors() or (self._needs_position() and self._missing_estimates())
-        unexplained = [CHECKS_FAIL] if self._checks_fail() and not explains else []
+        is_explained = texts or self._failing_sensors() or (self._needs_position() and self._missing_estimates())
+        unexplained = [CHECKS_FAIL] if self._checks_fail() and not is_explained else []
         return in_order([*missing, *self._out_of_date()], [*texts, *self._failing(), *unexplained])
 
     def _recent_texts(self) -> list[str]:

@@ -100,9 +100,8 @@ async def _request_missing(session: VehicleSession, rate_hz: float, cleanup: Exi
     await anyio.sleep(FIRST_MESSAGE_TIMEOUT_S)
     telemetry = session.telemetry
     missing = [name for name in REQUIRED_STATES if not telemetry.cells[name].is_known]
-    for message_type in dict.fromkeys(
-        message_type for name in missing for message_type in telemetry.required_messages(name)
-    ):
+    required = (message_type for name in missing for message_type in telemetry.required_messages(name))
+    for message_type in dict.fromkeys(required):  # Several states may require the same message.
         cleanup.callback(session.rates.request(message_type, rate_hz))
 
 

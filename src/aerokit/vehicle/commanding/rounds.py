@@ -130,7 +130,7 @@ class RoundFlight:
             refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
             refusal = next(refusals, "")
             if refusal:
-                self._circle_problem = refusal
+                self._circle_problem = refusal  # so that `fly_by_command` orders the vehicle to hold
             if reason := mode_failure() or refusal:
                 return reason
             if session.connection.now() <= started + CIRCLE_REPORT_S:  # PX4 may still report the previous circle.

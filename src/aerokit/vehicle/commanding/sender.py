@@ -142,10 +142,11 @@ class OrderSender:
         with self._session.refusals_of(MavCmd.DO_SET_MODE) as refusals, self._arbiter.changing_mode():
             # All four attempts must fit into the time-out.
             await self.request_mode(mode, order, attempt_timeout=min(1.0, timeout / 4))
-            now = self._session.connection.now()
+            acknowledged_at = self._session.connection.now()
             if was_in_doubt:
-                reported_since = now
-            await self.await_mode(mode, order, refusals, timeout - (now - started), reported_since)
+                reported_since = acknowledged_at
+            remaining_s = timeout - (acknowledged_at - started)
+            await self.await_mode(mode, order, refusals, remaining_s, reported_since)
             # The mode is reported, so the modes of earlier orders cannot follow.
             self._arbiter.mode_settles_at = -math.inf
 

@@ -166,7 +166,8 @@ def wants_motion(setpoint: object, context: VehicleContext) -> bool:
         return math.hypot(setpoint.forward_m_s, setpoint.right_m_s, setpoint.down_m_s) >= SLOW_M_S
     max_resting_m = MAX_RESTING_RADII * context.session.autopilot.arrival_radius_m
     if isinstance(setpoint, PositionSetpoint):
-        return max_resting_m < context.vehicle_position.distance_to(setpoint.position) < math.inf
+        distance_m = context.vehicle_position.distance_to(setpoint.position)  # infinite if the position is unknown
+        return max_resting_m < distance_m < math.inf
     # The position is read only here, because reading decodes it and set-points are sent at up to 400 Hz.
     if isinstance(setpoint, LocalPositionSetpoint) and (here := context.session.telemetry.local_position.latest):
         north_m, east_m = setpoint.north_m - here.north_m, setpoint.east_m - here.east_m
@@ -185,9 +186,9 @@ class SetpointEncoder:
         """Return SET_POSITION_TARGET_LOCAL_NED with the vectors that the set-point has."""
         mask, yaw, yaw_rate = _yaw(setpoint.yaw_deg, setpoint.yaw_rate_deg_s)
         vectors: list[tuple[float, float, float]] = []
-        for ignore_bits, (north, east, down) in VECTORS.items():
-            if hasattr(setpoint, north):
-                vectors.append((getattr(setpoint, north), getattr(setpoint, east), getattr(setpoint, down)))
+        for ignore_bits, (x_field, y_field, z_field) in VECTORS.items():
+            if hasattr(setpoint, x_field):
+                vectors.append((getattr(setpoint, x_field), getattr(setpoint, y_field), getattr(setpoint, z_field)))
             else:
                 vectors.append(ZERO)
                 mask |= ignore_bits

@@ -153,8 +153,9 @@ class StickStream(SteeringStream[StickInput]):
             check_range(name, getattr(sticks, name), -1, 1)
         check_range("buttons", sticks.buttons, 0, MAX_BUTTONS)
         forward, right, yaw = (round(1000 * value) for value in (sticks.forward, sticks.right, sticks.yaw))
-        is_signed = self._rules is not None and self._rules.signed_throttle
-        throttle = 1000 * sticks.throttle if is_signed else 500 * (sticks.throttle + 1)
+        is_throttle_signed = self._rules is not None and self._rules.signed_throttle
+        # -1000 to 1000, or 0 to 1000.
+        throttle = 1000 * sticks.throttle if is_throttle_signed else 500 * (sticks.throttle + 1)
         return ManualControl(self._session.system_id, forward, right, round(throttle), yaw, sticks.buttons)
 
     def _send(self) -> None:
@@ -170,9 +171,10 @@ class StickStream(SteeringStream[StickInput]):
         if self._rules.release == "axes":
             message = ManualControl(self._session.system_id, NO_VALUE, NO_VALUE, NO_VALUE, NO_VALUE, 0)
         elif self._rules.release == "channels":
-            # The message has 18 channels, of which those above 8 have another value for a release.
-            upper = SUB_CHANNELS - 8
-            values = [RELEASED] * 8 + [RELEASED_UPPER] * upper + [UNCHANGED] * (10 - upper)
+            # The message has 18 channels. The upper ten, above channel 8, have another value for a release.
+            released_upper_count = SUB_CHANNELS - 8
+            upper = [RELEASED_UPPER] * released_upper_count + [UNCHANGED] * (10 - released_upper_count)
+            values = [RELEASED] * 8 + upper
             message = RcChannelsOverride(self._session.system_id, self._session.component_id, *values)
         if message is not None:
             with contextlib.suppress(AerokitError):  # The overrides expire by themselves.

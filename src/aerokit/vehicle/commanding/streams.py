@@ -345,7 +345,9 @@ class TakeoverCheck:
         if self._arbiter.latest(STEERING) is not self._order_before:
             raise OperationRejected(f"{operation}: {SUPERSEDED} before anything was ordered")
         before, mode = self._mode_before, self._telemetry.mode.latest
-        if before is None or mode in (before, self._next_mode) or (before, mode) == self._end_of_take_off:
+        is_unchanged = before is None or mode == before
+        is_end_of_take_off = (before, mode) == self._end_of_take_off
+        if is_unchanged or mode == self._next_mode or is_end_of_take_off:
             return
         raise OperationRejected(f"{operation}: the mode changed from {before} to {mode} before anything was ordered")
 

@@ -124,6 +124,7 @@ class TravelActions(VehicleBase):
         A vehicle that does not support the command gets a SET_POSITION_TARGET_GLOBAL_INT. This message is returned,
         because it must be repeated on the way: the vehicle does not acknowledge it.
         """
+        # -1 leaves the speed to the vehicle.
         speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
         params = (speed, MavDoRepositionFlags.CHANGE_MODE, 0, yaw)
         modes = (self._sender.mode_for("go_to", self.autopilot.reposition_purpose),)
@@ -237,7 +238,8 @@ class TravelActions(VehicleBase):
         order = self._arbiter.order(mode)
         if self._turns_by_reposition:
             yaw = math.remainder(math.radians(goal_deg), 2 * math.pi)
-            params = (-1, MavDoRepositionFlags.CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
+            no_place = (math.nan,) * 3
+            params = (-1, MavDoRepositionFlags.CHANGE_MODE, 0, yaw, *no_place)
             await self._sender.send_long(order, MavCmd.DO_REPOSITION, *params, modes=(mode,))
         else:
             await self._sender.ensure_mode(mode, order)

@@ -68,7 +68,9 @@ class MeasurementEncoder:
             quaternion = multiply(multiply(to_mavlink, quaternion), FLU_TO_FRD)
             x, y, up = position  # x and y are east and north in "enu", forward and left in "flu".
             position = (y, x, -up) if is_earth_frame else (x, -y, -up)
-            velocity = None if velocity is None else (velocity[0], -velocity[1], -velocity[2])
+            if velocity is not None:  # The velocity is along the axes of the body in every frame.
+                forward, left, upward = velocity
+                velocity = (forward, -left, -upward)
         frame = self._session.autopilot.external.ned_frame if is_earth_frame else MavFrame.LOCAL_FRD
         return (
             m.Odometry(

@@ -190,7 +190,8 @@ class MeasurementStream(Generic[MeasurementT]):
             self._timer = None
         if self._waiting is None:
             return
-        (messages, measured_at), self._waiting = self._waiting, None
+        messages, measured_at = self._waiting
+        self._waiting = None
         session, now = self._session, self._session.connection.now()
         age_s = now - measured_at + session.connection._slept_since(measured_at)
         if age_s > self._valid_for_s or session.watch.is_silent or not session.connection.is_open:

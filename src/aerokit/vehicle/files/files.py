@@ -110,13 +110,13 @@ class Files:
             RemoteProtocolError: as for :meth:`read`.
             OSError: the local file cannot be written.
         """
-        path_bytes(path)
+        path_bytes(path)  # Raises InvalidArgument before anything is written or sent.
         part = PartFile(to)
         start = part.size if resume and not is_virtual(path) else 0
         try:
             await self._fetch_to(part, path, start, idle_timeout_s, timeout, on_progress)
             is_correct = not start or await self._has_same_crc(path, part, idle_timeout_s, timeout)
-        except _ShorterError:
+        except _ShorterError:  # The vehicle's file is shorter than the part, so the download starts again.
             is_correct = False
         if not is_correct:
             await self._fetch_to(part, path, 0, idle_timeout_s, timeout, on_progress)
@@ -130,7 +130,7 @@ class Files:
         Raises:
             RemoteProtocolError: the listing does not end.
         """
-        path_bytes(path)
+        path_bytes(path)  # Raises InvalidArgument before anything is sent.
         entries: dict[str, FileEntry] = {}
         offset = empty_replies = 0
         async with self._channel.operation(f"list {path}", timeout=timeout, idle_timeout_s=idle_timeout_s):
@@ -180,7 +180,7 @@ class Files:
             VerificationFailed: the vehicle acknowledged everything, but the file has other content.
             RemoteProtocolError: the answer is not a CRC-32.
         """
-        path_bytes(path)
+        path_bytes(path)  # Raises InvalidArgument before anything is sent.
         data = bytes(data)
         if len(data) > MAX_FILE_SIZE:
             raise InvalidArgument(f"data of {len(data)} bytes is not allowed: it must have at most {MAX_FILE_SIZE}")
@@ -295,7 +295,7 @@ class Files:
         timeout: float | None,
         on_progress: OnProgress | None,
     ) -> None:
-        path_bytes(path)
+        path_bytes(path)  # Raises InvalidArgument before anything is sent.
         channel = self._channel
 
         async def read_file(file: RemoteFile) -> None:

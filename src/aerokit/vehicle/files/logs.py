@@ -275,14 +275,12 @@ class Logs:
         max_unanswered = MAX_UNANSWERED_REQUESTS if may_be_silent else None
         async with self._channel.operation(f"log {log_id}", timeout):
             entries = await self._entries(idle_timeout_s, only_id, max_unanswered)
-        for entry in entries:
-            if entry.id == log_id:
-                if isinstance(log, LogEntry) and _is_different_log(log, entry):
-                    break
-                return entry
-        if isinstance(log, int):
+        current = next((entry for entry in entries if entry.id == log_id), None)
+        if current is None and isinstance(log, int):
             raise _no_such_log(log_id, "there is no such log")
-        raise _no_such_log(log_id, "the logs on the vehicle have changed: call list() again")
+        if current is None or (isinstance(log, LogEntry) and _is_different_log(log, current)):
+            raise _no_such_log(log_id, "the logs on the vehicle have changed: call list() again")
+        return current
 
     async def _entries(
         self, idle_timeout_s: float, only_id: int | None = None, max_unanswered: int | None = None

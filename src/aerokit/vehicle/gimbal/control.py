@@ -287,7 +287,8 @@ class GimbalControl:
         # Another block may have been entered during the wait, or the first gimbal may now be another one.
         if self._is_primary in device.control_blocks:
             raise BusyError(f"{orders.name}: another block of this program already has control")
-        device.control_blocks[self._is_primary], self._device = self, device
+        self._device = device
+        device.control_blocks[self._is_primary] = self
         self._detach.append(device.controllers.observe(self._on_controllers, every_arrival=True))
         orders.context.on_finish.append(self._finish)
 

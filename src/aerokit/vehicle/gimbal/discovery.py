@@ -135,7 +135,8 @@ class GimbalRegistry:
         has_own_id = component_id > MAX_GIMBAL_NUMBER and component_id != self._session.component_id
         # A sender with its own component id may send 0 for itself.
         is_sender = device_id > MAX_GIMBAL_NUMBER or (device_id == 0 and has_own_id)
-        number = 0 if is_sender else device_id or 1  # Older autopilots send 0 for their gimbal.
+        attached_number = device_id or 1  # Older autopilots send 0 for their gimbal.
+        number = 0 if is_sender else attached_number
         return self._marked_discovered(self.device(component_id, number))
 
     def _marked_discovered(self, device: GimbalDevice | None) -> GimbalDevice | None:
@@ -189,7 +190,8 @@ class GimbalRegistry:
             self._record_received(message)
             device = self._device_with_own_id(device_id, may_be_new=rank > RANK_STATUS)
         else:  # The device is the sender itself, or attached to it.
-            device, rank = self._device_of(message, device_id), max(rank, RANK_INFORMATION)
+            device = self._device_of(message, device_id)
+            rank = max(rank, RANK_INFORMATION)
         if device is None:
             return None
         is_gone = device.manager_id is not None and self._is_component_gone(device.manager_id)

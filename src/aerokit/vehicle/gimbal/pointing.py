@@ -65,7 +65,7 @@ class RestTarget:
     """
 
     def __init__(self, flag: int, *, or_ahead: bool) -> None:
-        self._flag, self._or_ahead = flag, or_ahead
+        self._flag, self._accepts_ahead = flag, or_ahead
         # Angles (pitch, roll, yaw from the nose) at the last movement, and its time.
         self._last_angles: tuple[float, float, float] | None = None
         self._moved_at = 0.0
@@ -77,8 +77,9 @@ class RestTarget:
             self._last_angles, self._moved_at = (pitch, roll, yaw), updated_at
             return False
         # A gimbal that is level and straight ahead counts as neutral, even if it does not report the flag.
-        is_ahead = self._or_ahead and abs(pitch) <= 2 * STILL_DEG and abs(yaw) <= 2 * STILL_DEG
-        return updated_at - self._moved_at >= STILL_S and bool(device.flags & self._flag or is_ahead)
+        is_ahead = abs(pitch) <= 2 * STILL_DEG and abs(yaw) <= 2 * STILL_DEG
+        is_at_rest = bool(device.flags & self._flag) or (self._accepts_ahead and is_ahead)
+        return updated_at - self._moved_at >= STILL_S and is_at_rest
 
     def _has_moved(self, angles: tuple[float, float, float]) -> bool:
         if self._last_angles is None:
@@ -118,14 +119,15 @@ async def wait_until_there(
     """Wait until an attitude newer than ``since`` shows that the target is reached; errors as for `Gimbal.point`."""
     session, checked_at = orders.session, since
     # `vehicle.gimbal` has one `public_device` for its state values, even while `attitude_source` and `device` change.
-    deadline, reboots = session.connection.now() + timeout, orders.public_device.reboots
+    deadline, reboots_before = session.connection.now() + timeout, orders.public_device.reboots
     watched = (orders.public_device.attitude, orders.attitude_source.attitude, orders.device.controllers)
     with orders.device.in_use(), ChangeSignal(session, *watched, every_arrival=True) as changes:
         while True:
             source = orders.attitude_source
             session.connection.raise_if_ended()
-            if not order.is_newest or orders.public_device.reboots != reboots:
-                reason = SUPERSEDED if orders.public_device.reboots == reboots else "the vehicle rebooted"
+            has_rebooted = orders.public_device.reboots != reboots_before
+            if not order.is_newest or has_rebooted:
+                reason = "the vehicle rebooted" if has_rebooted else SUPERSEDED
                 raise OperationRejected(f"{description}: {reason}")
             orders.raise_if_taken()
             if source.attitude.is_known and source.attitude.updated_at > checked_at:

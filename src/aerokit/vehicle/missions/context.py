@@ -140,7 +140,7 @@ class MissionTracker:
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
         self._source = Source(session.system_id, session.component_id, "MISSION_CURRENT")
-        self._offset = int(session.autopilot.home_is_item_0)
+        self._offset = int(session.autopilot.home_is_item_0)  # number of items before the program's first item
         self._repeats_item_reached = session.autopilot.repeats_item_reached
         new_cell = session.connection.new_cell
         self.current: StateCell[int | None] = new_cell("mission.current", "MISSION_CURRENT")

@@ -134,7 +134,8 @@ class _Response:
                 yield data
             return
         while line := await self._reader.readline():
-            size = int(line.split(b";")[0] or b"0", 16)
+            size_text, _, _ = line.partition(b";")  # Extensions of the chunk may follow the size.
+            size = int(size_text or b"0", 16)
             if not 0 < size <= MAX_CHUNK_SIZE:  # A chunk of size 0 ends the body.
                 return
             yield await self._reader.readexactly(size)
@@ -342,7 +343,11 @@ class NtripClient:
                     break
         # In a row, column 1 is the name of the mount point, and column 11 is `nmea`.
         rows = [line.split(";") for line in text.decode("latin-1").splitlines() if line.startswith("STR;")]
-        return {printable(row[1]): len(row) > 11 and row[11] == "1" for row in rows if len(row) > 1}
+        needs_position: dict[str, bool] = {}
+        for row in rows:
+            if len(row) > 1:
+                needs_position[printable(row[1])] = len(row) > 11 and row[11] == "1"
+        return needs_position
 
     async def _report_position(self) -> None:
         """Send the position to the caster every 10 s. While the position is unknown, check for it every second."""

@@ -112,7 +112,8 @@ class CommandSender:
         """Send a COMMAND_INT with param1 to param4, x, y, z and return its ACCEPTED ack."""
         target = self._component_id if component_id is None else component_id
         message = command_int(self._system_id, target, command, params, frame=frame, x=x, y=y, z=z)
-        return await self._run(message, attempts, attempt_timeout, progress_timeout, on_progress, order_status, False)
+        options = (attempts, attempt_timeout, progress_timeout, on_progress, order_status)
+        return await self._run(message, *options, is_sent=False)
 
     async def send_place(
         self,

@@ -296,8 +296,9 @@ class MessageRates:
             return
         # One message fewer does not count as slow, because that message may have arrived just outside the window.
         min_messages = SLOW_FACTOR * stream.requested_hz * WATCH_WINDOW * WATCH_PERIOD_S - 1
+        received_messages = achieved_hz * WATCH_WINDOW * WATCH_PERIOD_S
         was_slow = stream.is_slow
-        stream.is_slow = achieved_hz * WATCH_WINDOW * WATCH_PERIOD_S < min_messages
+        stream.is_slow = received_messages < min_messages
         if achieved_hz == 0 and stream.is_optional:  # An optional stream may be missing altogether.
             return
         if stream.is_slow and not was_slow:
