@@ -176,8 +176,9 @@ class Fleet(Selection):
         Raises:
             InvalidArgument: a name is unknown, or none is given.
         """
+        checked_names = names or ("",)  # no state is named "", so a call without names raises, too
         for member in self:
-            for name in names or ("",):  # without names, the unknown name "" raises
+            for name in checked_names:
                 if name not in member.vehicle.telemetry.cells:
                     raise InvalidArgument(f"names: {short_repr(name)} is not a state; docs/states.md lists them")
 

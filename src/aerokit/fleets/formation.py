@@ -260,7 +260,8 @@ class Following:
         return self._stopped.is_set()
 
     def _setpoint(self, member: Member) -> VelocitySetpoint:
-        velocity, leader_velocity = self._leader.vehicle.velocity.latest, (0.0, 0.0, 0.0)  # 0 while unknown
+        velocity = self._leader.vehicle.velocity.latest
+        leader_velocity = (0.0, 0.0, 0.0)  # while the velocity is unknown
         if velocity is not None:
             leader_velocity = velocity.north_m_s, velocity.east_m_s, -velocity.down_m_s
         north, east, up = follow_velocity(

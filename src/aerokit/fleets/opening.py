@@ -193,7 +193,8 @@ def _requested_ids(
 def _check_names(members: list[Member]) -> None:
     seen: dict[str, Member] = {}
     for member in members:
-        if seen.setdefault(member.name, member) is not member:
+        first_with_name = seen.setdefault(member.name, member)
+        if first_with_name is not member:
             raise InvalidArgument(f"two vehicles are named {member.name!r}: pass a mapping with different names")
         for other in members:
             if other is not member and other.vehicle is member.vehicle:
@@ -256,7 +257,8 @@ async def find_systems(
         names = [f"{name}/{system_id}" for name, ids in found.items() for system_id in ids]
         listed = ", ".join(names)
         if count is not None:
-            text = f"{passed_count + len(names) or 'none'} of {count} vehicles were found"
+            found_count = passed_count + len(names)
+            text = f"{found_count or 'none'} of {count} vehicles were found"
             if passed_count:
                 text += f", {passed_count} of them passed as vehicles"
             return f"{text}: {listed}" if names else text

@@ -87,7 +87,7 @@ class Path(Snapshot):
         return list(pairwise(points))
 
     def _check(self) -> None:
-        object.__setattr__(self, "points", tuple(self.points))
+        object.__setattr__(self, "points", tuple(self.points))  # a copy; this object is immutable otherwise
         if not self.points:
             raise InvalidArgument(f"points: the path of {self.name} has no points")
         for point, next_point in pairwise(self.points):
@@ -125,8 +125,10 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
     other_legs = other.legs(begin, end)
     for leg in path.legs(begin, end):
         for other_leg in other_legs:
-            if other_leg[0].t_s - slack_s > leg[1].t_s or other_leg[1].t_s + slack_s < leg[0].t_s:
-                continue  # the vehicles never fly these legs at the same time
+            is_other_later = other_leg[0].t_s - slack_s > leg[1].t_s
+            is_other_earlier = other_leg[1].t_s + slack_s < leg[0].t_s
+            if is_other_later or is_other_earlier:  # the vehicles never fly these legs at the same time
+                continue
             if _lower_bound(leg, other_leg) >= min(best.distance_m, below_m):
                 # These legs are at least `below_m` apart, which is the result unless other legs are closer.
                 if best.distance_m == math.inf:
@@ -167,14 +169,15 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
     With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The time condition
     cuts a strip out of the unit square of (s, t). The minimum is inside the resulting polygon or on its border.
     """
-    start, other_start = leg[0].place, other[0].place
-    vector = [leg[1].place[i] - start[i] for i in range(3)]
-    other_vector = [other[1].place[i] - other_start[i] for i in range(3)]
+    (begin, end), (other_begin, other_end) = leg, other
+    start, other_start = begin.place, other_begin.place
+    vector = [end.place[i] - start[i] for i in range(3)]
+    other_vector = [other_end.place[i] - other_start[i] for i in range(3)]
     start_difference = [start[i] - other_start[i] for i in range(3)]
-    duration_s, other_duration_s = leg[1].t_s - leg[0].t_s, other[1].t_s - other[0].t_s
+    duration_s, other_duration_s = end.t_s - begin.t_s, other_end.t_s - other_begin.t_s
 
     def time_difference(s: float, t: float) -> float:
-        return (leg[0].t_s + s * duration_s) - (other[0].t_s + t * other_duration_s)
+        return (begin.t_s + s * duration_s) - (other_begin.t_s + t * other_duration_s)
 
     def difference(s: float, t: float) -> list[float]:
         return [start_difference[i] + s * vector[i] - t * other_vector[i] for i in range(3)]
@@ -191,7 +194,7 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
             corners = _clip(corners, lambda s, t: -time_difference(s, t) - slack_s)
     best: tuple[float, float, float] | None = None  # the smallest distance so far, with its s and t
     for index, corner in enumerate(corners):
-        previous = corners[index - 1]
+        previous = corners[index - 1]  # the last corner is before the first one
         s, t = _closest_on_edge(corner, previous, difference(*corner), difference(*previous))
         distance = math.hypot(*difference(s, t))
         if best is None or distance < best[0]:
@@ -199,7 +202,7 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
     if best is None:
         return None
     distance, s, t = best
-    return Approach(distance, leg[0].t_s + s * duration_s, other[0].t_s + t * other_duration_s)
+    return Approach(distance, begin.t_s + s * duration_s, other_begin.t_s + t * other_duration_s)
 
 
 def _closest_inside(
@@ -209,6 +212,7 @@ def _closest_inside(
 
     At the closest points, the derivatives of the squared distance with respect to s and t are 0.
     """
+    # Dot products of a (`vector`), b (`other_vector`) and d (`start_difference`).
     aa, bb, ab = _dot(vector, vector), _dot(other_vector, other_vector), _dot(vector, other_vector)
     determinant = aa * bb - ab * ab
     if determinant <= TOLERANCE * max(aa * bb, TOLERANCE):  # the lines are parallel, or a leg has no length
@@ -222,7 +226,7 @@ def _clip(corners: list[tuple[float, float]], outside: _Outside) -> list[tuple[f
     """Return the part of a convex polygon where ``outside`` is not positive (Sutherland-Hodgman)."""
     clipped: list[tuple[float, float]] = []
     for index, corner in enumerate(corners):
-        previous = corners[index - 1]
+        previous = corners[index - 1]  # the last corner is before the first one
         value, previous_value = outside(*corner), outside(*previous)
         if (value > TOLERANCE) != (previous_value > TOLERANCE):  # the edge crosses the border
             fraction = previous_value / (previous_value - value)

@@ -160,7 +160,7 @@ def separate_by_time(
         return Deconfliction("clear", "no paths come too close", min_distance_m)
     resting_paths = _resting_paths(stationary)
     order, refusal = list(routes), ""
-    for _ in routes:
+    for _ in routes:  # at most one try for each route
         delays, blocked_route, blocker = _delays(order, resting_paths, min_distance_m, speed_m_s, slack_s, max_delay_s)
         if blocked_route is None:
             delays = {route.name: delays[route.name] for route in routes}  # back in the order of `routes`

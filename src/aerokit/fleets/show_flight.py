@@ -264,7 +264,7 @@ class TrackRecorder:
         if frame is None or frame.component_id != self._vehicle.component_id:
             return
         measured_at = self._clock.to_local_time(message.time_boot_ms / 1000)
-        if abs(measured_at - frame.received_at) > MAX_CLOCK_ERROR_S:
+        if abs(measured_at - frame.received_at) > MAX_CLOCK_ERROR_S:  # TIMESYNC uses another clock of the vehicle.
             measured_at = frame.received_at
         place = (
             (message.lat / 1e7 - self._latitude) * self._metres_per_latitude_degree,

@@ -126,7 +126,7 @@ class Travel(SelectionBase):
         else:
             max_m = math.inf if max_altitude_m is None else max_altitude_m
             deconfliction = separate_by_altitude(routes, stationary, min_m, max_altitude_m=max_m)
-            if by == "refuse" and deconfliction.decision == "layers":
+            if by == "refuse" and deconfliction.decision == "layers":  # the paths cross
                 deconfliction = deconfliction.replace(decision="refused", heights_m={})
         self._context.publish(PathsCompared(self._context.now(), 0, "", deconfliction))
         return deconfliction

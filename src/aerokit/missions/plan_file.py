@@ -206,7 +206,7 @@ def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
 
 
 def _read_fence(value: JsonValue) -> Fence:
-    if _check_version(value, "polygon", "polygons", "circles") == 1:
+    if _check_version(value, "polygon", "polygons", "circles") == 1:  # Version 1 is allowed only for empty fences.
         return Fence()
     polygons, circles = (value.child(key) for key in ("polygons", "circles"))
     point = value.child("breachReturn")
@@ -247,7 +247,7 @@ def _read_circle(value: JsonValue) -> FenceCircle:
 
 
 def _read_rally(value: JsonValue) -> RallyPoints:
-    if _check_version(value, "points") == 1:
+    if _check_version(value, "points") == 1:  # Version 1 is allowed only without rally points.
         return RallyPoints()
     return RallyPoints([_read_rally_point(point) for point in value["points"].elements()])
 
@@ -272,7 +272,10 @@ def _read_place(value: JsonValue, *, altitude: str) -> Position | None:
         return None
     height = elements[2].number(null=True) if len(elements) == 3 else math.nan
     place = Position(latitude, longitude)
-    return place if math.isnan(height) else place.replace(**{f"altitude_{altitude}_m": height})
+    if math.isnan(height):
+        return place
+    altitude_field = f"altitude_{altitude}_m"
+    return place.replace(**{altitude_field: height})
 
 
 # ------------------------------------------------------------------------------------------- writing

@@ -62,13 +62,14 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
     numbered_lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     numbered_lines = [(number, line) for number, line in numbered_lines if line and not line.startswith("#")]
     first_line = numbered_lines[0][1] if numbered_lines else "nothing"
-    version = first_line.split()
-    if version not in (["QGC", "WPL", "110"], ["QGC", "WPL", "120"]):
+    header = first_line.split()
+    if header not in (["QGC", "WPL", "110"], ["QGC", "WPL", "120"]):
         raise FileFormatError(f"{name}: line 1: expected 'QGC WPL 110', found {first_line[:40]!r}")
     rows = [
         _Row(f"{name}: line {number}", line.split(), index) for index, (number, line) in enumerate(numbered_lines[1:])
     ]
-    if not rows or version[2] != "110" or not rows[0].is_home():
+    may_begin_with_home = header[2] == "110"
+    if not rows or not may_begin_with_home or not rows[0].is_home():
         return Mission([row.item() for row in rows])
     # In the file, jump targets count home as an item, unlike in `Mission`.
     home = rows[0].home()
@@ -97,7 +98,8 @@ def format_waypoints(mission: Mission, *, version: int = 110) -> str:
     if version == 110:
         rows.append(_home_row(mission.home))
         items = shift_jumps(items, 1)
-    rows += [_item_row(item, index) for index, item in enumerate(items, len(rows) - 1)]
+    first_index = len(rows) - 1  # The header line has no index.
+    rows += [_item_row(item, index) for index, item in enumerate(items, first_index)]
     return "\n".join(rows) + "\n"
 
 
@@ -111,7 +113,7 @@ class _Row:
         if self._integer("index", 0xFFFF) != index:
             raise FileFormatError(f"{where}: index = {texts[0]}: expected {index}; lines are missing or not in order")
         self.frame, self.command = self._integer("frame", 0xFF), self._integer("command", 0xFFFF)
-        self._integer("current", 0xFF)
+        self._integer("current", 0xFF)  # Raises for an invalid number. The value is not used.
 
     def is_home(self) -> bool:
         """Return True if this line can be home, because it is a waypoint above mean sea level.

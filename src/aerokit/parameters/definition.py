@@ -313,7 +313,8 @@ def _parse_condition(condition: str) -> list[tuple[str, str, str, str]]:
     if not condition:
         return []
     tests = []
-    joiner, words = "AND", list[str]()
+    joiner = "AND"
+    words: list[str] = []
     for word in (*condition.split(), "AND"):  # The added AND ends the last test.
         if word not in ("AND", "OR"):
             words.append(word)

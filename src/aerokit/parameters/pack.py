@@ -177,22 +177,24 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
         RemoteProtocolError: the data is not an entry: the type or flags are undefined, or the name is too long.
     """
     code, flags = data[position] & 0x0F, data[position] & 0xF0
+    has_default = bool(flags & _HAS_DEFAULT)
     if code not in _CODES or flags & ~_HAS_DEFAULT:
         _raise_damaged(position, f"invalid type {code} or flags {flags >> 4}")
     if position + 1 == len(data):
         return None
     # The name begins with characters of the previous name, which the file does not repeat.
-    common, own_length = data[position + 1] & 0x0F, (data[position + 1] >> 4) + 1
-    if common > len(previous_name) or common + own_length > NAME_LENGTH:
-        _raise_damaged(position, f"invalid name length {common} + {own_length} after {previous_name!r}")
+    common_length, own_length = data[position + 1] & 0x0F, (data[position + 1] >> 4) + 1
+    if common_length > len(previous_name) or common_length + own_length > NAME_LENGTH:
+        _raise_damaged(position, f"invalid name length {common_length} + {own_length} after {previous_name!r}")
     kind, format_ = _CODES[code]
     start = position + 2 + own_length
-    end = start + format_.size * (2 if flags else 1)
+    end = start + format_.size * (2 if has_default else 1)
     if end > len(data):
         return None
     value = format_.unpack_from(data, start)[0]
-    default = format_.unpack_from(data, start + format_.size)[0] if flags else None
-    return PackEntry(previous_name[:common] + data[position + 2 : start], kind, value, default, end)
+    default = format_.unpack_from(data, start + format_.size)[0] if has_default else None
+    name = previous_name[:common_length] + data[position + 2 : start]
+    return PackEntry(name, kind, value, default, end)
 
 
 def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parameter]:

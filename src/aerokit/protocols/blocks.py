@@ -53,7 +53,7 @@ class AdaptiveWindow:
 
         ``seconds`` is the time since its request; None if the answer may be to one of several transmissions.
         """
-        self._loss -= self._loss / 16
+        self._loss -= self._loss / 16  # an average, to which an answer adds 0 and a lost request 1
         if seconds is None:
             return
         if self._fastest_s is None or seconds < self._fastest_s:
@@ -243,7 +243,8 @@ class Reassembly:
 
     def add(self, offset: int, data: bytes) -> bool:
         """Add a block, and return True if it was missing. A block shorter than ``block_size`` ends the file."""
-        if not data or (offset - self.start) % self.block_size or not self._is_missing(offset):
+        is_aligned = (offset - self.start) % self.block_size == 0
+        if not data or not is_aligned or not self._is_missing(offset):
             return False
         if offset >= self.tail:  # All blocks between the tail and this block are missing.
             self.gaps.update(dict.fromkeys(range(self.tail, offset, self.block_size)))

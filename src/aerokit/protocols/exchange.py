@@ -141,7 +141,8 @@ class RoundTrip:
             first_s = min(1.0, self._max_s)
         else:
             first_s = self.smoothed_s + max(DEVIATIONS * self._deviation_s, JITTER_S)
-        backed_off_s = max(first_s, self._min_s) * BACKOFF ** min(max(0, attempt - 2), MAX_BACKOFFS)
+        backoffs = min(max(0, attempt - 2), MAX_BACKOFFS)
+        backed_off_s = max(first_s, self._min_s) * BACKOFF**backoffs
         # The maximum must not be shorter than a slow link needs for a normal answer.
         return min(backed_off_s, max(self._max_s, first_s))
 

@@ -30,7 +30,8 @@ def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Param
     """
     value, type_ = reported.value, reported.type
     if not bytewise and known.type.is_integer:
-        if type_ is ParameterType.REAL32 and value == value // 1:
+        is_whole = value == value // 1  # False for NaN and infinity
+        if type_ is ParameterType.REAL32 and is_whole:
             value, type_ = int(value), known.type
         if same_value(float(known.value), float(value)):
             value = known.value  # The reported value is equal, except for bits that a float cannot hold.

@@ -301,7 +301,8 @@ class SessionFtpServer(Generic[FilesT]):
 
     def _send_blocks(self, peer: FtpPeer, session: FtpSession) -> None:
         """Send the next blocks of a burst, none while the link is congested, until the burst has ended."""
-        for number in range(0 if self._is_congested() else self.burst):
+        max_blocks = 0 if self._is_congested() else self.burst
+        for number in range(max_blocks):
             if session.burst is None:
                 return
             self._send_block(peer, session, session.burst, may_end=number == self.burst - 1)
@@ -326,7 +327,8 @@ class SessionFtpServer(Generic[FilesT]):
         session.burst_sent += len(data)
         is_complete = may_end and session.burst_sent > _BURST_BYTES
         self._reply(peer, answer.replace(data=data, size=len(data), burst_complete=is_complete))
-        next_block = burst.replace(sequence=burst.sequence + 1 & 0xFFFF, offset=burst.offset + len(data))
+        next_sequence = (burst.sequence + 1) & 0xFFFF
+        next_block = burst.replace(sequence=next_sequence, offset=burst.offset + len(data))
         session.burst = None if is_complete else next_block
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
