@@ -117,7 +117,8 @@ class Fleet(Selection):
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.
             ConnectionClosed, LinkLost: a link has ended. Links before it have already got the corrections.
         """
-        messages, count = rtcm_messages(rtcm), 0
+        messages = rtcm_messages(rtcm)
+        count = 0  # of the last link, because every link gets the same messages
         for connection in dict.fromkeys(self._context.networks.values()):
             count = sum(send_rtcm(connection, message, self) for message in messages)
         return count

@@ -115,7 +115,7 @@ class Formation(Snapshot):
         return min(distances, default=math.inf)
 
     def _check(self) -> None:
-        object.__setattr__(self, "offsets", dict(self.offsets))
+        object.__setattr__(self, "offsets", dict(self.offsets))  # a copy; this object is immutable otherwise
         if self.frame not in ("north", "heading"):
             raise InvalidArgument(f"frame = {self.frame!r} is not allowed: it must be 'north' or 'heading'")
         for name, offset in self.offsets.items():

@@ -202,8 +202,9 @@ def _check_names(members: list[Member]) -> None:
 
 
 def _assign(context: FleetContext, patterns_by_name: Mapping[str, Iterable[str]], attribute: str) -> None:
-    for name, patterns in patterns_by_name.items():
-        for member in context.matching(*([patterns] if isinstance(patterns, str) else patterns)):
+    for name, one_or_more in patterns_by_name.items():
+        patterns = [one_or_more] if isinstance(one_or_more, str) else one_or_more
+        for member in context.matching(*patterns):
             previous = getattr(context.members[member], attribute)
             if previous:
                 raise InvalidArgument(f"member {member} has two {attribute}s: {previous!r} and {name!r}")

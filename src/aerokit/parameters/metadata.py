@@ -69,7 +69,8 @@ class ParameterMetadata(Snapshot):
         """Describe a value by its name, by the names of its bits, or as a number with its unit."""
         if value in self.values:
             return self.values[value]
-        if self.bitmask and 0 <= value < math.inf and value == int(value):
+        is_whole = 0 <= value < math.inf and value == int(value)
+        if self.bitmask and is_whole:
             bits = [bit for bit in range(64) if int(value) >> bit & 1]
             return ", ".join(self.bitmask.get(bit, f"bit {bit}") for bit in bits) or "none"
         return f"{value:g} {self.unit}".rstrip()

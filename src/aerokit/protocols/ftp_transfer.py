@@ -303,8 +303,7 @@ class FtpDownload(FtpExchange[int]):
         # The replies to a burst have increasing sequence numbers. These are reserved, because a later request with such
         # a number would look like a repetition of this one, and the server would only repeat its last reply.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
-        earlier_bursts = self._bursts[1 - MAX_BURSTS :]  # the last MAX_BURSTS - 1
-        self._bursts = [*earlier_bursts, _Burst(sequence, offset, now)]
+        self._bursts = [*self._bursts[1 - MAX_BURSTS :], _Burst(sequence, offset, now)]  # at most MAX_BURSTS
         self._is_bursting, self._burst_at = True, now
         self._repeated_bursts += 1
         self._send(FtpMessage(sequence, MavFtpOpcode.BURSTREADFILE, self._session, DATA_SIZE, offset=offset))

@@ -291,7 +291,8 @@ class FileTree:
         """
         if self.free_bytes is None:
             return
-        if size >= 0 and (size > self.free_bytes or self.free_bytes == 0):
+        is_full = self.free_bytes == 0  # Then there is not even room for a new name, which has size 0.
+        if size >= 0 and (size > self.free_bytes or is_full):
             raise FileFault(ENOSPC)
         self.free_bytes -= size
 

@@ -129,7 +129,8 @@ class SessionFtpServer(Generic[FilesT]):
         may be the end of a burst, which does not replace the blocks of the burst.
         """
         is_same = peer.request is not None and request.repeats(peer.request)
-        return is_same and request.opcode == last.request_opcode and request.sequence + 1 & 0xFFFF == last.sequence
+        reply_sequence = (request.sequence + 1) & 0xFFFF
+        return is_same and request.opcode == last.request_opcode and reply_sequence == last.sequence
 
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
         """Return the number for a new session.
@@ -294,7 +295,8 @@ class SessionFtpServer(Generic[FilesT]):
         """Start a burst, or move a running one to another offset. Return None, because the blocks are the answer."""
         session = self._opened(peer, request)
         is_running = session.burst is not None
-        session.burst, session.burst_sent = request.replace(sequence=request.sequence + 1 & 0xFFFF), 0
+        first_sequence = (request.sequence + 1) & 0xFFFF
+        session.burst, session.burst_sent = request.replace(sequence=first_sequence), 0
         if not is_running:
             self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
         return None

@@ -36,7 +36,7 @@ class FtpPacket(FtpMessage):
     def acknowledge(self, data: bytes = b"", *, offset: int = 0, session: int | None = None) -> FtpPacket:
         """Return the ACK of this request."""
         session = self.session if session is None else session
-        sequence, opcode = self.sequence + 1 & 0xFFFF, MavFtpOpcode.ACK
+        sequence, opcode = (self.sequence + 1) & 0xFFFF, MavFtpOpcode.ACK
         return FtpPacket(
             sequence, opcode, session, len(data), self.opcode, offset=offset & 0xFFFFFFFF, data=data, client=self.client
         )

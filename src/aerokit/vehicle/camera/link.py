@@ -252,7 +252,8 @@ class CameraLink(CameraOrders):
 
     def _on_heartbeat(self, _: m.Heartbeat) -> None:
         previous_at, self._heartbeat_at = self._heartbeat_at, self.now()
-        if self._heartbeat_at - previous_at > MAX_SILENCE_S and previous_at > -math.inf:
+        is_first = previous_at == -math.inf
+        if not is_first and self._heartbeat_at - previous_at > MAX_SILENCE_S:
             self._forget_refusals()
             self._was_silent = self.information._known
             if self._was_silent:

@@ -233,7 +233,8 @@ class PhotoInterval:
     async def _begin(self, operation: ActiveOperation) -> None:
         before = await self._shutter.reliable_status()
         self._next_index = None if before is None else before.image_count
-        self._newest_index, self._newest_at = (self._next_index or 0) - 1, self._link.now()
+        first_index = 0 if before is None else before.image_count
+        self._newest_index, self._newest_at = first_index - 1, self._link.now()
         self._known_reset_at = self._log.reset_at
         self._new_captures.__enter__()
         await self._shutter.start_series(operation.order, self._seconds, self._count, before)

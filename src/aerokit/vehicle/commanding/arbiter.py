@@ -419,12 +419,10 @@ class CommandArbiter:
         is_unanswered = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
         was_accepted = math.isfinite(self._arming_accepted_at)
         is_effect = was_accepted and was_armed_by_order(self._disarmed_at, self._arming_accepted_at)
-        if not is_unanswered and not is_effect:  # Another party has armed the vehicle.
-            self._armed_by_program = None
-            return
+        was_armed_by_program = is_unanswered or is_effect
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
-        self._armed_by_program = self._create_order(modes, ())
+        self._armed_by_program = self._create_order(modes, ()) if was_armed_by_program else None
 
     def _active_orders(self) -> tuple[Order, ...]:
         """Orders that process the reports of the vehicle."""

@@ -169,7 +169,8 @@ class TurnCounter:
     def add(self, north_m: float, east_m: float) -> None:
         """Process a reported position of the vehicle, in metres from the centre."""
         self.is_on_path = abs(math.hypot(north_m, east_m) - self._radius_m) <= self._tolerance_m
-        bearing_before, self._bearing = self._bearing, math.atan2(east_m, north_m) if self.is_on_path else None
+        bearing_before = self._bearing
+        self._bearing = math.atan2(east_m, north_m) if self.is_on_path else None
         if bearing_before is not None and self._bearing is not None:
             turned = math.remainder(self._bearing - bearing_before, 2 * math.pi)
             self.rounds += self._direction * turned / (2 * math.pi)

@@ -280,7 +280,8 @@ class Order:
     def on_armed(self, armed: bool, reported_at: float) -> None:
         """Process the armed state reported by HEARTBEAT."""
         armed_before, self._armed_now = self._armed_now, armed
-        if armed_before is not None and armed_before is not armed and armed is self.armed:
+        has_changed = armed_before is not None and armed_before is not armed
+        if has_changed and armed is self.armed:  # The order to arm or disarm has taken effect.
             self.is_confirmed = True
         elif armed_before and not armed and self._ends_on_disarm:
             self.takeover_reason = self.takeover_reason or "the vehicle disarmed"

@@ -266,5 +266,9 @@ def _yaw(yaw_deg: float | None, yaw_rate_deg_s: float | None) -> tuple[int, floa
     if yaw_deg is not None and yaw_rate_deg_s is not None:
         raise InvalidArgument(f"yaw_deg = {yaw_deg} and yaw_rate_deg_s = {yaw_rate_deg_s} are not allowed together")
     check_finite("yaw", yaw_deg or 0.0, yaw_rate_deg_s or 0.0)
-    mask = (IGNORE_YAW if yaw_deg is None else 0) | (IGNORE_YAW_RATE if yaw_rate_deg_s is None else 0)
+    mask = 0
+    if yaw_deg is None:
+        mask |= IGNORE_YAW
+    if yaw_rate_deg_s is None:
+        mask |= IGNORE_YAW_RATE
     return mask, math.radians(yaw_deg or 0.0), math.radians(yaw_rate_deg_s or 0.0)

@@ -106,7 +106,8 @@ class PlanContext:
         if frame is None or frame.received_at <= since or self.now() - frame.received_at > PLAN_ID_MAX_AGE_S:
             return 0
         current = MissionCurrent.decode_body(frame.body)
-        return (current.mission_id, current.fence_id, current.rally_points_id)[mission_type]
+        ids_by_mission_type = (current.mission_id, current.fence_id, current.rally_points_id)
+        return ids_by_mission_type[mission_type]
 
     async def wait_for_plan_id(self, mission_type: int, opaque_id: int) -> bool:
         """Wait for a MISSION_CURRENT with this plan id; return False if none arrives in time."""

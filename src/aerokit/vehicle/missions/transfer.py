@@ -280,10 +280,8 @@ class PlanTransfer(Generic[PlanT]):
                 raise NotSupported(f"{self._name}: the vehicle has no file transfer; nothing was sent")
             return True
         # ArduPilot clears the old mission before it reads the file, and refuses to do so while it flies the mission.
-        is_mission_upload = is_upload and self._type == MavMissionType.MISSION
-        is_refused = is_mission_upload and self._context.is_flying_mission
-        may_have_file = self._cache.has_file is not False  # None until tried
-        return has_ftp and may_have_file and not is_refused
+        is_refused = is_upload and self._type == MavMissionType.MISSION and self._context.is_flying_mission
+        return has_ftp and self._cache.has_file is not False and not is_refused  # `has_file` is None until tried.
 
     def _on_file_error(self, error: Exception, method: str) -> None:
         """Transfer no files from now on. Raise the error if the caller chose files, or if files have worked."""

@@ -148,7 +148,8 @@ class MessageRates:
     def request_again(self) -> None:
         """Request all messages again, because the vehicle may have lost the requests, for example by a reboot."""
         for stream in self._streams.values():
-            stream.requested_hz, stream.is_refused, stream.retry_interval_s = None, False, RETRY_INTERVAL_S
+            stream.requested_hz, stream.retry_interval_s = None, RETRY_INTERVAL_S
+            stream.is_refused = False
             stream.failures, stream.next_attempt_at = 0, -math.inf
         self._reset_count += 1
         self._has_due_streams.set()

@@ -175,8 +175,10 @@ class VehicleSession:
     def start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
         """Process the first heartbeat, request streams and constants, and start the background tasks."""
         self.telemetry.receive(heartbeat)
-        for message_type, hz in (self.telemetry.default_rates if rates is None else rates).items():
-            self.rates.request(message_type, hz, is_optional=rates is None)
+        are_default = rates is None
+        requested_rates = self.telemetry.default_rates if rates is None else rates
+        for message_type, hz in requested_rates.items():
+            self.rates.request(message_type, hz, is_optional=are_default)
         for task in (self.rates.run, self.rates.watch, self._run_link_watch, self._learn_constants):
             self.background.start(task, f"aerokit {task.__qualname__}")
 

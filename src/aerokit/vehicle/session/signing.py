@@ -51,8 +51,10 @@ def _check_vehicle(session: VehicleSession) -> None:
     """Raise unless both sides use MAVLink 2 and the vehicle is disarmed."""
     heartbeat = session.connection.heartbeats.get((session.system_id, session.component_id))
     frame = None if heartbeat is None else heartbeat.received_frame
-    if session.connection.mavlink_version == 1 or (frame is not None and frame.version == 1):
-        whose = "our" if session.connection.mavlink_version == 1 else "the vehicle's"
+    sends_mavlink_1 = session.connection.mavlink_version == 1
+    receives_mavlink_1 = frame is not None and frame.version == 1
+    if sends_mavlink_1 or receives_mavlink_1:
+        whose = "our" if sends_mavlink_1 else "the vehicle's"
         raise NotSupported(f"setup_signing: {whose} frames are MAVLink 1, which has no signatures")
     session.check_disarmed("setup_signing")
 

@@ -221,8 +221,10 @@ class VehicleWatch:
 
     def _on_reboot_detected(self, clock: str, milliseconds: int) -> None:
         now = self._connection.now()
-        self._last_times, self._decreased_times, self._first_time = {clock: (milliseconds, now)}, {}, None
-        self._expects_reboot, self._last_answer = False, (now, 0)
+        # Times of the previous boot no longer count.
+        self._last_times = {clock: (milliseconds, now)}
+        self._decreased_times, self._first_time, self._last_answer = {}, None, (now, 0)
+        self._expects_reboot = False
         self.reboots += 1
         self._on_reboot()
         self._connection.bus.publish(VehicleRebooted(now, self._system_id))
