@@ -193,7 +193,8 @@ def _read_mission(value: JsonValue) -> Mission:
 
 
 def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
-    defaults = default_firmware, default_vehicle, default_cruise, default_hover = _numbers(Plan())
+    defaults = _numbers(Plan())
+    default_firmware, default_vehicle, default_cruise, default_hover = defaults
     if mission is None:
         return defaults
     firmware, vehicle, cruise, hover = (mission.child(key) for key in _NUMBER_KEYS.values())

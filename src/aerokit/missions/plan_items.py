@@ -155,7 +155,8 @@ def json_number(value: float) -> int | float | None:
     """Convert a number to QGroundControl's form: null for NaN, whole numbers without a decimal point."""
     if math.isnan(value):
         return None
-    return int(value) if math.isfinite(value) and value == int(value) and abs(value) < 2**53 else value
+    is_whole = math.isfinite(value) and value == int(value)
+    return int(value) if is_whole and abs(value) < 2**53 else value  # Beyond 2**53, not every integer is a float.
 
 
 def _simple_values(entry: JsonValue) -> list[JsonValue] | None:

@@ -158,7 +158,8 @@ class _Row:
             value = float(text) if "_" not in text else math.inf  # float() would accept 1_000.
         except ValueError:
             value = math.inf
-        if math.isinf(value) or (math.isnan(value) and not may_be_nan) or abs(value) > limit:
+        is_forbidden_nan = math.isnan(value) and not may_be_nan
+        if math.isinf(value) or is_forbidden_nan or abs(value) > limit:
             bounds = f" from {-limit:g} to {limit:g}" if math.isfinite(limit) else ""
             raise FileFormatError(f"{self.where}: {column} = {text!r}: expected a number{bounds}")
         return value

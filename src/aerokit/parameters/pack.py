@@ -206,7 +206,8 @@ def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parame
         # A file with defaults omits those that equal the value.
         default = entry.value if entry.default is None and with_defaults else entry.default
         yield Parameter(_text(entry.name, position), entry.value, entry.type, default, index)
-        position, previous_name, index = _skip_padding(data, entry.end), entry.name, index + 1
+        position, previous_name = _skip_padding(data, entry.end), entry.name
+        index += 1
 
 
 def _skip_padding(data: bytes, position: int) -> int:

@@ -116,6 +116,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._on_streamed_value(index, now)
         else:
             self._window.on_answer(index, now)
+        # Near the end of the list, answers to requests do not delay the requests for the last missing values.
         if self._is_streaming and (is_streamed or not self._is_near_end):
             self._quiet_at = now + self._quiet_s()
         parameter = parameter_of(message, self._bytewise)
@@ -184,7 +185,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         return ParamRequestRead(self.target_system, self.target_component, "", index)
 
     def _on_quiet(self, now: float) -> None:
-        if self._streamed < MIN_STREAMED and (self._count is None or self._count > MIN_STREAMED):
+        is_longer = self._count is None or self._count > MIN_STREAMED
+        if self._streamed < MIN_STREAMED and is_longer:  # The stream has never begun.
             self._send_list_request(now)
             return
         self._end_stream()

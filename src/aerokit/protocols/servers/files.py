@@ -274,9 +274,10 @@ class FileTree:
         node = self._find(path)
         folder, name = self._parent(to)
         existing = folder.get(name)
-        if isinstance(existing, dict) and (existing or not isinstance(node, dict)):
-            raise FileFault(ENOTEMPTY if isinstance(node, dict) else EISDIR)
-        if isinstance(existing, _File) and isinstance(node, dict):
+        is_folder = isinstance(node, dict)
+        if isinstance(existing, dict) and (existing or not is_folder):  # Only a folder replaces a folder, if empty.
+            raise FileFault(ENOTEMPTY if is_folder else EISDIR)
+        if isinstance(existing, _File) and is_folder:
             raise FileFault(ENOTDIR)
         if isinstance(node, dict) and _contains(node, folder):  # A folder cannot be moved into itself.
             raise FileFault(EINVAL)

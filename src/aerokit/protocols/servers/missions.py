@@ -179,7 +179,8 @@ class MissionServer:
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         """Return the item as MISSION_ITEM_INT or MISSION_ITEM, like the request."""
-        seq, (system, component), kind = request.seq, sender_of(request), request.mission_type
+        seq, kind = request.seq, request.mission_type
+        system, component = sender_of(request)
         current = seq == self.current and kind == MavMissionType.MISSION
         if isinstance(request, m.MissionRequestInt):
             return _item_message(item, seq, (system, component), kind, current=current)
@@ -222,9 +223,8 @@ class MissionServer:
         client, kind = sender_of(count), count.mission_type
         running = self._uploads.get(self._key(kind))
         refusal = self._refusal(count, channel)
-        if refusal is None and running is not None and (running.client != client or running.is_being_validated):
-            refusal = _R.DENIED
-        if refusal is None and self._clearing is not None:
+        is_occupied = running is not None and (running.client != client or running.is_being_validated)
+        if refusal is None and (is_occupied or self._clearing is not None):
             refusal = _R.DENIED
         if refusal is not None:
             self._acknowledge(client, kind, refusal, channel)

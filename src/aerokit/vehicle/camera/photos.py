@@ -370,9 +370,10 @@ class PhotoInterval:
         status = await self._shutter.status(2.0 * CHECK_INTERVAL_S)
         self._collect()
         is_ahead = status is not None and self._next_index is not None and status.image_count > self._next_index
+        is_over = status is not None and not status.is_in_series and not status.is_capturing
         if status is not None and is_ahead and self._is_plausible(status.image_count - 1):
             await self._fetch_missing()
-        elif status is not None and not (status.is_in_series or status.is_capturing or self._waiting or self._failed):
+        elif is_over and not self._waiting and not self._failed:
             raise OperationRejected(
                 f"{self._link.describe()} ended the series after {self._delivered + self._missed} pictures"
             )

@@ -210,7 +210,8 @@ def place_of(
 def information_of(message: m.CameraInformation, number: int) -> CameraInformation:
     # Major, minor, patch and dev version, one byte each, lowest byte first.
     version = message.firmware_version
-    firmware = ".".join(str(version >> shift & 0xFF) for shift in (0, 8, 16, 24)) if version else ""
+    numbers = [(version >> shift) & 0xFF for shift in (0, 8, 16, 24)]
+    firmware = ".".join(map(str, numbers)) if version else ""
     return CameraInformation(
         number=number,
         vendor=_text(message.vendor_name),

@@ -163,13 +163,11 @@ class FlightCleanup:
         """
         if not order.may_move:
             return False
-        mode = self._session.autopilot.mode_for("hold", is_vtol=self._session.telemetry.is_vtol)
-        if (
-            mode is None
-            or not self._session.connection.is_open
-            or self._session.telemetry.is_confirmed_disarmed
-            or order.end
-        ):
+        session = self._session
+        mode = session.autopilot.mode_for("hold", is_vtol=session.telemetry.is_vtol)
+        if mode is None or not session.connection.is_open:  # A hold cannot be sent.
+            return False
+        if session.telemetry.is_confirmed_disarmed or order.end:  # A hold must not be sent.
             return False
         is_sent = self._arbiter.is_state_recent
         if is_sent:

@@ -160,7 +160,9 @@ class RoundFlight:
     def _is_flown_since(self, started: float) -> bool:
         """Return True if the rounds are flown; without rounds, if the vehicle is in place."""
         is_known = self._context.vehicle_position.is_known_since(started)
-        return is_known and self._count() >= self._rounds and (self._rounds > 0 or self._is_in_place)
+        if not is_known or self._count() < self._rounds:
+            return False
+        return self._rounds > 0 or self._is_in_place
 
     @property
     def _is_in_place(self) -> bool:

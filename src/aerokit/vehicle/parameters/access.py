@@ -386,7 +386,9 @@ class _CachedList:
 
     async def load_if_current(self, refresh: bool) -> bool:
         """Load the cached list into the store if its hash is the vehicle's; return True if it was loaded."""
-        key, store, since = await self._key(), self._access.store, self._access.store.updates
+        store = self._access.store
+        key = await self._key()
+        since = store.updates
         self._hash = await self._read_hash()  # With `refresh` too, because `save` needs the hash.
         if refresh or self._hash is None:
             return False

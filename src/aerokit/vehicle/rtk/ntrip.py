@@ -75,7 +75,8 @@ class Caster:
             parts, host, port = urlsplit(""), None, None
         mount = unquote(parts.path[1:])
         is_mount_valid = mount.isascii() and mount.isprintable() and "/" not in mount and " " not in mount
-        if not host or not mount or not is_mount_valid or parts.scheme not in ("ntrip", "ntrips") or port == 0:
+        is_scheme_valid = parts.scheme in ("ntrip", "ntrips")
+        if not host or not mount or not is_mount_valid or not is_scheme_valid or port == 0:
             raise InvalidArgument(
                 "url is not allowed (it is not shown, because it may contain a password): write"
                 " ntrip://user:password@host:2101/MOUNT, with %40 for an @ in the password"

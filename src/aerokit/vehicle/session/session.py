@@ -251,7 +251,8 @@ class VehicleSession:
         A HEARTBEAT that waited long while the event loop was blocked does not count.
         """
         # Every HEARTBEAT updates `armed`.
-        armed, start = self.telemetry.armed, self.connection.now() if since is None else since
+        armed = self.telemetry.armed
+        start = self.connection.now() if since is None else since
         await armed.wait_until(
             lambda _: armed.updated_at > start and armed.age <= MAX_HEARTBEAT_AGE_S, description="the next HEARTBEAT"
         )
