@@ -184,9 +184,10 @@ def _requested_ids(
         if name not in ids:
             raise InvalidArgument(f"system_ids: {short_repr(name)} is not a network; networks: {', '.join(networks)}")
         ids[name] = list(numbers)
-    for number in (number for numbers in ids.values() for number in numbers or ()):
-        if not isinstance(number, int) or not 1 <= number <= 255:
-            raise InvalidArgument(f"system_ids: {short_repr(number)} is not allowed: it must be 1 to 255")
+    for requested in ids.values():
+        for number in requested or ():
+            if not isinstance(number, int) or not 1 <= number <= 255:
+                raise InvalidArgument(f"system_ids: {short_repr(number)} is not allowed: it must be 1 to 255")
     return ids
 
 

@@ -245,6 +245,7 @@ def _paths_cross(route: Route, other: Route, min_distance_m: float) -> bool:
 def _is_layer_blocked(
     route: Route, stationary: Mapping[str, LocalPoint], height_m: float, min_distance_m: float
 ) -> bool:
+    # A stationary vehicle counts as a path that ends where it begins: (point, point).
     return any(
         abs(point[2] - height_m) < min_distance_m
         and horizontal_distance((route.start, route.target), (point, point)) < min_distance_m

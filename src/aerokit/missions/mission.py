@@ -223,7 +223,7 @@ def _return_item(place: Position) -> MissionItem:
 def _read_polygon(items: Sequence[MissionItem], first: int) -> FencePolygon:
     # On PX4 and ArduPilot, every vertex contains the number of vertices of its polygon.
     item = items[first]
-    count = int(item.param1) if 3 <= item.param1 <= 0xFFFF else 0
+    count = int(item.param1) if 3 <= item.param1 <= 0xFFFF else 0  # A polygon has at least 3 vertices.
     vertices = items[first : first + count]
     if not count or len(vertices) < count or any(vertex.command != item.command for vertex in vertices):
         raise RemoteProtocolError(

@@ -182,7 +182,7 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
         _raise_damaged(position, f"invalid type {code} or flags {flags >> 4}")
     if position + 1 == len(data):
         return None
-    # The name begins with characters of the previous name, which the file does not repeat.
+    # The name begins with characters of the previous name, which the file does not repeat. 1 to 16 more follow.
     common_length, own_length = data[position + 1] & 0x0F, (data[position + 1] >> 4) + 1
     if common_length > len(previous_name) or common_length + own_length > NAME_LENGTH:
         _raise_damaged(position, f"invalid name length {common_length} + {own_length} after {previous_name!r}")

@@ -76,7 +76,7 @@ def max_attempts(command: int, params: Sequence[float]) -> int:
     _, condition = UNREPEATABLE_COMMANDS[command]
     if condition is None:
         return 1
-    index, value = condition
+    index, value = condition  # A repetition has a further effect only if this parameter has this value.
     return 1 if params[index] == value else MAX_ATTEMPTS
 
 

@@ -190,7 +190,7 @@ class MessageStream:
         """Record a message of the stream. It comes ``messages`` places after the previous one, so 1 means no loss."""
         if self._received_at is not None and messages > 0:
             self._interval.add_sample((now - self._received_at) / messages)
-        elif self._received_at is None and self.failures == 0:
+        elif self._received_at is None and self.failures == 0:  # The first message answers the only request.
             self._round_trip.add_sample(now - self._last_at)
         self._last_at = self._received_at = now
         self.failures = 0

@@ -188,7 +188,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _advance(self, seq: int, now: float) -> None:
         """Record that the vehicle has all items before ``seq``."""
-        if self._send_counts.get(seq - 1) == 1:
+        if self._send_counts.get(seq - 1) == 1:  # After a repetition, it is unknown which transmission was answered.
             self._measure(now - self._sent_at[seq - 1])
         self._confirmed_end = seq
         self._attempt = 1

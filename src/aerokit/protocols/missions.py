@@ -153,7 +153,7 @@ class MissionClear(MissionExchange[None]):
         if not isinstance(message, MissionAck) or not self._is_ours(message):
             return
         if message.type == MavMissionResult.ACCEPTED:
-            if self._attempt == 1:
+            if self._attempt == 1:  # After a repetition, it is unknown which transmission was answered.
                 self.round_trip.add_sample(now - self._sent_at)
             self._finish(None)
         elif message.type not in (MavMissionResult.OPERATION_CANCELLED, MavMissionResult.INVALID_SEQUENCE):

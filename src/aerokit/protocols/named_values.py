@@ -259,6 +259,7 @@ class NamedReads(NamedRequests[ValueT]):
         if not self._probes_answered:
             return 1.0
         lost = self._probes_sent - self._probes_answered
+        # Factor i is the probability of a further loss after `lost + i` losses in `sent + i` requests.
         return math.prod((lost + 1 + i) / (self._probes_sent + 2 + i) for i in range(attempts))
 
 

@@ -138,7 +138,8 @@ class _Videos:
         if camera.free_mib <= 0:
             return MavResult.FAILED
         await camera.start_video()
-        captures.record(1.0 / command.param2 if command.param2 else 0.0)
+        status_interval_s = 1.0 / command.param2 if command.param2 else 0.0  # 0 requests no status.
+        captures.record(status_interval_s)
         return MavResult.ACCEPTED
 
     async def stop(self, _: ReceivedCommand) -> int:

@@ -61,7 +61,7 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
         # `every_arrival`: a repeated text is a new report.
         cleanup.callback(telemetry.status_text.observe(lambda _, text: on_text(text.text), every_arrival=True))
 
-        def has_ended_silently() -> bool:
+        def has_ended_silently() -> bool:  # `run.wait` calls this again and again.
             nonlocal calibrating_at
             if telemetry.system_status.latest == MavState.CALIBRATING:
                 calibrating_at = now()

@@ -146,6 +146,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
                 if consecutive_missing == MAX_CONSECUTIVE_MISSING:
                     break
             return self.captures()
+        # The time-out has expired.
         not_reported = "how many pictures it has taken" if count is None else f"all of its {count} pictures"
         raise self._link.timeout_error(f"did not report {not_reported} within {timeout:g} s")
 

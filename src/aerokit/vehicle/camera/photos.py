@@ -61,7 +61,8 @@ class Shutter:
         # A camera that has never sent its status may not support the message. It gets fewer requests, and only one if
         # it has left all requests of an earlier order unanswered.
         attempts_before_first = 1 if self._never_answered else FIRST_STATUS_ATTEMPTS
-        for _ in range(STATUS_ATTEMPTS if self._reports_status else attempts_before_first):
+        attempts = STATUS_ATTEMPTS if self._reports_status else attempts_before_first
+        for _ in range(attempts):
             status = await self.status(STATUS_TIMEOUT_S)
             if status is not None or self.link.is_trigger or m.CameraCaptureStatus in self.link.unavailable:
                 return status

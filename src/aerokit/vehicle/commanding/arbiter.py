@@ -173,7 +173,7 @@ class CommandArbiter:
         """
         if device_order is not None and not device_order.is_newest:
             raise OperationRejected(f"{SUPERSEDED}; the rest of the order was not sent")
-        modes = () if self.newest is None else self.newest.modes
+        modes = () if self.newest is None else self.newest.modes  # The steering order goes on, and may change to them.
         device_topics = () if device_order is None else device_order.ended_by
         order = self._create_order(modes, (ACTION, *device_topics), ends_flight)
         self._orders.append(order)

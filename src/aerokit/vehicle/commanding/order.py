@@ -273,7 +273,7 @@ class Order:
 
         An order to land, to return or to disarm is not ended by any failsafe.
         """
-        if is_worse_failsafe(state, self._state_before):
+        if is_worse_failsafe(state, self._state_before):  # `end` ignores a failsafe if the order ends the flight.
             self.failsafe = self.failsafe or failsafe_text(state)
         self._state_before = state
 

@@ -137,7 +137,7 @@ class StickStream(SteeringStream[StickInput]):
                 f"sticks: ArduPilot accepts stick positions only from system {ground_station:g} (MAV_GCS_SYSID), and"
                 f" this program is system {own_id}: connect with source_system={ground_station:g}"
             )
-        release_after_s = values.get("RC_OVERRIDE_TIME", 3.0)
+        release_after_s = values.get("RC_OVERRIDE_TIME", 3.0)  # 3 s is ArduPilot's default.
         if release_after_s <= 0:
             effect = "ignores stick positions"
             if release_after_s < 0:

@@ -258,7 +258,7 @@ class Settings:
         """
         definition, name = self._definition, defined.name
         assert definition is not None
-        # Refuse a value that is never allowed before anything is sent.
+        # Before anything is sent, refuse a value that is never allowed.
         definition.checked(name, value, self._values())
         to_read = [
             setting for setting in definition.dependencies(name) if self._must_be_read(definition.settings[setting])

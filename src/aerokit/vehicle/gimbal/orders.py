@@ -182,7 +182,7 @@ class GimbalOrders:
     async def send_mount_angles(self, order: Order, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
         """Send mount angles. The mount turns with the vehicle, so a yaw from north is only correct when it is sent."""
         attitude = self.session.telemetry.attitude.latest
-        heading = 0.0 if attitude is None else attitude.yaw_deg
+        heading = 0.0 if attitude is None else attitude.yaw_deg  # An unknown heading counts as north.
         yaw_from_nose = yaw if from_nose else math.remainder(yaw - heading, 360.0)
         were_angles_sent = await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, yaw_from_nose)
         if not were_angles_sent:

@@ -81,8 +81,8 @@ class MissionEndDetector:
         """Return True if the vehicle reports the end of the mission. A vehicle that has fallen may report it too."""
         if self._tracker.is_complete:
             # ArduPilot reports completion at home, PX4 already when it begins to return.
-            at_home = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
-            return not self._ends_by_landing or self._is_on_ground or at_home
+            has_returned = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
+            return not self._ends_by_landing or self._is_on_ground or has_returned
         # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.
         if self._ends_in_air and self._is_landing:
             return self._is_on_ground or self._is_home
@@ -359,6 +359,7 @@ class MissionControl(VehiclePlan["Mission"]):
                     raise
             else:
                 return
+        # The vehicle supports only the older MISSION_SET_CURRENT.
         with vehicle_context.arbiter.sending(order) as sending:
             try:
                 await self._set_current_by_message(seq, timeout, sending)
