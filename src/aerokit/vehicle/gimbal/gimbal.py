@@ -202,9 +202,9 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         except (CommandRejected, CommandTimeout) as error:
             failure = error
         device = orders.device
-        is_discovered = device.component_id != 0
-        if failure is None or is_discovered:  # If no manager answered, only a discovered gimbal can be asked.
-            has_own_id = is_discovered and device.number == 0
+        is_placeholder = device.component_id == 0
+        if failure is None or not is_placeholder:  # If no manager answered, only a discovered gimbal can be asked.
+            has_own_id = not is_placeholder and device.number == 0
             target = device.component_id if has_own_id else manager_id
             try:
                 await orders.ask(GimbalDeviceInformation.ID, target, attempts=1)
