@@ -177,7 +177,7 @@ def state_at(path: Path, at_s: float) -> tuple[LocalPoint, LocalPoint]:
         return points[0].place, (0.0, 0.0, 0.0)
     if next_index == len(points):
         return points[-1].place, (0.0, 0.0, 0.0)
-    start, end = points[next_index - 1], points[next_index]
+    start, end = points[next_index - 1], points[next_index]  # The end is later than `at_s`, so the duration is not 0.
     duration_s = end.t_s - start.t_s
     fraction = (at_s - start.t_s) / duration_s
     vector = [b - a for a, b in zip(start.place, end.place, strict=True)]

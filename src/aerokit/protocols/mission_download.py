@@ -130,6 +130,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
             # PX4 (window 1) repeats MISSION_COUNT by itself, so there it does not measure the round trip.
             if self._attempt == 1 and not self._restarts and self._window > 1:
                 self.round_trip.add_sample(now - self._list_requested_at)
+            # After a restart, the items received before stay valid only if the plan has the same id.
             if not opaque_id or opaque_id != self._opaque_id:
                 self._items.clear()
         elif message.count == self._count and opaque_id == self._opaque_id:

@@ -212,7 +212,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             if self._is_accepted:
                 # The vehicle already has the item that was sent, or an item before it was lost.
                 self._send_window(now, ahead=1)
-                if self._outbox:
+                if self._outbox:  # If nothing was sent, the present deadline stays.
                     self._wait(now)
         elif result == MavMissionResult.OPERATION_CANCELLED:
             self._restart(now)

@@ -208,7 +208,7 @@ class MeasurementEncoder:
         """Return one OBSTACLE_DISTANCE_3D for each point, all with the same time stamp."""
         check_range("min_m", value.min_m, 0, 1e5)
         check_range("max_m", value.max_m, 0, 1e5, above=True)
-        time_ms = self._time_us(value.measured_at) // 1000 & 0xFFFFFFFF
+        time_ms = (self._time_us(value.measured_at) // 1000) & 0xFFFFFFFF  # The field has 32 bits.
         limits_m = (value.min_m, value.max_m)
         for point in value.points_m:
             check_finite("points_m", *point)
@@ -230,7 +230,7 @@ class MeasurementEncoder:
         covariance_cm2 = UNKNOWN_COVARIANCE
         if value.variance_m2 is not None:
             covariance_cm2 = min(UNKNOWN_COVARIANCE - 1, round(value.variance_m2 * 1e4))
-        time_ms = self._time_us(value.measured_at) // 1000 & 0xFFFFFFFF
+        time_ms = (self._time_us(value.measured_at) // 1000) & 0xFFFFFFFF  # The field has 32 bits.
         sensor = (LASER, 0, ORIENTATIONS[value.direction])  # type, id, orientation
         quality = value.quality or 0  # 0 means "unknown"
         return (m.DistanceSensor(time_ms, *limits_cm, distance_cm, *sensor, covariance_cm2, signal_quality=quality),)

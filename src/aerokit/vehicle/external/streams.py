@@ -175,7 +175,7 @@ class MeasurementStream(Generic[MeasurementT]):
             connection.send(messages[0])  # This raises the error that has ended the connection.
         now = connection.now()
         measured_at: float | None = getattr(measurement, "measured_at", None)
-        if self._waiting is not None:
+        if self._waiting is not None:  # The new measurement replaces the waiting one.
             self._dropped += 1
         self._waiting = (messages, now if measured_at is None else measured_at)
         if now >= self._next_at:
