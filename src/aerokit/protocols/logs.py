@@ -198,6 +198,7 @@ class LogDownload(Transfer[int]):
         if self._received < self._requested / 2:
             self._range = max(self._range // 2, MIN_RANGE)
         elif self._requested >= self._range and self._stream.interval_s:
+            # Ranges grow until the pause between two ranges is negligible.
             useful_blocks = MIN_RANGE_ROUND_TRIPS * self.round_trip.timeout_s() / self._stream.interval_s
             self._range = min(2 * self._range, max(int(useful_blocks), FIRST_RANGE), MAX_RANGE)
 
