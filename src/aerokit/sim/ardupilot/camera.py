@@ -107,7 +107,8 @@ class ArduPilotCamera:
                 self.take()
         elif item.command == MavCmd.DO_SET_CAM_TRIGG_DIST:
             self.trigger_by_distance(item.param1)
-            if item.param3 == 1.0:
+            takes_first_image_now = item.param3 == 1.0
+            if takes_first_image_now:
                 self.take()
         elif item.command == MavCmd.IMAGE_START_CAPTURE:
             interval_s, image_count = item.param2, item.param3
@@ -155,7 +156,9 @@ class ArduPilotCamera:
     def focus(self, command: ReceivedCommand) -> int:
         """Handle MAV_CMD_SET_CAMERA_FOCUS. Focus by rate or in percent is accepted. Autofocus is UNSUPPORTED."""
         kind = whole(command.param1)
-        if kind in (SetFocusType.STEP, SetFocusType.METERS) or kind not in list(SetFocusType):
+        # The firmware denies these types even without a camera (AP_Camera.cpp).
+        is_unsupported = kind in (SetFocusType.STEP, SetFocusType.METERS)
+        if is_unsupported or kind not in list(SetFocusType):
             return MavResult.DENIED
         if not self.is_fitted:
             return MavResult.FAILED

@@ -49,9 +49,11 @@ class MotorTest:
     def command(self, command: ReceivedCommand) -> int:
         """Start a test, or replace the running test. A status text reports the end of the test."""
         if not self.is_running:
-            reason = "" if self._copter.is_landed else "vehicle not landed"
+            reason = ""
             if not self._copter.is_initialised:
                 reason = "Board initialising"
+            elif not self._copter.is_landed:
+                reason = "vehicle not landed"
             if reason:
                 self._copter.send_text(MavSeverity.CRITICAL, f"Motor Test: {reason}")
                 return MavResult.FAILED

@@ -59,7 +59,8 @@ class _CircleLeg:
     def __init__(self, auto: CopterAuto, centre: Ned, *, turns: float, radius: float) -> None:
         self._copter, self._turns, self._centre = auto.vehicle, turns, centre
         parameters, motion = self._copter.parameters, self._copter.motion
-        self._radius = abs(radius) or parameters["CIRCLE_RADIUS"] / 100.0
+        self._radius = abs(radius) or parameters["CIRCLE_RADIUS"] / 100.0  # 0 selects the parameter.
+        # A negative radius turns anticlockwise.
         self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
         north, east = motion.north - centre[0], motion.east - centre[1]
         self._angle = math.atan2(east, north)
@@ -80,6 +81,7 @@ class _CircleLeg:
                 self._approach = None
             return
         motion = self._copter.motion
+        # The acceleration towards the centre, rate² * radius, is limited to a share of the maximum.
         max_rate = math.sqrt(_TURN_SHARE_OF_ACCELERATION * motion.limits.acceleration_m_s2 / max(0.5, self._radius))
         rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)
         self._report_new_turn()  # The first turn is reported before the copter moves.
@@ -245,7 +247,8 @@ class CopterAuto(MissionMode):
     def update(self, dt: float) -> None:
         self.start_if_waiting()
         if not self.is_waiting:
-            if self._check_upcoming() and isinstance(self._leg, _FlyLeg):
+            has_upload_changed_route = self._check_upcoming()
+            if has_upload_changed_route and isinstance(self._leg, _FlyLeg):
                 self._restart_command()
             self.vehicle.mission.update()
             self._check_upcoming()  # `mission.update` may have started the next command

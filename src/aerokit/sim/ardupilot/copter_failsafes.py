@@ -54,6 +54,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
         mode = self.vehicle.mode
         if not mode.can_arm:
             return [f"{mode.name} mode not armable"]
+        # In modes that control the climb rate, a centred stick holds the altitude.
         max_throttle = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
         if not mode.arms_with_raised_throttle and self.vehicle.rc[RC_THROTTLE] > max_throttle:
             return ["Throttle too high"]

@@ -312,7 +312,7 @@ class ArduPilotArming(Generic[HostT]):
         reasons = self.mandatory_reasons() if force else self.reasons()
         if not reasons and not force and not self.checks_nothing:
             reasons = self.final_reasons()
-        if not vehicle.is_initialised:
+        if not vehicle.is_initialised:  # This text replaces the reasons of the checks.
             reasons = ["System not initialised"]
         if reasons:
             self._send_reasons("Arm", reasons)

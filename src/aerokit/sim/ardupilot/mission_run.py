@@ -241,7 +241,7 @@ class MissionRun:
                 self.nav_index, self._running_nav = command
                 self._state = MissionState.NOT_STARTED
                 return True
-            if self._running_do is None:
+            if self._running_do is None:  # The mission resumes at the first "do" command before the navigation command.
                 self._running_do, self._last_do_index = command, command_index
             index = command_index + 1
         self.nav_index = 0

@@ -325,7 +325,8 @@ class SmartPath:
         accuracy, maximum = parameters["SRTL_ACCURACY"], int(parameters["SRTL_POINTS"])
         if self._points and math.dist(self._points[-1], place) < accuracy:
             return True
-        if len(self._points) - self._cleaned_count >= _CLEAN_UP_AFTER_POINTS or len(self._points) >= maximum:
+        new_count = len(self._points) - self._cleaned_count
+        if new_count >= _CLEAN_UP_AFTER_POINTS or len(self._points) >= maximum:
             self._points = simplify(self._points, _BEND * accuracy)
             if len(self._points) >= maximum - _LOW_SPACE_POINTS:
                 self._points = prune(self._points, _LOOP * accuracy)

@@ -133,6 +133,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
         plane, command = self.vehicle, item.command
+        # `_report` sends a text and returns True.
         if command == Cmd.NAV_TAKEOFF:
             assert self._place is not None
             is_altitude_reached = plane.wing.down <= self._place[2]

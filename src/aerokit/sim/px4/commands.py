@@ -207,7 +207,8 @@ class _Flight:
         px4, result = self._px4, self._change(modes.TAKEOFF)
         if result == MavResult.ACCEPTED and math.isfinite(command.z):
             down = px4.frame.origin.altitude_m - command.z
-            if px4.is_armed and down > px4.motion.down and not px4.is_landed:
+            is_target_lower = down > px4.motion.down
+            if px4.is_armed and is_target_lower and not px4.is_landed:
                 px4.send_text(MavSeverity.CRITICAL, "Already higher than takeoff altitude")
                 down = px4.motion.down
             px4.flight.plan_take_off(down)
@@ -282,7 +283,7 @@ class _Flight:
             return result
         if not orbit.plan(radius, speed, (north, east), down):
             px4.send_text(MavSeverity.CRITICAL, "Orbit radius limit exceeded")
-            return MavResult.ACCEPTED
+            return MavResult.ACCEPTED  # PX4 checks the radius only after the acknowledgement (FlightTaskOrbit.cpp).
         return self._change(modes.ORBIT)
 
     def tune(self, command: ReceivedCommand) -> int | None:
@@ -405,8 +406,9 @@ class _Requests:
             return self._send_interval(_number(command.param2), command)
         if message_id != m.AvailableModes.ID:
             return self.send_now(message_id, command)
-        messages, index = available_modes(self._px4), _number(command.param2)  # The index 0 selects all modes.
-        for message in messages if index == 0 else messages[index - 1 : index]:
+        messages, index = available_modes(self._px4), _number(command.param2)
+        requested = messages if index == 0 else messages[index - 1 : index]  # The index 0 selects all modes.
+        for message in requested:
             self._px4.send(message, command.channel)
         return MavResult.ACCEPTED if 0 <= index <= len(messages) else MavResult.DENIED
 

@@ -343,7 +343,8 @@ class Px4Failsafes:
             if cause not in self._active and action >= Action.HOLD:
                 self._is_overridden = False
             is_worse = action > self._active.get(cause, Action.WARN)
-            if is_worse and self.action <= Action.HOLD and self._holds_until < self._px4.now:
+            has_delay_ended = self._holds_until < self._px4.now
+            if is_worse and self.action <= Action.HOLD and has_delay_ended:
                 self._holds_until = self._px4.now + self._px4.parameters["COM_FAIL_ACT_T"]
         still_acting = {cause: action for cause, action in self._active.items() if action >= Action.HOLD}
         self._active, self._failing = {**still_acting, **failing}, frozenset(failing)
