@@ -78,6 +78,7 @@ class ParameterDownload:
             await self._request(name)
             return
         async with anyio.create_task_group() as group:
+            # The request and the download run at the same time. The first that ends successfully cancels the other.
 
             async def read() -> None:
                 if await self._request(name):

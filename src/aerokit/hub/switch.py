@@ -195,7 +195,7 @@ class Switch:
         if len(plans) > 1 and not (len(data) <= MAX_JOINED_BYTES and all(out.joins_frames for out in outs)):
             return False
         for out in outs:
-            if not out.batch and out.must_queue():
+            if not out.batch and out.must_queue():  # A queue contains single frames.
                 return False
         for out in outs:
             if not out.batch:

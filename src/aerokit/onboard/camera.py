@@ -329,7 +329,8 @@ class CameraAdapter(CameraDevice):
             move = move_at
         else:
             return False
-        if not _implements(self._camera, move.__name__):
+        is_implemented = _implements(self._camera, move.__name__)  # `move` is a method of the camera driver.
+        if not is_implemented:
             return False
         await self._call(move, value)
         return True

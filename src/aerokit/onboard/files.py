@@ -136,7 +136,7 @@ class DirectoryFiles:
                         if len(sizes) >= MAX_ENTRIES:
                             break
             except (OSError, FileFault):
-                if path not in self._memory:
+                if path not in self._memory:  # A directory in memory need not exist on the disk.
                     raise
         if self._root is None or path in self._memory:  # Without a directory, `entries` raises for an unknown path.
             sizes.update(self._memory.entries(path))

@@ -386,6 +386,7 @@ def opened(
             raise error.with_traceback(None) from error.__cause__
         raise
     if not is_connection:
+        # A vehicle has the attribute `connection`. Without it, the value is the connection itself.
         connection: Connection = getattr(context.value, "connection", context.value)
         connection._use_activity_monitor(loop.activity)
     if issubclass(twin, VehicleTwin):

@@ -189,6 +189,7 @@ class Page:
             text = part.value if isinstance(part, ast.Constant) and isinstance(part.value, str) else None
             if isinstance(part, ast.Name):
                 self._import_name(part.id, modules, at_run_time)
+            # In an annotation, a text that is a name is a forward reference.
             elif text is not None and text.isidentifier() and not at_run_time:
                 self._import_name(text, modules, at_run_time)
 
@@ -200,7 +201,8 @@ class Page:
             return
         imports = (imports_of(module) for module in modules)
         origin = next((imported[name] for imported in imports if name in imported), (modules[0], name))
-        # Several modules may export a name. It is always imported from the first of them.
+        # Several modules may export a name. It is always imported from the first of them. The name in its module is
+        # empty for a module that is imported itself.
         origin = self._import_sources.setdefault(origin[1] or name, origin)
         if at_run_time:
             self.at_run_time.add(origin)
@@ -375,7 +377,7 @@ def _from_lines(module: str, names: set[tuple[str, str]], indent: str) -> str:
     statements = {name: f"{indent}from {module} import {name}\n" for name in imported if name not in plain_names}
     if plain_names:
         statement = f"{indent}from {module} import {', '.join(plain_names)}\n"
-        if len(statement) > WIDTH + 1:
+        if len(statement) > WIDTH + 1:  # `statement` includes the line end, WIDTH does not.
             statement = f"{indent}from {module} import (\n{_lines(plain_names, indent + '    ')}{indent})\n"
         statements[plain_names[0]] = statement
     return "".join(statements[name] for name in sorted(statements, key=_by_kind))

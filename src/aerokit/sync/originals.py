@@ -195,7 +195,8 @@ def members_of(twin: Twin) -> list[ClassMember]:
     for base in reversed(cls.__mro__):
         if base.__module__.startswith("aerokit.") and base not in classes_of_base_twin:
             members |= {member.name: fill(member) for member in _own_members(base)}
-    selected = twin.only or {name for name in members if not name.startswith("_")} | twin.special
+    public_names = {name for name in members if not name.startswith("_")}
+    selected = twin.only or (public_names | twin.special)
     return [member for name, member in members.items() if name in selected and name not in twin.without]
 
 

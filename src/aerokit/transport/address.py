@@ -264,8 +264,10 @@ class _Parser:
 
     def port(self, kind: LinkKind, tail: str) -> int:
         """Parse the text after a host, which must be ``:port``."""
-        if not tail.startswith(":") or tail == ":":
-            self.fail("the port is missing" if tail in ("", ":") else f"{tail!r} follows the host, not :port")
+        if tail in ("", ":"):
+            self.fail("the port is missing")
+        if not tail.startswith(":"):
+            self.fail(f"{tail!r} follows the host, not :port")
         port = self.whole_number("the port", tail[1:])
         min_port = 0 if kind in _LISTENING else 1
         if not min_port <= port <= 65535:
