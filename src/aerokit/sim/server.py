@@ -67,7 +67,8 @@ class SimulatorServer:
         self._speedup = speedup
         self._dues = [0.0] * len(self.vehicles)  # The simulated time of each vehicle's next event.
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
-        self._min_wait_s = _MIN_WAIT_S if speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD else 0.0
+        runs_several_ticks = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD  # in one callback
+        self._min_wait_s = _MIN_WAIT_S if runs_several_ticks else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None
         # Ends the event source, which replaces the timers on a `VirtualClockLoop`.
         self._end_source: Callable[[], None] | None = None

@@ -164,8 +164,9 @@ class CompassCalibration:
         # The mask of ten bytes has one bit for each of 80 directions in which the vehicle can point.
         direction_count = percent * 80 // 100
         directions = ((1 << direction_count) - 1).to_bytes(10, "little")
+        attempt, no_direction = 1, (0.0, 0.0, 0.0)
         return m.MagCalProgress(
-            self._progress_compass, self._compass_mask, status, 1, percent, directions, 0.0, 0.0, 0.0
+            self._progress_compass, self._compass_mask, status, attempt, percent, directions, *no_direction
         )
 
     def report(self) -> m.MagCalReport | None:

@@ -216,9 +216,11 @@ class ArduPilotCamera:
     def capture_status(self) -> m.CameraCaptureStatus | None:
         if not self.is_fitted:
             return None
+        # Like the firmware, report even an unlimited series (-1) as idle (AP_Camera_Backend.cpp).
+        is_series_reported = self.remaining > 0
         return m.CameraCaptureStatus(
             time_boot_ms=self._vehicle.time_boot_ms,
-            image_status=_INTERVAL_SET if self.remaining > 0 else _IDLE,
+            image_status=_INTERVAL_SET if is_series_reported else _IDLE,
             video_status=0,
             image_interval=self.interval_s,
             recording_time_ms=0,

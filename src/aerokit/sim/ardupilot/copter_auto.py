@@ -64,7 +64,7 @@ class _CircleLeg:
         self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
         north, east = motion.north - centre[0], motion.east - centre[1]
         self._angle = math.atan2(east, north)
-        self._turned_rad, self._reported_turns = 0.0, -1
+        self._turned_rad, self._reported_turns = 0.0, -1  # -1: not even turn 0 is reported yet.
         self._approach: _FlyLeg | None = None
         distance_to_circle = abs(math.hypot(north, east) - self._radius)
         if distance_to_circle > _ON_CIRCLE_M or abs(motion.down - centre[2]) > _ON_CIRCLE_M:
@@ -268,7 +268,8 @@ class CopterAuto(MissionMode):
         has_same_index = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
         if commands.version == self._list_version and has_same_index:
             return False
-        upcoming = tuple(islice(run.navigation_from(max(1, run.nav_index)), _CHECKED_COMMANDS))
+        first_index = max(1, run.nav_index)  # Item 0 is home, not a command.
+        upcoming = tuple(islice(run.navigation_from(first_index), _CHECKED_COMMANDS))
         has_changed = upcoming != self._upcoming
         self._list_version, self._upcoming = commands.version, upcoming
         return has_changed and has_same_index

@@ -266,7 +266,7 @@ class ArduPilotArming(Generic[HostT]):
         return self.gps_reasons() if self.is_checked(ArmingCheck.GPS) else ()
 
     def _check(self) -> None:
-        self._follow_requirement()
+        self._apply_requirement()
         vehicle = self.vehicle
         if vehicle.motors.is_armed:  # The checks run only while disarmed.
             self.passes = True
@@ -296,7 +296,7 @@ class ArduPilotArming(Generic[HostT]):
         """False with ARMING_REQUIRE 0, which keeps the vehicle armed."""
         return self.vehicle.parameters.get("ARMING_REQUIRE", 1) != _NOT_REQUIRED
 
-    def _follow_requirement(self) -> None:
+    def _apply_requirement(self) -> None:
         """Arm or disarm when ARMING_REQUIRE has changed."""
         vehicle, is_always_armed = self.vehicle, not self.needs_arming
         if is_always_armed == self._was_always_armed:

@@ -62,7 +62,7 @@ class FenceZones:
         """
         out_of_inclusions = [zone.outside_m(place) for zone in self._inclusions]
         into_exclusions = [-zone.outside_m(place) for zone in self._exclusions]
-        if union and out_of_inclusions:
+        if union and out_of_inclusions:  # A place inside one of the inclusion zones is allowed.
             out_of_inclusions = [min(out_of_inclusions)]
         return max(out_of_inclusions + into_exclusions, default=-math.inf)
 
@@ -377,7 +377,8 @@ class ArduPilotFence(Generic[HostT]):
         self._follow_parameters()
         if self.vehicle.parameters["FENCE_ENABLE"] and not self.present:
             return "Fences enabled, but none selected"
-        if not (self.enabled or self._value("FENCE_AUTOENABLE")) or not self.configured:
+        may_be_enabled = self.enabled or self._value("FENCE_AUTOENABLE")
+        if not may_be_enabled or not self.configured:
             return None
         if self.configured & (_CIRCLE | _POLYGON) and self.vehicle.navigation.home is None:
             return "Fence requires position"

@@ -187,7 +187,8 @@ class MissionRun:
         else:
             self._state = MissionState.ACTIVE
             # Resume at the "do" command that was running, which precedes the navigation command.
-            self.set_current(self._running_do[0] if self._running_do is not None else self.nav_index)
+            resume_index = self.nav_index if self._running_do is None else self._running_do[0]
+            self.set_current(resume_index)
 
     def _start(self) -> None:
         self._state = MissionState.ACTIVE
@@ -290,7 +291,7 @@ class MissionRun:
         """Start the next "do" command, if one is left in front of the next navigation command."""
         if not self._last_do_index:
             return
-        command = self._next(self._last_do_index + 1, count_jumps=False)
+        command = self._next(self._last_do_index + 1, count_jumps=False)  # (index, item)
         if command is None or is_navigation(command[1]):
             self._last_do_index = 0
             return

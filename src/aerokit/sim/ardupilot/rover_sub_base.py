@@ -86,15 +86,15 @@ class GuidedSetpoints:
 
     def _on_local(self, message: SetPositionTargetLocalNed, _: Channel) -> None:
         if message.coordinate_frame in _FIXED | self.BODY_FRAMES:
-            self._follow(message, self.vehicle.local_point(message, self.BODY_FRAMES), has_yaw=True)
+            self._follow(message, self.vehicle.local_point(message, self.BODY_FRAMES), uses_yaw=True)
 
     def _on_global(self, message: SetPositionTargetGlobalInt, _: Channel) -> None:
         frame = message.coordinate_frame
         point = self.vehicle.world_point(message.lat_int, message.lon_int, message.alt, frame)
         if point is not None or not Setpoint.of(message).has_position:
-            self._follow(message, point, has_yaw=self.GLOBAL_YAW)
+            self._follow(message, point, uses_yaw=self.GLOBAL_YAW)
 
-    def _follow(self, message: PositionTarget, point: Ned | None, *, has_yaw: bool) -> None:
+    def _follow(self, message: PositionTarget, point: Ned | None, *, uses_yaw: bool) -> None:
         setpoint, frame = Setpoint.of(message), message.coordinate_frame
         if not self._is_guided:
             return
@@ -106,7 +106,7 @@ class GuidedSetpoints:
         if not is_finite(position, velocity):
             return
         yaw = yaw_rate = None
-        if has_yaw:
+        if uses_yaw:
             yaw, yaw_rate = setpoint.yaw, setpoint.yaw_rate
         if yaw is not None and frame in self.RELATIVE_YAW_FRAMES:
             yaw += self.vehicle.motion.yaw

@@ -108,6 +108,7 @@ _UNCONTROLLED: dict[Kind, tuple[tuple[int, tuple[int, ...]], ...]] = {
 def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
     """Return the present, enabled and healthy sensors of SYS_STATUS."""
     sensors, nav, kind = _SENSORS[vehicle.KIND], vehicle.navigation, vehicle.KIND
+    # The kinds of control that are off in the present mode.
     uncontrolled = next((bits for bits, modes in _UNCONTROLLED[kind] if vehicle.mode.number in modes), 0)
     controls = sensors.always | (sensors.control & ~uncontrolled)
     present = sensors.working | sensors.control | sensors.unhealthy | _PREARM | _AHRS | _LOGGING

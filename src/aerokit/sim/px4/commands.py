@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
@@ -257,8 +258,8 @@ class _Flight:
         """Return the position in a command. Values that are NaN or INT32_MAX mean the vehicle's present position."""
         px4, motion = self._px4, self._px4.motion
         north, east, down = motion.north, motion.east, motion.down
-        keeps_place = _INT32_MAX in (command.x, command.y) or not math.isfinite(command.x + command.y)
-        if not keeps_place:
+        has_place = math.isfinite(command.x) and math.isfinite(command.y) and _INT32_MAX not in (command.x, command.y)
+        if has_place:
             north, east = px4.frame.to_local(*command.place())
         if math.isfinite(command.z):
             down = px4.frame.origin.altitude_m - command.z
@@ -338,7 +339,7 @@ class _Flight:
         uses_current_place = command.param1 > 0.5
         if uses_current_place:
             px4.home = motion.place
-        elif not math.isfinite(command.x + command.y + command.z):
+        elif not all(map(math.isfinite, (command.x, command.y, command.z))):
             return MavResult.DENIED
         else:
             north, east = px4.frame.to_local(*command.place())
@@ -371,8 +372,8 @@ def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         Cmd.SET_MESSAGE_INTERVAL: requests.set_interval,
         Cmd.GET_MESSAGE_INTERVAL: requests.get_interval,
     }
-    for command, message_id in _LEGACY_REQUESTS.items():  # Each lambda keeps its own id as a default value.
-        handlers[command] = lambda request, message_id=message_id: requests.send_now(message_id, request)  # type: ignore[misc]
+    for command, message_id in _LEGACY_REQUESTS.items():
+        handlers[command] = partial(requests.send_now, message_id)
     return handlers
 
 

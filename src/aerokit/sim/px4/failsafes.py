@@ -92,7 +92,7 @@ class Px4Fence:
             item = items[index]
             if item.command in _POLYGONS:
                 count = max(1, int(item.param1))  # The number of corners, which every corner contains.
-                corners = [self._place(item) for item in items[index : index + count]]
+                corners = [self._place(corner) for corner in items[index : index + count]]
                 yield _POLYGONS[Cmd(item.command)], _is_in_polygon(corners, north, east)
                 index += count
                 continue
