@@ -346,7 +346,8 @@ class VehicleCore(HasObservers):
             ValueError: a name is not a string.
             APIException: the link is down, or reading an attribute has failed.
         """
-        names = DEFAULT_ATTRIBUTES if not types or types == (True,) else types
+        waits_for_defaults = not types or types == (True,)
+        names = DEFAULT_ATTRIBUTES if waits_for_defaults else types
         if not all(isinstance(name, str) for name in names):
             raise ValueError("wait_ready expects one or more string arguments.")
         required = {str(name) for name in names}

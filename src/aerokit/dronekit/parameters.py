@@ -206,7 +206,8 @@ async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int
 def convert_to_type(name: str, value: float, type: ParameterType) -> int | float:  # noqa: A002
     """Convert a value to a parameter type; InvalidArgument if that is impossible."""
     if type.is_integer and isinstance(value, float) and abs(value) < float("inf"):
-        value = int(value - ROUNDING if value < 0 else value + ROUNDING)
+        rounding = -ROUNDING if value < 0 else ROUNDING
+        value = int(value + rounding)
     return checked_value(name, value, type)
 
 

@@ -174,7 +174,8 @@ class Router(Generic[PortT]):
         self, node: RouterPort[PortT], frames: list[Frame], now: float, late: list[Frame]
     ) -> list[ForwardingPlan[PortT]]:
         """Return the plans for frames received together at ``node``. ``late``: frames with a number out of order."""
-        # Hot path for new frames of known streams. :meth:`route` processes all other frames.
+        # Hot path for new frames of known streams. :meth:`route` processes all other frames: frames that are out of
+        # order or may return in a loop, and frames after the tables of recent frames have expired or are full.
         recent, streams, number = self._recent, node.streams, node.number
         if late or node.echoes or now >= recent.ends_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES:
             return [self.route(node, frame, now, frame in late) for frame in frames]

@@ -192,6 +192,7 @@ class Switch:
         for plan in plans:
             if plan.outs is not outs or not plan.is_plain:
                 return False
+        # Several frames are written in one piece only if they are short enough and every port permits it.
         if len(plans) > 1 and not (len(data) <= MAX_JOINED_BYTES and all(out.joins_frames for out in outs)):
             return False
         for out in outs:

@@ -73,8 +73,9 @@ class BatteryFailsafe:
         """Return ``level`` if the battery has been below the limits of this level for long enough, otherwise 0."""
         is_voltage_low, is_charge_low = self._is_voltage_and_charge_low(level)
         voltage_low_for = self._voltage_low[level].seconds(is_voltage_low, self._vehicle.now)
-        timeout = self._vehicle.parameters["BATT_LOW_TIMER"]
-        return level if is_charge_low or 0 < timeout < voltage_low_for else _OK
+        timeout = self._vehicle.parameters["BATT_LOW_TIMER"]  # 0 ignores a low voltage.
+        is_voltage_low_for_long = 0 < timeout < voltage_low_for
+        return level if is_charge_low or is_voltage_low_for_long else _OK
 
     def _is_voltage_and_charge_low(self, level: int) -> tuple[bool, bool]:
         """Return whether the voltage, and whether the charge, is below the limit of the level."""
@@ -257,7 +258,8 @@ class ArduPilotArming(Generic[HostT]):
     def gps_reasons(self) -> Sequence[str]:
         """Return the failures of the checks of the GPS receiver and of home."""
         nav = self.vehicle.navigation
-        if nav.fix_type < GpsFixType.TYPE_3D_FIX and not (nav.uses_external and not nav.is_gps_detected):
+        flies_without_gps = nav.uses_external and not nav.is_gps_detected
+        if nav.fix_type < GpsFixType.TYPE_3D_FIX and not flies_without_gps:
             return ("GPS 1: Bad fix" if nav.is_gps_detected else "GPS 1: not healthy",)
         return () if nav.home is not None else ("AHRS: waiting for home",)
 

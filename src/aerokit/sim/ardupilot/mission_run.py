@@ -135,7 +135,8 @@ class MissionRun:
         """MISSION_STATE of MISSION_CURRENT."""
         if not self.is_present:
             return MissionState.NO_MISSION
-        return MissionState.PAUSED if self.is_running and self._mode.is_paused else self._state
+        is_paused = self.is_running and self._mode.is_paused
+        return MissionState.PAUSED if is_paused else self._state
 
     @property
     def count(self) -> int:
@@ -148,7 +149,8 @@ class MissionRun:
         return MissionCurrent(seq, self.count, self.state, int(self._vehicle.mode.needs_mission))
 
     def starts_with_take_off(self) -> bool:
-        first_index = _FIRST if self._restarts or not self.nav_index else self.nav_index
+        is_resumed = self.nav_index != 0 and not self._restarts
+        first_index = self.nav_index if is_resumed else _FIRST
         return self.is_take_off(first_index)
 
     def is_take_off(self, index: int) -> bool:

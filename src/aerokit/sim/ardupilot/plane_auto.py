@@ -192,8 +192,10 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._go(item, _LAND)
         wing, plane = self.vehicle.wing, self.vehicle
         point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
-        north, east = self._leg_start[:2] if point is None or (item.x, item.y) == (0, 0) else point[:2]
-        self._landing = PlaneLanding(plane, (north, east, wing.ground_down if point is None else point[2]))
+        north, east, down = (*self._leg_start[:2], wing.ground_down) if point is None else point
+        if (item.x, item.y) == (0, 0):  # Zero coordinates mean the plane's coordinates.
+            north, east = self._leg_start[:2]
+        self._landing = PlaneLanding(plane, (north, east, down))
         plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
 
     def _return(self, _: MissionItem) -> None:

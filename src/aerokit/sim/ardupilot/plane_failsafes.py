@@ -95,10 +95,11 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def _check_short(self) -> None:
         action = int(self.vehicle.parameters["FS_SHORT_ACTN"])
+        is_needed = self.is_radio_lost and action != _SHORT_DISABLED
         is_landing = self.vehicle.mode.is_landing
-        if self.state == _NONE and self.is_radio_lost and action != _SHORT_DISABLED and not is_landing:
+        if self.state == _NONE and is_needed and not is_landing:
             self._start_short(action)
-        elif self.state == _SHORT and (not self.is_radio_lost or action == _SHORT_DISABLED):
+        elif self.state == _SHORT and not is_needed:
             self._end_short()
 
     def _start_short(self, action: int) -> None:

@@ -164,8 +164,9 @@ class RoverSubVehicle(ArduPilotVehicle):
     def _change_speed(self, command: ReceivedCommand) -> int:
         if command.param1 in (SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED):
             return MavResult.DENIED
-        horizontal_speeds = (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
-        if not self.mode.can_change_speed or command.param1 not in horizontal_speeds or not command.param2 > 0:
+        is_horizontal = command.param1 in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
+        is_valid = is_horizontal and command.param2 > 0
+        if not self.mode.can_change_speed or not is_valid:
             return MavResult.FAILED
         cast("Any", self.mode).speed = command.param2
         return MavResult.ACCEPTED
@@ -271,10 +272,12 @@ class RoverSubAuto(MissionMode):
 
     def _has_stayed(self, index: int, item: MissionItem) -> bool:
         """Return True if the vehicle has reached a waypoint and has waited there for param 1 seconds."""
-        if self._place is None or (self._reached_at is None and not self.has_arrived(self._place)):
+        if self._place is None:
             return False
         now = self.vehicle.now
         if self._reached_at is None:
+            if not self.has_arrived(self._place):
+                return False
             self._reached_at = now
             self.vehicle.info(self.reached_text(index, item.param1))
         delay_s = max(0.0, item.param1)

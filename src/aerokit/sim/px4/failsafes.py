@@ -282,7 +282,9 @@ class Px4Failsafes:
         if px4.has_position:
             self._position_at = px4.now
         is_lost = px4.now - self._position_at > _POSITION_TIMEOUT_S
-        return Action.LAND if is_lost and MODES[px4.intended_mode].needs_position else Action.NONE
+        if not is_lost:
+            return Action.NONE
+        return Action.LAND if MODES[px4.intended_mode].needs_position else Action.NONE
 
     def can_be_overridden(self, moved: float) -> bool:
         """Return True if a stick movement ends the current mode. ``moved`` is its size: 2 is from end to end."""

@@ -226,7 +226,9 @@ class ZenohListen(NetworkLink):
 
     def _on_beacon(self, data: bytes) -> None:
         beacon = Beacon.decode(data)
-        if beacon is None or beacon.epoch == self._freshness.epoch or self._rival_found.is_set():
+        if beacon is None or beacon.epoch == self._freshness.epoch:  # A beacon with this epoch is our own.
+            return
+        if self._rival_found.is_set():  # Report a rival only once.
             return
         self._rival_found.set()
         if self._is_serving:
