@@ -116,7 +116,7 @@ class Switch:
         # Hot path: local variables are faster than attributes.
         node, guard, peer = port.node, port.guard, port.peer
         if node is None or port.is_read_only:
-            if guard is not None:
+            if guard is not None:  # The guard still records the ids that each peer uses.
                 for frame in frames:
                     guard.admits(frame, framer, peer)
             port.counters.dropped["read_only"] += len(frames)

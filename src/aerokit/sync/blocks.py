@@ -378,7 +378,8 @@ def opened(
     is_connection = isinstance(address, ConnectionTwin)
     loop = address._loop if is_connection else LoopThread()
     try:
-        context: OpenContext[Any] = loop.open_context(open_async(address.aio if is_connection else address, **options))
+        async_address = address.aio if is_connection else address
+        context: OpenContext[Any] = loop.open_context(open_async(async_address, **options))
     except BaseException as error:
         if not is_connection:
             loop.close()

@@ -365,7 +365,8 @@ def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
     for is_ours in (False, True):
         modules = {module for module, _ in names if module.startswith("aerokit") == is_ours}
         plain = [f"{indent}import {module}\n" for module in sorted(modules) if (module, "") in names]
-        parts.append("".join([*plain, *(_from_lines(module, names, indent) for module in sorted(modules))]))
+        from_imports = [_from_lines(module, names, indent) for module in sorted(modules)]
+        parts.append("".join([*plain, *from_imports]))
     return "\n".join(part for part in parts if part)
 
 

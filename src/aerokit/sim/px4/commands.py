@@ -131,6 +131,7 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         Cmd.MISSION_START: flight.start_mission,
         Cmd.DO_SET_HOME: flight.set_home,
         Cmd.EXTERNAL_WIND_ESTIMATE: px4.external.set_wind,
+        # A reboot replaces `px4.calibration`, so the attribute is read at each command.
         Cmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),
         Cmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
         Cmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,

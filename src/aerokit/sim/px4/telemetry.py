@@ -283,6 +283,7 @@ def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
         return m.PositionTargetLocalNed(
             px4.time_boot_ms, MavFrame.LOCAL_NED, mask, *unknown, *unknown, *acceleration, yaw, 0.0
         )
+    # Apart from the position, the simulation sends the present values as the targets.
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     acceleration = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down)
     return m.PositionTargetLocalNed(
