@@ -299,7 +299,9 @@ def generate(name: str = "twins") -> str:
     page, twins = Page(name), [twin for twin in TWINS if twin.page == name]
     classes = [_class(page, twin) for twin in twins]
     functions = [_opener(page, path) for path in FUNCTIONS[name]]
-    names = sorted((*(twin.name for twin in twins), *(path.rpartition(".")[2] for path in FUNCTIONS[name])))
+    function_names = [path.rpartition(".")[2] for path in FUNCTIONS[name]]
+    exports = sorted([*(twin.name for twin in twins), *function_names])
+    # `_class` and `_opener` have added the imports of the code. These are the imports that every file needs.
     page.at_run_time |= {(f"aerokit.sync.{BASE_MODULES.get(twin.base, 'blocks')}", twin.base) for twin in twins}
     page.at_run_time |= {OPENERS[name], ("aerokit._internal.arguments", "checked")}
     page.for_types |= {
@@ -317,7 +319,7 @@ def generate(name: str = "twins") -> str:
         text = text.replace("from functools import cached_property\n", "")
     head = text + _import_lines(page.at_run_time, "") + "\nif TYPE_CHECKING:\n"
     head += _import_lines(page.for_types, "    ") + "\n"
-    head += "__all__ = [\n" + "".join(f'    "{exported}",\n' for exported in names) + "]\n"
+    head += "__all__ = [\n" + "".join(f'    "{export}",\n' for export in exports) + "]\n"
     head += "\n" if variables else ""
     for variable, bound in variables.items():
         head += f'{variable} = TypeVar("{variable}"{f", bound={bound}" if bound else ""})\n'

@@ -347,7 +347,8 @@ class CopterAuto(MissionMode):
             return False
         if not self._is_leg_complete:
             return False
-        if int(copter.parameters["MIS_OPTIONS"]) & _CONTINUE_AFTER_LAND and copter.mission.is_take_off(index + 1):
+        may_continue = int(copter.parameters["MIS_OPTIONS"]) & _CONTINUE_AFTER_LAND
+        if may_continue and copter.mission.is_take_off(index + 1):
             return True
         copter.arming.disarm()
         return False

@@ -203,8 +203,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         block = request.acknowledge(data, offset=offset)
         block = block.replace(sequence=sequence, burst_complete=is_short or is_last)
         self._reply(peer, block)
-        # The firmware uses one reply for the whole burst. After a block, it increments the sequence number. After a short
-        # block, it also advances the offset, for the refusal that follows (GCS_FTP.cpp).
+        # The firmware uses one reply for the whole burst. After a block, it increments the sequence number. After a
+        # short block, it also advances the offset, for the refusal that follows (GCS_FTP.cpp).
         next_offset = offset + len(data) if is_short else offset
         peer.reply = block.replace(sequence=(sequence + 1) & 0xFFFF, offset=next_offset)
         next_step = self._end_burst if is_last else partial(self._send_next, peer, session, request, block_number + 1)

@@ -252,13 +252,13 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
         if self.caused_mode:  # The plane already returns from an earlier breach.
             return
         self.report("breached", new_breaches)
-        mode = plane.mode.number
+        mode_before = plane.mode.number
         if self._action == _RTL:
-            self._turn_back(mode, PlaneMode.RTL)
-        elif self._action == _AUTOLAND and mode != PlaneMode.AUTOLAND:
-            self._turn_back(mode, PlaneMode.AUTOLAND, PlaneMode.RTL)
+            self._turn_back(mode_before, PlaneMode.RTL)
+        elif self._action == _AUTOLAND and mode_before != PlaneMode.AUTOLAND:  # A running landing continues.
+            self._turn_back(mode_before, PlaneMode.AUTOLAND, PlaneMode.RTL)
         elif self._action in (_GUIDED, _GUIDED_THROTTLE):
-            self._turn_back(mode, PlaneMode.GUIDED)
+            self._turn_back(mode_before, PlaneMode.GUIDED)
             plane.guided.go_to(self.return_place())
 
     def return_place(self) -> Ned:

@@ -298,7 +298,8 @@ class _Flight:
         elif math.isnan(self._tuning_since):
             self._tuning_since = px4.now
         steps = (px4.now - self._tuning_since) / _TUNING_STEP_S  # NaN while disarmed
-        progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), len(_TUNING_PROGRESS) - 1)]
+        last_step = len(_TUNING_PROGRESS) - 1
+        progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), last_step)]
         answer = m.CommandAck(command.command, MavResult.IN_PROGRESS, progress, 0, *command.sender)
         px4.send(answer, command.channel)
         return None

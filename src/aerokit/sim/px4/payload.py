@@ -289,12 +289,13 @@ class Px4CameraTrigger:
         if not self.is_fitted:
             return None
         was_running = self.is_running
-        if whole(command.param3) in (0, 1):
-            self._is_paused = whole(command.param3) == 1
-        if whole(command.param2) == 1:
+        enable, reset, pause = whole(command.param1), whole(command.param2), whole(command.param3)
+        if pause in (0, 1):
+            self._is_paused = pause == 1
+        if reset == 1:
             self.sequence = 0
-        if whole(command.param1) in (0, 1):
-            self._is_enabled = whole(command.param1) == 1
+        if enable in (0, 1):
+            self._is_enabled = enable == 1
         if self.is_running and not was_running:
             self._series_number += 1
             self._take_next(self._series_number)

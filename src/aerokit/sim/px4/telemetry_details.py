@@ -150,6 +150,7 @@ def _distance_sensor(px4: Px4Vehicle) -> m.DistanceSensor:
 def _measured_acceleration(px4: Px4Vehicle) -> tuple[float, float, float]:
     """Return the acceleration that the accelerometers measure, in m/s² forward, right and down."""
     motion = px4.motion
+    # At rest, accelerometers measure the force of the ground: 1 g upwards.
     north, east, down = (
         motion.acceleration_north,
         motion.acceleration_east,
