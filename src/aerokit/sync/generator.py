@@ -91,6 +91,7 @@ def arguments_of(arguments: ast.arguments) -> list[str]:
     """Return the source of the arguments of a definition, one text for each."""
     positional = [*arguments.posonlyargs, *arguments.args]
     no_defaults: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults))
+    # Only the last positional arguments have defaults.
     texts = [_argument(*pair) for pair in zip(positional, [*no_defaults, *arguments.defaults])]  # noqa: B905
     if arguments.vararg is not None:
         texts.append("*" + _argument(arguments.vararg, None))

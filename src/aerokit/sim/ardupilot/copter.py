@@ -222,7 +222,7 @@ class SimulatedCopter(CopterHost):
 
     @property
     def base_mode(self) -> int:
-        if not self.has_left_boot:
+        if not self.has_left_boot:  # During the boot, GUIDED_ENABLED is set in every mode.
             return _BASE | _GUIDED
         flags, mode_name = _BASE, self.mode.name
         # GUIDED_ENABLED is set in modes that use a position, in RTL only while armed.
