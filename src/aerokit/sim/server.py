@@ -215,7 +215,7 @@ class SimulatorServer:
                 # This vehicle may be ahead of `now`, because a timer fired early or another vehicle advanced it.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
-            port.reader.forget()
+            port.reader.forget()  # All vehicles have used the decoded messages.
             self._flush()
             self._schedule()
         except Exception as error:

@@ -324,7 +324,7 @@ class _Parser:
 
     def option_value(self, key: str, value: str) -> str:
         """Check the value of an option, and return its canonical form."""
-        if key == "baud":
+        if key == "baud":  # `serial` checks the number.
             return value
         if key in _CHOICES:
             if value not in _CHOICES[key]:

@@ -46,8 +46,8 @@ class BatteryFailsafe:
         self._vehicle.send_text(MavSeverity.WARNING, f"Battery 1 is {_WORDS[level]} {used}")
         action = int(self._vehicle.parameters[f"BATT_FS_{_NAMES[level]}_ACT"])
         priority = self._priorities.index(action) if action in self._priorities else len(self._priorities)
-        is_as_severe = priority <= self.priority  # The most severe action has the index 0.
-        if is_as_severe:
+        is_at_least_as_severe = priority <= self.priority  # The most severe action has the index 0.
+        if is_at_least_as_severe:
             self.priority = priority
             self._act(action)
 

@@ -212,7 +212,9 @@ class ArduPilotNavigation:
         if self.uses_external:  # External navigation provides the position, even without GPS.
             return
         if self.has_position and lost_for >= _POSITION_TIMEOUT_S:
-            self.flags = _DEAD_RECKONING | (Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0)
+            # On the ground, the velocity stays known.
+            velocity_flag = Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0
+            self.flags = _DEAD_RECKONING | velocity_flag
         elif self.flags != _ATTITUDE_ONLY and lost_for >= _AIDING_TIMEOUT_S:
             self.flags = _ATTITUDE_ONLY
             self._report_cores("stopped aiding")
