@@ -154,6 +154,7 @@ def test_web_server_example_serves_state() -> None:
     assert state["mode"] == "STABILIZE"
 
 
+@pytest.mark.exhaustive
 def test_survey_photos_example_writes_geotagged_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     example = runpy.run_path(str(EXAMPLES / "survey_photos.py"))
     run_virtual(example["simulated"](str(tmp_path)))

@@ -339,6 +339,7 @@ async def test_link_that_opens_late_is_used() -> None:
         await vehicle.arm()
 
 
+@pytest.mark.exhaustive
 async def test_ground_station_shares_all_links() -> None:
     """Its transfer continues when one of them fails, and each of its orders arrives once."""
     radios = Radios(2, models=[FaultModel(delay_s=0.02)] * 2)

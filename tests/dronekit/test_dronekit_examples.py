@@ -102,6 +102,7 @@ def test_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
         assert text in notified.out
 
 
+@pytest.mark.exhaustive
 def test_example_as_program() -> None:
     with served_copter() as address:
         done = subprocess.run(

@@ -201,6 +201,7 @@ print(vehicle.mode.name)
 """
 
 
+@pytest.mark.exhaustive
 def test_open_vehicles_are_closed_after_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with served_copter() as address:
         threads = set(threading.enumerate())

@@ -150,6 +150,7 @@ async def test_policy_of_failed_members_group_applies() -> None:
         assert list(stage.fleet.group("show").members) == ["north/2", "north/3"]
 
 
+@pytest.mark.exhaustive
 async def test_policy_function_decides_per_member() -> None:
     failures: list[MemberFailure] = []
 

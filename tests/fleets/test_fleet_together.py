@@ -375,6 +375,7 @@ async def test_send_corrections_sends_once_per_link() -> None:
             stage.fleet.send_corrections(b"")
 
 
+@pytest.mark.exhaustive
 async def test_px4_after_mission_end_is_not_taken_over() -> None:
     async with (
         simulated_link(

@@ -48,6 +48,7 @@ def circle(
     ]
 
 
+@pytest.mark.exhaustive
 async def test_show_report_measures_deviation() -> None:
     async with open_stage(3) as stage:
         await stage.take_off(8)

@@ -214,6 +214,7 @@ def test_vehicle_is_reported_once_per_port(stage: Stage) -> None:
     assert events == ["a"]
 
 
+@pytest.mark.exhaustive
 def test_flooded_tables_affect_no_known_sender(stage: Stage) -> None:
     stage.receive("a", COPTER)
     for number in range(3 * MAX_ROUTES):
@@ -229,6 +230,7 @@ def test_flooded_tables_affect_no_known_sender(stage: Stage) -> None:
     assert len(stage.nodes["b"].plans) <= MAX_PLANS
 
 
+@pytest.mark.exhaustive
 def test_recent_frames_are_bounded(stage: Stage) -> None:
     encoder = FrameEncoder(1, 1)
     for number in range(2 * MAX_RECENT_FRAMES + 100):

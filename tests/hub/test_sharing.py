@@ -107,6 +107,7 @@ def test_transfers_pass_in_both_directions_at_once(way: Any, kind: str) -> None:
     run_virtual(run())
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("way", [through_a_hub, through_a_program], ids=["hub", "share"])
 def test_transfers_pass_over_a_lossy_link(way: Any) -> None:
     vehicle, path = make("px4")

@@ -309,6 +309,7 @@ def test_definition_rejects_large_decompressed_file() -> None:
         parse_definition(bytes(MAX_FILE_SIZE + 1))
 
 
+@pytest.mark.exhaustive
 def test_long_condition_and_many_options_are_fast() -> None:
     options = "".join(f'<option name="{n}" value="{n}"/>' for n in range(10_000))
     condition = " " * 200_000 + "A=1" + " AND A=1" * 20_000

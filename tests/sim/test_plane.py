@@ -121,6 +121,7 @@ async def test_arming_after_autoland_disarms_again() -> None:
         assert (plane.is_armed, vehicle.mode_name) == (True, "FBWA")
 
 
+@pytest.mark.exhaustive
 async def test_loiter_circle_is_kept_in_wind() -> None:
     plane = SimulatedPlane(boot_time_s=1.0, wind=SimulatedWind(4.0, -3.0))
     async with flown(plane) as vehicle:

@@ -432,6 +432,7 @@ def test_reboot_resets_the_state() -> None:
     assert client.all(m.Statustext)[0].id == 0
 
 
+@pytest.mark.exhaustive
 @given(
     command=st.sampled_from([int(c) for c in MavCmd]),
     numbers=st.tuples(*(st.floats(width=32),) * 7),

@@ -131,6 +131,7 @@ def test_land_mode_descends_in_circles() -> None:
     assert plane.motion.impact_speed_m_s < 1.0
 
 
+@pytest.mark.exhaustive
 def test_mission_from_climb_out_to_roll_out() -> None:
     plane, client = ready_plane()
     items = [

@@ -134,6 +134,7 @@ requests: st.SearchStrategy[Request] = st.tuples(
 )
 
 
+@pytest.mark.sampled(2)
 @both
 @given(asked=st.lists(requests, max_size=25), sizes=st.lists(st.none() | st.integers(0, 255), min_size=25))
 def test_random_requests_leave_no_session_open(kind: str, asked: list[Request], sizes: list[int | None]) -> None:

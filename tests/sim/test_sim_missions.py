@@ -580,6 +580,7 @@ def test_ardupilot_handles_random_messages_without_open_transfers(
     assert len(copter.missions.items(0)) <= 650
 
 
+@pytest.mark.exhaustive
 @given(conversation)
 def test_px4_handles_random_messages_without_open_transfers(
     talk: list[tuple[Message, bool, float]],

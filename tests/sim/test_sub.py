@@ -87,6 +87,7 @@ async def test_sub_dives_to_place_and_stays() -> None:
         assert sub.motion.ground_speed_m_s < 0.05
 
 
+@pytest.mark.exhaustive
 async def test_sub_target_above_surface_stays_at_surface() -> None:
     async with diving(1.0) as (sub, _):
         sub.guided.go_to((3.0, 0.0, -10.0))
@@ -129,6 +130,7 @@ async def test_surface_mode_ends_in_alt_hold() -> None:
         assert sub.is_armed
 
 
+@pytest.mark.exhaustive
 async def test_buoyancy_lifts_disarmed_sub() -> None:
     async with diving() as (sub, vehicle):
         await vehicle.disarm()

@@ -160,6 +160,7 @@ def test_failed_test_describes_the_flight(pytester: pytest.Pytester) -> None:
     assert len(list((pytester.path / "pictures" / "of failures").glob("*.svg"))) == 3
 
 
+@pytest.mark.exhaustive
 def test_vehicle_error_fails_the_test(pytester: pytest.Pytester) -> None:
     source = """
     import pytest, time
@@ -196,6 +197,7 @@ def test_vehicle_error_fails_the_test(pytester: pytest.Pytester) -> None:
     assert result.stdout.str().count("E       LookupError: mine") == 3
 
 
+@pytest.mark.exhaustive
 def test_a_fleet(pytester: pytest.Pytester) -> None:
     source = """
     import pytest

@@ -47,6 +47,7 @@ def test_fly_flies_mission_to_end(copter: SimulatedCopter, capsys: pytest.Captur
     assert (copter.is_armed, copter.is_landed) == (False, True)
 
 
+@pytest.mark.exhaustive
 def test_fly_from_auto_shows_no_warning_about_mode(copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]) -> None:
     async def scenario() -> int:
         async with simulated_link(copter) as link, aerokit.connect(link) as pilot:
@@ -62,6 +63,7 @@ def test_fly_from_auto_shows_no_warning_about_mode(copter: SimulatedCopter, caps
     assert not any("!" in line for line in lines)
 
 
+@pytest.mark.exhaustive
 def test_fly_sim_starts_at_planned_home(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_virtual(run_on(None, "fly", "m.waypoints", "--sim")) == 0
     assert "simulated copter at 47.397742, 8.545594" in capsys.readouterr().out

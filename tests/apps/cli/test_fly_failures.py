@@ -210,6 +210,7 @@ def test_command_prints_no_names_of_calls(text: str, plain: str, capsys: pytest.
     assert capsys.readouterr().err == f"aerokit: {plain}\n"
 
 
+@pytest.mark.exhaustive
 def test_demo_repeats_reasons_of_vehicle_while_not_ready(capsys: pytest.CaptureFixture[str]) -> None:
     async def scenario() -> int:
         copter = SimulatedCopter(boot_time_s=0.0, home=HOME)
@@ -295,6 +296,7 @@ def test_conditions_of_simulated_vehicle(capsys: pytest.CaptureFixture[str]) -> 
         assert f"{condition[0]} needs --sim" in capsys.readouterr().err
 
 
+@pytest.mark.exhaustive
 def test_crash_in_fast_simulation_is_recorded_for_twenty_seconds(capsys: pytest.CaptureFixture[str]) -> None:
     """The seconds are those of the flight: two of the recording, at ten times real speed."""
     options = ("--fault", "motor_failed@25", "--record", "x.tlog")
@@ -326,6 +328,7 @@ def test_summaries_of_fly_and_report_agree(capsys: pytest.CaptureFixture[str]) -
     assert int(flown[1]) == pytest.approx(int(reported[1]), abs=1)
 
 
+@pytest.mark.exhaustive
 def test_fly_in_unknown_simulation_counts_its_seconds(
     copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]
 ) -> None:

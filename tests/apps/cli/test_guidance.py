@@ -190,6 +190,7 @@ def test_fly_prints_four_words_for_each_item(capsys: pytest.CaptureFixture[str])
     assert not any("Reached command" in line or "Mission: " in line for line in lines)
 
 
+@pytest.mark.exhaustive
 def test_next_command_replaces_report_of_earlier_flight(capsys: pytest.CaptureFixture[str]) -> None:
     Path("x.html").touch()
     copter = SimulatedCopter(boot_time_s=0.0, home=HOME)

@@ -229,6 +229,7 @@ def test_number_has_no_sign_for_zero(value: float | None, text: str) -> None:
     assert number(value, 1, " m/s", "+") == text
 
 
+@pytest.mark.exhaustive
 async def test_heading_is_shown_once_and_zero_without_sign() -> None:
     async with stage(1) as it:
         await it.wait_drawn("climb")
@@ -239,6 +240,7 @@ async def test_heading_is_shown_once_and_zero_without_sign() -> None:
     assert "-0" not in screen.replace("-35", "")
 
 
+@pytest.mark.exhaustive
 async def test_wide_terminal_shows_more_and_puts_texts_below_map() -> None:
     async with stage(2, size=(200, 50)) as it:
         await it.wait_drawn("throttle")
@@ -276,6 +278,7 @@ async def test_state_lists_missing_reasons_where_room(size: tuple[int, int], sho
         assert rows["missing"].plain.split("\n") == shown
 
 
+@pytest.mark.exhaustive
 async def test_tall_wide_terminal_lists_all_missing_reasons() -> None:
     names = ("horizontal velocity", "relative horizontal position", "absolute horizontal position", "vertical speed")
     reasons = [f"the estimator has no {name} (EKF_STATUS_REPORT)" for name in names]
@@ -288,6 +291,7 @@ async def test_tall_wide_terminal_lists_all_missing_reasons() -> None:
             assert "more)" not in it.app._state_rows()[1][1].plain
 
 
+@pytest.mark.exhaustive
 async def test_key_shows_all_missing_reasons_in_small_terminal() -> None:
     reasons = [*(f"reason {number}" for number in range(1, 10)), "home (HOME_POSITION not received)"]
     with pytest.MonkeyPatch.context() as patch:
@@ -304,6 +308,7 @@ async def test_key_shows_all_missing_reasons_in_small_terminal() -> None:
             assert it.app.is_running
 
 
+@pytest.mark.exhaustive
 async def test_vehicle_without_mission_shows_no_item() -> None:
     async with stage(1, size=(200, 50)) as it:
         await it.wait_drawn("mission")
@@ -355,6 +360,7 @@ def test_text_styles_are_readable_on_light_and_dark_terminals() -> None:
             assert style.color is None or style.color.name in {"red", "magenta", "green"}
 
 
+@pytest.mark.exhaustive
 async def test_vehicles_behind_one_peer_are_not_heard_twice() -> None:
     copters = [SimulatedCopter(system_id=1 + number_, boot_time_s=0.0) for number_ in range(3)]
     async with simulated_link(copters) as link, open_connection(link) as connection, vehicles_on(connection):

@@ -129,6 +129,7 @@ def read_table(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 def test_folder_has_table_per_message_type(tmp_path: Path, kind: str) -> None:
     if kind == "parquet":

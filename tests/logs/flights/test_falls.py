@@ -146,6 +146,7 @@ def test_unequal_motor_outputs_name_the_motor() -> None:
     ]
 
 
+@pytest.mark.exhaustive
 def test_measurements_of_px4_fall_name_the_motors(tmp_path: Path) -> None:
     log = tmp_path / "crash.tlog"
 
@@ -190,6 +191,7 @@ def test_log_without_sink_rates_has_no_falls() -> None:
     assert falls(flight) == []
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("is_disarmed", [False, True], ids=["motor", "disarmed"])
 def test_report_of_crash_begins_and_ends_with_fall(
     is_disarmed: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -8,6 +8,7 @@ import pytest
 
 from aerokit import messages as m
 from aerokit.logs.flights import FlightLog, failsafes, read_flight
+from aerokit.logs.flights.codes import failsafe_action
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
@@ -112,3 +113,17 @@ def test_charge_state_names_cause_without_texts(tmp_path: Path) -> None:
     assert failsafe.evidence[0].text == "charge state critical (BATTERY_STATUS)"
     assert failsafe.reaction == "mode MISSION → RTL immediately"
     assert "mAh" not in " ".join(failsafe.context)
+
+
+@pytest.mark.parametrize(("vehicle", "parameter", "value", "meaning"), [
+    ("ArduCopter 4.7.0", "BATT_FS_LOW_ACT", 2, "RTL"),
+    ("ArduPlane 4.7.0", "BATT_FS_LOW_ACT", 2, "LAND"),
+    ("PX4 1.17.0", "COM_LOW_BAT_ACT", 3, "Return if critical, Land in an emergency"),
+    ("PX4 1.17.0", "COM_LOW_BAT_ACT", 1, ""),
+    ("ArduCopter 4.7.0", "BATT_FS_LOW_ACT", 99, ""),
+    ("ArduCopter 4.7.0", "BATT_FS_LOW_ACT", -1, ""),
+    ("ArduCopter 4.7.0", "BATT_LOW_VOLT", 2, ""),
+    ("", "BATT_FS_LOW_ACT", 2, ""),
+])  # fmt: skip
+def test_values_of_failsafe_parameters_are_explained(vehicle: str, parameter: str, value: float, meaning: str) -> None:
+    assert failsafe_action(vehicle, parameter, value) == meaning

@@ -155,6 +155,7 @@ def test_failsafe_without_reaction_names_parameters_to_read() -> None:
     assert failsafe_section(flight).explanation.endswith("and the parameters that configure it.")
 
 
+@pytest.mark.exhaustive
 def test_log_of_vehicle_on_ground_says_nothing_about_rest(tmp_path: Path) -> None:
     async def land(flight: Any, vehicle: Any) -> None:
         await vehicle.land()

@@ -202,6 +202,7 @@ async def test_rover_mission_with_return_ends_at_home() -> None:
         assert home.distance_to(vehicle.position.value) <= vehicle.autopilot.arrival_radius_m
 
 
+@pytest.mark.exhaustive
 async def test_px4_plane_mission_with_return_ends_above_home() -> None:
     await anyio.sleep(1000.0)  # a loop's clock may start at any value
     async with simulated_link(SimulatedPx4Plane()) as link, connect(link) as vehicle:
@@ -221,6 +222,7 @@ async def test_px4_plane_mission_with_return_ends_above_home() -> None:
         assert vehicle.is_armed
 
 
+@pytest.mark.exhaustive
 async def test_arduplane_mission_with_return_ends_above_home() -> None:
     """The mission does not complete: the plane changes to RTL, which stops the mission."""
     async with simulated_link(SimulatedPlane(boot_time_s=1.0)) as link, connect(link) as vehicle:

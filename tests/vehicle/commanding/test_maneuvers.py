@@ -204,6 +204,7 @@ async def test_orbit_px4_flying_another_circle_is_held() -> None:
         await vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=5)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.sampled(2)
 @BOTH
 async def test_figure_eight_reaches_both_lobes_and_its_center(kind: Callable[..., Kind]) -> None:
@@ -240,6 +241,7 @@ async def test_loiter_returns_after_its_time_at_the_place(kind: Callable[..., Ki
         assert now() - began == pytest.approx(7, abs=0.6)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", [SimulatedPlane, SimulatedPx4Plane])
 async def test_loiter_of_plane_circles_with_its_radius(kind: Callable[..., SimulatedVehicle]) -> None:

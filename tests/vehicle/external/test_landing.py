@@ -114,6 +114,7 @@ async def test_lost_target_is_reported() -> None:
         assert miss_m(simulated.motion) < 0.3
 
 
+@pytest.mark.exhaustive
 async def test_px4_search_is_reported_as_climb() -> None:
     simulated = SimulatedPx4(boot_time_s=1.0, parameters={"PLD_BTOUT": 1.0, "PLD_SRCH_TOUT": 5.0, "PLD_MAX_SRCH": 1.0})
     async with open_px4(simulated) as flight:

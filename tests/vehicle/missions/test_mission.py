@@ -174,6 +174,7 @@ async def test_wait_finished_continues_through_hold_of_minutes() -> None:
         assert now() - started > 80
 
 
+@pytest.mark.exhaustive
 async def test_wait_finished_continues_through_pause_of_minutes() -> None:
     async with armed(open_flight) as flight:
         mission = flight.vehicle.mission

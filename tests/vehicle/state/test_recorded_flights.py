@@ -112,6 +112,7 @@ def test_copter(flights: Flights) -> None:
     assert {"ArduPilot Ready", "Arming motors", "Disarming motors"} <= set(flight.texts)
 
 
+@pytest.mark.exhaustive
 def test_plane(flights: Flights) -> None:
     flight = flights("ardupilot-plane")
     assert flight.modes == ["INITIALISING", "MANUAL", "AUTO"]

@@ -54,7 +54,7 @@ class PlanFlight(SupervisedFlight):
         options: argparse.Namespace,
     ) -> None:
         super().__init__(vehicle, report, interrupts, options.on_interrupt)
-        self._plan, self._options, self._report = plan, options, report
+        self._plan, self._options = plan, options
         self.sent: str = _NOTHING_SENT
         """Words for what was sent to the vehicle before arming, for the message after Ctrl-C."""
 

@@ -142,3 +142,77 @@ def error_text(subsystem: int, code: int, text: str) -> str:
 def clean_text(text: str) -> str:
     """Remove terminal control sequences and surrounding white space; PX4 ends texts with a tab."""
     return _CONTROL_CHARACTERS.sub("", text).strip()
+
+
+_STOPS = "stops the motors"
+_COPTER_BATTERY = (
+    "none",
+    "LAND",
+    "RTL",
+    "SMART_RTL or RTL",
+    "SMART_RTL or LAND",
+    _STOPS,
+    "landing sequence or RTL",
+    "BRAKE or LAND",
+)
+_ROVER_BATTERY = ("none", "RTL", "HOLD", "SMART_RTL", "SMART_RTL or HOLD", _STOPS, "LOITER or HOLD")
+_PLANE_BATTERY = ("none", "RTL", "LAND", _STOPS, "QLAND", "parachute", "LOITER, then QLAND", "AUTOLAND or RTL")
+_SUB_BATTERY = ("none", "", "disarms", "SURFACE")
+_BATTERY = ("BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT")
+_PX4_LINK = ("none", "Hold", "Return", "Land", "", _STOPS, "disarms")
+# Maps firmwares and parameters of failsafes to the meanings of the values, from 0. Sources: AP_BattMonitor_Params.cpp,
+# AC_Fence.cpp and Parameters.cpp of ArduPilot 4.7, commander and navigator parameters of PX4 1.17.
+_ACTIONS: dict[str, dict[str, tuple[str, ...]]] = {
+    "ArduCopter": {
+        **dict.fromkeys(_BATTERY, _COPTER_BATTERY),
+        "FENCE_ACTION": (
+            "report",
+            "RTL or LAND",
+            "LAND",
+            "SMART_RTL, RTL or LAND",
+            "BRAKE or LAND",
+            "SMART_RTL or LAND",
+        ),
+        "FS_EKF_ACTION": ("report", "LAND", "ALT_HOLD", "LAND from all modes"),
+        "FS_THR_ENABLE": (
+            "off",
+            "RTL",
+            "RTL",
+            "LAND",
+            "SMART_RTL or RTL",
+            "SMART_RTL or LAND",
+            "landing sequence or RTL",
+            "BRAKE or LAND",
+        ),
+    },
+    "Rover": {
+        **dict.fromkeys(_BATTERY, _ROVER_BATTERY),
+        "FENCE_ACTION": (
+            "report",
+            "RTL or HOLD",
+            "HOLD",
+            "SMART_RTL, RTL or HOLD",
+            "SMART_RTL or HOLD",
+            _STOPS,
+            "LOITER or HOLD",
+        ),
+    },
+    "ArduPlane": {
+        **dict.fromkeys(_BATTERY, _PLANE_BATTERY),
+        "FENCE_ACTION": ("report", "RTL", "", "", "", "", "GUIDED", "GUIDED, pilot's throttle", "AUTOLAND or RTL"),
+    },
+    "ArduSub": dict.fromkeys(_BATTERY, _SUB_BATTERY),
+    "PX4": {
+        "COM_LOW_BAT_ACT": ("warning", "", "Land", "Return if critical, Land in an emergency"),
+        "GF_ACTION": ("none", "warning", "Hold", "Return", _STOPS, "Land"),
+        "NAV_DLL_ACT": _PX4_LINK,
+        "NAV_RCL_ACT": _PX4_LINK,
+    },
+}
+
+
+def failsafe_action(vehicle: str, parameter: str, value: float) -> str:
+    """Return the meaning of a failsafe parameter's value; empty if unknown. ``vehicle`` begins with the firmware."""
+    actions = next((actions for firmware, actions in _ACTIONS.items() if firmware in vehicle), {})
+    meanings = actions.get(parameter, ())
+    return meanings[int(value)] if value in range(len(meanings)) else ""

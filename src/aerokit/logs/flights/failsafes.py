@@ -7,6 +7,7 @@ import re
 from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
+from aerokit.logs.flights.codes import failsafe_action
 from aerokit.logs.flights.flight import FailsafeEvidence, TangentPlane, battery_name
 from aerokit.mavlink.enums import GpsFixType
 
@@ -391,8 +392,13 @@ def _max_before(columns: TimeSeries, name: str, time_s: float) -> float | None:
 
 def _limit_parameters(flight: FlightLog, kind: str, time_s: float) -> list[str]:
     values = ((name, flight.parameter_at(name, time_s)) for name in configured_by(flight, kind))
-    known = [f"{name} = {value:g}" for name, value in values if not math.isnan(value)]
+    known = [_parameter_text(flight, name, value) for name, value in values if not math.isnan(value)]
     return [f"parameters: {', '.join(known)}"] if known else []
+
+
+def _parameter_text(flight: FlightLog, name: str, value: float) -> str:
+    action = failsafe_action(flight.vehicle, name, value)
+    return f"{name} = {value:g} ({action})" if action else f"{name} = {value:g}"
 
 
 def _missing_parameters(flight: FlightLog, kind: str) -> list[str]:
