@@ -60,7 +60,6 @@ class _CircleLeg:
         self._copter, self._turns, self._centre = auto.vehicle, turns, centre
         parameters, motion = self._copter.parameters, self._copter.motion
         self._radius = abs(radius) or parameters["CIRCLE_RADIUS"] / 100.0  # 0 selects the parameter.
-        # A negative radius turns anticlockwise.
         self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
         north, east = motion.north - centre[0], motion.east - centre[1]
         self._angle = math.atan2(east, north)
@@ -81,9 +80,8 @@ class _CircleLeg:
                 self._approach = None
             return
         motion = self._copter.motion
-        # The acceleration towards the centre, rate² * radius, is limited to a share of the maximum.
         max_rate = math.sqrt(_TURN_SHARE_OF_ACCELERATION * motion.limits.acceleration_m_s2 / max(0.5, self._radius))
-        rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)
+        rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)  # limits rate² * radius
         self._report_new_turn()  # The first turn is reported before the copter moves.
         self._angle += rate * dt
         self._turned_rad += abs(rate) * dt
@@ -247,8 +245,7 @@ class CopterAuto(MissionMode):
     def update(self, dt: float) -> None:
         self.start_if_waiting()
         if not self.is_waiting:
-            has_upload_changed_route = self._check_upcoming()
-            if has_upload_changed_route and isinstance(self._leg, _FlyLeg):
+            if self._check_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the route.
                 self._restart_command()
             self.vehicle.mission.update()
             self._check_upcoming()  # `mission.update` may have started the next command
@@ -268,8 +265,7 @@ class CopterAuto(MissionMode):
         has_same_index = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
         if commands.version == self._list_version and has_same_index:
             return False
-        first_index = max(1, run.nav_index)  # Item 0 is home, not a command.
-        upcoming = tuple(islice(run.navigation_from(first_index), _CHECKED_COMMANDS))
+        upcoming = tuple(islice(run.navigation_from(max(1, run.nav_index)), _CHECKED_COMMANDS))  # Item 0 is home.
         has_changed = upcoming != self._upcoming
         self._list_version, self._upcoming = commands.version, upcoming
         return has_changed and has_same_index
@@ -347,8 +343,7 @@ class CopterAuto(MissionMode):
             return False
         if not self._is_leg_complete:
             return False
-        may_continue = int(copter.parameters["MIS_OPTIONS"]) & _CONTINUE_AFTER_LAND
-        if may_continue and copter.mission.is_take_off(index + 1):
+        if int(copter.parameters["MIS_OPTIONS"]) & _CONTINUE_AFTER_LAND and copter.mission.is_take_off(index + 1):
             return True
         copter.arming.disarm()
         return False

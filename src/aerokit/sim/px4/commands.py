@@ -131,8 +131,7 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         Cmd.MISSION_START: flight.start_mission,
         Cmd.DO_SET_HOME: flight.set_home,
         Cmd.EXTERNAL_WIND_ESTIMATE: px4.external.set_wind,
-        # A reboot replaces `px4.calibration`, so the attribute is read at each command.
-        Cmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),
+        Cmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),  # A reboot replaces the object.
         Cmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
         Cmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,
     }
@@ -209,8 +208,7 @@ class _Flight:
         px4, result = self._px4, self._change(modes.TAKEOFF)
         if result == MavResult.ACCEPTED and math.isfinite(command.z):
             down = px4.frame.origin.altitude_m - command.z
-            is_target_lower = down > px4.motion.down
-            if px4.is_armed and is_target_lower and not px4.is_landed:
+            if px4.is_armed and down > px4.motion.down and not px4.is_landed:
                 px4.send_text(MavSeverity.CRITICAL, "Already higher than takeoff altitude")
                 down = px4.motion.down
             px4.flight.plan_take_off(down)
@@ -298,8 +296,7 @@ class _Flight:
         elif math.isnan(self._tuning_since):
             self._tuning_since = px4.now
         steps = (px4.now - self._tuning_since) / _TUNING_STEP_S  # NaN while disarmed
-        last_step = len(_TUNING_PROGRESS) - 1
-        progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), last_step)]
+        progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), len(_TUNING_PROGRESS) - 1)]
         answer = m.CommandAck(command.command, MavResult.IN_PROGRESS, progress, 0, *command.sender)
         px4.send(answer, command.channel)
         return None
@@ -410,8 +407,7 @@ class _Requests:
         if message_id != m.AvailableModes.ID:
             return self.send_now(message_id, command)
         messages, index = available_modes(self._px4), _number(command.param2)
-        requested = messages if index == 0 else messages[index - 1 : index]  # The index 0 selects all modes.
-        for message in requested:
+        for message in messages if index == 0 else messages[index - 1 : index]:  # The index 0 selects all modes.
             self._px4.send(message, command.channel)
         return MavResult.ACCEPTED if 0 <= index <= len(messages) else MavResult.DENIED
 
