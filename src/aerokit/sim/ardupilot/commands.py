@@ -169,7 +169,8 @@ class _CommonCommands:
         point = vehicle.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:
             return Result.DENIED
-        if not vehicle.set_mode(guided.number) or not vehicle.may_go_to(point):
+        # Like Copter, Plane and Sub, change the mode only if the vehicle may fly to the target.
+        if not vehicle.may_go_to(point) or not vehicle.set_mode(guided.number):
             return Result.FAILED
         guided.go_to(point)
         return Result.ACCEPTED

@@ -133,7 +133,7 @@ class ArduPilotMessageRequests:
         """
         vehicle = self._vehicle
         modes = vehicle.available_modes()
-        requested_modes = modes if index == 0 else modes[index - 1 : index]  # empty if there is no such mode
+        requested_modes = modes[max(0, index - 1) : max(0, index)] if index else modes  # empty if there is no such mode
         for message in requested_modes:
             vehicle.call_later(0.0, partial(vehicle.send, message, channel))
         channel.streams.set_interval(m.AvailableModesMonitor.ID, _MODES_MONITOR_INTERVAL_S, vehicle.now)

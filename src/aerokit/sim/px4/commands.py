@@ -406,10 +406,11 @@ class _Requests:
             return self._send_interval(_number(command.param2), command)
         if message_id != m.AvailableModes.ID:
             return self.send_now(message_id, command)
-        messages, index = available_modes(self._px4), _number(command.param2)
-        for message in messages if index == 0 else messages[index - 1 : index]:  # The index 0 selects all modes.
+        if not 0 <= (index := _number(command.param2)) <= len(messages := available_modes(self._px4)):
+            return MavResult.DENIED
+        for message in messages[index - 1 : index] if index else messages:  # The index 0 selects all modes.
             self._px4.send(message, command.channel)
-        return MavResult.ACCEPTED if 0 <= index <= len(messages) else MavResult.DENIED
+        return MavResult.ACCEPTED
 
     def set_interval(self, command: ReceivedCommand) -> int:
         message_id = _number(command.param1)
