@@ -127,9 +127,11 @@ def test_fence_option_refuses_mode_changes_during_breach() -> None:
 
 def test_reposition_outside_fence_is_refused() -> None:
     copter, client = flying_copter(parameters=ENABLED)
+    assert set_mode(client, CopterMode.LOITER) == MavResult.ACCEPTED
     far = copter.frame.to_global(0.0, 100.0, 0.0)
     x, y = far.latitude_e7, far.longitude_e7
     assert client.command_int(MavCmd.DO_REPOSITION, 3, -1, 1, x=x, y=y, z=10) == MavResult.FAILED
+    assert copter.mode.number == CopterMode.LOITER
     near = copter.frame.to_global(0.0, 10.0, 0.0)
     x, y = near.latitude_e7, near.longitude_e7
     assert client.command_int(MavCmd.DO_REPOSITION, 3, -1, 1, x=x, y=y, z=40) == MavResult.FAILED

@@ -112,6 +112,7 @@ def test_available_modes_can_be_requested() -> None:
     assert {(mode.custom_mode, mode.mode_name) for mode in modes} >= {(4, "GUIDED"), (6, "RTL"), (9, "LAND")}
     client.clear()
     client.command(MavCmd.REQUEST_MESSAGE, m.AvailableModes.ID, 2)
+    client.command(MavCmd.REQUEST_MESSAGE, m.AvailableModes.ID, -1)
     assert [mode.mode_index for mode in client.all(m.AvailableModes)] == [2]
     client.run(11.0)
     assert len(client.all(m.AvailableModesMonitor)) >= 2

@@ -278,7 +278,10 @@ def test_available_modes_include_external_modes() -> None:
     assert len(modes) == 26
     assert [mode.mode_name for mode in modes[-8:]] == ["(Mode not available)"] * 8
     assert {mode.standard_mode for mode in modes} == {0, 1, 2, 4, 5, 6, 7, 8}
-    assert client.command(MavCmd.REQUEST_MESSAGE, m.AvailableModes.ID, 99) == MavResult.DENIED
+    client.clear()
+    for index in (99, -1):
+        assert client.command(MavCmd.REQUEST_MESSAGE, m.AvailableModes.ID, index) == MavResult.DENIED
+    assert client.all(m.AvailableModes) == []
 
 
 def test_event_sequence_starts_before_the_overflow() -> None:

@@ -209,10 +209,10 @@ class BackgroundCalls:
             concurrent.futures.wait(pending, timeout)
 
     def _begin(self, call: BackgroundCall, function: CoroutineFunction) -> None:
-        kind = SHARED_KINDS.get(call.kind, call.kind)
+        kind = SHARED_KINDS.get(call.kind, call.kind)  # Disarming and arming replace each other.
         if kind in self._newest:
             self._cancel(self._newest[kind])  # the new call replaces it
-        if call.set_running_or_notify_cancel():
+        if call.set_running_or_notify_cancel():  # False if the call was cancelled before its start
             name = f"dronekit {call.kind}"
             call.task = asyncio.get_running_loop().create_task(self._run(call, function), name=name)
             call.task.add_done_callback(lambda _: self._end(kind, call))

@@ -341,7 +341,7 @@ def _checked_index(index: Any, count: int) -> int:
         raise TypeError("Invalid argument type.") from None
     if not -count <= position < count:
         raise IndexError(f"Index {position} out of range.")
-    return position % count
+    return position % count  # A negative index counts from the end.
 
 
 def _command_from(cmd: Any) -> Command:

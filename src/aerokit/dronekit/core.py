@@ -245,8 +245,9 @@ class Core:
             return
         age = aio.heartbeat_age
         self.listeners.notify("last_heartbeat", age)
-        if (age > SILENCE_WARNING_S) != self._is_silent:
-            self._is_silent = not self._is_silent
+        is_silent = age > SILENCE_WARNING_S
+        if is_silent != self._is_silent:
+            self._is_silent = is_silent
             post = self.handler.listener_thread.post  # not on the loop, because the program's log handlers may block
             if self._is_silent:
                 post(self.logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENCE_WARNING_S)
@@ -345,7 +346,8 @@ class VehicleCore(HasObservers):
             ValueError: a name is not a string.
             APIException: the link is down, or reading an attribute has failed.
         """
-        names = DEFAULT_ATTRIBUTES if not types or types == (True,) else types
+        waits_for_defaults = not types or types == (True,)
+        names = DEFAULT_ATTRIBUTES if waits_for_defaults else types
         if not all(isinstance(name, str) for name in names):
             raise ValueError("wait_ready expects one or more string arguments.")
         required = {str(name) for name in names}

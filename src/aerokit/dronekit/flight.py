@@ -176,6 +176,7 @@ class FlightMethods(VehicleAttributes):
         """
         aio = self._dk.check_link()
         modes = flight_orders.reposition_modes(aio)
+        # Autopilots without such modes take the altitude above home.
         target = self._dk_target(location, is_relative=not modes)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
             flight_orders.check_speed(name, speed)  # before anything is sent

@@ -189,7 +189,7 @@ class CurrentCommand:
     def __init__(self, core: Core) -> None:
         self._core = core
         # Index of the item that was set as current on PX4, until the vehicle reports another item.
-        self._chosen: int | None = None
+        self._requested_index: int | None = None
         self._latest = core.on(m.MissionCurrent, self._on_current)
 
     @property
@@ -200,8 +200,8 @@ class CurrentCommand:
             return 0
         if self._core.aio.autopilot.home_is_item_0:
             return int(message.seq)
-        is_chosen = message.seq == self._chosen
-        if message.total == NO_MISSION or (self._is_no_mission_active(message) and not is_chosen):
+        is_requested = message.seq == self._requested_index
+        if message.total == NO_MISSION or (self._is_no_mission_active(message) and not is_requested):
             return 0
         return int(message.seq) + 1
 
@@ -209,17 +209,17 @@ class CurrentCommand:
         """Set the next command without waiting. Raises InvalidArgument if ``seq`` is not from 0 to 65,535."""
         if not 0 <= operator.index(seq) <= MAX_SEQ:
             raise InvalidArgument(f"next = {seq!r} is not allowed: it must be 0 to {MAX_SEQ}")
-        self._core.order("commands.next", self._choose, operator.index(seq))
+        self._core.order("commands.next", self._set_current, operator.index(seq))
 
     def _on_current(self, message: m.MissionCurrent) -> None:
-        if message.seq != self._chosen:
-            self._chosen = None
+        if message.seq != self._requested_index:
+            self._requested_index = None
 
     def _is_no_mission_active(self, message: m.MissionCurrent) -> bool:
         is_at_start_or_end = message.seq == 0 or message.mission_state == MissionState.COMPLETE
         return is_at_start_or_end and not self._core.aio.is_armed
 
-    async def _choose(self, seq: int) -> None:
+    async def _set_current(self, seq: int) -> None:
         """Set the current command on the vehicle.
 
         Like DroneKit, sends ArduPilot one MISSION_SET_CURRENT. If that is not confirmed, sends a command with retries.
@@ -227,12 +227,13 @@ class CurrentCommand:
         aio = self._core.aio
         if not aio.autopilot.home_is_item_0:
             await aio.mission.set_current(max(seq - 1, 0))
-            self._chosen = seq - 1  # -1 is the index of no item
+            self._requested_index = seq - 1  # -1 is the index of no item
             return
         aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))
         with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):
             await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
             return
+        # The vehicle has not confirmed the item in time.
         if aio.heartbeat_age > MODE_MAX_AGE_S:
             raise APIException(f"the vehicle is silent; it may or may not have set the next command to {seq}")
         if seq == 0:  # home, which mission.set_current() cannot set, because it counts the items after home

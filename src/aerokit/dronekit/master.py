@@ -334,7 +334,7 @@ class Inbox(Mapping[str, Any]):
                 if wait_s > 0:
                     self._raise_if_closed()
                     self._frame_arrived.wait(wait_s)
-                elif not self._frames:
+                else:
                     return None
 
     def _raise_if_closed(self) -> None:

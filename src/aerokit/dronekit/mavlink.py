@@ -218,7 +218,9 @@ def _open(
                 context.value._use_activity_monitor(loop.activity)
                 return context
             except LinkOpenError as error:
-                if attempt == MAX_OPEN_ATTEMPTS - 1 or not isinstance(error.__context__, ConnectionRefusedError):
+                is_last_attempt = attempt == MAX_OPEN_ATTEMPTS - 1
+                was_refused = isinstance(error.__context__, ConnectionRefusedError)
+                if is_last_attempt or not was_refused:
                     _raise_classic(error)
                 time.sleep(RETRY_INTERVAL_S)
         raise AssertionError("unreachable: the last attempt returns or raises")

@@ -78,6 +78,7 @@ class ParameterDownload:
             await self._request(name)
             return
         async with anyio.create_task_group() as group:
+            # The request and the download run at the same time. The first that ends successfully cancels the other.
 
             async def read() -> None:
                 if await self._request(name):
@@ -205,7 +206,8 @@ async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int
 def convert_to_type(name: str, value: float, type: ParameterType) -> int | float:  # noqa: A002
     """Convert a value to a parameter type; InvalidArgument if that is impossible."""
     if type.is_integer and isinstance(value, float) and abs(value) < float("inf"):
-        value = int(value - ROUNDING if value < 0 else value + ROUNDING)
+        rounding = -ROUNDING if value < 0 else ROUNDING
+        value = int(value + rounding)
     return checked_value(name, value, type)
 
 

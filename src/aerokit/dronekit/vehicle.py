@@ -214,12 +214,13 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         Raises:
             APIException: no vehicle was found in time; the text describes what was received instead.
         """
+        heartbeat_limit_s = max(heartbeat_timeout or 0.0, 0.0)
+        timeout = heartbeat_limit_s or CONNECT_TIMEOUT_S
         with self._dk_initializing:
             if self._dk.aio_or_none is not None:  # already connected by an earlier call
-                self._dk_wait_until_booted(timeout=max(heartbeat_timeout or 0.0, 0.0) or CONNECT_TIMEOUT_S)
+                self._dk_wait_until_booted(timeout)
                 return
-            self._dk.heartbeat_limit_s = max(heartbeat_timeout or 0.0, 0.0)
-            timeout = self._dk.heartbeat_limit_s or CONNECT_TIMEOUT_S
+            self._dk.heartbeat_limit_s = heartbeat_limit_s
             try:
                 connected = _connected(self._handler.connection, timeout, weak_callback(self._dk_begin), rate)
                 self._dk_context = self._handler.loop.open_context(connected)

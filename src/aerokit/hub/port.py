@@ -72,6 +72,7 @@ class FrameQueue:
             dropped.append(("queue_full", self._remove(oldest_key)))
         self._frames[key] = frame
         self._bytes += len(frame.raw)
+        # True counts as 1.
         self._order_count += frame.kind is MessageKind.ORDER
         self._telemetry_count += frame.kind is MessageKind.TELEMETRY
         return dropped

@@ -174,7 +174,8 @@ class Router(Generic[PortT]):
         self, node: RouterPort[PortT], frames: list[Frame], now: float, late: list[Frame]
     ) -> list[ForwardingPlan[PortT]]:
         """Return the plans for frames received together at ``node``. ``late``: frames with a number out of order."""
-        # Hot path for new frames of known streams. :meth:`route` processes all other frames.
+        # Hot path for new frames of known streams. :meth:`route` processes all other frames: frames that are out of
+        # order or may return in a loop, and frames after the tables of recent frames have expired or are full.
         recent, streams, number = self._recent, node.streams, node.number
         if late or node.echoes or now >= recent.ends_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES:
             return [self.route(node, frame, now, frame in late) for frame in frames]
@@ -182,7 +183,7 @@ class Router(Generic[PortT]):
         record = number, self._port_count, now  # value for `RecentFrames.newer`
         for frame in frames:
             body = frame.body
-            plan = streams.get(body[4:9])
+            plan = streams.get(body[4:9])  # system id, component id and message id
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
@@ -340,6 +341,7 @@ class Router(Generic[PortT]):
         if message_id == _SETUP_SIGNING:
             return ForwardingPlan(plan_key, message_id, ids, reason="secret")
         has_target = ids[0] != 0
+        # The keys of the dictionary are used as a set that keeps its order.
         if has_target:
             numbers = self._ports_to(*ids, source, node.number)
             if not numbers:
@@ -347,7 +349,7 @@ class Router(Generic[PortT]):
                 return ForwardingPlan(plan_key, message_id, ids, reason="no_route")
         else:
             numbers = dict.fromkeys(self._nodes)
-            if self._targets.is_order(message_id):
+            if self._targets.is_order(message_id):  # An autopilot that is received at two ports gets an order once.
                 numbers = {number: None for number in numbers if not self._is_redundant(number)}
         numbers.pop(node.number, None)
         if message_id in _RADIOS:  # An autopilot would adapt its message rates to a radio that is not its own.

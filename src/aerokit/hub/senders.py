@@ -167,7 +167,7 @@ class IdentityGuard:
             self._current_peer = peer
             if not self._routes.claims_route(frame, peer, framer.counters_of(frame), is_signed=False):
                 return False
-        if frame.message_id == 0:
+        if frame.message_id == 0:  # HEARTBEAT
             self._heartbeat_at[peer] = frame.received_at
             if is_autopilot(frame.body):
                 self._routes.record_heartbeat(frame, peer, framer.counters_of(frame))

@@ -116,7 +116,7 @@ class Switch:
         # Hot path: local variables are faster than attributes.
         node, guard, peer = port.node, port.guard, port.peer
         if node is None or port.is_read_only:
-            if guard is not None:
+            if guard is not None:  # The guard still records the ids that each peer uses.
                 for frame in frames:
                     guard.admits(frame, framer, peer)
             port.counters.dropped["read_only"] += len(frames)
@@ -192,10 +192,11 @@ class Switch:
         for plan in plans:
             if plan.outs is not outs or not plan.is_plain:
                 return False
+        # Several frames are written in one piece only if they are short enough and every port permits it.
         if len(plans) > 1 and not (len(data) <= MAX_JOINED_BYTES and all(out.joins_frames for out in outs)):
             return False
         for out in outs:
-            if not out.batch and out.must_queue():
+            if not out.batch and out.must_queue():  # A queue contains single frames.
                 return False
         for out in outs:
             if not out.batch:

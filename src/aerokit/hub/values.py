@@ -67,7 +67,7 @@ class Endpoint(Snapshot):
                 raise _not_allowed(field, patterns, "a tuple of message names")
         if not isinstance(self.rates, Mapping) or not _are_texts(self.rates):
             raise _not_allowed("rates", self.rates, "a mapping of message names to Hz, such as {'ATTITUDE': 5}")
-        for hz in self.rates.values():
+        for hz in self.rates.values():  # A bool is an int for Python, but not a number here.
             if isinstance(hz, bool) or not isinstance(hz, (int, float)):
                 raise _not_allowed("rates", self.rates, "a mapping of message names to Hz, such as {'ATTITUDE': 5}")
         if isinstance(self.baud, bool) or not isinstance(self.baud, int) or self.baud <= 0:

@@ -329,7 +329,8 @@ class CameraAdapter(CameraDevice):
             move = move_at
         else:
             return False
-        if not _implements(self._camera, move.__name__):
+        is_implemented = _implements(self._camera, move.__name__)  # `move` is a method of the camera driver.
+        if not is_implemented:
             return False
         await self._call(move, value)
         return True
@@ -353,6 +354,8 @@ def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
     if not isinstance(photo, Photo):
         raise InvalidArgument(f"take_photo returned {photo!r}, not a Photo")
     place = photo.position
+    amsl_m = None if place is None else place.altitude_amsl_m
+    relative_m = None if place is None else place.altitude_relative_m
     angles = (photo.roll_deg, photo.pitch_deg, photo.yaw_deg)
     known_angles = [math.radians(angle) for angle in angles if angle is not None]
     message = partial(
@@ -362,10 +365,8 @@ def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
         camera_id=0,
         lat=0 if place is None else round(place.latitude_deg * 1e7),
         lon=0 if place is None else round(place.longitude_deg * 1e7),
-        alt=0 if place is None or place.altitude_amsl_m is None else round(place.altitude_amsl_m * 1000),
-        relative_alt=0
-        if place is None or place.altitude_relative_m is None
-        else round(place.altitude_relative_m * 1000),
+        alt=0 if amsl_m is None else round(amsl_m * 1000),
+        relative_alt=0 if relative_m is None else round(relative_m * 1000),
         q=UNKNOWN_ATTITUDE if len(known_angles) < 3 else quaternion_from_euler(*known_angles),
     )
     # The caller may replace the URL.

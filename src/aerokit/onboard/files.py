@@ -136,7 +136,7 @@ class DirectoryFiles:
                         if len(sizes) >= MAX_ENTRIES:
                             break
             except (OSError, FileFault):
-                if path not in self._memory:
+                if path not in self._memory:  # A directory in memory need not exist on the disk.
                     raise
         if self._root is None or path in self._memory:  # Without a directory, `entries` raises for an unknown path.
             sizes.update(self._memory.entries(path))
@@ -185,7 +185,8 @@ class DirectoryFiles:
         target = self._root
         parts = [part for part in path.split("/") if part not in ("", ".")]
         for part in parts:
-            if part == ".." or "\0" in part or "\\" in part or (os.name == "nt" and ":" in part):
+            has_windows_colon = os.name == "nt" and ":" in part  # a drive, or a second stream of a file
+            if part == ".." or "\0" in part or "\\" in part or has_windows_colon:
                 raise FileFault(EINVAL)
             if "\ufffd" in part:  # The name was not valid UTF-8.
                 raise FileFault(ENOENT)

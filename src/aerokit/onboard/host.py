@@ -75,15 +75,16 @@ class ComponentHost:
         self._detachments.append(self.connection.bus.attach(message_class, on_message))
 
     def _is_addressed(self, message: Message, sender: tuple[int, int]) -> bool:
-        system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
+        # A message without these fields is for all (0).
+        target_system, target_component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         if sender == (self.system_id, self.component_id) or sender[0] == 0:  # System id 0 is not a valid sender.
             return False
         if self._accepts is not None and sender[0] not in self._accepts:
             return False
-        if system not in (0, self.system_id) or component not in (0, self.component_id):
+        if target_system not in (0, self.system_id) or target_component not in (0, self.component_id):
             return False
         # A command that this component does not know may be meant for another one, so do not refuse it.
-        is_command_to_all = component == 0 and message.ID in _COMMANDS
+        is_command_to_all = target_component == 0 and message.ID in _COMMANDS
         return not is_command_to_all or self.knows_command(message.command)  # type: ignore[attr-defined]
 
     def _is_late(self, message: Message) -> bool:

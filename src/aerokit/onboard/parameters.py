@@ -263,7 +263,7 @@ class _Store:
         try:
             checked = self._parameters._checked(row, value)
             if row.on_set is not None:
-                row.on_set(checked)
+                row.on_set(checked)  # The program's function refuses a value by an exception.
         except InvalidArgument as error:
             self._parameters._host.send_text(MavSeverity.WARNING, str(error))
             return MavParamError.VALUE_OUT_OF_RANGE, ParamAck.VALUE_UNSUPPORTED

@@ -53,10 +53,11 @@ class VehicleSigning:
         if self.key is None or channel.version == 1 or not self.is_for(link_id):
             channel.sign_with(None)
             return
+        first_timestamp = (self.timestamp + self.AHEAD) & LAST_TIMESTAMP
         signing = _Signing(
             self.key,
             link_id=link_id,
-            timestamp=(self.timestamp + self.AHEAD) & LAST_TIMESTAMP,
+            timestamp=first_timestamp,
             allow_unsigned=self.unsigned_on(link_id),
         )
         signing.streams = self._streams  # The last time stamps of all senders, which the ports share.

@@ -40,11 +40,13 @@ def fitted(message: MessageT) -> MessageT:
 
 def _fit_field(field: Field, value: Any) -> Any:
     """Return the value of a field, fitted as `fitted` describes."""
-    if field.type == "char" and isinstance(value, str) and field.is_text:
-        max_bytes = field.array_length or 1
-        return value.encode(errors="replace")[:max_bytes].decode(errors="ignore")
     if field.type == "char":
-        return value[: field.array_length] if isinstance(value, bytes) and not field.is_text else value
+        if isinstance(value, str) and field.is_text:
+            max_bytes = field.array_length or 1
+            return value.encode(errors="replace")[:max_bytes].decode(errors="ignore")
+        if isinstance(value, bytes) and not field.is_text:
+            return value[: field.array_length]
+        return value  # of a wrong type
     if isinstance(value, tuple):
         return tuple(_fit_number(field.type, element) for element in value)
     return _fit_number(field.type, value)

@@ -9,6 +9,7 @@ import random
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from aerokit.mavlink.message import Message
@@ -127,7 +128,7 @@ class LogServer:
         data = self.content(number)
         end = min(len(data), offset + count)
         starts = range(offset, end, _BLOCK) if offset < end else range(offset, offset + 1)
-        return [lambda start=start: _block(data, log_id, start, end) for start in starts]  # type: ignore[misc]
+        return [partial(_block, data, log_id, start, end) for start in starts]
 
     def transfer(self, messages: Sequence[Callable[[], Message]], channel: Channel) -> None:
         """Abort the running transfer, if any, and send these messages."""
@@ -173,7 +174,7 @@ class ArduPilotLogServer(LogServer):
         if not self.logs:  # Without logs, answer with a single empty entry that has the number 0.
             first = last = 0
         numbers = range(first, last + 1)
-        self.transfer([lambda number=number: self._entry(number, last) for number in numbers], channel)  # type: ignore[misc]
+        self.transfer([partial(self._entry, number, last) for number in numbers], channel)
 
     def _entry(self, number: int, last: int) -> LogEntry:
         if number == 0:
@@ -219,7 +220,7 @@ class Px4LogServer(LogServer):
         count = len(self.logs)
         last = count if request.end == 0xFFFF else request.end
         numbers = range(request.start, count)
-        self.transfer([lambda number=number: self._entry(number, last) for number in numbers], channel)  # type: ignore[misc]
+        self.transfer([partial(self._entry, number, last) for number in numbers], channel)
 
     def _entry(self, number: int, last: int) -> LogEntry:
         log = self.logs[number]

@@ -114,7 +114,8 @@ class _Writer(UploadedFile):
             raise FileFault(EINVAL) from None
         # ArduPilot counts the items by the length of the file, and rejects an item of zero bytes
         # (AP_Filesystem_Mission.cpp, finish_upload).
-        if len(self.content) >= header.length + MissionItemInt.LENGTH or _EMPTY in items:
+        has_extra_item = len(self.content) >= header.length + MissionItemInt.LENGTH
+        if has_extra_item or _EMPTY in items:
             raise FileFault(EINVAL)
         clear = not header.options & NO_CLEAR
         result = self._store.replace(self._type, items, start=header.first, clear=clear)

@@ -202,7 +202,8 @@ class Px4ParameterServer(ParameterServer):
         if name not in self._vehicle.faults.read_only_parameters:
             parameters[name] = self.clamped(name, value)
         self.send(name, parameters.index(name), channel)
-        if parameters[name] != previous and not math.isnan(value):
+        is_changed = parameters[name] != previous and not math.isnan(value)  # NaN differs even from itself.
+        if is_changed:
             # PX4 also broadcasts every changed parameter (mavlink_parameters.cpp).
             self._vehicle.call_later(_SECOND_ECHO_S, lambda: self.send(name, parameters.index(name), None))
 

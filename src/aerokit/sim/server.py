@@ -67,7 +67,8 @@ class SimulatorServer:
         self._speedup = speedup
         self._dues = [0.0] * len(self.vehicles)  # The simulated time of each vehicle's next event.
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
-        self._min_wait_s = _MIN_WAIT_S if speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD else 0.0
+        runs_several_ticks = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD  # in one callback
+        self._min_wait_s = _MIN_WAIT_S if runs_several_ticks else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None
         # Ends the event source, which replaces the timers on a `VirtualClockLoop`.
         self._end_source: Callable[[], None] | None = None
@@ -214,7 +215,7 @@ class SimulatorServer:
                 # This vehicle may be ahead of `now`, because a timer fired early or another vehicle advanced it.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
-            port.reader.forget()
+            port.reader.forget()  # All vehicles have used the decoded messages.
             self._flush()
             self._schedule()
         except Exception as error:

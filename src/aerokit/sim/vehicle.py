@@ -375,6 +375,7 @@ class SimulatedVehicle:
 
     def _handle(self, message: Message, channel: Channel) -> None:
         handler = self.handlers.get(message.ID)
+        # Observers get all messages, even those for other vehicles and those that a fault drops.
         for observer in self._observers.get(message.ID, ()):
             observer(message, channel)
         if handler is None or not self.is_addressed(message):

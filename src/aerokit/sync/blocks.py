@@ -378,7 +378,8 @@ def opened(
     is_connection = isinstance(address, ConnectionTwin)
     loop = address._loop if is_connection else LoopThread()
     try:
-        context: OpenContext[Any] = loop.open_context(open_async(address.aio if is_connection else address, **options))
+        async_address = address.aio if is_connection else address
+        context: OpenContext[Any] = loop.open_context(open_async(async_address, **options))
     except BaseException as error:
         if not is_connection:
             loop.close()
@@ -386,6 +387,7 @@ def opened(
             raise error.with_traceback(None) from error.__cause__
         raise
     if not is_connection:
+        # A vehicle has the attribute `connection`. Without it, the value is the connection itself.
         connection: Connection = getattr(context.value, "connection", context.value)
         connection._use_activity_monitor(loop.activity)
     if issubclass(twin, VehicleTwin):

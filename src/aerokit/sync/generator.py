@@ -91,6 +91,7 @@ def arguments_of(arguments: ast.arguments) -> list[str]:
     """Return the source of the arguments of a definition, one text for each."""
     positional = [*arguments.posonlyargs, *arguments.args]
     no_defaults: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults))
+    # Only the last positional arguments have defaults.
     texts = [_argument(*pair) for pair in zip(positional, [*no_defaults, *arguments.defaults])]  # noqa: B905
     if arguments.vararg is not None:
         texts.append("*" + _argument(arguments.vararg, None))
@@ -189,6 +190,7 @@ class Page:
             text = part.value if isinstance(part, ast.Constant) and isinstance(part.value, str) else None
             if isinstance(part, ast.Name):
                 self._import_name(part.id, modules, at_run_time)
+            # In an annotation, a text that is a name is a forward reference.
             elif text is not None and text.isidentifier() and not at_run_time:
                 self._import_name(text, modules, at_run_time)
 
@@ -200,7 +202,8 @@ class Page:
             return
         imports = (imports_of(module) for module in modules)
         origin = next((imported[name] for imported in imports if name in imported), (modules[0], name))
-        # Several modules may export a name. It is always imported from the first of them.
+        # Several modules may export a name. It is always imported from the first of them. The name in its module is
+        # empty for a module that is imported itself.
         origin = self._import_sources.setdefault(origin[1] or name, origin)
         if at_run_time:
             self.at_run_time.add(origin)
@@ -297,7 +300,9 @@ def generate(name: str = "twins") -> str:
     page, twins = Page(name), [twin for twin in TWINS if twin.page == name]
     classes = [_class(page, twin) for twin in twins]
     functions = [_opener(page, path) for path in FUNCTIONS[name]]
-    names = sorted((*(twin.name for twin in twins), *(path.rpartition(".")[2] for path in FUNCTIONS[name])))
+    function_names = [path.rpartition(".")[2] for path in FUNCTIONS[name]]
+    exports = sorted([*(twin.name for twin in twins), *function_names])
+    # `_class` and `_opener` have added the imports of the code. These are the imports that every file needs.
     page.at_run_time |= {(f"aerokit.sync.{BASE_MODULES.get(twin.base, 'blocks')}", twin.base) for twin in twins}
     page.at_run_time |= {OPENERS[name], ("aerokit._internal.arguments", "checked")}
     page.for_types |= {
@@ -315,7 +320,7 @@ def generate(name: str = "twins") -> str:
         text = text.replace("from functools import cached_property\n", "")
     head = text + _import_lines(page.at_run_time, "") + "\nif TYPE_CHECKING:\n"
     head += _import_lines(page.for_types, "    ") + "\n"
-    head += "__all__ = [\n" + "".join(f'    "{exported}",\n' for exported in names) + "]\n"
+    head += "__all__ = [\n" + "".join(f'    "{export}",\n' for export in exports) + "]\n"
     head += "\n" if variables else ""
     for variable, bound in variables.items():
         head += f'{variable} = TypeVar("{variable}"{f", bound={bound}" if bound else ""})\n'
@@ -363,7 +368,8 @@ def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
     for is_ours in (False, True):
         modules = {module for module, _ in names if module.startswith("aerokit") == is_ours}
         plain = [f"{indent}import {module}\n" for module in sorted(modules) if (module, "") in names]
-        parts.append("".join([*plain, *(_from_lines(module, names, indent) for module in sorted(modules))]))
+        from_imports = [_from_lines(module, names, indent) for module in sorted(modules)]
+        parts.append("".join([*plain, *from_imports]))
     return "\n".join(part for part in parts if part)
 
 
@@ -375,7 +381,7 @@ def _from_lines(module: str, names: set[tuple[str, str]], indent: str) -> str:
     statements = {name: f"{indent}from {module} import {name}\n" for name in imported if name not in plain_names}
     if plain_names:
         statement = f"{indent}from {module} import {', '.join(plain_names)}\n"
-        if len(statement) > WIDTH + 1:
+        if len(statement) > WIDTH + 1:  # `statement` includes the line end, WIDTH does not.
             statement = f"{indent}from {module} import (\n{_lines(plain_names, indent + '    ')}{indent})\n"
         statements[plain_names[0]] = statement
     return "".join(statements[name] for name in sorted(statements, key=_by_kind))

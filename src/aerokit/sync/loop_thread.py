@@ -120,7 +120,8 @@ class LoopThread:
                 self._cancel(call)
                 wait_s = SIGNAL_CHECK_INTERVAL_S if interrupt_timeout_s is None else interrupt_timeout_s
                 while call.is_scheduled and not call.wait(wait_s):
-                    if not is_shielded or not self._thread.is_alive():
+                    may_wait_on = is_shielded and self._thread.is_alive()  # Only clean-up is awaited without limit.
+                    if not may_wait_on:
                         break
                 # An error of the clean-up function must not be lost, so it becomes the cause of the raised exception.
                 failure = call.pop_exception() if is_shielded else None
@@ -259,7 +260,7 @@ class OpenContext(Generic[T]):
         try:
             loop._start(self._call)
             loop.wait_for(opened)
-            if not opened.has_result:
+            if not opened.has_result:  # __aenter__ has failed.
                 loop.wait_for(self._call)
                 self._call.result()  # This raises the exception of __aenter__.
         except BaseException:

@@ -195,7 +195,8 @@ def members_of(twin: Twin) -> list[ClassMember]:
     for base in reversed(cls.__mro__):
         if base.__module__.startswith("aerokit.") and base not in classes_of_base_twin:
             members |= {member.name: fill(member) for member in _own_members(base)}
-    selected = twin.only or {name for name in members if not name.startswith("_")} | twin.special
+    public_names = {name for name in members if not name.startswith("_")}
+    selected = twin.only or (public_names | twin.special)
     return [member for name, member in members.items() if name in selected and name not in twin.without]
 
 
@@ -209,8 +210,9 @@ def _type_argument_filler(cls: type) -> Callable[[ClassMember], ClassMember]:
     arguments: dict[str, str] = {}
     for base in getattr(cls, "__orig_bases__", ()):
         names = [parameter.__name__ for parameter in getattr(get_origin(base), "__parameters__", ())]
+        # Only forward references are filled in. No base of an original has them together with other arguments.
         values = [argument.__forward_arg__ for argument in get_args(base) if isinstance(argument, ForwardRef)]
-        arguments |= dict(zip(names, values))  # noqa: B905 - other arguments are no forward references
+        arguments |= dict(zip(names, values))  # noqa: B905 - empty for other arguments
 
     class Fill(ast.NodeTransformer):
         def visit_Name(self, node: ast.Name) -> ast.Name:

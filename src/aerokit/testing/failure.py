@@ -78,6 +78,7 @@ def _picture(flights: Sequence[Flight | ServedFlight], test: str, directory: Pat
 
 def _recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: Path) -> list[str]:
     """Save a recording of each link and a report on each vehicle. Return the lines about these files."""
+    # The vehicles of a fleet share one recording.
     by_recording: dict[int, list[Flight | ServedFlight]] = {}
     for flight in flights:
         by_recording.setdefault(id(flight.recording), []).append(flight)

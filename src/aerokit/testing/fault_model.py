@@ -132,8 +132,10 @@ class FaultyPath:
             due += model.overtaken_s
         else:  # Jitter alone must not change the order.
             due = self._latest_due = max(due, self._latest_due)
-        self.duplicated += is_duplicated
-        return [(due, frame)] * (2 if is_duplicated else 1)
+        if is_duplicated:
+            self.duplicated += 1
+            return [(due, frame), (due, frame)]
+        return [(due, frame)]
 
     def _transmit(self, size: int, now: float) -> float | None:
         """Return the time at which the last byte of a frame is sent; None if the queue is full."""

@@ -283,7 +283,7 @@ class FaultyLink(Link):
         if self._incoming_path is None or is_stalled == was_stalled:  # Report only a change, and only while open.
             return
         self._stalled_at = now if is_stalled else None
-        if stalled_at is None:
+        if stalled_at is None:  # The stall begins now.
             self._incoming_path.link_stalled(self.unsent_bytes)
         else:
             self._incoming_path.link_drained(now - stalled_at)

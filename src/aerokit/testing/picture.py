@@ -192,7 +192,8 @@ def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
     # All tracks are drawn relative to the first home: east to the right, north upwards.
     paths = [[(east, north) for north, east, _ in track.local(tracks[0].home)] for track in tracks]
     outlines = [outline for track in tracks for outline in _outlines(track, tracks[0].home)]
-    easts, norths = zip(*(place for path in paths + outlines for place in path), strict=True)
+    all_places = [place for path in paths + outlines for place in path]
+    easts, norths = zip(*all_places, strict=True)
     axes = _Axes(easts, norths, top=30, height=_MAP_HEIGHT - 60, square=True)
     shapes = axes.grid("m", "m")
     shapes += [_Line([axes.place(*corner) for corner in outline], _FAILED, is_dashed=True) for outline in outlines]
@@ -277,7 +278,8 @@ def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
     paths = [[(point.time_s, point.altitude_m) for point in track] for track in tracks]
     limits = [track.failure.altitude_m for track in tracks if track.failure is not None]
     limit = next((altitude for altitude in limits if altitude is not None), None)
-    times, heights = zip(*(place for path in paths for place in path), strict=True)
+    all_points = [point for path in paths for point in path]
+    times, heights = zip(*all_points, strict=True)
     shown_heights = heights if limit is None else (*heights, limit)  # The chart also shows the line of the limit.
     axes = _Axes(times, shown_heights, top=_MAP_HEIGHT, height=_PROFILE_HEIGHT - 40, square=False)
     shapes = axes.grid("s", "m up")

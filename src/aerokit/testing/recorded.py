@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Iterable
+from functools import partial
 from os import PathLike
 from typing import BinaryIO, ClassVar
 
@@ -299,7 +300,7 @@ class RecordedVehicle(SimulatedVehicle):
         for delay, ack in answer.acks:
             # The recorded acknowledgement is addressed to the recorded client.
             readdressed = m.CommandAck(ack.command, ack.result, ack.progress, ack.result_param2, *command.sender)
-            self.call_later(delay, lambda ack=readdressed: self.send(ack, command.channel))  # type: ignore[misc]
+            self.call_later(delay, partial(self.send, readdressed, command.channel))
         return None  # The acknowledgements were recorded, so no further one is sent.
 
     def _answer_to(self, command: ReceivedCommand) -> RecordedAnswer | None:
@@ -311,7 +312,7 @@ class RecordedVehicle(SimulatedVehicle):
         # A message request matches an answer for the same message, whose id is param 1.
         if not candidates and command.command in _MESSAGE_REQUESTS:
             candidates = [answer for answer in answers if answer.params[:1] == params[:1]]
-        elif not candidates:
+        elif not candidates:  # Any other command gets the answers to the command with other params.
             candidates = answers
         if not candidates:
             return None

@@ -264,8 +264,10 @@ class _Parser:
 
     def port(self, kind: LinkKind, tail: str) -> int:
         """Parse the text after a host, which must be ``:port``."""
-        if not tail.startswith(":") or tail == ":":
-            self.fail("the port is missing" if tail in ("", ":") else f"{tail!r} follows the host, not :port")
+        if tail in ("", ":"):
+            self.fail("the port is missing")
+        if not tail.startswith(":"):
+            self.fail(f"{tail!r} follows the host, not :port")
         port = self.whole_number("the port", tail[1:])
         min_port = 0 if kind in _LISTENING else 1
         if not min_port <= port <= 65535:
@@ -322,7 +324,7 @@ class _Parser:
 
     def option_value(self, key: str, value: str) -> str:
         """Check the value of an option, and return its canonical form."""
-        if key == "baud":
+        if key == "baud":  # `serial` checks the number.
             return value
         if key in _CHOICES:
             if value not in _CHOICES[key]:

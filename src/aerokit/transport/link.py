@@ -257,7 +257,7 @@ class BaseLink(Link):
         receiver = self._receiver
         if not isinstance(receiver, DrainListener):
             return
-        if stalled_at is None:
+        if stalled_at is None:  # The stall begins now.
             receiver.link_stalled(self.unsent_bytes)
         else:
             receiver.link_drained(now - stalled_at)
@@ -390,6 +390,7 @@ class MemoryLink(BaseLink):
         now = max(self._loop.time(), self._inbox[0][0])  # A timer may fire early by the clock's resolution.
         # Due items are counted before the delivery, because the receiver may write data that is due at once. This data
         # must arrive in a later loop iteration.
+        # The first item is always due, which saves the count for a single item.
         due_count = 1 if len(self._inbox) == 1 else sum(due <= now for due, _ in self._inbox)
         for _ in range(due_count):
             if not self._inbox:  # The receiver has closed the link in its callback.

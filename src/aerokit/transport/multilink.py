@@ -125,7 +125,7 @@ class MultiLink(Link):
         self._is_opening, self._last_loss = True, None
         openings = [asyncio.ensure_future(self._open_one(index)) for index in range(len(self._links))]
         try:
-            failures = await asyncio.gather(*openings)
+            failures = await asyncio.gather(*openings)  # None for each link that was opened
             if None not in failures:
                 raise LinkOpenError("no link can be opened: " + "; ".join(map(str, failures)))
         except BaseException:

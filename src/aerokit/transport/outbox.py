@@ -67,7 +67,7 @@ class Outbox:
             self._dropped(1)
             return
         if self._is_full or self._is_stalled or self._waiting:
-            self._keep(bytes(data))
+            self._buffer(bytes(data))
         else:
             self._forward(data)
         if self._timer is None:
@@ -109,7 +109,8 @@ class Outbox:
         while self._waiting:
             self._forward(self._joined())
 
-    def _keep(self, data: bytes) -> None:
+    def _buffer(self, data: bytes) -> None:
+        # An empty buffer accepts even a frame that is larger than the limit.
         if self._waiting and self._waiting_bytes + len(data) > self._limit:
             self._dropped(1)
             return

@@ -277,7 +277,7 @@ class UdpBroadcast(_UdpLink):
         elif not self._is_accepted(source):
             return
         elif not self._keeps_peers:
-            self.keep_peer(source)
+            self.keep_peer(source)  # From now on, `write` sends to this peer instead of broadcasting.
         # If the receiver keeps no peers, this link has a single remote end, and its peer is None.
         self._deliver(data, source if self._keeps_peers else None)
 

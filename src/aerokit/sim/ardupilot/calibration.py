@@ -59,8 +59,8 @@ class AccelerometerCalibration:
     def _on_sample(self, run_number: int, position: int) -> None:
         if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
-        is_first_position = position == AccelcalVehiclePos.LEVEL
-        if self.is_held_wrong and not is_first_position:
+        has_earlier_position = position != AccelcalVehiclePos.LEVEL  # The vehicle is level first.
+        if self.is_held_wrong and has_earlier_position:
             self._end("Calibration FAILED", AccelcalVehiclePos.FAILED)
         elif position == _LAST:
             self._end("Calibration successful", AccelcalVehiclePos.SUCCESS)
@@ -164,8 +164,9 @@ class CompassCalibration:
         # The mask of ten bytes has one bit for each of 80 directions in which the vehicle can point.
         direction_count = percent * 80 // 100
         directions = ((1 << direction_count) - 1).to_bytes(10, "little")
+        attempt, no_direction = 1, (0.0, 0.0, 0.0)
         return m.MagCalProgress(
-            self._progress_compass, self._compass_mask, status, 1, percent, directions, 0.0, 0.0, 0.0
+            self._progress_compass, self._compass_mask, status, attempt, percent, directions, *no_direction
         )
 
     def report(self) -> m.MagCalReport | None:
@@ -252,5 +253,6 @@ class Calibrations:
             self._simple_calibration_at = vehicle.now
             vehicle.info("Initialising ArduPilot")
             return CommandProgress(percents=(), interval_s=_ACCELEROMETERS_S)
-        accepts_present = _ACCEPTS_PRESENT_CALIBRATION in (command.x, command.param2)  # accelerometers, compasses
-        return MavResult.ACCEPTED if accepts_present else MavResult.UNSUPPORTED
+        keeps_accelerometers = command.x == _ACCEPTS_PRESENT_CALIBRATION
+        keeps_compasses = command.param2 == _ACCEPTS_PRESENT_CALIBRATION
+        return MavResult.ACCEPTED if keeps_accelerometers or keeps_compasses else MavResult.UNSUPPORTED

@@ -107,7 +107,8 @@ class ArduPilotCamera:
                 self.take()
         elif item.command == MavCmd.DO_SET_CAM_TRIGG_DIST:
             self.trigger_by_distance(item.param1)
-            if item.param3 == 1.0:
+            takes_first_image_now = item.param3 == 1.0
+            if takes_first_image_now:
                 self.take()
         elif item.command == MavCmd.IMAGE_START_CAPTURE:
             interval_s, image_count = item.param2, item.param3
@@ -155,7 +156,9 @@ class ArduPilotCamera:
     def focus(self, command: ReceivedCommand) -> int:
         """Handle MAV_CMD_SET_CAMERA_FOCUS. Focus by rate or in percent is accepted. Autofocus is UNSUPPORTED."""
         kind = whole(command.param1)
-        if kind in (SetFocusType.STEP, SetFocusType.METERS) or kind not in list(SetFocusType):
+        # The firmware denies these types even without a camera (AP_Camera.cpp).
+        is_unsupported = kind in (SetFocusType.STEP, SetFocusType.METERS)
+        if is_unsupported or kind not in list(SetFocusType):
             return MavResult.DENIED
         if not self.is_fitted:
             return MavResult.FAILED
@@ -213,9 +216,11 @@ class ArduPilotCamera:
     def capture_status(self) -> m.CameraCaptureStatus | None:
         if not self.is_fitted:
             return None
+        # Like the firmware, report even an unlimited series (-1) as idle (AP_Camera_Backend.cpp).
+        is_series_reported = self.remaining > 0
         return m.CameraCaptureStatus(
             time_boot_ms=self._vehicle.time_boot_ms,
-            image_status=_INTERVAL_SET if self.remaining > 0 else _IDLE,
+            image_status=_INTERVAL_SET if is_series_reported else _IDLE,
             video_status=0,
             image_interval=self.interval_s,
             recording_time_ms=0,

@@ -126,25 +126,25 @@ class _CommonCommands:
         vehicle = self._vehicle
         must_arm, must_disarm = command.param1 == 1.0, command.param1 == 0.0
         if must_arm:
-            force = command.param2 in (_FORCE_ARM, _FORCE_ARM_OR_DISARM)
-            is_done = vehicle.motors.is_armed or vehicle.arming.arm(force=force)
+            skips_checks = command.param2 in (_FORCE_ARM, _FORCE_ARM_OR_DISARM)
+            is_done = vehicle.motors.is_armed or vehicle.arming.arm(force=skips_checks)
         elif must_disarm:
-            is_done = vehicle.arming.disarm(force=command.param2 == _FORCE_ARM_OR_DISARM)
+            stops_in_air = command.param2 == _FORCE_ARM_OR_DISARM
+            is_done = vehicle.arming.disarm(force=stops_in_air)
         else:
             return Result.UNSUPPORTED
         return Result.ACCEPTED if is_done else Result.FAILED
 
     def set_mission_current(self, command: ReceivedCommand) -> int:
-        # A reset sets the counters of jumps to 0. It restarts a complete mission, too.
         vehicle, resets_mission = self._vehicle, command.param2 == 1.0
         if not 0 <= command.param1 < vehicle.missions.commands.count:
             return Result.DENIED
         if resets_mission:
-            vehicle.mission.reset()
+            vehicle.mission.reset()  # sets the counters of jumps to 0
         if not vehicle.mission.set_current(whole(command.param1)):
             return Result.FAILED
         if resets_mission:
-            vehicle.mission.start_or_resume()
+            vehicle.mission.start_or_resume()  # A reset restarts a complete mission, too.
         vehicle.requests.send_soon(m.MissionCurrent.ID, command.channel)
         return Result.ACCEPTED
 
@@ -169,7 +169,8 @@ class _CommonCommands:
         point = vehicle.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:
             return Result.DENIED
-        if not vehicle.set_mode(guided.number) or not vehicle.may_go_to(point):
+        # Like Copter, Plane and Sub, change the mode only if the vehicle may fly to the target.
+        if not vehicle.may_go_to(point) or not vehicle.set_mode(guided.number):
             return Result.FAILED
         guided.go_to(point)
         return Result.ACCEPTED
@@ -224,7 +225,8 @@ class _CommonCommands:
             point = self._vehicle.world_point(*command.place(), command.z, command.altitude_frame)
             if point is None:
                 return Result.DENIED
-            if command.place() == (0, 0) and command.z == 0:
+            has_only_zeros = command.place() == (0, 0) and command.z == 0
+            if has_only_zeros:
                 point = None
         self._vehicle.look_at(point)  # None clears the region.
         return Result.ACCEPTED
@@ -349,8 +351,9 @@ class GimbalCommands:
         # Params 1 and 2 held the position until AP 4.2. Newer firmware refuses such a command (AP_Mount_Backend.cpp).
         has_place_in_params = command.param1 and command.param2 and not command.x and not command.y
         if mode == MavMountMode.GPS_POINT and not has_place_in_params:
-            place = (whole(command.x), whole(command.y), float(whole(command.param4)))
-            gimbal.look_at(self._vehicle.world_point(*place, MavFrame.GLOBAL_RELATIVE_ALT))
+            altitude = float(whole(command.param4))  # The firmware uses whole metres (AP_Mount_Backend.cpp).
+            frame = MavFrame.GLOBAL_RELATIVE_ALT
+            gimbal.look_at(self._vehicle.world_point(whole(command.x), whole(command.y), altitude, frame))
             return Result.ACCEPTED
         return Result.FAILED
 

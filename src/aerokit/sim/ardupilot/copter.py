@@ -49,9 +49,11 @@ class MotorTest:
     def command(self, command: ReceivedCommand) -> int:
         """Start a test, or replace the running test. A status text reports the end of the test."""
         if not self.is_running:
-            reason = "" if self._copter.is_landed else "vehicle not landed"
+            reason = ""
             if not self._copter.is_initialised:
                 reason = "Board initialising"
+            elif not self._copter.is_landed:
+                reason = "vehicle not landed"
             if reason:
                 self._copter.send_text(MavSeverity.CRITICAL, f"Motor Test: {reason}")
                 return MavResult.FAILED
@@ -220,7 +222,7 @@ class SimulatedCopter(CopterHost):
 
     @property
     def base_mode(self) -> int:
-        if not self.has_left_boot:
+        if not self.has_left_boot:  # During the boot, GUIDED_ENABLED is set in every mode.
             return _BASE | _GUIDED
         flags, mode_name = _BASE, self.mode.name
         # GUIDED_ENABLED is set in modes that use a position, in RTL only while armed.

@@ -59,11 +59,11 @@ class _CircleLeg:
     def __init__(self, auto: CopterAuto, centre: Ned, *, turns: float, radius: float) -> None:
         self._copter, self._turns, self._centre = auto.vehicle, turns, centre
         parameters, motion = self._copter.parameters, self._copter.motion
-        self._radius = abs(radius) or parameters["CIRCLE_RADIUS"] / 100.0
+        self._radius = abs(radius) or parameters["CIRCLE_RADIUS"] / 100.0  # 0 selects the parameter.
         self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
         north, east = motion.north - centre[0], motion.east - centre[1]
         self._angle = math.atan2(east, north)
-        self._turned_rad, self._reported_turns = 0.0, -1
+        self._turned_rad, self._reported_turns = 0.0, -1  # -1: not even turn 0 is reported yet.
         self._approach: _FlyLeg | None = None
         distance_to_circle = abs(math.hypot(north, east) - self._radius)
         if distance_to_circle > _ON_CIRCLE_M or abs(motion.down - centre[2]) > _ON_CIRCLE_M:
@@ -81,7 +81,7 @@ class _CircleLeg:
             return
         motion = self._copter.motion
         max_rate = math.sqrt(_TURN_SHARE_OF_ACCELERATION * motion.limits.acceleration_m_s2 / max(0.5, self._radius))
-        rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)
+        rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)  # limits rate² * radius
         self._report_new_turn()  # The first turn is reported before the copter moves.
         self._angle += rate * dt
         self._turned_rad += abs(rate) * dt
@@ -245,7 +245,7 @@ class CopterAuto(MissionMode):
     def update(self, dt: float) -> None:
         self.start_if_waiting()
         if not self.is_waiting:
-            if self._check_upcoming() and isinstance(self._leg, _FlyLeg):
+            if self._check_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the route.
                 self._restart_command()
             self.vehicle.mission.update()
             self._check_upcoming()  # `mission.update` may have started the next command
@@ -265,7 +265,7 @@ class CopterAuto(MissionMode):
         has_same_index = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
         if commands.version == self._list_version and has_same_index:
             return False
-        upcoming = tuple(islice(run.navigation_from(max(1, run.nav_index)), _CHECKED_COMMANDS))
+        upcoming = tuple(islice(run.navigation_from(max(1, run.nav_index)), _CHECKED_COMMANDS))  # Item 0 is home.
         has_changed = upcoming != self._upcoming
         self._list_version, self._upcoming = commands.version, upcoming
         return has_changed and has_same_index

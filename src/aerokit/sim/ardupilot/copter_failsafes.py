@@ -41,7 +41,8 @@ class CopterArming(ArduPilotArming[CopterHost]):
     def mandatory_reasons(self) -> list[str]:
         copter, nav = self.vehicle, self.vehicle.navigation
         reasons = []
-        if copter.mode.needs_position and not (nav.has_position and not copter.failsafes.has_estimator_failed):
+        is_position_usable = nav.has_position and not copter.failsafes.has_estimator_failed
+        if copter.mode.needs_position and not is_position_usable:
             reasons.append("Need Position Estimate")
         if not copter.mode.has_manual_throttle and not nav.has_altitude:
             reasons.append("Need Alt Estimate")
@@ -54,6 +55,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
         mode = self.vehicle.mode
         if not mode.can_arm:
             return [f"{mode.name} mode not armable"]
+        # In modes that control the climb rate, a centred stick holds the altitude.
         max_throttle = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
         if not mode.arms_with_raised_throttle and self.vehicle.rc[RC_THROTTLE] > max_throttle:
             return ["Throttle too high"]
@@ -199,7 +201,8 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         """Execute the action in the air, or disarm on the ground. With FS_OPTIONS bit 3 a landing continues."""
         if self._disarm_if_landed("Battery"):
             return
-        if self.vehicle.mode.is_landing and self._has_option(_IF_LANDING) and action != _NONE:
+        continues_landing = self.vehicle.mode.is_landing and self._has_option(_IF_LANDING)
+        if continues_landing and action != _NONE:
             action = self._report_continuation("Battery", "Continuing Landing", _LAND)
         else:
             self.warn("Battery Failsafe")

@@ -274,7 +274,8 @@ class CopterSetpoints:
         has_attitude, ignored_rates = not mask & AttitudeMask.ATTITUDE_IGNORE, mask & _ALL_RATES
         quaternion_norm = math.sqrt(sum(component * component for component in target.q))
         has_one_or_two_rates = ignored_rates not in (0, _ALL_RATES)  # The firmware needs all rates or none.
-        is_mask_invalid = mask & AttitudeMask.THROTTLE_IGNORE or has_one_or_two_rates
+        is_thrust_missing = mask & AttitudeMask.THROTTLE_IGNORE
+        is_mask_invalid = is_thrust_missing or has_one_or_two_rates
         is_quaternion_invalid = has_attitude and not abs(quaternion_norm - 1.0) < _UNIT_LENGTH_TOLERANCE
         if is_mask_invalid or is_quaternion_invalid:
             guided.enter(force=False)  # An invalid message stops the vehicle.

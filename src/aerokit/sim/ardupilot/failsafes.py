@@ -46,8 +46,8 @@ class BatteryFailsafe:
         self._vehicle.send_text(MavSeverity.WARNING, f"Battery 1 is {_WORDS[level]} {used}")
         action = int(self._vehicle.parameters[f"BATT_FS_{_NAMES[level]}_ACT"])
         priority = self._priorities.index(action) if action in self._priorities else len(self._priorities)
-        is_as_severe = priority <= self.priority  # The most severe action has the index 0.
-        if is_as_severe:
+        is_at_least_as_severe = priority <= self.priority  # The most severe action has the index 0.
+        if is_at_least_as_severe:
             self.priority = priority
             self._act(action)
 
@@ -73,8 +73,9 @@ class BatteryFailsafe:
         """Return ``level`` if the battery has been below the limits of this level for long enough, otherwise 0."""
         is_voltage_low, is_charge_low = self._is_voltage_and_charge_low(level)
         voltage_low_for = self._voltage_low[level].seconds(is_voltage_low, self._vehicle.now)
-        timeout = self._vehicle.parameters["BATT_LOW_TIMER"]
-        return level if is_charge_low or 0 < timeout < voltage_low_for else _OK
+        timeout = self._vehicle.parameters["BATT_LOW_TIMER"]  # 0 ignores a low voltage.
+        is_voltage_low_for_long = 0 < timeout < voltage_low_for
+        return level if is_charge_low or is_voltage_low_for_long else _OK
 
     def _is_voltage_and_charge_low(self, level: int) -> tuple[bool, bool]:
         """Return whether the voltage, and whether the charge, is below the limit of the level."""
@@ -257,7 +258,8 @@ class ArduPilotArming(Generic[HostT]):
     def gps_reasons(self) -> Sequence[str]:
         """Return the failures of the checks of the GPS receiver and of home."""
         nav = self.vehicle.navigation
-        if nav.fix_type < GpsFixType.TYPE_3D_FIX and not (nav.uses_external and not nav.is_gps_detected):
+        flies_without_gps = nav.uses_external and not nav.is_gps_detected
+        if nav.fix_type < GpsFixType.TYPE_3D_FIX and not flies_without_gps:
             return ("GPS 1: Bad fix" if nav.is_gps_detected else "GPS 1: not healthy",)
         return () if nav.home is not None else ("AHRS: waiting for home",)
 
@@ -266,7 +268,7 @@ class ArduPilotArming(Generic[HostT]):
         return self.gps_reasons() if self.is_checked(ArmingCheck.GPS) else ()
 
     def _check(self) -> None:
-        self._follow_requirement()
+        self._apply_requirement()
         vehicle = self.vehicle
         if vehicle.motors.is_armed:  # The checks run only while disarmed.
             self.passes = True
@@ -296,7 +298,7 @@ class ArduPilotArming(Generic[HostT]):
         """False with ARMING_REQUIRE 0, which keeps the vehicle armed."""
         return self.vehicle.parameters.get("ARMING_REQUIRE", 1) != _NOT_REQUIRED
 
-    def _follow_requirement(self) -> None:
+    def _apply_requirement(self) -> None:
         """Arm or disarm when ARMING_REQUIRE has changed."""
         vehicle, is_always_armed = self.vehicle, not self.needs_arming
         if is_always_armed == self._was_always_armed:
@@ -312,7 +314,7 @@ class ArduPilotArming(Generic[HostT]):
         reasons = self.mandatory_reasons() if force else self.reasons()
         if not reasons and not force and not self.checks_nothing:
             reasons = self.final_reasons()
-        if not vehicle.is_initialised:
+        if not vehicle.is_initialised:  # This text replaces the reasons of the checks.
             reasons = ["System not initialised"]
         if reasons:
             self._send_reasons("Arm", reasons)

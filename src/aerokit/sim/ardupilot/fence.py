@@ -62,7 +62,7 @@ class FenceZones:
         """
         out_of_inclusions = [zone.outside_m(place) for zone in self._inclusions]
         into_exclusions = [-zone.outside_m(place) for zone in self._exclusions]
-        if union and out_of_inclusions:
+        if union and out_of_inclusions:  # A place inside one of the inclusion zones is allowed.
             out_of_inclusions = [min(out_of_inclusions)]
         return max(out_of_inclusions + into_exclusions, default=-math.inf)
 
@@ -207,7 +207,7 @@ class ArduPilotFence(Generic[HostT]):
 
     def command(self, command: ReceivedCommand) -> int:
         """Execute DO_FENCE_ENABLE. Param 1 is 0 to disable, 1 to enable, and 2 to disable only the lower limit."""
-        kinds = whole(command.param2) or _ALL
+        kinds = whole(command.param2) or _ALL  # The value 0 selects all kinds.
         if command.param1 == 1.0:
             if not self.present & kinds:
                 return MavResult.FAILED
@@ -259,7 +259,8 @@ class ArduPilotFence(Generic[HostT]):
         """Compare the position with all active limits, and return the kinds of fences with a new breach."""
         vehicle = self.vehicle
         may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed  # near the ground on purpose
-        if may_be_low and self._floor_enabled_by_command is not True and self.enabled & _MIN_ALT:
+        is_floor_kept = self._floor_enabled_by_command is True  # A command has precedence.
+        if may_be_low and not is_floor_kept and self.enabled & _MIN_ALT:
             self.report("auto-disabled", self.enable(False, _MIN_ALT, by_command=False))
         new_breaches = 0
         for kind, beyond_m in self._beyond(vehicle.motion.place).items():
@@ -302,7 +303,8 @@ class ArduPilotFence(Generic[HostT]):
         """Enable the lower limit once the vehicle is FENCE_MARGIN metres above the limit."""
         enable, auto_enable = self._enabling_parameters
         enables_floor = self.configured & _MIN_ALT and (enable or auto_enable > 1)
-        if not enables_floor or self._floor_enabled_by_command is False or self.active & _MIN_ALT:
+        is_disabled_by_command = self._floor_enabled_by_command is False
+        if not enables_floor or is_disabled_by_command or self.active & _MIN_ALT:
             return
         floor = self._value("FENCE_ALT_MIN") + self.vehicle.parameters["FENCE_MARGIN"]
         if self.vehicle.altitude_m >= floor:
@@ -375,7 +377,8 @@ class ArduPilotFence(Generic[HostT]):
         self._follow_parameters()
         if self.vehicle.parameters["FENCE_ENABLE"] and not self.present:
             return "Fences enabled, but none selected"
-        if not (self.enabled or self._value("FENCE_AUTOENABLE")) or not self.configured:
+        may_be_enabled = self.enabled or self._value("FENCE_AUTOENABLE")
+        if not may_be_enabled or not self.configured:
             return None
         if self.configured & (_CIRCLE | _POLYGON) and self.vehicle.navigation.home is None:
             return "Fence requires position"

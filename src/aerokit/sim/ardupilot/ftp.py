@@ -182,31 +182,32 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._is_bursting = True
         self._send_next(peer, session, request, 0)
 
-    def _send_next(self, peer: FtpPeer, session: FtpSession, request: FtpPacket, number: int) -> None:
+    def _send_next(self, peer: FtpPeer, session: FtpSession, request: FtpPacket, block_number: int) -> None:
         """Send a block of a burst, and schedule the next block. Other requests wait until the end of the burst."""
         block_size = request.size or DATA_SIZE
-        offset, sequence = request.offset + number * block_size, (request.sequence + 1 + number) & 0xFFFF
-        refusal = request.refuse(MavFtpErr.EOF)
+        offset = request.offset + block_number * block_size
+        sequence = (request.sequence + 1 + block_number) & 0xFFFF
+        refusal = request.refuse(MavFtpErr.EOF)  # sent if no data are left
         try:
             data = session.file.read(offset, block_size)
         except FileFault as fault:
             data, refusal = b"", request.refuse_errno(fault.errno)
         if not data:
             # The firmware sends the refusal with the offset and the flag burst_complete of the previous block.
-            previous = peer.reply if number and peer.reply is not None else refusal
+            previous = peer.reply if block_number and peer.reply is not None else refusal
             end = refusal.replace(sequence=sequence, offset=previous.offset, burst_complete=previous.burst_complete)
             self._reply(peer, end)
             self._end_burst()
             return
-        is_short, is_last = len(data) < block_size, number == _BURST_BLOCKS - 1
+        is_short, is_last = len(data) < block_size, block_number == _BURST_BLOCKS - 1
         block = request.acknowledge(data, offset=offset)
         block = block.replace(sequence=sequence, burst_complete=is_short or is_last)
         self._reply(peer, block)
-        # The firmware has already advanced its stored reply to the next block when it repeats this reply, or when it
-        # refuses to read on.
+        # The firmware uses one reply for the whole burst. After a block, it increments the sequence number. After a
+        # short block, it also advances the offset, for the refusal that follows (GCS_FTP.cpp).
         next_offset = offset + len(data) if is_short else offset
         peer.reply = block.replace(sequence=(sequence + 1) & 0xFFFF, offset=next_offset)
-        next_step = self._end_burst if is_last else partial(self._send_next, peer, session, request, number + 1)
+        next_step = self._end_burst if is_last else partial(self._send_next, peer, session, request, block_number + 1)
         self._host.call_later(self.burst_interval_s, next_step)
 
     def _end_burst(self) -> None:

@@ -99,17 +99,16 @@ def altitude_frame(frame: int) -> int | None:
 def stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
     """Return the item as a download sends it after this upload, or the MAV_MISSION_RESULT of a refusal."""
     result = _check_numbers(item)
-    # The storage format reserves the command ids 0 and 1 (AP_Mission.cpp).
-    if result == MavMissionResult.ACCEPTED and item.command in (0, 1):
-        result = MavMissionResult.INVALID
+    if result != MavMissionResult.ACCEPTED:
+        return result
+    if item.command in (0, 1):  # The storage format reserves these command ids (AP_Mission.cpp).
+        return MavMissionResult.INVALID
     # One letter for each stored param; empty for an unsupported command.
     layout = STORED_COMMANDS.get(item.command, _UNKNOWN).parameters
     if kind == "plane":
         layout = _PLANE_PARAMETERS.get(item.command, layout)
-    if result == MavMissionResult.ACCEPTED and not layout:
-        result = MavMissionResult.UNSUPPORTED
-    if result != MavMissionResult.ACCEPTED:
-        return result
+    if not layout:
+        return MavMissionResult.UNSUPPORTED
     values = (item.param1, item.param2, item.param3, item.param4, float(item.x), float(item.y), item.z)
     types = layout.ljust(len(values), _NOT_STORED)
     stored_values = [_CONVERSIONS[type_](value) for type_, value in zip(types, values, strict=True)]

@@ -135,7 +135,8 @@ class MissionRun:
         """MISSION_STATE of MISSION_CURRENT."""
         if not self.is_present:
             return MissionState.NO_MISSION
-        return MissionState.PAUSED if self.is_running and self._mode.is_paused else self._state
+        is_paused = self.is_running and self._mode.is_paused
+        return MissionState.PAUSED if is_paused else self._state
 
     @property
     def count(self) -> int:
@@ -148,7 +149,8 @@ class MissionRun:
         return MissionCurrent(seq, self.count, self.state, int(self._vehicle.mode.needs_mission))
 
     def starts_with_take_off(self) -> bool:
-        first_index = _FIRST if self._restarts or not self.nav_index else self.nav_index
+        is_resumed = self.nav_index != 0 and not self._restarts
+        first_index = self.nav_index if is_resumed else _FIRST
         return self.is_take_off(first_index)
 
     def is_take_off(self, index: int) -> bool:
@@ -187,7 +189,8 @@ class MissionRun:
         else:
             self._state = MissionState.ACTIVE
             # Resume at the "do" command that was running, which precedes the navigation command.
-            self.set_current(self._running_do[0] if self._running_do is not None else self.nav_index)
+            resume_index = self.nav_index if self._running_do is None else self._running_do[0]
+            self.set_current(resume_index)
 
     def _start(self) -> None:
         self._state = MissionState.ACTIVE
@@ -241,7 +244,7 @@ class MissionRun:
                 self.nav_index, self._running_nav = command
                 self._state = MissionState.NOT_STARTED
                 return True
-            if self._running_do is None:
+            if self._running_do is None:  # The mission resumes at the first "do" command before the navigation command.
                 self._running_do, self._last_do_index = command, command_index
             index = command_index + 1
         self.nav_index = 0
@@ -290,7 +293,7 @@ class MissionRun:
         """Start the next "do" command, if one is left in front of the next navigation command."""
         if not self._last_do_index:
             return
-        command = self._next(self._last_do_index + 1, count_jumps=False)
+        command = self._next(self._last_do_index + 1, count_jumps=False)  # (index, item)
         if command is None or is_navigation(command[1]):
             self._last_do_index = 0
             return

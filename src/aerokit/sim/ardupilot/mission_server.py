@@ -168,6 +168,7 @@ class ArduPilotMissionServer(MissionServer):
     def _on_write_partial_list(self, request: m.MissionWritePartialList, channel: Channel) -> None:
         kind, start, end = request.mission_type, request.start_index, request.end_index
         refusal = self._refusal(request, channel)
+        # The last index may be equal to the number of items: this item is appended.
         if refusal is None and not 0 <= start <= end <= self.count(kind):
             self._warn("Flight plan update rejected")
             refusal = Result.ERROR

@@ -212,7 +212,9 @@ class ArduPilotNavigation:
         if self.uses_external:  # External navigation provides the position, even without GPS.
             return
         if self.has_position and lost_for >= _POSITION_TIMEOUT_S:
-            self.flags = _DEAD_RECKONING | (Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0)
+            # On the ground, the velocity stays known.
+            velocity_flag = Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0
+            self.flags = _DEAD_RECKONING | velocity_flag
         elif self.flags != _ATTITUDE_ONLY and lost_for >= _AIDING_TIMEOUT_S:
             self.flags = _ATTITUDE_ONLY
             self._report_cores("stopped aiding")
@@ -325,7 +327,8 @@ class SmartPath:
         accuracy, maximum = parameters["SRTL_ACCURACY"], int(parameters["SRTL_POINTS"])
         if self._points and math.dist(self._points[-1], place) < accuracy:
             return True
-        if len(self._points) - self._cleaned_count >= _CLEAN_UP_AFTER_POINTS or len(self._points) >= maximum:
+        new_count = len(self._points) - self._cleaned_count
+        if new_count >= _CLEAN_UP_AFTER_POINTS or len(self._points) >= maximum:
             self._points = simplify(self._points, _BEND * accuracy)
             if len(self._points) >= maximum - _LOW_SPACE_POINTS:
                 self._points = prune(self._points, _LOOP * accuracy)

@@ -133,6 +133,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
         plane, command = self.vehicle, item.command
+        # `_report` sends a text and returns True.
         if command == Cmd.NAV_TAKEOFF:
             assert self._place is not None
             is_altitude_reached = plane.wing.down <= self._place[2]
@@ -168,7 +169,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         distance = horizontal_distance(self.vehicle, self._place)
         if distance <= self.vehicle.parameters["WP_RADIUS"]:
             return self._report(f"Reached waypoint #{index} dist {int(distance)}m")
-        # The plane has passed the waypoint if its offset from the waypoint points along the leg.
+        # The plane has passed the waypoint if its offset from there points along the leg. `_report` returns True.
         dot_product = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
         return dot_product > 0 and self._report(f"Passed waypoint #{index} dist {int(distance)}m")
 
@@ -191,8 +192,10 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._go(item, _LAND)
         wing, plane = self.vehicle.wing, self.vehicle
         point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
-        north, east = self._leg_start[:2] if point is None or (item.x, item.y) == (0, 0) else point[:2]
-        self._landing = PlaneLanding(plane, (north, east, wing.ground_down if point is None else point[2]))
+        north, east, down = (*self._leg_start[:2], wing.ground_down) if point is None else point
+        if (item.x, item.y) == (0, 0):  # Zero coordinates mean the plane's coordinates.
+            north, east = self._leg_start[:2]
+        self._landing = PlaneLanding(plane, (north, east, down))
         plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
 
     def _return(self, _: MissionItem) -> None:

@@ -95,16 +95,18 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def _check_short(self) -> None:
         action = int(self.vehicle.parameters["FS_SHORT_ACTN"])
+        is_needed = self.is_radio_lost and action != _SHORT_DISABLED
         is_landing = self.vehicle.mode.is_landing
-        if self.state == _NONE and self.is_radio_lost and action != _SHORT_DISABLED and not is_landing:
+        if self.state == _NONE and is_needed and not is_landing:
             self._start_short(action)
-        elif self.state == _SHORT and (not self.is_radio_lost or action == _SHORT_DISABLED):
+        elif self.state == _SHORT and not is_needed:
             self._end_short()
 
     def _start_short(self, action: int) -> None:
         plane = self.vehicle
         self.state, self._short_since = _SHORT, plane.now
         mode = self._mode_before = plane.mode.number
+        # With the action "best guess", the modes that navigate continue (events.cpp).
         if mode in _PILOTED or (mode in _NAVIGATING and action != _SHORT_BEST_GUESS):
             plane.set_mode(_SHORT_MODES.get(action, PlaneMode.CIRCLE))  # Every other action circles.
         self._mode_after = plane.mode.number
@@ -144,8 +146,8 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     def _check_end_of_long(self) -> None:
         """End the long failsafe once its link has returned: the ground station, or the radio."""
         parameters = self.vehicle.parameters
-        has_short = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
-        timeout = parameters["FS_SHORT_TIMEOUT" if has_short else "FS_LONG_TIMEOUT"]
+        is_short_enabled = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
+        timeout = parameters["FS_SHORT_TIMEOUT" if is_short_enabled else "FS_LONG_TIMEOUT"]
         if self.state == _GCS and self.ground_station_silence < timeout:
             self.is_ground_station_lost: bool = False
             self._end_long("GCS Failsafe Off")
@@ -170,7 +172,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
                 self._is_long_pending = True  # The action follows after the initial climb.
             else:  # In these modes, action 0 returns to launch; only in AUTO and GUIDED it continues.
                 self.change_to(*_LONG_MODES.get(action or _LONG_RTL, ()))
-        elif mode == PlaneMode.RTL:
+        elif mode == PlaneMode.RTL:  # The plane returns already, so only a landing changes anything.
             if action in (_LONG_AUTO, _LONG_AUTOLAND):
                 self.change_to(*_LONG_MODES[action])
         elif mode in (PlaneMode.AUTO, PlaneMode.GUIDED) and not plane.mode.is_landing:
@@ -250,13 +252,13 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
         if self.caused_mode:  # The plane already returns from an earlier breach.
             return
         self.report("breached", new_breaches)
-        mode = plane.mode.number
+        mode_before = plane.mode.number
         if self._action == _RTL:
-            self._turn_back(mode, PlaneMode.RTL)
-        elif self._action == _AUTOLAND and mode != PlaneMode.AUTOLAND:
-            self._turn_back(mode, PlaneMode.AUTOLAND, PlaneMode.RTL)
+            self._turn_back(mode_before, PlaneMode.RTL)
+        elif self._action == _AUTOLAND and mode_before != PlaneMode.AUTOLAND:  # A running landing continues.
+            self._turn_back(mode_before, PlaneMode.AUTOLAND, PlaneMode.RTL)
         elif self._action in (_GUIDED, _GUIDED_THROTTLE):
-            self._turn_back(mode, PlaneMode.GUIDED)
+            self._turn_back(mode_before, PlaneMode.GUIDED)
             plane.guided.go_to(self.return_place())
 
     def return_place(self) -> Ned:

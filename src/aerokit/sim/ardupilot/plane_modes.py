@@ -337,11 +337,13 @@ class PlaneTakeOff(PlaneNavigatingMode):
         north, east = wing.north + distance * math.cos(wing.yaw), wing.east + distance * math.sin(wing.yaw)
         self._place = (north, east, plane.home_or_ground[2] - height)
         self._is_climbing = self._missing_height_m() > _TAKE_OFF_DONE_M
-        heading = math.degrees(wing.yaw) % 360.0
-        text = "Climbing to TKOFF alt then loitering" if self._is_climbing else "Above TKOFF alt - loitering"
         if plane.is_landed:
-            text = f"Takeoff to {height:.0f}m for {distance:.1f}m heading {heading:.1f} deg"
-        plane.info(text)
+            heading = math.degrees(wing.yaw) % 360.0
+            plane.info(f"Takeoff to {height:.0f}m for {distance:.1f}m heading {heading:.1f} deg")
+        elif self._is_climbing:
+            plane.info("Climbing to TKOFF alt then loitering")
+        else:
+            plane.info("Above TKOFF alt - loitering")
 
 
 class PlaneAutoland(PlaneNavigatingMode):

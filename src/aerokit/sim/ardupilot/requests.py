@@ -133,7 +133,7 @@ class ArduPilotMessageRequests:
         """
         vehicle = self._vehicle
         modes = vehicle.available_modes()
-        requested_modes = modes if index == 0 else modes[index - 1 : index]  # empty if there is no such mode
+        requested_modes = modes[max(0, index - 1) : max(0, index)] if index else modes  # empty if there is no such mode
         for message in requested_modes:
             vehicle.call_later(0.0, partial(vehicle.send, message, channel))
         channel.streams.set_interval(m.AvailableModesMonitor.ID, _MODES_MONITOR_INTERVAL_S, vehicle.now)
@@ -172,13 +172,13 @@ class ArduPilotMessageRequests:
         vehicle, parameters = self._vehicle, self._vehicle.parameters
         if name not in parameters or parameters[name] == rate:
             return
-        # The value to restore is that before the first change since boot.
-        saved, _ = self._saved.get(name, (parameters[name], rate))
+        # After the next reboot, the parameter has the value that it had before the first change since boot.
+        value_after_reboot, _ = self._saved.get(name, (parameters[name], rate))
         parameters[name] = rate
         if vehicle.KIND == "plane":  # Only ArduPlane saves stream rates beyond a reboot (persist_streamrates).
             vehicle.announce_parameter(name)
         else:
-            self._saved[name] = (saved, rate)
+            self._saved[name] = (value_after_reboot, rate)
 
     def _stream_group(self, stream: int, rate: float, channel: Channel, first: float) -> None:
         group_interval = max(1.0 / rate, _MIN_INTERVAL_S) if rate > 0 else 0.0

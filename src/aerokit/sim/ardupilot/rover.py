@@ -144,7 +144,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     def _update_link(self, name: str, *, is_lost: bool) -> None:
         """Record whether a link is lost, and start or end the common failsafe of both links."""
         rover, was_any_link_lost = self.vehicle, bool(self._lost)
-        self._lost = self._lost | {name} if is_lost else self._lost - {name}
+        self._lost = (self._lost | {name}) if is_lost else (self._lost - {name})
         if self._lost and not was_any_link_lost:
             self._lost_since = rover.now
         if self._triggered and not self._lost:
@@ -319,6 +319,7 @@ class SimulatedRover(RoverHost):
     def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
         """Create the motion model with limits from the parameters. Wind is reported, but does not move the rover."""
         parameters = self.parameters
+        # The value 0 means that there is no limit, but the motion model needs one.
         limits = GroundLimits(
             acceleration_m_s2=parameters["ATC_ACCEL_MAX"] or 1.0,
             top_speed_m_s=self.top_speed,

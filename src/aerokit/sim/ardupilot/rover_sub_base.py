@@ -86,15 +86,15 @@ class GuidedSetpoints:
 
     def _on_local(self, message: SetPositionTargetLocalNed, _: Channel) -> None:
         if message.coordinate_frame in _FIXED | self.BODY_FRAMES:
-            self._follow(message, self.vehicle.local_point(message, self.BODY_FRAMES), has_yaw=True)
+            self._follow(message, self.vehicle.local_point(message, self.BODY_FRAMES), uses_yaw=True)
 
     def _on_global(self, message: SetPositionTargetGlobalInt, _: Channel) -> None:
         frame = message.coordinate_frame
         point = self.vehicle.world_point(message.lat_int, message.lon_int, message.alt, frame)
         if point is not None or not Setpoint.of(message).has_position:
-            self._follow(message, point, has_yaw=self.GLOBAL_YAW)
+            self._follow(message, point, uses_yaw=self.GLOBAL_YAW)
 
-    def _follow(self, message: PositionTarget, point: Ned | None, *, has_yaw: bool) -> None:
+    def _follow(self, message: PositionTarget, point: Ned | None, *, uses_yaw: bool) -> None:
         setpoint, frame = Setpoint.of(message), message.coordinate_frame
         if not self._is_guided:
             return
@@ -106,7 +106,7 @@ class GuidedSetpoints:
         if not is_finite(position, velocity):
             return
         yaw = yaw_rate = None
-        if has_yaw:
+        if uses_yaw:
             yaw, yaw_rate = setpoint.yaw, setpoint.yaw_rate
         if yaw is not None and frame in self.RELATIVE_YAW_FRAMES:
             yaw += self.vehicle.motion.yaw
@@ -164,8 +164,9 @@ class RoverSubVehicle(ArduPilotVehicle):
     def _change_speed(self, command: ReceivedCommand) -> int:
         if command.param1 in (SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED):
             return MavResult.DENIED
-        horizontal_speeds = (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
-        if not self.mode.can_change_speed or command.param1 not in horizontal_speeds or not command.param2 > 0:
+        is_horizontal = command.param1 in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
+        is_valid = is_horizontal and command.param2 > 0
+        if not self.mode.can_change_speed or not is_valid:
             return MavResult.FAILED
         cast("Any", self.mode).speed = command.param2
         return MavResult.ACCEPTED
@@ -271,10 +272,12 @@ class RoverSubAuto(MissionMode):
 
     def _has_stayed(self, index: int, item: MissionItem) -> bool:
         """Return True if the vehicle has reached a waypoint and has waited there for param 1 seconds."""
-        if self._place is None or (self._reached_at is None and not self.has_arrived(self._place)):
+        if self._place is None:
             return False
         now = self.vehicle.now
         if self._reached_at is None:
+            if not self.has_arrived(self._place):
+                return False
             self._reached_at = now
             self.vehicle.info(self.reached_text(index, item.param1))
         delay_s = max(0.0, item.param1)

@@ -108,6 +108,7 @@ _UNCONTROLLED: dict[Kind, tuple[tuple[int, tuple[int, ...]], ...]] = {
 def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
     """Return the present, enabled and healthy sensors of SYS_STATUS."""
     sensors, nav, kind = _SENSORS[vehicle.KIND], vehicle.navigation, vehicle.KIND
+    # The kinds of control that are off in the present mode.
     uncontrolled = next((bits for bits, modes in _UNCONTROLLED[kind] if vehicle.mode.number in modes), 0)
     controls = sensors.always | (sensors.control & ~uncontrolled)
     present = sensors.working | sensors.control | sensors.unhealthy | _PREARM | _AHRS | _LOGGING
@@ -118,7 +119,8 @@ def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
         health |= 0 if nav.gps_is_lost else _GPS
     if nav.is_healthy:
         enabled |= _AHRS
-        health |= _AHRS if vehicle.timeline.estimator_leads_early or nav.has_position else 0
+        is_estimator_in_use = vehicle.timeline.estimator_leads_early or nav.has_position
+        health |= _AHRS if is_estimator_in_use else 0
     # The firmware continues its log for some seconds after disarming.
     if vehicle.motors.is_armed or vehicle.now - vehicle.motors.disarmed_at < _LOG_AFTER_DISARMING_S:
         enabled |= _LOGGING

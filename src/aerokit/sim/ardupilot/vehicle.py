@@ -306,7 +306,7 @@ class ArduPilotVehicle(ArduPilotHost):
         if not is_entered:
             self.send_text(MavSeverity.WARNING, self.refusal(mode, mode.refused_because))
             return False
-        self.mode.leave()
+        self.mode.leave()  # Like the firmware, leave the previous mode only after the new mode was entered.
         self.mode = mode
         self.fence.on_mode_changed()
         self.call_later(0.0, lambda: self.send_built(m.Heartbeat.ID))  # The firmware reports a new mode at once.

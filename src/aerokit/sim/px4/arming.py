@@ -34,7 +34,7 @@ def _side_texts(sensor: str, sides_done: int) -> list[str]:
         "hold vehicle still on a pending side",
         "detected rest position, hold still...",
         f"{side} orientation detected",
-        f"{side} orientation detected",
+        f"{side} orientation detected",  # PX4 sends this text twice.
         _SIDE_INSTRUCTIONS[sensor].format(side=side),
     ]
 

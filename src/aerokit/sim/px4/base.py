@@ -379,9 +379,10 @@ class Px4Vehicle(Px4Host):
     def _auto_disarm(self) -> None:
         if not self.is_armed or not self.is_landed or self.flight.lifts_off:
             return
-        if self._has_flown and self.now - self._landed_at >= self.parameters["COM_DISARM_LAND"]:
-            self.arming.disarm("landing")
-        elif not self._has_flown and 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.since:
+        if self._has_flown:
+            if self.now - self._landed_at >= self.parameters["COM_DISARM_LAND"]:
+                self.arming.disarm("landing")
+        elif 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.since:  # The value 0 turns this off.
             self.arming.disarm("auto preflight disarming")
 
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
@@ -130,7 +131,7 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         Cmd.MISSION_START: flight.start_mission,
         Cmd.DO_SET_HOME: flight.set_home,
         Cmd.EXTERNAL_WIND_ESTIMATE: px4.external.set_wind,
-        Cmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),
+        Cmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),  # A reboot replaces the object.
         Cmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
         Cmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,
     }
@@ -256,8 +257,8 @@ class _Flight:
         """Return the position in a command. Values that are NaN or INT32_MAX mean the vehicle's present position."""
         px4, motion = self._px4, self._px4.motion
         north, east, down = motion.north, motion.east, motion.down
-        keeps_place = _INT32_MAX in (command.x, command.y) or not math.isfinite(command.x + command.y)
-        if not keeps_place:
+        has_place = math.isfinite(command.x) and math.isfinite(command.y) and _INT32_MAX not in (command.x, command.y)
+        if has_place:
             north, east = px4.frame.to_local(*command.place())
         if math.isfinite(command.z):
             down = px4.frame.origin.altitude_m - command.z
@@ -282,7 +283,7 @@ class _Flight:
             return result
         if not orbit.plan(radius, speed, (north, east), down):
             px4.send_text(MavSeverity.CRITICAL, "Orbit radius limit exceeded")
-            return MavResult.ACCEPTED
+            return MavResult.ACCEPTED  # PX4 checks the radius only after the acknowledgement (FlightTaskOrbit.cpp).
         return self._change(modes.ORBIT)
 
     def tune(self, command: ReceivedCommand) -> int | None:
@@ -337,7 +338,7 @@ class _Flight:
         uses_current_place = command.param1 > 0.5
         if uses_current_place:
             px4.home = motion.place
-        elif not math.isfinite(command.x + command.y + command.z):
+        elif not all(map(math.isfinite, (command.x, command.y, command.z))):
             return MavResult.DENIED
         else:
             north, east = px4.frame.to_local(*command.place())
@@ -370,8 +371,8 @@ def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         Cmd.SET_MESSAGE_INTERVAL: requests.set_interval,
         Cmd.GET_MESSAGE_INTERVAL: requests.get_interval,
     }
-    for command, message_id in _LEGACY_REQUESTS.items():  # Each lambda keeps its own id as a default value.
-        handlers[command] = lambda request, message_id=message_id: requests.send_now(message_id, request)  # type: ignore[misc]
+    for command, message_id in _LEGACY_REQUESTS.items():
+        handlers[command] = partial(requests.send_now, message_id)
     return handlers
 
 
@@ -405,10 +406,11 @@ class _Requests:
             return self._send_interval(_number(command.param2), command)
         if message_id != m.AvailableModes.ID:
             return self.send_now(message_id, command)
-        messages, index = available_modes(self._px4), _number(command.param2)  # The index 0 selects all modes.
-        for message in messages if index == 0 else messages[index - 1 : index]:
+        if not 0 <= (index := _number(command.param2)) <= len(messages := available_modes(self._px4)):
+            return MavResult.DENIED
+        for message in messages[index - 1 : index] if index else messages:  # The index 0 selects all modes.
             self._px4.send(message, command.channel)
-        return MavResult.ACCEPTED if 0 <= index <= len(messages) else MavResult.DENIED
+        return MavResult.ACCEPTED
 
     def set_interval(self, command: ReceivedCommand) -> int:
         message_id = _number(command.param1)

@@ -81,7 +81,9 @@ class Px4LogStream:
 
     def _on_ack(self, ack: m.LoggingAck, _: Channel) -> None:
         if ack.sequence == self._sequence and self._sends_definitions:
-            self._sequence, self._acknowledged, self._tries = self._sequence + 1, self._acknowledged + 1, 0
+            self._sequence += 1
+            self._acknowledged += 1
+            self._tries = 0
 
     @property
     def _sends_definitions(self) -> bool:
@@ -97,7 +99,8 @@ class Px4LogStream:
         message_class = m.LoggingDataAcked if self._sends_definitions else m.LoggingData
         header = _HEADER if self._acknowledged == 0 else b""
         data = header + b"".join(_ulog_message(number) for number in range(2))
-        sequence, first_message_offset, padded = self._sequence & 0xFFFF, len(header), data.ljust(_DATA, b"\0")
+        sequence, first_message_offset = self._sequence & 0xFFFF, len(header)
+        padded = data.ljust(_DATA, b"\0")
         block = message_class(*self._station, sequence, len(data), first_message_offset, padded)
         self._px4.send(block, self._channel)
         if not self._sends_definitions:  # A definition block keeps its number until it is acknowledged.

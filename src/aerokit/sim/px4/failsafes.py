@@ -92,7 +92,7 @@ class Px4Fence:
             item = items[index]
             if item.command in _POLYGONS:
                 count = max(1, int(item.param1))  # The number of corners, which every corner contains.
-                corners = [self._place(item) for item in items[index : index + count]]
+                corners = [self._place(corner) for corner in items[index : index + count]]
                 yield _POLYGONS[Cmd(item.command)], _is_in_polygon(corners, north, east)
                 index += count
                 continue
@@ -282,7 +282,9 @@ class Px4Failsafes:
         if px4.has_position:
             self._position_at = px4.now
         is_lost = px4.now - self._position_at > _POSITION_TIMEOUT_S
-        return Action.LAND if is_lost and MODES[px4.intended_mode].needs_position else Action.NONE
+        if not is_lost:
+            return Action.NONE
+        return Action.LAND if MODES[px4.intended_mode].needs_position else Action.NONE
 
     def can_be_overridden(self, moved: float) -> bool:
         """Return True if a stick movement ends the current mode. ``moved`` is its size: 2 is from end to end."""
@@ -343,7 +345,8 @@ class Px4Failsafes:
             if cause not in self._active and action >= Action.HOLD:
                 self._is_overridden = False
             is_worse = action > self._active.get(cause, Action.WARN)
-            if is_worse and self.action <= Action.HOLD and self._holds_until < self._px4.now:
+            has_delay_ended = self._holds_until < self._px4.now
+            if is_worse and self.action <= Action.HOLD and has_delay_ended:
                 self._holds_until = self._px4.now + self._px4.parameters["COM_FAIL_ACT_T"]
         still_acting = {cause: action for cause, action in self._active.items() if action >= Action.HOLD}
         self._active, self._failing = {**still_acting, **failing}, frozenset(failing)

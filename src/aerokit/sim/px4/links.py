@@ -197,7 +197,8 @@ class Px4StreamRates:
         if message_id not in rates:
             return MavResult.FAILED
         requested_us = round(interval_us) if math.isfinite(interval_us) else 0
-        new_us = _interval_us(rates[message_id]) if requested_us == 0 else max(_OFF, requested_us)
+        default_us = _interval_us(rates[message_id])
+        new_us = default_us if requested_us == 0 else max(_OFF, requested_us)
         self._intervals_us[channel][message_id] = new_us
         if self._is_built(message_id):
             channel.streams.set_interval(message_id, max(0, new_us) / 1e6, now)  # 0 stops the stream.

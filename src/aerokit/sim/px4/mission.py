@@ -223,7 +223,9 @@ class Px4Mission:
         """Enter mission mode. A finished mission starts again, unless another item was selected in the meantime."""
         if not self.is_valid:
             return
-        if self.current >= self.count or (self.is_finished and self.current == self.count - 1):
+        # A finished mission stays at its last item.
+        is_still_finished = self.is_finished and self.current == self.count - 1
+        if self.current >= self.count or is_still_finished:
             self.current = 0
             self.forget_reached()
             self._jumps.clear()
@@ -353,7 +355,9 @@ class Px4Mission:
         if item.command == Cmd.NAV_LOITER_UNLIM:
             return False
         stays = item.command in _STAYING or item.command == Cmd.NAV_DELAY
-        return not stays or self._px4.now - self._arrived_at >= item.param1
+        if not stays:
+            return True
+        return self._px4.now - self._arrived_at >= item.param1
 
     def on_landed(self) -> None:
         """Handle a landing, which completes a landing item."""

@@ -183,12 +183,9 @@ def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
     In PX4, unlike in the standard, -2 gives control to the autopilot instead of the sender. -3 releases control.
     """
     # The firmware applies special values to the system id (param 1) and to the component id (param 2) separately.
-    system, component = (
-        _id_in_control(whole(requested), present, own, sender)
-        for requested, present, own, sender in zip(
-            (command.param1, command.param2), gimbal.in_control, gimbal.own_ids, command.sender, strict=True
-        )
-    )
+    present, own, sender = gimbal.in_control, gimbal.own_ids, command.sender
+    system = _id_in_control(whole(command.param1), present[0], own[0], sender[0])
+    component = _id_in_control(whole(command.param2), present[1], own[1], sender[1])
     gimbal.in_control = (system, component)
     return MavResult.ACCEPTED
 
@@ -292,12 +289,13 @@ class Px4CameraTrigger:
         if not self.is_fitted:
             return None
         was_running = self.is_running
-        if whole(command.param3) in (0, 1):
-            self._is_paused = whole(command.param3) == 1
-        if whole(command.param2) == 1:
+        enable, reset, pause = whole(command.param1), whole(command.param2), whole(command.param3)
+        if pause in (0, 1):
+            self._is_paused = pause == 1
+        if reset == 1:
             self.sequence = 0
-        if whole(command.param1) in (0, 1):
-            self._is_enabled = whole(command.param1) == 1
+        if enable in (0, 1):
+            self._is_enabled = enable == 1
         if self.is_running and not was_running:
             self._series_number += 1
             self._take_next(self._series_number)

@@ -96,7 +96,8 @@ class _Writer(FileHandle):
             self._raise_rejected()
 
     def close(self) -> None:
-        if self._is_rejected or self._pending or self._header != (self._count, self._written):
+        is_complete = not self._pending and self._header == (self._count, self._written)
+        if self._is_rejected or not is_complete:
             raise FileFault(EINVAL)
 
     def _raise_rejected(self) -> NoReturn:
@@ -129,7 +130,8 @@ class _Writer(FileHandle):
         name = entry.name.decode("ascii", "replace")
         if name in self._parameters:
             self._apply(name, entry.value)
-        self._pending, self._previous_name, self._count = pending[entry.end :], entry.name, self._count + 1
+        self._pending, self._previous_name = pending[entry.end :], entry.name
+        self._count += 1
         return True
 
 

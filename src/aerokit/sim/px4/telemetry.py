@@ -60,7 +60,7 @@ def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
         base_mode |= MavModeFlag.SAFETY_ARMED
     if mode == modes.OFFBOARD and px4.offboard.is_fresh:
         base_mode |= MavModeFlag.STABILIZE_ENABLED
-    custom_mode = modes.custom_mode(px4.mode)
+    custom_mode = modes.custom_mode(px4.mode)  # A termination does not change the custom mode.
     return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base_mode, custom_mode, _state(px4), mavlink_version=3)
 
 
@@ -130,7 +130,7 @@ def _extended_sys_state(px4: Px4Vehicle) -> m.ExtendedSysState:
 
 def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
     battery = px4.battery
-    voltages = (round(battery.voltage_v * 1000), *(0xFFFF,) * 9)
+    voltages = (round(battery.voltage_v * 1000), *(0xFFFF,) * 9)  # 0xFFFF: there is no such cell.
     return m.BatteryStatus(
         id=0,
         battery_function=MavBatteryFunction.ALL,
@@ -283,6 +283,7 @@ def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
         return m.PositionTargetLocalNed(
             px4.time_boot_ms, MavFrame.LOCAL_NED, mask, *unknown, *unknown, *acceleration, yaw, 0.0
         )
+    # Apart from the position, the simulation sends the present values as the targets.
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     acceleration = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down)
     return m.PositionTargetLocalNed(
@@ -327,6 +328,7 @@ def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
         name = "" if standard_mode else modes.MODES[mode].name
         properties = _MODE_PROPERTIES.get(mode, MavModeProperty.ADVANCED)
         messages.append(m.AvailableModes(count, index, standard_mode, modes.custom_mode(mode), properties, name))
+    # PX4 also lists modes for external programs, even if no program has registered a mode.
     for number in range(_EXTERNAL_MODES):
         mode, index = (modes.AUTO, modes.EXTERNAL_1[1] + number), len(_AVAILABLE_MODES) + 1 + number
         properties = MavModeProperty.NOT_USER_SELECTABLE

@@ -150,6 +150,7 @@ def _distance_sensor(px4: Px4Vehicle) -> m.DistanceSensor:
 def _measured_acceleration(px4: Px4Vehicle) -> tuple[float, float, float]:
     """Return the acceleration that the accelerometers measure, in m/s² forward, right and down."""
     motion = px4.motion
+    # At rest, accelerometers measure the force of the ground: 1 g upwards.
     north, east, down = (
         motion.acceleration_north,
         motion.acceleration_east,
@@ -249,6 +250,7 @@ def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None
     if not px4.is_armed or not px4.has_position:
         return None
     place, motion = px4.frame.to_global(*px4.flight.target), px4.motion
+    # The simulation has no target for the velocity and the yaw, so it sends the present values.
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     yaw_and_rate = (motion.yaw, motion.yaw_rate)
     frame, no_mask, no_acceleration = MavFrame.GLOBAL_INT, 0, (0.0, 0.0, 0.0)

@@ -242,7 +242,8 @@ class Px4PlaneMission(Px4Mission):
         elif item.command == Cmd.NAV_LOITER_TO_ALT:
             radius = item.param2
         default = self._plane.parameters["NAV_LOITER_RAD"]
-        flight.radius_m = radius if radius and math.isfinite(radius) else default
+        has_radius = radius != 0.0 and math.isfinite(radius)
+        flight.radius_m = radius if has_radius else default
         if item.command in _LANDINGS:
             self._phase = "land"
 

@@ -116,6 +116,7 @@ class ZenohConnect(NetworkLink):
             await self._first_beacon.wait()
             self._schedule_poll()
             return
+        # The time-out has ended the block above.
         if self._session is None:
             reason = f"the zenoh network was not reached within {self._open_timeout_s:g} s"
             raise LinkOpenError(f"cannot open {self.address}: {reason}")

@@ -186,7 +186,9 @@ class ClientFilter:
 
     def _is_namesake(self, nonce: int, mode: ControlMode, now: float) -> bool:
         """Return True if another program recently used this client name, unless this program takes control."""
-        if self._nonce not in (None, nonce) and mode != "take" and now - self._nonce_at <= LEASE_TIMEOUT_S:
+        is_other_program = self._nonce not in (None, nonce)
+        is_recent = now - self._nonce_at <= LEASE_TIMEOUT_S
+        if is_other_program and is_recent and mode != "take":
             return True
         self._nonce, self._nonce_at = nonce, now
         return False

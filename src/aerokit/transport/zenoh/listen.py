@@ -134,9 +134,8 @@ class ZenohListen(NetworkLink):
 
         self._zenoh = zenoh
         self._declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
-        self._may_have_rival = any(
-            True for _ in session.liveliness().get(self._keys.alive(), timeout=_RIVAL_QUERY_TIMEOUT_S)
-        )
+        tokens = session.liveliness().get(self._keys.alive(), timeout=_RIVAL_QUERY_TIMEOUT_S)
+        self._may_have_rival = any(True for _ in tokens)  # True if there is at least one token.
 
     def _serve(self, queue: LoopQueue[Callable[[], object]]) -> None:
         """Declare the subscribers, publisher and token that clients need.
@@ -227,7 +226,9 @@ class ZenohListen(NetworkLink):
 
     def _on_beacon(self, data: bytes) -> None:
         beacon = Beacon.decode(data)
-        if beacon is None or beacon.epoch == self._freshness.epoch or self._rival_found.is_set():
+        if beacon is None or beacon.epoch == self._freshness.epoch:  # A beacon with this epoch is our own.
+            return
+        if self._rival_found.is_set():  # Report a rival only once.
             return
         self._rival_found.set()
         if self._is_serving:
