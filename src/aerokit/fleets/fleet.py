@@ -111,16 +111,17 @@ class Fleet(Selection):
             rtcm: one or more complete RTCM 3 messages of at most 720 bytes each.
 
         Returns:
-            The number of MAVLink messages sent on each link.
+            The number of MAVLink messages sent on each link, without those that another sender has sent there.
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.
             ConnectionClosed, LinkLost: a link has ended. Links before it have already got the corrections.
         """
         messages = rtcm_messages(rtcm)
-        count = 0  # of the last link, because every link gets the same messages
+        count = 0
         for connection in dict.fromkeys(self._context.networks.values()):
-            count = sum(send_rtcm(connection, message, self) for message in messages)
+            # A link on which another sender has just sent the same message does not get it again.
+            count = max(count, sum(send_rtcm(connection, message, self) for message in messages))
         return count
 
     # -------------------------------------------------------------------------------------- streams

@@ -539,7 +539,7 @@ class Fleet(FleetTwin, Selection):
             rtcm: one or more complete RTCM 3 messages of at most 720 bytes each.
 
         Returns:
-            The number of MAVLink messages sent on each link.
+            The number of MAVLink messages sent on each link, without those that another sender has sent there.
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.
