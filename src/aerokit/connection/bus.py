@@ -195,7 +195,9 @@ class Bus:
         kinds = {kind for kind, _ in entries}
         kind = MESSAGE if kinds == {MESSAGE} else BOTH
         if MESSAGE not in kinds:
-            kind = FRAME  # No sink needs the message, so it is not decoded. Sinks of kind BOTH get only the frame.
+            # No sink needs the decoded message, so the frame is not decoded. Sinks of kind BOTH also accept a frame
+            # alone.
+            kind = FRAME
         plan = self._plans[frame.system_id << 24 | frame.message_id] = kind, tuple(sink for _, sink in entries)
         return plan
 

@@ -228,7 +228,7 @@ class StateCell(Generic[T]):
 
     def forget(self) -> None:
         """Make the value unknown again, e.g. after a reboot. Waiters keep waiting."""
-        # `_latest` is kept, because another thread may have read `_known` as True just before this line.
+        # `_latest` keeps its value: another thread may have just read `_known` as True, and reads `_latest` next.
         self._known = False
         self._source = None
         self._updated_at = -math.inf

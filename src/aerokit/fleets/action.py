@@ -153,7 +153,7 @@ class FleetAction:
     def result_so_far(self) -> FleetResult:
         """Return a result with the members that have finished so far."""
         names = [member.name for member in self._members]
-        # In the order of the members, not in that of their ends.
+        # The outcomes have the order of the members, not the order in which the members have finished.
         outcomes = {name: self._outcomes[name] for name in names if name in self._outcomes}
         return FleetResult(self.name, outcomes, failed=self._failed, stopped=self._stopped, skipped=self._skipped)
 
@@ -306,7 +306,8 @@ class FleetAction:
         )
 
     def _hold_finished_members(self) -> None:
-        # The other members are still executing the action. They hold because its cancellation makes them hold.
+        # Only members that have finished the action get an order to hold. The others still execute the action, and its
+        # cancellation makes them hold.
         for member in self._members:
             if (
                 member.is_flown_by_program

@@ -355,7 +355,8 @@ class Formations(Travel):
             offset = formation.offset_of(follower.name, heading)
             target = leader_position.offset(north_m=offset.north_m, east_m=offset.east_m, up_m=offset.up_m)
             if target.altitude_amsl_m is not None:
-                # Without the altitude above the leader's home, because the followers' homes may be at other altitudes.
+                # The target gets no altitude above the leader's home, because the followers' homes may be at other
+                # altitudes.
                 target = Position(target.latitude_deg, target.longitude_deg, altitude_amsl_m=target.altitude_amsl_m)
             targets[follower.name] = target
         if speed_m_s is not None:

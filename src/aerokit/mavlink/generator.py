@@ -128,7 +128,8 @@ MODULES: dict[str, tuple[str, ...]] = {
 }
 
 # Messages of ``common.xml`` that every flight uses. They are in ``common.py``. The other two hundred messages are in
-# ``common_more.py``, so that a program imports them only if it needs one: that takes several times as long.
+# ``common_more.py``, which is imported only if a program needs one of them, because this import takes several times as
+# long.
 EVERYDAY = """
     Attitude AttitudeQuaternion AvailableModes BatteryStatus CommandAck CommandInt CommandLong CurrentMode
     DistanceSensor EstimatorStatus ExtendedSysState FileTransferProtocol Gps2Raw GpsGlobalOrigin GpsRawInt

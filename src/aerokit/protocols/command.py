@@ -34,7 +34,8 @@ MAX_ATTEMPTS = 4
 _ARM, _RELATIVE, _STEP = (0, 1.0), (3, 1.0), (0, 0.0)
 
 # Commands of which a repetition has a further effect. Maps MAV_CMD to (effect, condition). The condition is a parameter
-# (index, value) with which the repetition has this effect; None: it always has. docs/reliability.md has the same table.
+# (index, value) with which a repetition has the effect; None means that every repetition has it. docs/reliability.md
+# has the same table.
 UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _ARM),
     MavCmd.CONDITION_YAW: ("turns by the same angle again", _RELATIVE),
@@ -249,8 +250,8 @@ class CommandExchange(Exchange[CommandAck]):
         """Process a COMMAND_ACK. Other messages are ignored."""
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
-        # An acknowledgement may belong to an earlier command. A command that is sent only once must not ignore one: if
-        # it was its own, no other would follow.
+        # The first acknowledgements may belong to earlier commands, so they are ignored. A command that is sent only
+        # once ignores none: if an ignored acknowledgement was its own, no other would follow.
         may_ignore = self._sent_count == 1 and self._attempts > 1
         is_to_earlier_command = may_ignore and self._answer_count < self._earlier_answers
         if message.result != MavResult.IN_PROGRESS:
@@ -319,7 +320,8 @@ class CommandExchange(Exchange[CommandAck]):
         self._sent_count += 1
         self._sent_at = now
         wait_s = self._attempt_timeout
-        if self._order_status is not None:  # An order checks earlier for a HEARTBEAT, and whether it has ended.
+        # For an order, the deadline is earlier, to check for a HEARTBEAT and whether the order has ended.
+        if self._order_status is not None:
             wait_s = min(MIN_RESEND_FRACTION * wait_s, ATTEMPT_TIMEOUT_S)
         self.deadline = now + wait_s
 

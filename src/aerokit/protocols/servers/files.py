@@ -275,7 +275,8 @@ class FileTree:
         folder, name = self._parent(to)
         existing = folder.get(name)
         is_folder = isinstance(node, dict)
-        if isinstance(existing, dict) and (existing or not is_folder):  # Only a folder replaces a folder, if empty.
+        # An existing folder is only replaced by a folder, and only if it is empty.
+        if isinstance(existing, dict) and (existing or not is_folder):
             raise FileFault(ENOTEMPTY if is_folder else EISDIR)
         if isinstance(existing, _File) and is_folder:
             raise FileFault(ENOTDIR)

@@ -186,10 +186,11 @@ class CommandSender:
         order_status: OrderStatus | None,
         is_sent: bool,
     ) -> CommandAck:
-        # A command to all components (0) is answered by many; the autopilot's ack is the one that counts.
+        # Several components answer a command to all (0). The autopilot's acknowledgement counts.
         key = (message.target_component or self._component_id, message.command)
         self._abort_if_ended(key)
-        # Only an order that ends while this call waits prevents the command: the caller knows of an earlier end.
+        # If the order ends while this call waits for the lock, the command is not sent. An end before this call does
+        # not prevent the command, because the caller already knew of it.
         earlier_end = "" if order_status is None else order_status.end
         async with self._locks[key]:
             if self._is_closed:
