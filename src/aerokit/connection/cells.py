@@ -289,7 +289,7 @@ class StateCell(Generic[T]):
     def __repr__(self) -> str:
         return f"<StateCell {self._describe()}>"
 
-    if not TYPE_CHECKING:  # Without these methods, type checkers report the misuse.
+    if not TYPE_CHECKING:  # Type checkers do not see these methods, and therefore report their use as an error.
 
         def __getattr__(self, name: str) -> NoReturn:
             """Raise an error that suggests ``.value``, e.g. for ``vehicle.position.latitude_deg``."""

@@ -263,8 +263,8 @@ class FleetAction:
                     partial(self._send_order, member, self._orders[member.name]),
                     f"aerokit policy {member.name}",
                 )
-        # The running actions are cancelled one loop iteration later, after the policy's orders have begun. These orders
-        # then have superseded those of the actions, so that the cancelled actions do not send a hold.
+        # The running actions are cancelled one loop iteration later, after the policy's orders have begun. By then, the
+        # policy's orders have superseded the orders of the actions, so that the cancelled actions do not send a hold.
         asyncio.get_running_loop().call_soon(self._cancel, [member for member in available if member.name in orders])
         if not self._orders:
             self._publish_completed()

@@ -104,7 +104,8 @@ def _entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[EntryDefi
     merged = {entry.name: _entry(by_name.get(entry.name, entry), entry) for entry in added.entries}
     for name, entry in by_name.items():
         merged.setdefault(name, entry)
-    # The additions come first in `merged` and, because sorting is stable, also among several names for one value.
+    # The additions come first in `merged`. Sorting is stable, so they also come first among several names for one
+    # value.
     return tuple(sorted(merged.values(), key=lambda entry: entry.value))
 
 

@@ -67,8 +67,8 @@ class SourceStatistics(SourceFields):
         """Number of lost frames. A frame that arrives late no longer counts as lost."""
         self.expected = sequence
         """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
-        # Number of steps by which `expected` has advanced without a received frame. `received` is `expected -
-        # _unreceived`, so a received frame only has to increase `expected`.
+        # Number of steps by which `expected` has advanced without a received frame. `received` is `expected` minus this
+        # number, so a received frame only has to increase `expected`.
         self._unreceived = sequence
         self._missing = 0  # bit n is set if the frame n + 1 before `_missing_at` is missing
         self._missing_at = sequence
@@ -164,8 +164,8 @@ class SourceStatistics(SourceFields):
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
-        # Repeated frames whose numbers follow each other may come from a second sender, so they count as alternations.
-        # Any other repeated frame resets the count to 0.
+        # Repeated frames whose numbers follow each other may come from a second sender, so they count as alternations
+        # between two streams. Any other repeated frame resets the count to 0.
         self._count_alternations(now, 1 if follows else -self._alternations)
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._late_sequence, self._late_at = sequence, self.received

@@ -97,8 +97,8 @@ Two HEARTBEATs may be lost. Ground-station failsafes act later (FS_GCS_TIMEOUT 5
 be older when it is processed, if the event loop was blocked.
 """
 
-# An order is repeated at the earliest after this fraction of ``attempt_timeout``. It is below 1, because a repetition
-# follows a HEARTBEAT, and HEARTBEATs arrive at 1 Hz with some jitter.
+# An order is repeated at the earliest after this fraction of ``attempt_timeout``. The fraction is below 1, because a
+# repetition follows a HEARTBEAT, and HEARTBEATs arrive at 1 Hz with some jitter.
 MIN_RESEND_FRACTION = 0.75
 
 
@@ -250,8 +250,8 @@ class CommandExchange(Exchange[CommandAck]):
         """Process a COMMAND_ACK. Other messages are ignored."""
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
-        # The first acknowledgements may belong to earlier commands, so they are ignored. A command that is sent only
-        # once ignores none: if an ignored acknowledgement was its own, no other would follow.
+        # The first `_earlier_answers` acknowledgements may belong to earlier commands, so they are ignored. A command
+        # that is sent only once ignores none: if an ignored acknowledgement was its own, no other would follow.
         may_ignore = self._sent_count == 1 and self._attempts > 1
         is_to_earlier_command = may_ignore and self._answer_count < self._earlier_answers
         if message.result != MavResult.IN_PROGRESS:
@@ -268,7 +268,7 @@ class CommandExchange(Exchange[CommandAck]):
     @property
     def pending_answers(self) -> int:
         """Number of acknowledgements that may still arrive, which the next command with this MAV_CMD must ignore."""
-        # Once the command was repeated, every acknowledgement counts for this command; see `receive`.
+        # Once the command was repeated, every acknowledgement counts as an answer to this command; see `receive`.
         ignored_answers = self._earlier_answers if self._sent_count == 1 else 0
         own_answers = max(0, self._answer_count - ignored_answers)
         return max(0, self._sent_count * self._acks_per_sending - own_answers)

@@ -228,8 +228,8 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _on_error(self, now: float) -> None:
         # PX4 sends ERROR when it is busy, when an item arrives after the end, when MISSION_COUNT arrives twice, and for
-        # real errors. ArduPilot sends ERROR for an item after the end. An item is therefore repeated before an ERROR
-        # counts.
+        # real errors. ArduPilot sends ERROR for an item after the end. Before an ERROR ends the upload, an item is
+        # therefore repeated.
         if not self._is_accepted:
             self._wait_while_busy(now)
         elif self._error_at is None:
@@ -254,8 +254,8 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._wait(now, BUSY_RETRY_INTERVAL_S)
 
     def _restart(self, now: float) -> None:
-        # A transfer has expired on the vehicle. If the vehicle has not requested an item of this upload yet, it was an
-        # older transfer.
+        # A transfer has expired on the vehicle. Until the vehicle has accepted this upload, that transfer was an older
+        # one.
         if not self._is_accepted:
             return
         if self._is_partial or self._restarts >= MAX_RESTARTS:

@@ -10,7 +10,7 @@ from aerokit.connection.multilink.vehicle_clock import VehicleClock
 if TYPE_CHECKING:
     from aerokit.connection.multilink.vehicle_clock import HardwareId
 
-# A link counts as dead after this silence, because probes are answered twice a second.
+# Probes are answered twice a second, so a link counts as dead after this silence.
 PROBED_TIMEOUT_S = 1.0
 
 # A costly link, or a link whose probes are not answered, counts as dead after this silence, in which two heartbeats are
@@ -311,7 +311,7 @@ class LinkChoice:
         """
         if candidate is not self.used:
             return not candidate.is_proven and candidate.request_hardware()
-        has_other_links = len(self.candidates) > 1  # Otherwise there is no other id to compare with.
+        has_other_links = len(self.candidates) > 1  # With a single link, there is no other id to compare with.
         return has_other_links and not is_attached and candidate.request_hardware()
 
     def _is_same_by_hardware(self, candidate: Candidate, now: float) -> bool:

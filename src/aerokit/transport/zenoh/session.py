@@ -239,7 +239,7 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
 
 
 def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
-    if options.mode or not options.config:  # Otherwise the configuration file determines the mode.
+    if options.mode or not options.config:  # Without `mode`, a configuration file determines the mode.
         is_client = bool(options.connect) and not options.listen
         yield "mode", options.mode or ("client" if is_client else "peer")
     if options.connect:

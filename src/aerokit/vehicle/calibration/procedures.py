@@ -30,8 +30,8 @@ CALIBRATE_AT_BOOT = 3
 END_GRACE_S = 3.0
 # Maximum seconds for restoring a parameter, because a cancelled call must end within two seconds.
 RESTORE_TIMEOUT_S = 1.5
-# ArduPilot repeats its request for a pose every second until it receives our confirmation. A request for the confirmed
-# pose within this many seconds was sent before that, so it is ignored.
+# ArduPilot repeats its request for a pose every second until it receives our confirmation. A request that arrives
+# within this many seconds after the confirmation was sent earlier, so it is ignored.
 POSE_REPEAT_S = 2.0
 POSES = {
     AccelcalVehiclePos.LEVEL: CalibrationPose.LEVEL,
@@ -249,7 +249,7 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
         while True:
             await run.wait(lambda: requests)
             request = requests.pop()
-            requests.clear()  # Only the newest request counts.
+            requests.clear()  # All requests before the newest one are obsolete.
             if request == AccelcalVehiclePos.SUCCESS:
                 yield run.result(reboot_due=True)
                 return

@@ -176,8 +176,7 @@ class CalibrationRun:
             )
 
     def _send_cancel(self, command: float, *params: float) -> None:
-        # All callers check first that the vehicle is not silent. The command needs no order, because repeating it has
-        # no effect.
+        # All callers check first that the vehicle is not silent. A repetition of the command has no further effect.
         self._cancel_sent_at = self.session.connection.now()
         self.session.commands.send_unconfirmed(int(command), *params)
 

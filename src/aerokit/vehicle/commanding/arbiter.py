@@ -71,7 +71,7 @@ class CommandArbiter:
         # The newest steering order, and the auxiliary orders in progress.
         self._orders: list[Order] = []
         self._posted: list[Order] = []
-        self._sent: list[SentCommand] = []
+        self._sent: list[SentCommand] = []  # commands whose `sending` block is active
         self._order_numbers = itertools.count(1)
         self._latest: dict[Topic, Order] = {}
         self._ordered_since_disarmed: set[Topic] = set()

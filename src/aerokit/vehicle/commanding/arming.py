@@ -322,7 +322,7 @@ class ArmingActions(VehicleBase):
         if not force:
             self._session.check_disarmed("reboot")
         reboots_before = self._session.watch.reboots
-        # A reboot is recognised by a shorter time since boot, so the present one must be known.
+        # A reboot is recognised by a shorter time since boot, so the present time since boot must be known.
         self._session.link_watch.request_time()
         unanswered: CommandTimeout | None = None
         with self._session.watch.expecting_reboot():

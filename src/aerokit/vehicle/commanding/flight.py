@@ -148,7 +148,7 @@ class FlightActions(VehicleBase):
         Earlier messages may describe the previous flight.
         """
         here, landed = self.telemetry.position.latest, self.telemetry.landed_state
-        # No altitude is greater than NaN, so only the landed state counts while the position is unknown.
+        # No altitude is greater than NaN, so only the landed state can show a climb while the position is unknown.
         start_m = math.nan if here is None else self._position.altitude_relative()
         state_before = landed.latest
 

@@ -45,7 +45,7 @@ MAX_READS_UNBOOSTED = 5
 # If reading a few parameters takes longer than this many seconds, ArduPilot's rate of answers is raised. This happens
 # if the vehicle lacks a parameter, which only several requests without an answer show.
 BOOST_DELAY_S = 0.5
-# Fewer changes than this are set one by one. That is as fast as a file, and the vehicle confirms each value.
+# Fewer changes than this are set one by one, which is as fast as a file. The vehicle then confirms each value.
 MIN_PACK_SIZE = 10
 # If more values than this must be read back, the whole list is downloaded instead.
 MAX_READ_BACK = 100

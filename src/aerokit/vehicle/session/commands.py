@@ -186,7 +186,7 @@ class CommandSender:
         order_status: OrderStatus | None,
         is_sent: bool,
     ) -> CommandAck:
-        # Several components answer a command to all (0). The autopilot's acknowledgement counts.
+        # Several components may answer a command to all components (0). Only the autopilot's answer ends this call.
         key = (message.target_component or self._component_id, message.command)
         self._abort_if_ended(key)
         # If the order ends while this call waits for the lock, the command is not sent. An end before this call does
@@ -270,7 +270,7 @@ class CommandSender:
         is_answer = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
         if is_answer and is_final:
             self._results[key] = ack.result
-            # An ack without a target may be for another ground station, so it does not count for `accepted_at`.
+            # An ack without a target may be for another ground station, so `accepted_at` ignores it.
             if ack.result == MavResult.ACCEPTED and ack.target_system == self._connection.source_system:
                 self._accepted_at[key] = self._connection.now()
         if run is not None:

@@ -297,7 +297,8 @@ class MessageRates:
         has_just_started = achieved_hz > 0 and stream.counts[0] == stream.counts[1]
         if has_just_started and not stream.is_slow:
             return
-        # One message fewer does not count as slow, because that message may have arrived just outside the window.
+        # A stream that lacks only one message is not slow, because that message may have arrived just outside the
+        # window.
         min_messages = SLOW_FACTOR * stream.requested_hz * WATCH_WINDOW * WATCH_PERIOD_S - 1
         received_messages = achieved_hz * WATCH_WINDOW * WATCH_PERIOD_S
         was_slow = stream.is_slow

@@ -37,8 +37,8 @@ REBOOT_STEP_MS = 3000
 # A decreased time shows a reboot only if it persists for this long and in at least two messages, because a single
 # message may be late.
 REBOOT_CONFIRM_S = 0.2
-# While a reboot is expected, it is detected when the vehicle's clock is behind its expected time by more than this. A
-# boot takes longer than this; messages are delayed by less.
+# An expected reboot is detected when the vehicle's clock is behind its expected time by more than this. A boot takes
+# longer than this, and messages are delayed by less.
 MIN_REBOOT_STEP_MS = 2000
 # A simulation's clock may be faster than real time. Its speed is computed once the first and the last reported time
 # differ by this many seconds.
