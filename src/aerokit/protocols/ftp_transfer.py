@@ -209,8 +209,7 @@ class FtpDownload(FtpExchange[int]):
             self._stop_bursting()
         if reply.error_code == MavFtpErr.EOF:
             self._end_at(end)
-        # Before the first block, an error of `NO_BURST` shows that the server does not support bursts. After the first
-        # block, it is a failure.
+        # An error of `NO_BURST` after the first block is a failure, because the server does support bursts.
         elif is_latest and reply.error_code in NO_BURST and self._into.done == self._into.start:
             self._supports_bursts = False
         elif is_latest:

@@ -121,8 +121,7 @@ class CommandArbiter:
         """
         self._notify_steering()
         self._ordered_modes.extend((self._now(), mode.custom_mode) for mode in modes)
-        # A posted order that is still in progress may change the mode later than this order does.
-        if self._posted_modes():
+        if self._posted_modes():  # A posted order may change the mode later than this order does.
             self.doubt_mode()
         was_flown = self.is_flown_by_program
         order = self._create_order(modes, (STEERING,), ends_flight or self._all_end_flight(modes))
@@ -132,8 +131,7 @@ class CommandArbiter:
         self._register(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
         self.newest = order
-        # A steering order ends all other actions, so their orders need no more reports of the vehicle.
-        self._orders = [order]
+        self._orders = [order]  # The order has ended all other actions, which need no more reports of the vehicle.
         return order
 
     def raw_order(self, subjects: Iterable[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()) -> Order:
@@ -175,8 +173,7 @@ class CommandArbiter:
         """
         if device_order is not None and not device_order.is_newest:
             raise OperationRejected(f"{SUPERSEDED}; the rest of the order was not sent")
-        # The steering order stays in progress, so the vehicle may still change to the modes of that order.
-        modes = () if self.newest is None else self.newest.modes
+        modes = () if self.newest is None else self.newest.modes  # The steering order may still lead to its modes.
         device_topics = () if device_order is None else device_order.ended_by
         order = self._create_order(modes, (ACTION, *device_topics), ends_flight)
         self._orders.append(order)
@@ -306,8 +303,7 @@ class CommandArbiter:
         there was no takeover.
         """
         order, topics = self.newest, self._ordered_since_disarmed
-        # After an order without modes, such as a raw command, a mode change may be the order's effect and does not
-        # prove a takeover.
+        # After an order without modes, such as a raw command, a mode change does not prove a takeover.
         was_taken_over = order is not None and order.modes and order.takeover_reason and order.is_newest
         return "arm" in topics if was_taken_over else bool(topics)
 
