@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self, dataclass_transform
 
     from aerokit.mavlink.frame import Frame
-else:  # At run time it is not imported, because importing typing_extensions takes longer than importing aerokit.
+else:  # At run time, typing_extensions is not imported, because that would take longer than importing aerokit.
 
     def dataclass_transform(**_: object) -> Any:
         return lambda cls: cls

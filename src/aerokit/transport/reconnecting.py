@@ -84,7 +84,7 @@ class ReconnectingLink(Link):
         self._make_link = make_link
         self._link = make_link()
         self._backoff = Backoff(min_delay_s, max_delay_s)
-        self._receiver: Receiver | None = None  # None before the opening and after the end: nothing is called
+        self._receiver: Receiver | None = None  # None before the opening and after the end, when nothing is called
         self._current: _CurrentReceiver | None = None  # receiver of the current link; callbacks of others are ignored
         self._was_opened = self._is_closed = self._is_up = False
         self._lost_at: float | None = None  # time of the reported loss; None while no loss is reported

@@ -293,7 +293,7 @@ class FileTree:
         """
         if self.free_bytes is None:
             return
-        is_full = self.free_bytes == 0  # Then there is not even room for a new name, which has size 0.
+        is_full = self.free_bytes == 0  # A new name has size 0, but does not fit either if no byte is free.
         if size >= 0 and (size > self.free_bytes or is_full):
             raise FileFault(ENOSPC)
         self.free_bytes -= size

@@ -320,7 +320,7 @@ class PhotoInterval:
             if self._next_index is None or self._contradicts_guess(capture.index):
                 self._is_start_guessed = self._next_index is None
                 self._next_index = capture.index
-                # The index is one lower, so that this capture counts as the newest one below.
+                # One lower than the index of this capture, so that this capture counts as the newest one below.
                 self._newest_index = capture.index - 1
             if not self._is_plausible(capture.index):
                 continue

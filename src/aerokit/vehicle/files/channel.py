@@ -78,7 +78,7 @@ class FileChannel:
                     for session in tuple(self._closing):
                         await self._finish_closing(session, idle_timeout_s)
                     yield
-        except OperationTimeout:  # This TimeoutError is from inside the operation, not from `fail_after`.
+        except OperationTimeout:  # This TimeoutError was raised inside the operation, not by `fail_after`.
             raise
         except TimeoutError:
             raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
@@ -125,7 +125,7 @@ class FileChannel:
                 self._close_soon(file.session, path)
                 raise
             except Exception:
-                with suppress(FileTimeout):  # The first error tells more.
+                with suppress(FileTimeout):  # The error of the transfer tells more than that of closing.
                     await self._close(file.session, path, min(idle_timeout_s, CLOSE_TIMEOUT_S))
                 raise
             except BaseException:  # A cancelled call must not wait.
@@ -293,7 +293,7 @@ class LogChannel:
                     except BaseException:
                         self._end()
                         raise
-        except OperationTimeout:  # This TimeoutError is from inside the operation, not from `fail_after`.
+        except OperationTimeout:  # This TimeoutError was raised inside the operation, not by `fail_after`.
             raise
         except TimeoutError:
             raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
