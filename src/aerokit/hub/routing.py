@@ -196,8 +196,8 @@ class Router(Generic[PortT]):
                     continue
             plans.append(self.route(node, frame, now))
             if node.echoes:
-                # A frame came back. From now on, `route` must process every frame, because it counts them to detect a
-                # loop.
+                # A frame came back. From now on, `route` must process every frame, because it counts returning and new
+                # frames in `echoes` to detect a loop.
                 streams = {}
         return plans
 
