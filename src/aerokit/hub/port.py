@@ -264,7 +264,7 @@ class Port:
             self._due[key] = now + period_s
         else:
             # The next due time is counted from the last one rather than from now, so that irregular messages reach the
-            # allowed average rate. It is not before now, so that no burst follows a pause.
+            # allowed average rate. The next due time is never before now, so that no burst follows a pause.
             self._due[key] = max(due, now - period_s) + period_s
         return True
 

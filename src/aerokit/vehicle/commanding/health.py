@@ -209,7 +209,8 @@ class Health:
         receiver.
         """
         sensors = self._telemetry.sensors.latest
-        # In a mode that does not allow arming, PX4 reports the requirements of that mode instead of those for arming.
+        # In a mode that does not allow arming, PX4 reports what this mode requires. The report then does not show what
+        # arming in another mode requires.
         is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
         if sensors is None or sensors.prearm_checks_pass is True or is_meaningless:
             return []
