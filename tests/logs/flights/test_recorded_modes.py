@@ -59,7 +59,7 @@ def test_commanded_mode_is_no_reaction(tmp_path: Path, speed: float) -> None:
     assert (flight.modes[-1].reason, failsafe.reaction) == ("ordered", "no mode change followed")
 
 
-PX4_MISSION, PX4_RTL, PX4_LAND = 4 << 16 | 4 << 24, 4 << 16 | 5 << 24, 4 << 16 | 6 << 24
+PX4_HOLD, PX4_MISSION, PX4_RTL, PX4_LAND = (4 << 16 | sub_mode << 24 for sub_mode in (3, 4, 5, 6))
 
 
 def written(path: Path, rows: list[tuple[float, Message]]) -> FlightLog:
@@ -113,6 +113,40 @@ def test_charge_state_names_cause_without_texts(tmp_path: Path) -> None:
     assert failsafe.evidence[0].text == "charge state critical (BATTERY_STATUS)"
     assert failsafe.reaction == "mode MISSION → RTL immediately"
     assert "mAh" not in " ".join(failsafe.context)
+
+
+def test_return_after_hold_belongs_to_battery_failsafe(tmp_path: Path) -> None:
+    """PX4 names the cause only when it begins to hold, five seconds before it returns."""
+    modes = [(25.0, PX4_MISSION), (30.2, PX4_HOLD), (60.0, PX4_RTL)]
+    flight = written(tmp_path / "log.tlog", [
+        *((float(second), px4_heartbeat(next(mode for end, mode in modes if second <= end))) for second in range(60)),
+        (25.1, m.Statustext(2, "Critical battery")),
+        (25.1, m.Statustext(2, "Failsafe activated: entering Hold for 5 seconds")),
+        (30.1, m.Statustext(2, "Failsafe activated")),
+    ])  # fmt: skip
+    (failsafe,) = failsafes(flight)
+    assert (failsafe.kind, failsafe.acted, len(failsafe.evidence)) == ("battery", True, 3)
+
+
+def test_mode_change_after_disarming_is_no_reaction(tmp_path: Path) -> None:
+    disarmed = m.Heartbeat(2, 12, 0x5D, PX4_HOLD, 3, 3)
+    flight = written(tmp_path / "log.tlog", [
+        *((float(second), px4_heartbeat(PX4_RTL) if second < 40 else disarmed) for second in range(60)),
+        (41.5, m.Statustext(2, "Critical battery")),
+    ])  # fmt: skip
+    (failsafe,) = failsafes(flight)
+    assert (failsafe.reaction, failsafe.acted) == ("no mode change followed", False)
+
+
+def test_estimator_failsafe_without_satellites_is_one_failsafe(tmp_path: Path) -> None:
+    """ArduCopter names the estimator, which has failed because the receiver has no fix."""
+    flight = written(tmp_path / "log.tlog", [
+        *((float(second), heartbeat(AUTO if second < 28 else LAND)) for second in range(60)),
+        *((float(second), fix(3, 10) if second < 20 else fix(1, 3)) for second in range(60)),
+        (28.0, m.Statustext(2, "EKF Failsafe: changed to LAND Mode")),
+    ])  # fmt: skip
+    (failsafe,) = failsafes(flight)
+    assert (failsafe.kind, failsafe.acted, failsafe.reaction) == ("gps", True, "mode AUTO → LAND 8.0 s later")
 
 
 @pytest.mark.parametrize(("vehicle", "parameter", "value", "meaning"), [

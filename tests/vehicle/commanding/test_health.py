@@ -347,3 +347,24 @@ async def test_wait_ready_timeout_names_failing_check(timeout: float) -> None:
             await flight.vehicle.wait_ready(timeout=timeout)
         assert now() - started == pytest.approx(timeout, abs=0.01)
         assert len(flight.wire.commands(MavCmd.RUN_PREARM_CHECKS)) <= 1  # the vehicle may report it by itself
+
+
+async def test_low_battery_is_reason_if_vehicle_names_none() -> None:
+    """PX4 sends a text about the battery only when it refuses to arm."""
+    async with open_px4(SimulatedPx4(boot_time_s=1.0, battery_percent=4)) as flight:
+        await anyio.sleep(40.0)
+        reason = "battery 1 reports the charge state emergency (4 %)"
+        assert await flight.vehicle.why_not_armable() == [reason]
+        assert flight.vehicle.missing_for_flight() == [reason]
+
+
+async def test_newest_prearm_report_replaces_older_one(grounded: Flight) -> None:
+    faults = grounded.copter.faults
+    faults.prearm_failures = ["Compass not healthy", "Gyros not healthy"]
+    await anyio.sleep(35.0)
+    assert "Gyros not healthy" in grounded.vehicle.missing_for_flight()
+    faults.prearm_failures = ["Compass not healthy"]
+    await anyio.sleep(29.0)
+    reasons = grounded.vehicle.missing_for_flight()
+    assert "Compass not healthy" in reasons
+    assert "Gyros not healthy" not in reasons

@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 
 # Pieces of evidence of the same kind belong to one failsafe if they are at most this time apart.
 _SAME_KIND_GAP_S = 8.0
-# Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart. Without
-# satellites, autopilots continue with dead reckoning for several seconds (PX4 for five) before they react.
+# Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart.
 _GENERAL_GAP_S = 3.0
-_GENERAL_GAP_AFTER_GPS_S = 10.0
+# The same for failsafes with a delayed reaction. Without satellites, autopilots continue with dead reckoning for some
+# seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
+_DELAYED_REACTION_GAP_S = 10.0
 _REACTION_TIMEOUT_S = 12.0
 # Values measured at most this time before a failsafe are shown with it.
 _BEFORE_S = 10.0
@@ -173,7 +174,7 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
         if not was_armed:
             continue
         recent_groups = [
-            group for group in recent_groups if evidence.time_s - group[-1].time_s <= _GENERAL_GAP_AFTER_GPS_S
+            group for group in recent_groups if evidence.time_s - group[-1].time_s <= _DELAYED_REACTION_GAP_S
         ]
         group = next((group for group in reversed(recent_groups) if _belongs_to(evidence, group)), None)
         if group is None:
@@ -191,9 +192,10 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
 def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -> bool:
     kind, gap_s = _kind_of(group), evidence.time_s - group[-1].time_s
     if "general" in (kind, evidence.kind):
-        return gap_s <= (_GENERAL_GAP_AFTER_GPS_S if kind == "gps" else _GENERAL_GAP_S)
+        is_reaction_delayed = kind == "gps" or "entering Hold" in group[-1].text
+        return gap_s <= (_DELAYED_REACTION_GAP_S if is_reaction_delayed else _GENERAL_GAP_S)
     if (kind, evidence.kind) == ("gps", "estimator"):  # The estimator fails because the satellites are missing.
-        return gap_s <= _GENERAL_GAP_AFTER_GPS_S
+        return gap_s <= _DELAYED_REACTION_GAP_S
     return kind == evidence.kind and gap_s <= _SAME_KIND_GAP_S
 
 
@@ -219,7 +221,10 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
     """
     last_s = group[-1].time_s
     for change in flight.modes:
-        if time_s - 2.5 <= change.time_s <= last_s + _REACTION_TIMEOUT_S and change.by_autopilot is not False:
+        is_near = time_s - 2.5 <= change.time_s <= last_s + _REACTION_TIMEOUT_S
+        # Some autopilots change the mode after disarming, which is no reaction to a failsafe.
+        was_armed = any(begin <= change.time_s < end for begin, end in flight.armed)
+        if is_near and was_armed and change.by_autopilot is not False:
             previous_mode = flight.mode_at(change.time_s - 1e-6)
             if previous_mode:
                 is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S

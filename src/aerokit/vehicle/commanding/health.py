@@ -10,9 +10,11 @@ import anyio
 from aerokit.autopilots.telemetry import SENSORS
 from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.events import LinkRestored, LinkState
-from aerokit.mavlink.enums import MavCmd, MavSysStatusSensor
+from aerokit.mavlink.enums import MavBatteryChargeState, MavCmd, MavSysStatusSensor
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from aerokit.autopilots import Mode
     from aerokit.vehicle.session.session import VehicleSession
 
@@ -28,6 +30,16 @@ CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
 """The reason for a refusal to arm if no other reason is known."""
 REPORTS_ABOUT_ARMING = ("heartbeats (", "sensors (")
 """How reasons begin that are about reports without which it is unknown whether the vehicle arms."""
+LOW_CHARGE_STATES: Mapping[int, str] = {
+    state: state.name.lower()
+    for state in (
+        MavBatteryChargeState.CRITICAL,
+        MavBatteryChargeState.EMERGENCY,
+        MavBatteryChargeState.FAILED,
+        MavBatteryChargeState.UNHEALTHY,
+    )
+}
+"""Charge states of a battery with which a vehicle refuses to arm, by MAV_BATTERY_CHARGE_STATE."""
 RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
 
@@ -66,7 +78,7 @@ class Health:
         ]
         texts = self._recent_texts()
         is_explained = texts or self._failing_sensors() or (self._needs_position() and self._missing_estimates())
-        unexplained = [CHECKS_FAIL] if self._checks_fail() and not is_explained else []
+        unexplained = self._unnamed_reasons() if self._checks_fail() and not is_explained else []
         return in_order([*missing, *self._out_of_date()], [*texts, *self._failing(), *unexplained])
 
     def _recent_texts(self) -> list[str]:
@@ -124,7 +136,17 @@ class Health:
         failing = self._failing() if self._needs_position() else self._failing_sensors()
         known = [*self.arming_texts(since), *self.unarmable_mode(), *failing]
         reasons = self._session.deduplicate_reasons(*in_order(self._out_of_date(), known))
-        return reasons or ((CHECKS_FAIL,) if self._checks_fail() else ())
+        return reasons or (tuple(self._unnamed_reasons()) if self._checks_fail() else ())
+
+    def _unnamed_reasons(self) -> list[str]:
+        """Return the probable reasons why checks fail, if the vehicle names none. PX4 names a low battery only once."""
+        low_batteries = []
+        for battery in self._telemetry.batteries.latest or ():
+            state = LOW_CHARGE_STATES.get(battery.charge_state)
+            if state is not None:
+                charge = "" if battery.remaining_percent is None else f" ({battery.remaining_percent} %)"
+                low_batteries.append(f"battery {battery.id + 1} reports the charge state {state}{charge}")
+        return low_batteries or [CHECKS_FAIL]
 
     def _needs_position(self) -> bool:
         mode = self._telemetry.mode.latest
