@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 MAX_MESSAGES = 1000
 MESSAGE_MAX_AGE_S = 5.0  # drops older messages, so that a program that reads rarely gets recent ones
-# A look-up waits for its message until this long after the first access, because none is stored before.
+# Messages are stored from the first access on. Until this long after the first access, a look-up waits for its message.
 FIRST_LOOKUP_TIMEOUT_S = 1.0
 SIGNAL_CHECK_INTERVAL_S = 0.2  # longer waits are split into steps, so that Ctrl-C and a closed connection end them
 

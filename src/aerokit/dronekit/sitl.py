@@ -163,7 +163,7 @@ class SITL:
         if _vehicle_for_program is not None:
             kind = kind or _vehicle_for_program.kind
             speedup = speedup or _vehicle_for_program.speedup
-            addresses += USUAL_ADDRESSES[1:]  # the UDP port; the TCP port is that of this instance
+            addresses += USUAL_ADDRESSES[1:]  # the UDP address; `_address` is the TCP address
             _vehicle_for_program.stop()
             _vehicle_for_program = None
         kind = kind or KINDS.get(options.model or "", "copter")

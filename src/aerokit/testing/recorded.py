@@ -87,7 +87,7 @@ class RecordedParameters(ParameterProtocolServer):
         if name not in self.names:
             self._refuse(request, -1, channel)
             return
-        # Without a successful write in the recording, the vehicle answers with the present value.
+        # If the recording has no successful write of the parameter, the vehicle keeps and answers the present value.
         if name in self._vehicle.recording.settable:
             self._written[name] = request.param_value
         self.send(name, self.names.index(name), None)
@@ -316,7 +316,7 @@ class RecordedVehicle(SimulatedVehicle):
             candidates = answers
         if not candidates:
             return None
-        # Count per list of candidates, which its first answer identifies.
+        # Count the answers from each list of candidates. The first candidate identifies the list.
         list_id = id(candidates[0])
         count = self._answered_counts.get(list_id, 0)
         self._answered_counts[list_id] = count + 1

@@ -18,12 +18,13 @@ if TYPE_CHECKING:
 
 # Pieces of evidence of the same kind belong to one failsafe if they are at most this time apart.
 _SAME_KIND_GAP_S = 8.0
-# Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart. Without
-# satellites, autopilots continue with dead reckoning for several seconds (PX4 for five) before they react.
+# Evidence of the kind "general" is added to a failsafe of a specific kind if it is at most this time apart from it. The
+# time after a GPS failsafe is longer, because autopilots continue with dead reckoning for several seconds (PX4 for
+# five).
 _GENERAL_GAP_S = 3.0
 _GENERAL_GAP_AFTER_GPS_S = 10.0
 _REACTION_TIMEOUT_S = 12.0
-# Values measured at most this time before a failsafe are shown with it.
+# A failsafe is shown with values that were measured in this time before it.
 _BEFORE_S = 10.0
 # A mode change within this time after a failsafe is attributed to the autopilot, even if the log has no cause.
 _AUTOPILOT_REACTION_S = 3.0

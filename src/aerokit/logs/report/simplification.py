@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-# At least one of this many consecutive points is selected. Otherwise spirals and repeated figures take quadratic time.
+# At least one of this many consecutive points is selected. Without this limit, spirals and repeated figures would take
+# quadratic time.
 _MAX_SEGMENT = 1024
 MAX_COORDINATE = 1e9
 """Larger coordinates are damaged data. They are ignored, because their squares could overflow."""

@@ -161,7 +161,7 @@ class CopterGuided(CopterModeBase):
 
     def _run_attitude(self, dt: float) -> None:
         copter = self.vehicle
-        if self._body_rates is not None and not copter.is_landed:  # Rates turn the attitude that was set last.
+        if self._body_rates is not None and not copter.is_landed:  # The body rates change the commanded attitude.
             roll, pitch = (angle + rate * dt for angle, rate in zip(self._attitude, self._body_rates, strict=True))
             self._attitude = (roll, pitch)
         (roll, pitch), climb = self._attitude, self._attitude_climb
@@ -286,8 +286,8 @@ class CopterSetpoints:
             copter.motion.face(yaw)
         elif not ignored_rates:
             copter.motion.turn(target.body_yaw_rate)
-        # The field thrust sets a climb rate: 0.5 holds the altitude. GUID_OPTIONS bit 3, with which the field sets the
-        # throttle, is not simulated.
+        # The field `thrust` sets a climb rate, and 0.5 holds the altitude. The simulation ignores bit 3 of
+        # GUID_OPTIONS, which makes the field set the throttle instead.
         climb_share = (max(0.0, min(1.0, target.thrust)) - 0.5) * 2.0
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * copter.parameters[max_climb_parameter] / 100.0

@@ -154,7 +154,7 @@ def _stored_turns(item: MissionItem) -> tuple[float, float, float, float]:
     """
     turns, radius = item.param1, abs(item.param3)
     turn_unit = 1 / 256 if 0 < turns < 1 else 1
-    turn_byte = int(min(255.0, turns / turn_unit)) & 0xFF  # A negative number keeps only its lowest byte.
+    turn_byte = int(min(255.0, turns / turn_unit)) & 0xFF  # The mask keeps only the lowest byte of a negative number.
     radius_unit = 1 if radius <= 255 else 10
     radius_byte = int(min(255.0, radius / radius_unit))
     sign = -1.0 if item.param3 < 0 else 1.0

@@ -123,8 +123,8 @@ class ArduPilotMissionServer(MissionServer):
         if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
             return Result.UNSUPPORTED
-        # During an upload, requests for a list are denied. The base class decides on MISSION_COUNT, and requests for
-        # single items are served.
+        # During an upload, only two messages are not denied here: the base class decides on MISSION_COUNT, and requests
+        # for single items are served.
         if kind in self._uploads and not isinstance(message, (m.MissionCount, m.MissionRequest)):
             return Result.DENIED
         return None if kind in self._lists else Result.UNSUPPORTED
@@ -168,7 +168,7 @@ class ArduPilotMissionServer(MissionServer):
     def _on_write_partial_list(self, request: m.MissionWritePartialList, channel: Channel) -> None:
         kind, start, end = request.mission_type, request.start_index, request.end_index
         refusal = self._refusal(request, channel)
-        # The last index may be equal to the number of items: this item is appended.
+        # `end` may be equal to the number of items, because the item with this index is appended to the list.
         if refusal is None and not 0 <= start <= end <= self.count(kind):
             self._warn("Flight plan update rejected")
             refusal = Result.ERROR
@@ -201,7 +201,7 @@ class ArduPilotMissionServer(MissionServer):
         if isinstance(item, int):  # The position is refused with this MAV_MISSION_RESULT.
             self._answer_item(message, item, channel)
         elif kind == MavMissionType.MISSION and message.current in (_GUIDED_TARGET, _ALTITUDE_CHANGE):
-            result = self._guide(item, message.current)  # The item is a target, and not part of a list.
+            result = self._guide(item, message.current)  # The item is a target, and is not stored in a list.
             self._answer_item(message, result, channel)
         elif kind not in self._lists:
             self._answer_item(message, Result.UNSUPPORTED, channel)

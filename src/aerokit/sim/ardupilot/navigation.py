@@ -212,7 +212,7 @@ class ArduPilotNavigation:
         if self.uses_external:  # External navigation provides the position, even without GPS.
             return
         if self.has_position and lost_for >= _POSITION_TIMEOUT_S:
-            # On the ground, the velocity stays known.
+            # On the ground, the estimator still knows the velocity.
             velocity_flag = Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0
             self.flags = _DEAD_RECKONING | velocity_flag
         elif self.flags != _ATTITUDE_ONLY and lost_for >= _AIDING_TIMEOUT_S:
