@@ -28,10 +28,11 @@ CLAIM_MIN_FRAMES = 3
 
 
 class RouteClaim:
-    """Claim of a peer to a component's route that belongs to another peer, the owner.
+    """Evidence on whether a component now sends from another peer of the link.
 
-    The peer's first frame after the owner's last frame decides the claim. The decision is final until the owner sends
-    again, because otherwise a peer could try many sequence numbers.
+    The owner is the peer to which the component's messages are sent at present. Another peer that sends with the ids of
+    the component claims the route. Its first frame after the owner's last frame decides the claim. The decision is final
+    until the owner sends again, because otherwise a peer could try many sequence numbers.
     """
 
     __slots__ = (

@@ -89,7 +89,7 @@ class MAVConnection(ClassicConnection):
     # ----------------------------------------------------------------------------- receiving
 
     def forward_message(self, fn: FunctionT) -> FunctionT:
-        """Decorator: call ``fn(connection, message)`` on the listener thread with every message (pymavlink's)."""
+        """Decorator: call ``fn(connection, message)`` on the listener thread with every pymavlink message."""
         self.message_listeners.append(fn)
         if len(self.message_listeners) == 1:
             self.loop.call_soon(self.connection.observe_frames, self._forward)

@@ -182,8 +182,9 @@ class Port:
     While the link accepts data, frames are collected in ``batch`` until the end of the loop iteration. While more than
     ``queue_above_bytes`` bytes are unsent, frames wait in a `FrameQueue`. `UNLIMITED` turns this check off.
 
-    ``endpoint`` is the endpoint's name, ``period(message_id)`` is `Filters.period`. ``report(kind, text)`` publishes an
-    event of the endpoint; ``on_drop(reason, frame)`` is called for each frame dropped from the queue.
+    ``endpoint`` is the endpoint's name. ``period(message_id)`` is the minimum interval in seconds, see `Filters.period`.
+    ``report(kind, text)`` publishes an event of the endpoint; ``on_drop(reason, frame)`` is called for each frame dropped
+    from the queue.
     """
 
     link: Link
@@ -219,7 +220,7 @@ class Port:
         """True to write each frame separately, because autopilots read datagrams into small buffers."""
         self.batch: list[bytes] = []
         """Data to write: single frames, or pieces of several."""
-        self.joined_frames: int = 0
+        self.joined_frames: int = 0  # A piece of n frames in `batch` counts as n - 1, in addition to its element.
         """Difference between the number of frames in ``batch`` and the number of its pieces, for the counters."""
         self.node: RouterPort[Port] | None = None
         self._dialect = dialect

@@ -32,9 +32,8 @@ _COMMANDS = (m.CommandLong.ID, m.CommandInt.ID)
 class ComponentHost:
     """Delivers messages that are addressed to one component of a connection, and sends the component's messages.
 
-    A channel is the (system id, component id) of a sender. ``accepts`` has the system ids whose messages are processed;
-    None means all. ``knows_command`` decides whether this component executes a command that is addressed to all
-    components.
+    ``accepts`` has the system ids whose messages are processed; None means all. ``knows_command`` decides whether this
+    component executes a command that is addressed to all components.
     """
 
     def __init__(

@@ -202,6 +202,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
         if self._streamed < MIN_STREAMED:  # A single value may be the answer to our request by index.
             return max(seconds, MIN_START_TIMEOUT_S)
+        # Near the end, waiting for a further tick of the vehicle would take longer than requesting the rest.
         return seconds if self._is_near_end else max(seconds, MAX_TICK_S)
 
     @property

@@ -253,8 +253,8 @@ def _only_on_virtual_time(opening_test: Callable[..., Any]) -> Callable[..., Any
 def _on_virtual_time(test: Callable[..., Any], *, try_first: Callable[..., Any] | None = None) -> Callable[..., None]:
     """Return a function that runs an ``async def`` test on virtual time.
 
-    ``try_first`` is the same test in the version that pytest-asyncio runs. If its loop is on virtual time, this version
-    is run instead.
+    ``try_first`` is the same test, as pytest-asyncio runs it. It runs to its end if the event loop of pytest-asyncio is
+    on virtual time; otherwise, it raises at once, and ``test`` runs on a loop of its own.
     """
 
     @functools.wraps(test)

@@ -152,7 +152,8 @@ class ArduPilotFence(Generic[HostT]):
         self.breach_time_ms: int = 0  # Start of the latest breach, in milliseconds since boot.
         self.caused_mode: bool = False  # True while the present mode is the result of FENCE_ACTION.
         self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE when they were read last.
-        self._new_breach_m: dict[int, float] = {}  # Metres beyond a breached limit, by kind, that are a new breach.
+        # By kind of fence: a breached fence is breached again if the vehicle is this many metres beyond the limit.
+        self._new_breach_m: dict[int, float] = {}
         # True or False if the last command about the lower limit enabled or disabled it; None without a command.
         self._floor_enabled_by_command: bool | None = None
         self._recovering_since = -math.inf

@@ -112,12 +112,12 @@ class Px4Flight:
 
     @property
     def cruise_speed_m_s(self) -> float:
-        """Initial speed of a mode."""
+        """Horizontal speed in m/s with which a mode flies until another speed is commanded."""
         return self._vehicle.parameters["MPC_XY_CRUISE"]
 
     @property
     def top_speed_m_s(self) -> float:
-        """Maximum speed that can be commanded."""
+        """Maximum horizontal speed in m/s that can be commanded."""
         return self._vehicle.parameters["MPC_XY_VEL_MAX"]
 
     def enter(self, mode: Px4Mode) -> None:

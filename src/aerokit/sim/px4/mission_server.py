@@ -262,7 +262,7 @@ class Px4MissionServer(MissionServer):
 
     def _accept(self, link: _Link, count: m.MissionCount) -> None:
         """Start an upload or refuse it. An upload of no items stores an empty list at once."""
-        if self._uploads:
+        if self._uploads:  # PX4 has one upload at a time, on all links.
             self._answer(link, Result.ERROR, sender_of(count))
             return
         link.client, link.mission_type = sender_of(count), count.mission_type

@@ -195,7 +195,7 @@ class RefusalNotice(Snapshot):
 
 
 def encode_sent_at(epoch: int, clock_s: float) -> bytes:
-    """Return the attachment of a vehicle side's datagrams: send time on its own clock."""
+    """Return the attachment of a datagram from the vehicle's program: the send time on the clock of that program."""
     return _SENT.pack(VERSION, epoch, int(clock_s * 1000))
 
 

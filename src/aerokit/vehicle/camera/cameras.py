@@ -274,7 +274,8 @@ class Cameras:
     def _record(self, message: Any, device_id: int) -> int:
         """Add the camera to the state value `cell`; return its number, or 0 if the message is not from a camera.
 
-        The number is ``device_id`` if the autopilot is the sender, otherwise the component id of the sender.
+        The number is ``device_id`` if the autopilot is the sender, otherwise the component id of the sender. The first
+        camera with a component of its own becomes `first`.
         """
         frame = message.received_frame
         if frame is None:

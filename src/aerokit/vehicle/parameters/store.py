@@ -212,6 +212,6 @@ def vehicle_key(autopilot: str, system_id: int, version: AutopilotVersion | None
 def _parameter(row: list[Any], index: int) -> Parameter:
     name, value, type_, default = row
     if not isinstance(name, str) or not isinstance(value, (int, float)):
-        raise ValueError("not a parameter")
+        raise ValueError("the row does not begin with a name and a number")
     kind = ParameterType(type_)
     return Parameter(name, int(value) if kind.is_integer else float(value), kind, default, index)

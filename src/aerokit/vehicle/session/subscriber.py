@@ -156,9 +156,9 @@ class ComponentSubscriber:
 
 
 class WatchedStream:
-    """Feed of a cell that requests the cell's message only while the program waits for its values or follows them.
+    """Requests the message of a state cell, only while the program waits for the cell or iterates over its values.
 
-    ``request`` returns None if the message need not be requested now.
+    The object is one of the feeds of the cell. ``request`` returns None if the message need not be requested now.
     """
 
     pending = False
