@@ -238,7 +238,7 @@ class CurrentCommand:
         # MISSION_SET_CURRENT was not confirmed in time, so a command, which the vehicle acknowledges, sets the item.
         if aio.heartbeat_age > MODE_MAX_AGE_S:
             raise APIException(f"the vehicle is silent; it may or may not have set the next command to {seq}")
-        if seq == 0:  # home, which mission.set_current() cannot set, because it counts the items after home
+        if seq == 0:  # home, for which mission.set_current() has no number: its 0 is the first item after home
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:
             await aio.mission.set_current(seq - 1)

@@ -223,7 +223,7 @@ class Master:
         ``alt`` is in metres above home with ``relative_alt``, otherwise above sea level.
         """
         gps = self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
-        hud = self.recv_match(type="VFR_HUD", blocking=True)  # like pymavlink, which takes the altitude from it
+        hud = self.recv_match(type="VFR_HUD", blocking=True)  # like pymavlink, take the altitude from VFR_HUD
         position = self.recv_match(type="GLOBAL_POSITION_INT", blocking=True)
         alt = position.relative_alt * 1e-3 if relative_alt else hud.alt
         return mavutil.location(gps.lat * 1e-7, gps.lon * 1e-7, alt, hud.heading)

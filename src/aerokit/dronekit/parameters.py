@@ -135,8 +135,7 @@ async def _download(
         return
     except AerokitError as error:
         on_failure(error)
-        # A waiting program starts the next download as soon as this download has ended, so the pause limits the
-        # attempts.
+        # The pause limits the attempts, because a waiting program starts the next download as soon as this one ends.
         await anyio.sleep(RETRY_DELAY_S)
     finally:
         on_ended()

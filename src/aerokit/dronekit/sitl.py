@@ -51,7 +51,7 @@ class ServedVehicle:
         self._vehicle = simulated(kind, home=home)
         self._requested_addresses = tuple(addresses)
         self._error: Exception | None = None
-        self._startup_ended = threading.Event()  # set when the vehicle is served, or when that has failed
+        self._startup_ended = threading.Event()  # set when the vehicle is served, or when the start has failed
         self._loop = asyncio.new_event_loop()
         self._stop_requested = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="aerokit simulated vehicle", daemon=True)

@@ -305,8 +305,7 @@ class _Writer(UploadedFile):
             raise FileFault(EINVAL) from None
 
     def _read_rows(self, content: bytes, count: int) -> None:
-        # `read_entry` needs the previous name, because an entry omits the beginning that its name has in common with
-        # it.
+        # An entry omits the beginning of its name that the previous name has, too, so `read_entry` needs that name.
         position, previous_name = HEADER.size, b""
         for _ in range(count):
             entry = read_entry(content, position, previous_name) if position < len(content) else None

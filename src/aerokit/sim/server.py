@@ -212,7 +212,7 @@ class SimulatorServer:
             self.on_datagram(now, data, False)
         try:
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
-                # `vehicle.now` may be later than `now`, because a timer fired early or another vehicle advanced this
+                # The vehicle may be ahead of `now`, because a timer fired early or another vehicle advanced this
                 # vehicle.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due

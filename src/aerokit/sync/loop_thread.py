@@ -332,8 +332,7 @@ class _Calls:
         call.has_started = True
         task = asyncio.get_running_loop().create_task(call.run())
         self._tasks[task] = call
-        # If the task is cancelled before its first step, only this callback finishes the call. Other calls finish in
-        # `run`.
+        # The callback finishes a call whose task was cancelled before its first step. `run` finishes all other calls.
         task.add_done_callback(lambda task: self._tasks.pop(task).finish())
 
     def end_soon(self, function: Callable[[], object] | None = None) -> None:

@@ -202,8 +202,7 @@ def _runnable_function(item: pytest.Function) -> Callable[..., Any]:
     test: Callable[..., Any] = item.obj
     opening_test = getattr(test, _OPENING_TEST, None)
     if opening_test is not None:  # The test has the asyncio marker.
-        # If `test` is a plain function, it is pytest-asyncio's wrapper, which runs the `async def` on pytest-asyncio's
-        # loop.
+        # If `test` is a plain function, it is the wrapper with which pytest-asyncio runs the test on its own loop.
         wrapped_by_pytest_asyncio = None if inspect.iscoroutinefunction(test) else test
         return _on_virtual_time(opening_test, try_first=wrapped_by_pytest_asyncio)
     if not fleets or not inspect.iscoroutinefunction(test):

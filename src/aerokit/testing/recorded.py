@@ -312,7 +312,7 @@ class RecordedVehicle(SimulatedVehicle):
         # A message request matches an answer for the same message, whose id is param 1.
         if not candidates and command.command in _MESSAGE_REQUESTS:
             candidates = [answer for answer in answers if answer.params[:1] == params[:1]]
-        elif not candidates:  # Any other command gets the answers to the command with other params.
+        elif not candidates:  # Use the answers to the same command with other params.
             candidates = answers
         if not candidates:
             return None

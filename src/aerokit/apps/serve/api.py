@@ -131,8 +131,7 @@ _BITS = {
         "ESTIMATOR_STATUS": EstimatorStatusFlags,
     }.items()
 }
-# With wait=false, an order is answered after this time. If the library refuses the order sooner, the answer has the
-# reason.
+# With wait=false, an order is answered after this time or, if the library refuses it sooner, with the reason.
 _REFUSAL_TIMEOUT_S = 0.2
 
 

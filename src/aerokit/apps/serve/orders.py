@@ -347,8 +347,7 @@ class OrderRunner:
         """Raise the error that applies if the order must not be sent now."""
         vehicle.connection.raise_if_ended()
         now = asyncio.get_running_loop().time()
-        # The loop's clock stands still while the computer sleeps, so the sleep is added to the age of the client's
-        # state.
+        # The clock of the loop stands still while the computer sleeps, so the sleep is added to the age of the state.
         slept_s = 0.0 if seen_at_s is None else vehicle.connection._slept_since(seen_at_s)
         if seen_at_s is not None and not 0 <= now - seen_at_s + slept_s <= STATE_MAX_AGE_S:
             raise HttpProblem(

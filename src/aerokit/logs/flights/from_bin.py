@@ -99,8 +99,7 @@ class _Tables:
         row_format = reader.formats[reader.name_to_id[table]]
         indices = [row_format.columns.index(name) for name in ("TimeUS", *columns)]
         unpack = struct.Struct(_struct_pattern(row_format, indices)).unpack_from
-        # An unpacked row has its columns in the order of the file. `positions` are the places of TimeUS and `columns`
-        # there.
+        # Unpacked rows have the order of the file. `positions` are the places of TimeUS and of `columns` in such a row.
         positions = [sorted(indices).index(index) for index in indices]
         scales = [row_format.msg_mults[index] for index in indices]
         data, offsets = reader.data_map, reader.offsets[row_format.type]

@@ -55,8 +55,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
         mode = self.vehicle.mode
         if not mode.can_arm:
             return [f"{mode.name} mode not armable"]
-        # In modes without manual throttle, the stick sets a climb rate, and its centre is safe because it holds the
-        # altitude.
+        # In modes without manual throttle, the stick sets a climb rate, and its centre holds the altitude.
         max_throttle = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
         if not mode.arms_with_raised_throttle and self.vehicle.rc[RC_THROTTLE] > max_throttle:
             return ["Throttle too high"]

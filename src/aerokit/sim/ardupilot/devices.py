@@ -27,7 +27,7 @@ class ArduPilotDevices:
         self.chute_is_released: bool = False
         self.line_m: float = 0.0  # Length of the winch's line.
         self.line_rate_m_s: float = 0.0  # Above 0 while the winch lets out line.
-        self._goal_m: float | None = None  # Length at which the winch stops; None without such a length.
+        self._goal_m: float | None = None  # Length at which the winch stops; None if it stops only on command.
 
     def _is_set(self, name: str) -> bool:
         return bool(self._vehicle.parameters.get(name, 0))

@@ -242,8 +242,7 @@ class ArduPilotFence(Generic[HostT]):
         """Check the position and react to a new breach."""
         vehicle = self.vehicle
         self._follow_parameters()
-        # Continue if a lower limit (`_MIN_ALT`) is configured but disabled, because `_check` may enable this limit in
-        # flight.
+        # Continue if only a disabled lower limit (`_MIN_ALT`) is configured, because `_check` may enable it in flight.
         if not self.enabled and not self.configured & _MIN_ALT:
             return
         is_due = vehicle.now - self._checked_at > self.PERIOD_S - 1e-6  # tolerates rounding errors

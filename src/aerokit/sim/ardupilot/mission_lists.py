@@ -118,8 +118,7 @@ class CommandList(ItemList):
 
     def _write(self, seq: int, stored_item: MissionItem) -> int:
         count = len(self._commands)
-        # A list with space only for home refuses every item. `max` lets it refuse even item 0 (home), which is never
-        # stored.
+        # A list with space only for home refuses every item. With `max`, it refuses even item 0, which is never stored.
         if seq > count or max(seq, 1) >= self.capacity:
             return MavMissionResult.ERROR
         if seq == count:

@@ -329,8 +329,7 @@ class MissionRun:
             if item.command not in (Cmd.DO_JUMP, Cmd.DO_JUMP_TAG):
                 return index, item
             target = self._jump_target(item)
-            # Without `count_jumps`, no jump uses up its repetitions. If the first jump is reached again, the loop is
-            # endless.
+            # Without `count_jumps`, no jump is used up, so the loop is endless if the first jump is reached again.
             is_endless = not count_jumps and first_jump == index
             if self._list.command(target) is None or is_endless:
                 return None

@@ -144,14 +144,14 @@ class ArduPilotMissionServer(MissionServer):
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         client, kind = sender_of(request), request.mission_type
-        # A bug of the firmware: it compares the command of the item, instead of the index of the item, with the index
+        # Reproduces a bug of the firmware, which compares the command of the item (instead of its index) with the index
         # of the current item.
         current = kind == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
         if isinstance(request, m.MissionRequestInt):
             return item_message_int(item, request.seq, client, kind, current=current)
         place: tuple[float, float] = (item.x, item.y)
         if has_location(item.command):
-            # Degrees. Like the firmware, convert them in single precision.
+            # The position in degrees, converted in single precision like in the firmware.
             place = (float32(item.x * float32(1e-7)), float32(item.y * float32(1e-7)))
         self._warn_once(request, "got MISSION_REQUEST; use MISSION_REQUEST_INT!")
         return item_message_float(item, place, request.seq, client, kind, int(current))

@@ -359,7 +359,7 @@ def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
     if distances[farthest] <= tolerance:
         return [path[0], path[-1]]
     middle = farthest + 1  # Index in `path`. The first point of `path` has no distance.
-    # Both halves contain the middle point, which is used once.
+    # Both halves contain the middle point, so `[:-1]` removes it from the first half.
     return simplify(path[: middle + 1], tolerance)[:-1] + simplify(path[middle:], tolerance)
 
 
@@ -410,7 +410,7 @@ def _closest_approach(start1: Ned, end1: Ned, start2: Ned, end2: Ned) -> tuple[f
     dot11, dot12, dot22 = _dot(line1, line1), _dot(line1, line2), _dot(line2, line2)
     dot1, dot2 = _dot(line1, between), _dot(line2, between)
     determinant = dot11 * dot22 - dot12 * dot12
-    are_nearly_parallel = determinant < 1e-6 * max(dot11 * dot22, 1e-9)  # 1e-9: segments without a length
+    are_nearly_parallel = determinant < 1e-6 * max(dot11 * dot22, 1e-9)  # 1e-9 includes segments without a length
     if are_nearly_parallel:
         return None
     # The nearest place on each segment, as a number from 0 (start) to 1 (end). Limiting one place to its segment moves

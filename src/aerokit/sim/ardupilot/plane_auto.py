@@ -169,7 +169,8 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         distance = horizontal_distance(self.vehicle, self._place)
         if distance <= self.vehicle.parameters["WP_RADIUS"]:
             return self._report(f"Reached waypoint #{index} dist {int(distance)}m")
-        # The plane has passed the waypoint if its offset from there points along the leg. `_report` returns True.
+        # The plane has passed the waypoint if its offset from the waypoint points in the direction of the leg.
+        # `_report` returns True.
         dot_product = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
         return dot_product > 0 and self._report(f"Passed waypoint #{index} dist {int(distance)}m")
 

@@ -28,7 +28,7 @@ _OVERRIDABLE, _CHANNELS = 16, 18
 # Values of SIM_RC_FAIL.
 _NO_PULSES, _LOW_THROTTLE = 1, 2
 _LOW_THROTTLE_PWM = 950
-# Special values in RC_CHANNELS_OVERRIDE: leave a channel unchanged, and release it (the latter for channels 9 to 18).
+# Values of RC_CHANNELS_OVERRIDE: `_UNCHANGED` keeps a channel, `_RELEASE_UPPER` releases a channel from 9 to 18.
 _UNCHANGED, _RELEASE_UPPER = 0xFFFF, 0xFFFE
 
 

@@ -319,7 +319,7 @@ class SimulatedRover(RoverHost):
     def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
         """Create the motion model with limits from the parameters. Wind is reported, but does not move the rover."""
         parameters = self.parameters
-        # The value 0 means that there is no limit, but the motion model needs one.
+        # The value 0 means that there is no limit. The motion model needs a limit, so `or` replaces the 0.
         limits = GroundLimits(
             acceleration_m_s2=parameters["ATC_ACCEL_MAX"] or 1.0,
             top_speed_m_s=self.top_speed,

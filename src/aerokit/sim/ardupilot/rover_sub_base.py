@@ -291,8 +291,7 @@ class RoverSubAuto(MissionMode):
         if item.command == Cmd.NAV_RETURN_TO_LAUNCH:
             self._place, self._stops = vehicle.navigation.home or current, True
             return
-        # If the position is invalid or its coordinates are 0, `current` is used: the place where the previous command
-        # ended.
+        # If the position is invalid or the coordinates are 0, use `current`, where the previous command ended.
         point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or current
         north, east = current[:2] if (item.x, item.y) == (0, 0) else point[:2]
         self._place = (north, east, current[2] if item.z == 0 else point[2])

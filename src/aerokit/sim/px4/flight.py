@@ -47,8 +47,7 @@ class Px4Orbit:
         turn_sign = math.copysign(1.0, self.radius_m)
         tangent = angle + turn_sign * math.pi / 2
         speed = self.speed_m_s
-        # The radial velocity, which leads back to the circle: away from the middle if positive, towards the middle if
-        # negative.
+        # The radial velocity, which leads back to the circle: positive away from the middle, negative towards it.
         outwards = max(-speed, min(speed, _BACK_TO_CIRCLE_PER_S * (abs(self.radius_m) - distance)))
         motion.seek_velocity(
             speed * math.cos(tangent) + outwards * math.cos(angle),

@@ -144,7 +144,7 @@ _FAST_MESSAGES = (
     m.ServoOutputRaw.ID,
 )
 _SIMULATION_RATES_HZ = {m.RcChannels.ID: 20.0, m.OpticalFlowRad.ID: 10.0, m.Statustext.ID: 20.0}
-# Rates of the messages that have the same rate on every link, which cannot be changed.
+# Messages whose rate is the same on every link and cannot be changed. The values are the rates in Hz.
 _ALWAYS_HZ = {m.Heartbeat.ID: 1.0, m.MissionCurrent.ID: 1.0, m.CurrentEventSequence.ID: 0.3}
 
 _OFF, _ON_CHANGE = -1, 0

@@ -95,8 +95,7 @@ _EXPO, _DEAD_ZONE = 0.6, 0.1
 _SLOW_SHARE = 0.3
 _LIFTS_OFF_ABOVE = 0.05
 _AT_REST_M_S = 0.3
-# Time constant of the velocity control of `Motion`. `_velocity_of_thrust` needs it to get a velocity from an
-# acceleration.
+# Time constant of the velocity control of `Motion`. `_velocity_of_thrust` multiplies an acceleration by it.
 _THRUST_AHEAD_S = 0.3
 
 _HOLDS_HEIGHT = frozenset({ALTITUDE, ALTITUDE_CRUISE, POSITION, POSITION_SLOW})

@@ -81,8 +81,7 @@ def _height_above_home(px4: Px4Host, item: MissionItem) -> float:
 
 def _landing_problem(items: Sequence[MissionItem]) -> str | None:
     """Return PX4's text about a wrong order of DO_LAND_START, landing and return, or None."""
-    # `land_start` is the index of DO_LAND_START, `approach` that of the item before the landing. -1: there is no such
-    # item.
+    # Indices of DO_LAND_START (`land_start`) and of the item before the landing (`approach`); -1 without such an item.
     land_start = approach = -1
     for index, item in enumerate(items):
         if item.command == Cmd.DO_LAND_START:
@@ -224,8 +223,7 @@ class Px4Mission:
         """Enter mission mode. A finished mission starts again, unless another item was selected in the meantime."""
         if not self.is_valid:
             return
-        # A finished mission stays at its last item. If `current` is another item, that item was selected in the
-        # meantime.
+        # A finished mission stays at its last item. If `current` is another item, that item was selected later.
         is_still_finished = self.is_finished and self.current == self.count - 1
         if self.current >= self.count or is_still_finished:
             self.current = 0
