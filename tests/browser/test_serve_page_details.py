@@ -26,8 +26,8 @@ def test_parameter_dialog_refuses_values_of_other_types(browser: Any, copters: C
             page.locator(f"dialog {each}") for each in ("input[name=value]", ".yes", ".problem", ".force")
         )
         texts = {
-            "2000.5": "RTL_ALT = 2000.5 must be a whole number (it is an INT32).",
-            "1e30": "RTL_ALT = 1e+30 must be in -2147483648..2147483647 (it is an INT32).",
+            "2000.5": "RTL_ALT = 2000.5 must be a whole number (its type is INT32).",
+            "1e30": "RTL_ALT = 1e+30 must be in -2147483648..2147483647 (its type is INT32).",
         }
         for text, expected in texts.items():
             value.fill(text)

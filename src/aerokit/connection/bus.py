@@ -195,7 +195,7 @@ class Bus:
         kinds = {kind for kind, _ in entries}
         kind = MESSAGE if kinds == {MESSAGE} else BOTH
         if MESSAGE not in kinds:
-            kind = FRAME  # No sink needs the message, so it is not decoded. Sinks of kind BOTH get only the frame.
+            kind = FRAME  # No sink needs the message decoded: sinks of kind BOTH also accept the frame alone.
         plan = self._plans[frame.system_id << 24 | frame.message_id] = kind, tuple(sink for _, sink in entries)
         return plan
 

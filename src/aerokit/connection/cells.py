@@ -228,7 +228,7 @@ class StateCell(Generic[T]):
 
     def forget(self) -> None:
         """Make the value unknown again, e.g. after a reboot. Waiters keep waiting."""
-        # `_latest` is kept, because another thread may have read `_known` as True just before this line.
+        # `_latest` keeps its value: another thread may have just read `_known` as True, and reads `_latest` next.
         self._known = False
         self._source = None
         self._updated_at = -math.inf
@@ -289,7 +289,7 @@ class StateCell(Generic[T]):
     def __repr__(self) -> str:
         return f"<StateCell {self._describe()}>"
 
-    if not TYPE_CHECKING:  # Without these methods, type checkers report the misuse.
+    if not TYPE_CHECKING:  # Type checkers do not see these methods, and therefore report their use as an error.
 
         def __getattr__(self, name: str) -> NoReturn:
             """Raise an error that suggests ``.value``, e.g. for ``vehicle.position.latitude_deg``."""

@@ -507,7 +507,7 @@ class Connection:
             return
         self._end_signal.error = error  # first, so that sinks of the following events find the connection closed
         self._receiver.close()
-        # A program that closes the connection itself needs no event about it.
+        # Only a lost link is published as an event: a program that closes the connection itself needs none.
         self._state_watch.mark_lost(self._clock(), publish=isinstance(error, LinkLost))
         self.link_state.close(error)
         if self._multilink is not None:

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-# Telemetry at 10 Hz or more arrives within this interval, and each time postpones the check. The check is late after
-# 0.2 s: this interval plus LATE_THRESHOLD_S.
+# After this interval, a timer checks whether the loop was blocked. Data that is read earlier, such as telemetry at 10
+# Hz, postpones the check. A check counts as late after 0.2 s: this interval plus LATE_THRESHOLD_S.
 CHECK_INTERVAL_S = 0.12
 
 LATE_THRESHOLD_S = 0.08
 
 BLOCKED_THRESHOLD_S = 0.25
 
-# If nothing was read in this many loop iterations, all data that waited during the pause has been read. One iteration
-# would not prove this, because some loops run timers before they read sockets.
+# If nothing was read in this many loop iterations, all data that arrived during the pause has been read. A single
+# iteration would not prove it, because some loops run timers before they read sockets.
 IDLE_ITERATIONS = 3
 
 MAX_SLEEPS = 16
@@ -95,7 +95,7 @@ class LoopWatch:
     def arrival(self, now: float) -> float:
         """Return the receive time of data that is read now: ``now``, or earlier if data may have waited."""
         if now < self._check_sleep_at and self.oldest_arrival < math.inf:
-            # The clocks were just checked, and data may still wait since the last pause.
+            # The clocks were checked a moment ago, and data that arrived during the last pause may still be unread.
             self._has_read = True
             return self.oldest_arrival
         self._check_sleep_at = now + CHECK_INTERVAL_S / 2
@@ -128,18 +128,19 @@ class LoopWatch:
         if has_slept or late_s > LATE_THRESHOLD_S:
             self._assume_waiting_data()
         self._set_timer(now)
-        if late_s > BLOCKED_THRESHOLD_S:  # The pause may have begun just after the timer was set.
+        # The pause may have begun just after the timer was set, so its maximum length is reported.
+        if late_s > BLOCKED_THRESHOLD_S:
             self._on_blocked(late_s + CHECK_INTERVAL_S)
 
     def _has_slept(self) -> bool:
-        # The suspended time is the difference of two clocks. It is too small if the process was preempted between
-        # reading them. The true time never decreases, so the largest result is closest to it.
+        # `_suspended` subtracts two clock readings. Its result is too small if the process was preempted between the
+        # readings. The true value never decreases, so the largest result so far is used.
         before = self._suspended_before
         self._suspended_before = max(before, self._suspended())
         slept_s = self._suspended_before - before
         if slept_s <= LATE_THRESHOLD_S:
             return False
-        self._ran_at -= slept_s  # The loop's clock stood still meanwhile, and data may have waited all this time.
+        self._ran_at -= slept_s  # The loop's clock stood still during the sleep, in which data may have arrived.
         self._sleeps.append((self._loop.time(), slept_s))
         self._on_slept(slept_s)
         return True

@@ -182,8 +182,8 @@ def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: boo
 
 
 def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | LinkAddress]) -> None:
-    # If an address is listed twice, its socket or port cannot be opened a second time. The error would look like a
-    # broken link, so it is reported here.
+    # An address that is listed twice is refused here. Otherwise its second link could not be opened, and the error
+    # would look like a broken link.
     seen: set[object] = set()
     for address, target in zip(addresses, targets):  # noqa: B905 - equal lengths
         key = _target_key(target)
@@ -214,7 +214,7 @@ def _return_link(link: Link) -> Link:
 
 
 # Noise of this many bytes contains a pattern that looks like a damaged frame with a probability of about 10 %. Damaged
-# frames are therefore only diagnosed if they are more frequent.
+# frames are therefore only diagnosed if there is more than one in this many bytes.
 NOISE_BYTES = 500
 
 MAX_LISTED_IDS = 5
@@ -250,7 +250,8 @@ class _Diagnosis:
         return self._without_vehicle()
 
     def _without_frames(self) -> str:
-        # Noise also contains a few patterns that look like frames. They must not lead to a wrong diagnosis.
+        # Noise contains a few patterns that look like frames of an unknown dialect. Such a dialect is therefore only
+        # diagnosed if most bytes belong to frames.
         received = f"{self._bytes} bytes were received"
         is_mostly_framed = 2 * self._bad_bytes < self._bytes
         if self._unknown_frames and is_mostly_framed:

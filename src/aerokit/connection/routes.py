@@ -31,8 +31,8 @@ class RouteClaim:
     """Evidence on whether a component now sends from another peer of the link.
 
     The owner is the peer to which the component's messages are sent at present. Another peer that sends with the ids of
-    the component claims the route. Its first frame after the owner's last frame decides the claim. The decision is final
-    until the owner sends again, because otherwise a peer could try many sequence numbers.
+    the component claims the route. Its first frame after the owner's last frame decides the claim. The decision is
+    final until the owner sends again, because otherwise a peer could try many sequence numbers.
     """
 
     __slots__ = (
@@ -65,7 +65,8 @@ class RouteClaim:
             self._sequence_matches, self._clock_matches = sequence_matches, None
             self._claimed_at = frame.received_at
         self._frames += 1
-        # Once the clock of a frame did not match, later matches do not count, because the peer could try many times.
+        # A mismatch of the clock is final. Otherwise another sender could try often enough until a frame matches by
+        # chance.
         if clock_matches is not None and self._clock_matches is not False:
             self._clock_matches = clock_matches
 
@@ -294,14 +295,16 @@ class Routes:
             expected = route.counters.expected
             # While silent, the owner may have sent 50 % more frames than at its measured rate, and a burst of eight.
             max_ahead = 8 + 1.5 * route.rate * silent_s
-            if max_ahead < 128:  # Otherwise more than half of the 256 sequence numbers would match by chance.
+            # With a larger range, more than half of the 256 sequence numbers would match by chance.
+            if max_ahead < 128:
                 sequence_matches = (frame.sequence - expected) & 0xFF <= max_ahead
         clock = self._boot_clocks.get((frame.system_id, frame.component_id))
         expected_ms = None if clock is None else clock(frame.received_at)
         boot_ms = boot_time_ms(frame)
         clock_matches: bool | None = None
         if expected_ms is None:
-            # The owner's clock is unknown, so the claim is decided by sequence numbers only.
+            # The owner's clock is unknown, so the sequence numbers alone decide. `continues_owner` needs a matching
+            # clock, so the clock counts as matching if the sequence numbers are known.
             clock_matches = None if sequence_matches is None else True
         elif boot_ms is not None:
             tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence

@@ -153,7 +153,7 @@ class FleetAction:
     def result_so_far(self) -> FleetResult:
         """Return a result with the members that have finished so far."""
         names = [member.name for member in self._members]
-        # In the order of the members, not in that of their ends.
+        # The outcomes have the order of the members, not the order in which the members have finished.
         outcomes = {name: self._outcomes[name] for name in names if name in self._outcomes}
         return FleetResult(self.name, outcomes, failed=self._failed, stopped=self._stopped, skipped=self._skipped)
 
@@ -263,8 +263,8 @@ class FleetAction:
                     partial(self._send_order, member, self._orders[member.name]),
                     f"aerokit policy {member.name}",
                 )
-        # The running actions are cancelled one loop iteration later, after the policy's orders have begun. These orders
-        # then have superseded those of the actions, so that the cancelled actions do not send a hold.
+        # The running actions are cancelled one loop iteration later, after the policy's orders have begun. By then, the
+        # policy's orders have superseded the orders of the actions, so that the cancelled actions do not send a hold.
         asyncio.get_running_loop().call_soon(self._cancel, [member for member in available if member.name in orders])
         if not self._orders:
             self._publish_completed()
@@ -306,7 +306,8 @@ class FleetAction:
         )
 
     def _hold_finished_members(self) -> None:
-        # The other members are still executing the action. They hold because its cancellation makes them hold.
+        # Only members that have finished the action get an order to hold. The others still execute the action, and its
+        # cancellation makes them hold.
         for member in self._members:
             if (
                 member.is_flown_by_program

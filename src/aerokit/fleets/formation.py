@@ -231,8 +231,9 @@ class Following:
                     await anyio.sleep(self._period_s)
                 await asyncio.Event().wait()  # waits to be cancelled, which makes the vehicle hold
         finally:
-            # Called later, when the action has recorded this follower's failure. The end of the action would be too
-            # late, because the action also waits for the policy's orders, such as landing the other members.
+            # The call waits until the action has recorded this follower's failure. At the end of the action, the call
+            # would be too late, because the action also waits for the policy's orders, such as landing the other
+            # members.
             asyncio.get_running_loop().call_soon(self._stop_if_no_followers)
 
     def _stop_if_no_followers(self) -> None:
@@ -249,7 +250,8 @@ class Following:
                 self._check_leader()
                 position_of(self._leader, LEADER_MAX_AGE_S)
             except (OperationRejected, ValueUnknownError) as error:
-                holding = self._action.active  # these hold, because _tasks.cancel() below ends their streams
+                # The active members hold, because `_tasks.cancel()` below ends their streams.
+                holding = self._action.active
                 skipped = {
                     member.name: member.status if member.reason else "it does not follow"
                     for member in self._followers
@@ -355,7 +357,8 @@ class Formations(Travel):
             offset = formation.offset_of(follower.name, heading)
             target = leader_position.offset(north_m=offset.north_m, east_m=offset.east_m, up_m=offset.up_m)
             if target.altitude_amsl_m is not None:
-                # Without the altitude above the leader's home, because the followers' homes may be at other altitudes.
+                # The target gets no altitude above the leader's home, because the followers' homes may be at other
+                # altitudes.
                 target = Position(target.latitude_deg, target.longitude_deg, altitude_amsl_m=target.altitude_amsl_m)
             targets[follower.name] = target
         if speed_m_s is not None:

@@ -172,8 +172,8 @@ class Member:
         return self.vehicle._arbiter.newest, self.vehicle.mode.latest
 
     def _refresh_soon(self, *_: object) -> None:
-        # Called later, when the whole HEARTBEAT is processed. After a landing, one HEARTBEAT reports a mode change and
-        # disarming; the mode change of a disarmed vehicle is no takeover.
+        # The refresh waits until the whole HEARTBEAT is processed. After a landing, one HEARTBEAT reports a mode change
+        # and disarming, and a mode change of a disarmed vehicle is no takeover.
         asyncio.get_running_loop().call_soon(self.refresh)
 
     def _on_silent(self, event: VehicleSilent) -> None:
@@ -185,7 +185,7 @@ class Member:
 
     def _on_recovered(self, event: VehicleRecovered) -> None:
         if event.system_id == self.vehicle.system_id:
-            # Called later, when the vehicle's HEARTBEAT is processed.
+            # The call waits until the HEARTBEAT that ended the silence is processed.
             asyncio.get_running_loop().call_soon(self._set_active_again)
 
     def _set_lost(self, reason: str) -> None:

@@ -360,7 +360,8 @@ class MemberConnections:
         self._has_block_failed = error is not None
         self._close.set()
         is_every_vehicle_connected = len(self._open) == self._running
-        if self._running and is_every_vehicle_connected:  # otherwise opening failed, and cancelling the tasks is enough
+        # If a vehicle is not connected, opening has failed, and cancelling the tasks is enough.
+        if self._running and is_every_vehicle_connected:
             await run_shielded(self._wait_until_all_closed())
         await self._tasks.aclose()
 

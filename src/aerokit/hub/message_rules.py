@@ -81,7 +81,8 @@ class Filters:
         if any(fnmatchcase(name, pattern) for pattern in self._block):
             return None
         if name in ANSWERS:
-            rate_hz = self._rates.get(name)  # Only the exact name limits answers, not a wildcard.
+            # Answers are limited only by a rule with their exact name, not by a rule with a wildcard.
+            rate_hz = self._rates.get(name)
         else:
             rate_hz = next((hz for pattern, hz in self._rates.items() if fnmatchcase(name, pattern)), None)
         return 0.0 if rate_hz is None else 1 / rate_hz

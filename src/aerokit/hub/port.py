@@ -182,9 +182,9 @@ class Port:
     While the link accepts data, frames are collected in ``batch`` until the end of the loop iteration. While more than
     ``queue_above_bytes`` bytes are unsent, frames wait in a `FrameQueue`. `UNLIMITED` turns this check off.
 
-    ``endpoint`` is the endpoint's name. ``period(message_id)`` is the minimum interval in seconds, see `Filters.period`.
-    ``report(kind, text)`` publishes an event of the endpoint; ``on_drop(reason, frame)`` is called for each frame dropped
-    from the queue.
+    ``endpoint`` is the endpoint's name. ``period(message_id)`` is the minimum interval in seconds of a message, see
+    `Filters.period`. ``report(kind, text)`` publishes an event of the endpoint; ``on_drop(reason, frame)`` is called for
+    each frame dropped from the queue.
     """
 
     link: Link
@@ -264,7 +264,7 @@ class Port:
             self._due[key] = now + period_s
         else:
             # The next due time is counted from the last one rather than from now, so that irregular messages reach the
-            # allowed average rate. It is not before now, so that no burst follows a pause.
+            # allowed average rate. The next due time is never before now, so that no burst follows a pause.
             self._due[key] = max(due, now - period_s) + period_s
         return True
 

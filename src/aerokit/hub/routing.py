@@ -187,8 +187,8 @@ class Router(Generic[PortT]):
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
-                # If the earlier frame arrived at this port, too, it is another frame. Its number and checksum are equal
-                # by chance.
+                # An earlier frame with this identity that arrived at the same port is another frame, whose number and
+                # checksum are equal by chance.
                 if is_new or (newer.get(identity) or older[identity])[0] == number:
                     newer[identity] = record
                     plan.sender.received_at = now
@@ -196,8 +196,8 @@ class Router(Generic[PortT]):
                     continue
             plans.append(self.route(node, frame, now))
             if node.echoes:
-                # A frame came back. From now on, `route` must process every frame, because it counts them to detect a
-                # loop.
+                # A frame came back. From now on, `route` must process every frame, because it counts returning and new
+                # frames in `echoes` to detect a loop.
                 streams = {}
         return plans
 

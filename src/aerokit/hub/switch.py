@@ -139,7 +139,7 @@ class Switch:
         if self._ports_to_flush:
             if len(frames) > MAX_BURST_FRAMES:
                 self.flush()
-            elif not (self._is_scheduled or port.reports_bursts):  # Otherwise the end of the burst flushes.
+            elif not (self._is_scheduled or port.reports_bursts):  # A reported burst flushes at its end.
                 self._is_scheduled = True
                 self._loop.call_soon(self.flush)
 

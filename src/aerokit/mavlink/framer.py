@@ -27,8 +27,8 @@ from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, So
 MAX_SOURCES = 1024
 """Number of senders with separate counters, for a framer without a shared `SourceLimit`."""
 
-# Struct has no number of three bytes. The message id is therefore the lower three bytes of the last item, whose upper
-# byte belongs to the payload.
+# The module struct has no format for three bytes. The message id is therefore the lower three bytes of the last item,
+# whose upper byte belongs to the payload.
 _HEADER_V2 = Struct("<BBBxBHI").unpack_from  # magic, length, flags, sequence, source, id
 _HEADER_V1 = Struct("<xBBHB").unpack_from  # length, sequence, source, id
 _CHECKSUM = Struct("<H").unpack_from

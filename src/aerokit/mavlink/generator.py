@@ -104,7 +104,7 @@ def _entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[EntryDefi
     merged = {entry.name: _entry(by_name.get(entry.name, entry), entry) for entry in added.entries}
     for name, entry in by_name.items():
         merged.setdefault(name, entry)
-    # The additions come first in `merged` and, because sorting is stable, also among several names for one value.
+    # Sorting is stable, so the additions, which are first in `merged`, stay first among several names for one value.
     return tuple(sorted(merged.values(), key=lambda entry: entry.value))
 
 
@@ -127,8 +127,8 @@ MODULES: dict[str, tuple[str, ...]] = {
     "development": ("development",),
 }
 
-# Messages of ``common.xml`` that every flight uses. They are in ``common.py``. The other two hundred messages are in
-# ``common_more.py``, so that a program imports them only if it needs one: that takes several times as long.
+# Messages of ``common.xml`` that every flight uses, for ``common.py``. The other two hundred are in ``common_more.py``,
+# which is imported only if a program needs one, because its import takes several times as long.
 EVERYDAY = """
     Attitude AttitudeQuaternion AvailableModes BatteryStatus CommandAck CommandInt CommandLong CurrentMode
     DistanceSensor EstimatorStatus ExtendedSysState FileTransferProtocol Gps2Raw GpsGlobalOrigin GpsRawInt

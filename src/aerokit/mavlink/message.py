@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self, dataclass_transform
 
     from aerokit.mavlink.frame import Frame
-else:  # At run time it is not imported, because importing typing_extensions takes longer than importing aerokit.
+else:  # At run time, typing_extensions is not imported, because that would take longer than importing aerokit.
 
     def dataclass_transform(**_: object) -> Any:
         return lambda cls: cls
@@ -353,8 +353,8 @@ def _text_problem(value: Any, size: int) -> str | None:
 
 # ------------------------------------------------------------------------------------------ enums
 
-# The standard library uses this decorator for its own long enums since Python 3.11. It creates the same enum in half
-# the time. It is private, so it may be missing.
+# The standard library uses this private decorator for its own long enums since Python 3.11, because it creates the same
+# enum in half the time. Other versions of Python may lack the decorator.
 _simple_enum: Any = getattr(enum, "_simple_enum", None)
 
 

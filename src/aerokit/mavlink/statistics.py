@@ -67,8 +67,8 @@ class SourceStatistics(SourceFields):
         """Number of lost frames. A frame that arrives late no longer counts as lost."""
         self.expected = sequence
         """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
-        # The number of steps by which `expected` has advanced without a received frame. `received` is the difference of
-        # both, so that a received frame costs a single addition.
+        # Number of steps by which `expected` has advanced without a received frame. `received` is `expected` minus this
+        # number, so a received frame only has to increase `expected`.
         self._unreceived = sequence
         self._missing = 0  # bit n is set if the frame n + 1 before `_missing_at` is missing
         self._missing_at = sequence
@@ -158,13 +158,14 @@ class SourceStatistics(SourceFields):
         is_direct_succession = follows and self._late_at == self.received
         self._late_run = self._late_run + 1 if is_direct_succession else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
-        min_run = 3 if is_near else 1  # A link may repeat a few recent frames, but hardly old ones.
+        # A link may repeat two or three recent frames, which are no reboot. It hardly ever repeats old frames.
+        min_run = 3 if is_near else 1
         if self._late_run >= min_run:
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
-        # Repeated frames whose numbers follow each other may come from a second sender, so they count as alternations.
-        # Any other repeated frame resets the count to 0.
+        # Repeated frames whose numbers follow each other may come from a second sender, so they count as alternations
+        # between two streams. Any other repeated frame resets the count to 0.
         self._count_alternations(now, 1 if follows else -self._alternations)
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._late_sequence, self._late_at = sequence, self.received
@@ -177,7 +178,8 @@ class SourceStatistics(SourceFields):
         self._missing, self._missing_at, self._skipped_over = 0, self.expected, 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
-        # The stream with more frames counts as the sender's. If the current stream has timed out, it is the other one.
+        # Of the two streams, the one with more frames counts as the sender's. If the current stream has timed out, the
+        # other one does.
         count = self.received - self._stream_start
         is_other_longer = self._other_count > count
         is_over = now - self._advanced_at > _STREAM_TIMEOUT_S

@@ -366,7 +366,8 @@ class _Reader:
     def __init__(self, root: Element) -> None:
         self._root = root
         nodes = list(root.iterfind("parameters/parameter"))
-        # Reversed, so that the first of several definitions of a setting counts.
+        # If a setting is defined several times, the first definition is used. In reversed order, it overwrites the
+        # others.
         self._types = {node.get("name", ""): TYPES.get(node.get("type", "")) for node in reversed(nodes)}
 
     def definition(self) -> CameraDefinition:
@@ -375,7 +376,8 @@ class _Reader:
         for node in root.iterfind("parameters/parameter"):
             setting = self._setting(node)
             if setting is not None:
-                settings.setdefault(setting.name, setting)  # The first definition counts.
+                # If a setting is defined several times, the first definition is used.
+                settings.setdefault(setting.name, setting)
         translations: dict[str, Mapping[str, str]] = {}
         for node in root.iterfind("localization/locale"):
             texts = {text.get("original", ""): text.get("translated", "") for text in node.iterfind("strings")}

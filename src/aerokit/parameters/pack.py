@@ -203,7 +203,7 @@ def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parame
         entry = read_entry(data, position, previous_name)
         if entry is None:
             _raise_damaged(position, "it ends inside an entry")
-        # A file with defaults omits those that equal the value.
+        # A file with defaults omits each default that equals the value.
         default = entry.value if entry.default is None and with_defaults else entry.default
         yield Parameter(_text(entry.name, position), entry.value, entry.type, default, index)
         position, previous_name = _skip_padding(data, entry.end), entry.name

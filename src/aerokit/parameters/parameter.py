@@ -127,10 +127,10 @@ def checked_value(name: str, value: float, type: ParameterType) -> int | float: 
     if isinstance(number, float) and not math.isfinite(number):
         raise InvalidArgument(f"{name} = {short_repr(value)} must be a finite number")
     if type.is_integer and number != int(number):
-        raise InvalidArgument(f"{name} = {short_repr(value)} must be a whole number (it is an {type.name})")
+        raise InvalidArgument(f"{name} = {short_repr(value)} must be a whole number (its type is {type.name})")
     if not type.minimum <= number <= type.maximum:
         raise InvalidArgument(
-            f"{name} = {short_repr(value)} must be in {type.minimum}..{type.maximum} (it is an {type.name})"
+            f"{name} = {short_repr(value)} must be in {type.minimum}..{type.maximum} (its type is {type.name})"
         )
     if type.is_integer:
         return int(number)

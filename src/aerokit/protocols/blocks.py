@@ -139,7 +139,8 @@ class BlockRequests:
         if sent_at is None:
             sent_at = self._sent_at_of_answer(block, now)
         self._timeouts = 0
-        # The time of an answer is not measured if its transmission is unknown, or if the server was busy with a burst.
+        # No time is measured if it is unknown which transmission was answered (None), or if the server was still busy
+        # with a burst when the request was sent.
         if sent_at is None or sent_at <= self._busy_until:
             self.window.on_answer(None)
             return

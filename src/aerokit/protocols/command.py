@@ -34,7 +34,8 @@ MAX_ATTEMPTS = 4
 _ARM, _RELATIVE, _STEP = (0, 1.0), (3, 1.0), (0, 0.0)
 
 # Commands of which a repetition has a further effect. Maps MAV_CMD to (effect, condition). The condition is a parameter
-# (index, value) with which the repetition has this effect; None: it always has. docs/reliability.md has the same table.
+# (index, value) with which a repetition has the effect; None means that every repetition has it. docs/reliability.md
+# has the same table.
 UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _ARM),
     MavCmd.CONDITION_YAW: ("turns by the same angle again", _RELATIVE),
@@ -96,8 +97,8 @@ Two HEARTBEATs may be lost. Ground-station failsafes act later (FS_GCS_TIMEOUT 5
 be older when it is processed, if the event loop was blocked.
 """
 
-# An order is repeated at the earliest after this fraction of ``attempt_timeout``. It is below 1, because a repetition
-# follows a HEARTBEAT, and HEARTBEATs arrive at 1 Hz with some jitter.
+# An order is repeated at the earliest after this fraction of ``attempt_timeout``. The fraction is below 1, because a
+# repetition follows a HEARTBEAT, and HEARTBEATs arrive at 1 Hz with some jitter.
 MIN_RESEND_FRACTION = 0.75
 
 
@@ -249,8 +250,8 @@ class CommandExchange(Exchange[CommandAck]):
         """Process a COMMAND_ACK. Other messages are ignored."""
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
-        # An acknowledgement may belong to an earlier command. A command that is sent only once must not ignore one: if
-        # it was its own, no other would follow.
+        # The first `_earlier_answers` acknowledgements may belong to earlier commands, so they are ignored. A command
+        # that is sent only once ignores none: if an ignored acknowledgement was its own, no other would follow.
         may_ignore = self._sent_count == 1 and self._attempts > 1
         is_to_earlier_command = may_ignore and self._answer_count < self._earlier_answers
         if message.result != MavResult.IN_PROGRESS:
@@ -267,7 +268,7 @@ class CommandExchange(Exchange[CommandAck]):
     @property
     def pending_answers(self) -> int:
         """Number of acknowledgements that may still arrive, which the next command with this MAV_CMD must ignore."""
-        # Once the command was repeated, every acknowledgement counts for this command; see `receive`.
+        # Once the command was repeated, every acknowledgement counts as an answer to this command; see `receive`.
         ignored_answers = self._earlier_answers if self._sent_count == 1 else 0
         own_answers = max(0, self._answer_count - ignored_answers)
         return max(0, self._sent_count * self._acks_per_sending - own_answers)
@@ -319,7 +320,8 @@ class CommandExchange(Exchange[CommandAck]):
         self._sent_count += 1
         self._sent_at = now
         wait_s = self._attempt_timeout
-        if self._order_status is not None:  # An order checks earlier for a HEARTBEAT, and whether it has ended.
+        # For an order, the deadline is earlier, to check for a HEARTBEAT and whether the order has ended.
+        if self._order_status is not None:
             wait_s = min(MIN_RESEND_FRACTION * wait_s, ATTEMPT_TIMEOUT_S)
         self.deadline = now + wait_s
 

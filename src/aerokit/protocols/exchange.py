@@ -317,7 +317,8 @@ class StaleAnswerFilter:
         if elapsed_s >= MIN_ROUND_TRIP_FRACTION * (self._round_trip.fastest_s or 0.0):
             return False
         if attempts == 1:
-            # The vehicle may really be this fast. The shorter round trip then makes the next answer acceptable.
+            # The sample shortens the round trip, so that the next answer is accepted if the vehicle really is this
+            # fast.
             self._round_trip.add_sample(elapsed_s)
         early_requests = self._early.setdefault(name, set())
         early_requests.add(sent_at)

@@ -209,8 +209,8 @@ ATTEMPTS_BEFORE_BACKOFF = 3
 
 SESSION_OPCODES = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)
 
-# Errors that mean "no file is open": PX4 answers INVALIDSESSION, ArduPilot FILENOTFOUND. After PX4 has answered
-# FILEEXISTS once, it answers every refused request so, until an operation fails with an errno.
+# Errors that mean "no file is open": PX4 answers INVALIDSESSION, ArduPilot FILENOTFOUND. Once PX4 has answered
+# FILEEXISTS, it answers every refused request with FILEEXISTS until an operation fails with an errno.
 NO_SESSION_ERRORS = (MavFtpErr.INVALIDSESSION, MavFtpErr.FILENOTFOUND, MavFtpErr.FILEEXISTS)
 
 
@@ -380,8 +380,8 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._end(reply)
 
     def _renumber(self, now: float) -> None:
-        # The earlier request had the same sequence number, so the server took this request for its repetition. With a
-        # new number, the server executes this request.
+        # An earlier request had the same sequence number, so the server took this request for a repetition of the
+        # earlier one. With a new number, the server executes this request.
         if self._renumbered < MAX_RENUMBERED:
             self._renumbered += 1
             self._request = self._request.replace(sequence=self._client.next_sequence())

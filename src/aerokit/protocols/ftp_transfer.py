@@ -39,7 +39,7 @@ WINDOW_DURING_BURST = 4
 MAX_GAPS = 512
 # Number of blocks that ArduPilot sends in one burst.
 BURST_BLOCKS = 500
-# Each block of a burst shows that the server is busy. It counts as busy for this many intervals between two blocks.
+# After each received block of a burst, the server counts as busy for the time of this many blocks.
 BUSY_BLOCKS = 3
 # Minimum seconds to wait for the first block of a long file. Even a slow radio carries a few blocks in this time.
 FIRST_BLOCK_TIMEOUT_S = 0.5
@@ -180,8 +180,8 @@ class FtpDownload(FtpExchange[int]):
         self._add(reply.offset, reply.data, now)
 
     def _measure(self, burst: _Burst, number: int, now: float) -> None:
-        # In a repeated burst, known blocks also count as progress, because the server works. The number of such bursts
-        # is limited, so that the download cannot go on forever.
+        # Blocks that a repeated burst sends again also count as progress, because they show that the server works. The
+        # number of such bursts is limited, so that the download cannot go on forever.
         if number > self._blocks_sent.get(burst.sequence, -1) and self._repeated_bursts <= MAX_REPEATED_BURSTS:
             self._blocks_sent[burst.sequence], self._progress_at = number, now
         last_burst, last_at, last_number = self._last_block
@@ -209,7 +209,7 @@ class FtpDownload(FtpExchange[int]):
             self._stop_bursting()
         if reply.error_code == MavFtpErr.EOF:
             self._end_at(end)
-        # After the first block, such an error is a failure, because the server does support bursts.
+        # An error of `NO_BURST` after the first block is a failure, because the server does support bursts.
         elif is_latest and reply.error_code in NO_BURST and self._into.done == self._into.start:
             self._supports_bursts = False
         elif is_latest:
@@ -313,7 +313,7 @@ class FtpDownload(FtpExchange[int]):
         """Deadline for the next block. If it passes, the burst counts as ended; before any block, as not started."""
         silence_s = self.round_trip.timeout_s(1 + self._failed_bursts)
         if self._interval.smoothed_s is None:
-            # Repeating the burst of a long file is expensive, so a burst gets more time to start.
+            # Repeating the burst of a long file is expensive, so such a burst gets more time to start.
             if self._size is not None and self._size > SHORT_FILE:
                 silence_s = max(silence_s, FIRST_BLOCK_TIMEOUT_S)
         else:

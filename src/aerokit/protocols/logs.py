@@ -315,7 +315,8 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         if not self._missing:
             self._finish(tuple(self._entries[number] for number in sorted(self._entries)))
             self._outbox.append(LogRequestEnd(self.target_system, self.target_component))
-        # Entries arrive in order, so none of the missing entries will follow one with a larger id.
+        # Entries arrive in the order of their ids. After an entry with a larger id, the missing ones will not arrive
+        # without a new request.
         elif message.id > next(reversed(self._missing)):
             self._request_missing(now)
         self._set_deadline()

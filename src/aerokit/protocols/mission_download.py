@@ -127,7 +127,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def _on_count(self, message: MissionCount, now: float) -> None:
         opaque_id = message.opaque_id
         if self._count is None:
-            # PX4 (window 1) repeats MISSION_COUNT by itself, so there it does not measure the round trip.
+            # PX4 (window 1) repeats MISSION_COUNT by itself, so the arrival of this message does not measure PX4's
+            # round trip.
             if self._attempt == 1 and not self._restarts and self._window > 1:
                 self.round_trip.add_sample(now - self._list_requested_at)
             # After a restart, the items received before stay valid only if the plan has the same id.
@@ -159,7 +160,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
             # An ERROR that arrives too soon after the request for the list answers an earlier message, e.g. a repeated
-            # item of an upload. It is ignored.
+            # item of an upload. Such an ERROR is ignored.
             if now - self._list_requested_at >= MIN_ROUND_TRIP_FRACTION * (self.round_trip.smoothed_s or 0.0):
                 self._restart_after_error(now)
         elif result not in (

@@ -228,8 +228,8 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _on_error(self, now: float) -> None:
         # PX4 sends ERROR when it is busy, when an item arrives after the end, when MISSION_COUNT arrives twice, and for
-        # real errors. ArduPilot sends ERROR for an item after the end. An item is therefore repeated before an ERROR
-        # counts.
+        # real errors. ArduPilot sends ERROR for an item after the end. Before an ERROR ends the upload, an item is
+        # therefore repeated.
         if not self._is_accepted:
             self._wait_while_busy(now)
         elif self._error_at is None:
@@ -254,7 +254,8 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._wait(now, BUSY_RETRY_INTERVAL_S)
 
     def _restart(self, now: float) -> None:
-        # The transfer has expired on the vehicle. Before the vehicle has requested an item, this was an older transfer.
+        # A transfer has expired on the vehicle. Until the vehicle has accepted this upload, that transfer was an older
+        # one.
         if not self._is_accepted:
             return
         if self._is_partial or self._restarts >= MAX_RESTARTS:
@@ -301,7 +302,8 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
         """Repeat all unconfirmed items and send ``ahead`` more items, because requests may have been lost."""
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
-            # PX4 takes any repeated item for the mission's last item. Its confirmation is then no proof.
+            # PX4 takes any repeated item for the mission's last item and confirms the upload. This confirmation does
+            # not prove that PX4 has all items.
             self._was_tail_repeated = True
         new_end = min(self._sent_end + ahead, self._confirmed_end + self._window + 1, self._end)
         for seq in range(self._confirmed_end, max(self._sent_end, new_end)):

@@ -124,8 +124,8 @@ class MissionExchange(Transfer[ResultT]):
         self.deadline: float | None = now + (self._timeout_s(self._attempt) if seconds is None else seconds)
 
     def _timeout_s(self, attempt: int) -> float:
-        # After a few attempts, the time-out stays the same for a while: longer waits are for a congested link, and the
-        # small messages of a mission do not congest a link.
+        # After a few attempts, the time-out stays the same for a while. Longer waits would help only on a congested
+        # link, which the small messages of a mission do not cause.
         backoff_attempt = min(attempt, max(GROWING_ATTEMPTS, attempt - CONSTANT_ATTEMPTS))
         return self.round_trip.timeout_s(backoff_attempt)
 

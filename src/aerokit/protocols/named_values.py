@@ -25,7 +25,7 @@ ResultT = TypeVar("ResultT")
 
 # The stream of a list has stopped if nothing arrives for its longest pause so far, multiplied by this number.
 PAUSES = 4
-# A list gets at least this many seconds to start. It is not requested again earlier, because that would restart it.
+# A list gets at least this many seconds to start. An earlier second request would restart the list.
 MIN_START_TIMEOUT_S = 0.3
 # Maximum number of times that old values are requested again because the number of parameters has changed.
 MAX_REFRESHES = 3
@@ -55,7 +55,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         self._count: int | None = None
         self._next = 0  # next index that is expected in the stream
         self._is_streaming = False
-        self._quiet_at: float | None = None  # deadline for the next message of the stream, which has then stopped
+        self._quiet_at: float | None = None  # The stream has stopped if no message of it arrives before this time.
         self._last_at = self._pause_s = 0.0  # time of the stream's last message, and its longest pause
         self._attempts = self._refreshes = 0
 

@@ -237,8 +237,8 @@ class ParameterWrites(ParameterRequests):
             self.target_system, self.target_component, name, requested.value, requested.type, self._bytewise
         )
         if unexpected:
-            # The vehicle has answered an earlier write with another value, so it may ignore this write. The read is
-            # answered in any case.
+            # The vehicle has answered an earlier write with another value, so it may ignore this write and send no
+            # answer. The read makes the vehicle send the value in any case.
             return [write, read]
         return [write]
 

@@ -196,7 +196,7 @@ class BaseLink(Link):
         self.address = address
         self.dropped_writes: int = 0
         self._state = _State.NEW
-        self._receiver: Receiver | None = None  # None before the opening and after the end: nothing is called
+        self._receiver: Receiver | None = None  # None before the opening and after the end, when nothing is called
         self._keeps_peers = False
         self._stalled_at: float | None = None
         self._released = asyncio.Event()

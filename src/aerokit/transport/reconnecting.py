@@ -84,7 +84,7 @@ class ReconnectingLink(Link):
         self._make_link = make_link
         self._link = make_link()
         self._backoff = Backoff(min_delay_s, max_delay_s)
-        self._receiver: Receiver | None = None  # None before the opening and after the end: nothing is called
+        self._receiver: Receiver | None = None  # None before the opening and after the end, when nothing is called
         self._current: _CurrentReceiver | None = None  # receiver of the current link; callbacks of others are ignored
         self._was_opened = self._is_closed = self._is_up = False
         self._lost_at: float | None = None  # time of the reported loss; None while no loss is reported
@@ -233,7 +233,8 @@ class ReconnectingLink(Link):
             logger.debug("the link still cannot be opened: %s", error)
             return False
         if current.is_lost:  # The new link was lost while it was being opened.
-            # Without a receiver, this link has ended, too (the end of a recording). Otherwise another attempt follows.
+            # If `_receiver` is None, this link has ended as well, at the end of a recording. Otherwise another attempt
+            # follows.
             return self._receiver is None
         self._is_up = True
         if self._lost_at is not None:

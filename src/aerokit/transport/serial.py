@@ -83,7 +83,8 @@ class SerialLink(BaseLink):
             self._port.reset_output_buffer()
         discarded_bytes = bytes_before - self._waiting_to_be_sent(self._transport)
         self._outbox.reclaimed(discarded_bytes)
-        if discarded_bytes > 0:  # The number of writes in these bytes is unknown: count one.
+        # It is unknown how many writes these bytes contain, so they count as one dropped write.
+        if discarded_bytes > 0:
             self._drop(1)
 
     async def _connect(self) -> None:
@@ -164,7 +165,8 @@ class SerialLink(BaseLink):
             transport.flush()
         if unsent:
             with contextlib.suppress(Exception):
-                self._port.reset_output_buffer()  # Otherwise close() would wait up to 30 s for the unsent data.
+                # Without this call, close() would wait up to 30 s for the unsent data.
+                self._port.reset_output_buffer()
         self._port.close()
         self._released.set()
 

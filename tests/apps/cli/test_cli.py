@@ -213,7 +213,7 @@ def test_demo_mode_change_by_pilot_is_not_overruled(mode: str, tmp_path: Path) -
         pilot.set_mode(mode)
         printed = read_rest(process)
         assert f"the mode changed to {mode}" in printed
-        assert f"another party changed the mode to {mode}" in printed
+        assert f"the vehicle itself or another party changed the mode to {mode}" in printed
         assert process.returncode == 1
         assert pilot.is_armed
 

@@ -134,8 +134,8 @@ def test_params_load_with_invalid_values_names_all_and_sets_nothing(run: Run, tm
     code, out, err = run("params", "load", str(file))
     assert (code, out) == (2, "")
     assert err.splitlines() == [
-        f"aerokit: {file}, line 3: FLTMODE1 = 3.5 must be a whole number (it is an INT8)",
-        f"{file}, line 4: FLTMODE2 = 300 must be in -128..127 (it is an INT8)",
+        f"aerokit: {file}, line 3: FLTMODE1 = 3.5 must be a whole number (its type is INT8)",
+        f"{file}, line 4: FLTMODE2 = 300 must be in -128..127 (its type is INT8)",
         f"{file}, line 2: the vehicle has no parameter NOSUCH",
         "nothing was set",
     ]

@@ -341,5 +341,5 @@ def test_fly_ctrl_c_after_pilot_mode_change_sends_nothing(
                 return await flight
 
     assert run_virtual(scenario()) == 130
-    assert "another party changed the mode to " in capsys.readouterr().out
+    assert "the vehicle itself or another party changed the mode to " in capsys.readouterr().out
     assert (mode_of(copter), copter.is_armed) == ("LOITER", True)

@@ -231,7 +231,9 @@ async def run_status(options: argparse.Namespace) -> int:
 
 
 async def _readiness_of(vehicle: Vehicle) -> Readiness:
-    for state, message in _REQUESTED:
+    # The messages about the estimator depend on the firmware.
+    estimator_messages = [("estimator", message) for message in vehicle.telemetry.required_messages("estimator")]
+    for state, message in [*_REQUESTED, *estimator_messages]:
         cell = getattr(vehicle, state)
         if not cell.is_known:
             try:

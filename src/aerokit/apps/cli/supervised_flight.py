@@ -165,7 +165,7 @@ class SupervisedFlight(ABC):
             if vehicle.is_confirmed_disarmed or not self._check_control():
                 return DONE
         text = INTERRUPT_ACTIONS[action]
-        self._print(text if action == "nothing" else f"{text}; press Ctrl-C again to exit at once")
+        self._print(text if action == "nothing" else f"{text}; Ctrl-C exits at once")
         if action == "return":
             await vehicle.return_to_launch(timeout=None)
         elif action == "land":
@@ -199,7 +199,9 @@ class SupervisedFlight(ABC):
     def _check_control(self) -> bool:
         if not self._is_in_our_mode:
             mode, now = self._vehicle.mode_name, self._vehicle.describe_now()
-            self._print(f"no command is sent, because another party changed the mode to {mode}: {now}")
+            self._print(
+                f"no command is sent, because the vehicle itself or another party changed the mode to {mode}: {now}"
+            )
         return self._is_in_our_mode
 
     @property

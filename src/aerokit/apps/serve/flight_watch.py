@@ -140,7 +140,10 @@ class FlightWatch:
     def _on_landed(self, before: int | None, landed: int) -> None:
         self._was_in_air = self._was_in_air or landed in _IN_AIR
         has_taken_off = before == MavLandedState.ON_GROUND and landed in _IN_AIR
-        if has_taken_off and self._crash is not None and self._vehicle.armed.latest:
+        velocity = self._vehicle.velocity.latest
+        # The land detector of a crashed vehicle with running motors may change again and again, although it lies still.
+        lies_still = velocity is not None and _is_still(velocity.ground_speed_m_s, abs(velocity.down_m_s))
+        if has_taken_off and self._crash is not None and self._vehicle.armed.latest and not lies_still:
             self._dismiss_impact()
 
     def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
@@ -168,7 +171,7 @@ class FlightWatch:
     def _evaluate_impact(self, at: float, ground_speed_m_s: float, climb_m_s: float) -> None:
         if self._is_impact_dismissed or self._impact_at is None:
             return
-        is_still = ground_speed_m_s < STILL_M_S and climb_m_s < CRASH_STILL_CLIMB_M_S
+        is_still = _is_still(ground_speed_m_s, climb_m_s)
         if self._crash is not None:
             self._moving_since = math.inf if is_still else min(self._moving_since, at)
             is_moving = max(ground_speed_m_s, climb_m_s) >= MOVING_M_S or at - self._moving_since >= CRASH_STILL_S
@@ -221,3 +224,7 @@ class FlightWatch:
 
     def _now(self) -> float:
         return self._vehicle.connection.now()
+
+
+def _is_still(ground_speed_m_s: float, climb_m_s: float) -> bool:
+    return ground_speed_m_s < STILL_M_S and climb_m_s < CRASH_STILL_CLIMB_M_S

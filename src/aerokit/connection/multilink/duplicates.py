@@ -19,12 +19,12 @@ MAX_REMEMBERED = 4096  # number of remembered frames, enough for 10 s at 400 fra
 # An equal frame over another link is always a duplicate if it arrives within this time after the first.
 COPY_WINDOW_S = 3.0
 
-# Over a slow link, a copy may arrive later, up to this time after the first. It is then a duplicate only if the first
-# copy was accepted.
+# A copy over a slow link may arrive up to this time after the first copy. Later than COPY_WINDOW_S, an equal frame can
+# only be a duplicate if the first copy was accepted.
 LATE_COPY_WINDOW_S = 10.0
 
-# Sequence numbers repeat after 256 frames. If a sender's frame has the bytes of an earlier one, but at least this many
-# of its frames came between them, it is a different frame.
+# A frame with the same bytes as an earlier frame counts as a new frame, not as a copy, if the sender has sent at least
+# this many frames in between. Sequence numbers repeat after 256 frames, so the bytes may be equal by chance.
 COPY_WINDOW_FRAMES = 128
 
 
@@ -114,8 +114,8 @@ ANSWERS = frozenset(
     )
 )  # fmt: skip
 
-# PX4 sends each acknowledgement over every port on which it received our frames. Without this list, the second one
-# would be taken for the answer to the next command.
+# PX4 sends an acknowledgement over every port on which it received our frames. The second one must not be taken for the
+# answer to the next command, so repetitions of these messages are counted.
 ACKNOWLEDGEMENTS = frozenset(message_type.ID for message_type in (m.CommandAck, m.MissionAck, m.ParamExtAck))
 
 
@@ -157,8 +157,8 @@ class MergedStreams:
         if not self.copies.is_copy(frame, link):
             return False
         choice = self._choices.get(frame.system_id)
-        # Equal frames prove that both links lead to one vehicle, but only if they contain the time since boot. Two
-        # vehicles may send equal heartbeats.
+        # Equal frames prove that both links lead to one vehicle if they contain the time since boot. Frames without
+        # that time, such as heartbeats, may be equal although they come from two vehicles.
         if choice is not None and boot_time_ms(frame):
             links = {link} if choice.used is None else {link, choice.used.link}
             for index in links:
@@ -181,7 +181,7 @@ class MergedStreams:
         if candidate is not None and not choice.may_be_used(candidate):
             return False
         if frame.received_at <= choice.fresh_after and frame.message_id not in ANSWERS:
-            return False  # This telemetry is older than that already delivered over the former link.
+            return False  # This telemetry may be older than the last telemetry that the former link delivered.
         if self.copies.is_late and not _may_be_different_frame(frame, link, choice):
             return False
         if link != choice.used.link and not _is_accepted_from_unused(frame, candidate, choice, stream):
@@ -213,7 +213,8 @@ def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: 
         return False
     is_answer = frame.message_id in ANSWERS
     if choice.is_shared(candidate, frame.received_at):
-        # Both links carry the same stream. This is the first copy: the link in use lost its copy, or delivers it later.
+        # Both links carry the same stream. The link in use has lost this frame, or delivers it later. Telemetry is
+        # refused if a newer frame was already accepted; an answer is valid in any case.
         is_overtaken = stream.newest >= 0 and (frame.sequence - stream.newest) & 0xFF >= 128
         return is_answer or not is_overtaken
     # The links carry separate streams. The frame is needed if only this link reaches the component, or if it answers a

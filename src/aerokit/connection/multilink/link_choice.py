@@ -10,10 +10,11 @@ from aerokit.connection.multilink.vehicle_clock import VehicleClock
 if TYPE_CHECKING:
     from aerokit.connection.multilink.vehicle_clock import HardwareId
 
-# A link counts as dead after this silence, because probes are answered twice a second.
+# Probes are answered twice a second, so a link counts as dead after this silence.
 PROBED_TIMEOUT_S = 1.0
 
-# A costly link, or a link whose probes are not answered, counts as dead after this silence: two missing heartbeats.
+# A costly link, or a link whose probes are not answered, counts as dead after this silence, in which two heartbeats are
+# missing.
 UNPROBED_TIMEOUT_S = 2.5
 
 # Consecutive matching clock samples that prove that a second link leads to the same vehicle.
@@ -165,7 +166,7 @@ class Candidate:
         """Expected seconds for a command and its answer, including retries after losses."""
         loss = min(0.9, self.loss or 0.0)
         round_trip_s = 0.1 if self.round_trip_s is None else self.round_trip_s
-        # Because of the constant, links with round trips of a few milliseconds cost about the same. The exponent is 2,
+        # Adding 0.05 s makes links with round trips of a few milliseconds cost about the same. The exponent is 2,
         # because both the command and its answer must arrive.
         return (round_trip_s + 0.05) / (1 - loss) ** 2
 
@@ -246,8 +247,9 @@ class LinkChoice:
             candidate.record_time()
             matches = self.clock.matches(at, vehicle_s, round_trip_s)
             if not matches and is_used_silent:
-                # The link in use is silent, so it is unknown whether the vehicle has rebooted since. A different clock
-                # then proves nothing. Only a matching hardware id counts; otherwise the answer is ignored (None).
+                # While the link in use is silent, the vehicle may have rebooted, so a different clock does not prove
+                # another vehicle. Only a matching hardware id counts as a match; otherwise the answer is ignored
+                # (None).
                 matches = True if self._is_same_by_hardware(candidate, now) else None
             if matches is not None:
                 candidate.record_clock(matches, may_prove=not self._awaits_hardware(candidate))
@@ -309,7 +311,7 @@ class LinkChoice:
         """
         if candidate is not self.used:
             return not candidate.is_proven and candidate.request_hardware()
-        has_other_links = len(self.candidates) > 1  # Otherwise there is no other id to compare with.
+        has_other_links = len(self.candidates) > 1  # With a single link, there is no other id to compare with.
         return has_other_links and not is_attached and candidate.request_hardware()
 
     def _is_same_by_hardware(self, candidate: Candidate, now: float) -> bool:
@@ -343,10 +345,11 @@ class LinkChoice:
         """Use this link from now on; return ``reason``."""
         former = self.used
         if former is not None:
-            # Frames that the new link delivers earlier may be older than the last one of the former link.
+            # Before `fresh_after`, telemetry over the new link may be older than the last telemetry of the former link.
             extra_transit_s = ((chosen.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
             self.fresh_after = former.received_at + extra_transit_s + JITTER_S
-            # The new link is used only because it leads to the same vehicle, so the former link leads there, too.
+            # A link is chosen only if it leads to the same vehicle as the former link. The choice therefore also proves
+            # the former link, unless its hardware id belongs to another vehicle.
             former.is_proven = not former.is_other_hardware
         self.former, self.used, self.changed_at, self._better = former, chosen, now, None
         self._adopt_hardware(chosen)

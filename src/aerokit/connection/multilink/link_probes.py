@@ -70,7 +70,7 @@ class LinkProbes:
         is_attached: bool,
     ) -> None:
         """Send a probe if one is due. ``is_attached``: the system has a vehicle object."""
-        # An unused costly link is probed rarely, but not before it is known which vehicle the link leads to.
+        # An unused costly link is probed rarely once it is known whether the link leads to the vehicle.
         is_idle = candidate.is_costly and candidate is not choice.used
         is_new = not candidate.is_proven and not candidate.is_doubted
         interval_s = IDLE_COSTLY_PROBE_INTERVAL_S if is_idle and not is_new else PROBE_INTERVAL_S
@@ -80,10 +80,11 @@ class LinkProbes:
         if not is_attached and not self._consume_budget(now):
             return
         self._probed_at[key] = now
-        # ts1 identifies the probe in the answer: our time in nanoseconds, in which the last three digits differ between
-        # systems and links that are probed at the same time.
+        # The answer contains `ts1`, which identifies the probe. It is our time in nanoseconds. The last three digits
+        # are a number of the system and the link, because several probes may be sent at the same time.
         ts1 = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
-        if ts1 <= 0 or ts1 in self._pending:  # The number is invalid, or another probe has it: try again later.
+        # `ts1` is invalid, or belongs to another pending probe. The next call tries again.
+        if ts1 <= 0 or ts1 in self._pending:
             return
         if len(self._pending) >= MAX_PENDING:
             del self._pending[next(iter(self._pending))]

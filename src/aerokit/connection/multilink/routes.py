@@ -300,7 +300,8 @@ class MultiLinkRoutes:
         """Return peers that together reach every system. No peer is added for a system that is already reached."""
         peers: set[Peer] = set()
         links_with_systems: set[int] = set()
-        # For each system, a list of options: the peers that reach the system, for each link that may be used.
+        # Each system has a list of options, one for each usable link: the peers on this link that reach the system. The
+        # link in use comes first.
         options_by_system: list[list[Collection[Peer]]] = []
         for system_id, choice in self._choices.items():
             links_with_systems.update(choice.candidates)
@@ -313,7 +314,8 @@ class MultiLinkRoutes:
                 options_by_system.append(
                     [self._peers_on(candidate.link, system_id, 0) for candidate in (choice.used, *usable)]
                 )
-        # Systems with a single option come first, because their peers are needed anyway and may reach other systems.
+        # Systems with a single option come first, because their peers must be added in any case. If these peers also
+        # reach a system with several options, no peer needs to be added for that system.
         for options in sorted(options_by_system, key=len):
             if not any(peers.issuperset(option) for option in options):
                 peers.update(options[0])
@@ -327,7 +329,7 @@ class MultiLinkRoutes:
         if reason is None or used is None:
             return
         if before is not None:
-            # Old data must not arrive after newer commands that are sent over the new link.
+            # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
             name, former = self._link.names[used.link], self._link.names[before.link]
@@ -357,7 +359,7 @@ class MultiLinkRoutes:
                 self._probes.probe(system_id, choice, candidate, peer, now, is_attached=is_attached)
 
 
-# The reason for a switch describes the new link. This table has the word that describes the former link, for the log.
+# Maps the reason for a switch, which describes the new link, to the word that describes the former link in the log.
 _DISADVANTAGE_OF_FORMER = {"better": "worse", "cheaper": "costly"}
 
 

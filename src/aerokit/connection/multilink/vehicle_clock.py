@@ -16,7 +16,8 @@ MAX_SAMPLES = 20
 TOLERANCE_S = 0.1
 MAX_SPEED_ERROR = 0.02  # Simulations do not keep their nominal speed exactly.
 MAX_DRIFT_S = 0.5  # Without this limit, any clock would match after a long enough silence.
-REAL_TIME_TOLERANCE = 0.05  # A measured speed of 1 ± this value counts as 1, so that errors do not add up in a silence.
+# A measured speed of 1 ± this value counts as 1. Otherwise its error would grow with the length of a silence.
+REAL_TIME_TOLERANCE = 0.05
 MIN_SPAN_S = 1.0
 MAX_SPEED = 200.0  # maximum speed of a simulation, relative to real time
 MAX_PAUSE_S = 10.0  # A simulation that was paused for longer counts as rebooted.

@@ -193,6 +193,8 @@ def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -
     kind, gap_s = _kind_of(group), evidence.time_s - group[-1].time_s
     if "general" in (kind, evidence.kind):
         return gap_s <= (_GENERAL_GAP_AFTER_GPS_S if kind == "gps" else _GENERAL_GAP_S)
+    if (kind, evidence.kind) == ("gps", "estimator"):  # The estimator fails because the satellites are missing.
+        return gap_s <= _GENERAL_GAP_AFTER_GPS_S
     return kind == evidence.kind and gap_s <= _SAME_KIND_GAP_S
 
 

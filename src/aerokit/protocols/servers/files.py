@@ -275,7 +275,8 @@ class FileTree:
         folder, name = self._parent(to)
         existing = folder.get(name)
         is_folder = isinstance(node, dict)
-        if isinstance(existing, dict) and (existing or not is_folder):  # Only a folder replaces a folder, if empty.
+        # An existing folder is only replaced by a folder, and only if it is empty.
+        if isinstance(existing, dict) and (existing or not is_folder):
             raise FileFault(ENOTEMPTY if is_folder else EISDIR)
         if isinstance(existing, _File) and is_folder:
             raise FileFault(ENOTDIR)
@@ -292,7 +293,7 @@ class FileTree:
         """
         if self.free_bytes is None:
             return
-        is_full = self.free_bytes == 0  # Then there is not even room for a new name, which has size 0.
+        is_full = self.free_bytes == 0  # A new name has size 0, but does not fit either if no byte is free.
         if size >= 0 and (size > self.free_bytes or is_full):
             raise FileFault(ENOSPC)
         self.free_bytes -= size

@@ -135,7 +135,7 @@ class ZenohListen(NetworkLink):
         self._zenoh = zenoh
         self._declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
         tokens = session.liveliness().get(self._keys.alive(), timeout=_RIVAL_QUERY_TIMEOUT_S)
-        self._may_have_rival = any(True for _ in tokens)  # True if there is at least one token.
+        self._may_have_rival = any(True for _ in tokens)
 
     def _serve(self, queue: LoopQueue[Callable[[], object]]) -> None:
         """Declare the subscribers, publisher and token that clients need.

@@ -108,8 +108,8 @@ _TX = "transport/link/tx/queue"
 _DROP_AT_ONCE = (f"{_TX}/congestion_control/drop/wait_before_drop", 0)
 
 _SETTINGS = (
-    # Number of batches of up to 64 KB that wait. It is enough for a burst of 1000 frames, and small, because a broken
-    # connection delays all data in them.
+    # Maximum number of waiting batches of up to 64 KB. Four are enough for a burst of 1000 frames. The number is small,
+    # because data in the queue of a broken connection arrives late.
     (f"{_TX}/size/data", 4),
     (f"{_TX}/size/real_time", 4),
     ("transport/shared_memory/enabled", False),  # The memory pool, which is for large messages, would take 16 MB.
@@ -239,7 +239,7 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
 
 
 def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
-    if options.mode or not options.config:  # Otherwise the configuration file determines the mode.
+    if options.mode or not options.config:  # Without `mode`, a configuration file determines the mode.
         is_client = bool(options.connect) and not options.listen
         yield "mode", options.mode or ("client" if is_client else "peer")
     if options.connect:

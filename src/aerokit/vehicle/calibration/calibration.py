@@ -84,8 +84,8 @@ class Calibration(AsyncIterator["CalibrationStep"]):
             await self._run.wait_cancelled()
 
     def __del__(self) -> None:
-        # A loop that is left by ``break`` does not call the iterator, so the iterator cancels when it is deleted. The
-        # blocking twin may delete it on another thread.
+        # A loop that is left by `break` does not call the iterator, so the iterator cancels the calibration when it is
+        # deleted. In the blocking API, another thread may delete it.
         is_started = getattr(self, "_loop", None) is not None  # If `__init__` failed, there is no such attribute.
         if is_started and not self._is_over:
             with suppress(RuntimeError):  # The event loop may be closed.

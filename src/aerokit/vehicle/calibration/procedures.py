@@ -25,12 +25,13 @@ CANCEL_ALL = (MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 0, 0, 0)
 REPORT_HZ = 4.0
 # Value of ESC_CALIBRATION with which ArduCopter calibrates the ESCs at its next boot.
 CALIBRATE_AT_BOOT = 3
-# Seconds to wait for the text with the result after HEARTBEAT no longer reports CALIBRATING. PX4 sends the text later.
+# PX4 sends the text with the result after HEARTBEAT has stopped reporting CALIBRATING. The text counts as lost after
+# this many seconds.
 END_GRACE_S = 3.0
-# Maximum seconds for restoring a parameter. A cancelled call restores it, and must end within two seconds.
+# Maximum seconds for restoring a parameter, because a cancelled call must end within two seconds.
 RESTORE_TIMEOUT_S = 1.5
-# ArduPilot repeats its request every second. If a request arrives this soon after our confirmation, ArduPilot sent it
-# before the confirmation arrived.
+# ArduPilot repeats its request for a pose every second until it receives our confirmation. A request that arrives
+# within this many seconds after the confirmation was sent earlier, so it is ignored.
 POSE_REPEAT_S = 2.0
 POSES = {
     AccelcalVehiclePos.LEVEL: CalibrationPose.LEVEL,
@@ -50,18 +51,19 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
-    # When the vehicle last reported that it calibrates. Infinite until the first report, so that no time is later.
+    # When the vehicle last reported that it calibrates. Until its first report, the value is infinite, so that
+    # `has_ended_silently` returns False.
     calibrating_at = math.inf
     with ExitStack() as cleanup:
 
         def on_text(text: str) -> None:
-            if report := parse_report(text):  # None for a text that is not about a calibration
+            if report := parse_report(text):  # Texts that are not about a calibration are ignored.
                 reports.append(report)
 
-        # `every_arrival`: a repeated text is a new report.
+        # With `every_arrival`, a text that equals the previous one is also a report.
         cleanup.callback(telemetry.status_text.observe(lambda _, text: on_text(text.text), every_arrival=True))
 
-        def has_ended_silently() -> bool:  # `run.wait` calls this again and again.
+        def has_ended_silently() -> bool:
             nonlocal calibrating_at
             if telemetry.system_status.latest == MavState.CALIBRATING:
                 calibrating_at = now()
@@ -247,7 +249,7 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
         while True:
             await run.wait(lambda: requests)
             request = requests.pop()
-            requests.clear()  # Only the newest request counts.
+            requests.clear()  # All requests before the newest one are obsolete.
             if request == AccelcalVehiclePos.SUCCESS:
                 yield run.result(reboot_due=True)
                 return
@@ -261,7 +263,9 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
                 yield run.step((request - 1) / len(POSES), text, pose, remaining, needs_confirmation=True)
                 await run.command(MavCmd.ACCELCAL_VEHICLE_POS, request)
                 confirmed_pose, confirmed_at = request, now()
-                requests.clear()  # ArduPilot repeated the request until it received the confirmation.
+                # While ArduPilot had not received the confirmation, it repeated its request. These requests are
+                # obsolete.
+                requests.clear()
 
 
 MIN_CHANNELS, MIN_TRAVEL_US = 4, 300
@@ -309,7 +313,8 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         raise run.failure(f"only {len(moved)} channels moved by {MIN_TRAVEL_US} µs or more; nothing was written")
     values: dict[str, float] = {}
     for number in moved:
-        low, high, trim = lows[number], highs[number], trims.get(number, 0)  # A missing trim fails the next check.
+        # A missing trim counts as 0, which fails the next check.
+        low, high, trim = lows[number], highs[number], trims.get(number, 0)
         if not LOWEST_US <= low <= trim <= high <= HIGHEST_US or not low < MIDDLE_US < high:
             raise run.failure(
                 f"channel {number} ranges from {low} to {high} µs with a centre of {trim} µs, which is implausible;"

@@ -40,7 +40,8 @@ REPORT_TIMEOUT_S = 120.0
 """Seconds to wait for the vehicle's next report. PX4 waits up to two minutes for a pose (calibration_routines.cpp)."""
 START_TIMEOUT_S = 40.0
 """Seconds to wait for the acknowledgement. ArduPilot calibrates its gyroscopes first, for at most 30 s."""
-# The interval is longer than two HEARTBEATs, because only HEARTBEAT shows that PX4 has ended the calibration.
+# The interval is longer than the time between two HEARTBEATs (1 s), because only HEARTBEAT shows that PX4 has ended the
+# calibration.
 MAX_CANCEL_ATTEMPTS, CANCEL_INTERVAL_S = 6, 2.5
 CONFIRM_POLL_INTERVAL_S = 0.1
 
@@ -150,7 +151,8 @@ class CalibrationRun:
             self.finish()
             return
         arbiter = self.context.arbiter
-        # The arbiter ends this order when another party takes over, and the cancel command is then not repeated.
+        # When another party takes over, the arbiter ends this order, and `_confirm_cancel` then sends no more cancel
+        # commands.
         order = self._cancel_order_stack.enter_context(arbiter.auxiliary_order())
         self._sent_cancel = self._cancel_order_stack.enter_context(arbiter.sending(order))
         if self.session.connection.is_open and arbiter.is_state_recent:
@@ -174,8 +176,7 @@ class CalibrationRun:
             )
 
     def _send_cancel(self, command: float, *params: float) -> None:
-        # Callers send the cancel command only while the vehicle's state is known. Sending it again has no further
-        # effect.
+        # All callers check first that the vehicle is not silent. A repetition of the command has no further effect.
         self._cancel_sent_at = self.session.connection.now()
         self.session.commands.send_unconfirmed(int(command), *params)
 
@@ -195,7 +196,8 @@ class CalibrationRun:
                 await self.session.wait_for_heartbeat(self._cancel_sent_at)
                 is_taken_over = self._sent_cancel is not None and bool(self._sent_cancel.end)
                 if self._has_rebooted or is_taken_over:
-                    return  # A reboot has ended the calibration, or another party must not be disturbed.
+                    # A reboot has ended the calibration. After a takeover, the command might disturb the other party.
+                    return
                 if self.context.arbiter.is_state_recent:
                     self._send_cancel(*self._cancel_command)
             logger.warning("%s: the vehicle did not confirm the cancellation", self.call_name)

@@ -245,7 +245,8 @@ class Cameras:
         self._record(message, message.camera_device_id or message.lens_id + 1)
 
     def _on_first_bound(self, number: int) -> None:
-        # `at` may have created another object for the same camera. Only one of the two publishes its events.
+        # `at` may have created another object for the same camera. The first link is then muted, so that events are
+        # published only once.
         self._first_link.is_muted = number in self._cameras
 
     def _on_capture(self, message: Any, device_id: int) -> None:
@@ -253,12 +254,12 @@ class Cameras:
         number = self._record(message, device_id)
         is_camera = number != 0
         has_object = number == self._first_link.number or number in self._cameras
-        if not is_camera or has_object:  # An existing object receives this message itself.
+        if not is_camera or has_object:  # The object of a known camera receives this message by itself.
             return
         if self._first_link.number is None:
             if not self._early_captures:
                 self._first_link.call_later(DISCOVERY_TIMEOUT_S, self._process_early)
-            del self._early_captures[MAX_EARLY_CAPTURES:]  # Beyond the limit, a new capture replaces the last one.
+            del self._early_captures[MAX_EARLY_CAPTURES:]  # If the list is full, a new capture replaces the last one.
             self._early_captures.append((number, message))
         else:
             self.at(number)._log.record(message)

@@ -239,7 +239,9 @@ def geotagged(jpeg: bytes, capture: Capture) -> bytes:
     exif = image.Exif()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # Pillow only warns when it drops tags that it cannot parse.
+            # Pillow only warns when it drops tags that it cannot parse. The warning becomes an error, so that no tags
+            # get lost.
+            warnings.simplefilter("error")
             exif.load(old_exif[4:])  # The marker and the length (4 bytes) are left out.
             exif.get_ifd(EXIF_IFD).update(_exif_tags(capture))
             exif.get_ifd(GPS_IFD).update(_gps_tags(capture))

@@ -33,12 +33,12 @@ FETCH_ATTEMPTS, REQUEST_TIMEOUT_S = 12, 1.0
 TRIGGER_GRACE_S = 0.3
 # Two messages of different types with the same index report the same picture if they arrive within this time.
 DUPLICATE_WINDOW_S = 10.0
-# A status whose time stamp is lower than that of the newest one by less than this arrived late. If the difference is
-# greater, the camera has restarted.
+# If a status has a lower time stamp than the newest one, it arrived late. If it is lower by this many milliseconds or
+# more, the camera has restarted instead.
 REORDER_WINDOW_MS = 5000
-# If an index exceeds the reported count by more than this, the camera's count does not follow the standard.
+# If an index exceeds the reported count by more than this, the camera does not count as the standard says.
 MAX_COUNT_LEAD = 100
-# If the index rises by more than this, it counts as corrupt until the next picture confirms it.
+# If an index is higher than the highest one by more than this, it counts as corrupt until the next picture confirms it.
 MAX_INDEX_GAP = 1000
 # If an index is lower than the previous one by more than this, the 16-bit counter of CAMERA_FEEDBACK has wrapped.
 HALF_RANGE = FEEDBACK_INDEX_RANGE // 2
@@ -59,13 +59,15 @@ class _Entry:
             self.utc_us, self.boot_us = (stamp, 0) if is_utc else (0, stamp)
 
     def reports_same_picture(self, other: _Entry) -> bool:
-        if self.kind is not other.kind:  # PX4 reports one picture by two messages in quick succession.
+        # PX4 reports each picture by two messages of different types, which arrive in quick succession.
+        if self.kind is not other.kind:
             return abs(self.capture.received_at - other.capture.received_at) <= DUPLICATE_WINDOW_S
         if self.utc_us and other.utc_us:
             return self.utc_us == other.utc_us
         if self.boot_us and other.boot_us:
             return self.boot_us == other.boot_us
-        return self.capture.place == other.capture.place  # Only the place is left to compare.
+        # Without comparable time stamps, only the place can be compared.
+        return self.capture.place == other.capture.place
 
     def was_taken_later(self, other: _Entry) -> bool:
         """Return True if the time stamps show that this picture is later. Returns False if they cannot be compared."""
@@ -89,7 +91,8 @@ class CaptureLog:
         self._highest: _Entry | None = None  # the entry with the highest plausible index
         self._outlier: _Entry | None = None  # the last entry, if its index is too far above `_highest`
         self._failed: _Entry | None = None  # the last failed picture
-        # Number of pictures, from CAMERA_CAPTURE_STATUS and indices. Not used until the camera has reported a number.
+        # Number of pictures, from CAMERA_CAPTURE_STATUS and from indices. `_is_count_used` is False until the camera
+        # has reported a number above 0.
         self._count, self._is_count_used = 0, False
         self._count_boot_ms = 0
         # Time of the event loop at the last reset. Captures from before the reset do not belong to this log.
@@ -115,7 +118,7 @@ class CaptureLog:
         """Request a missed capture. Returns None if the camera has deleted it or does not answer."""
         if not self.has(index) and self._link.is_trigger:
             return None  # PX4's trigger cannot send a capture again.
-        self._requested.add(index)  # The answer, an old index, must not count as a reset of the camera.
+        self._requested.add(index)  # The answer has a low index, which must not count as a reset of the camera.
         try:
             for _ in range(FETCH_ATTEMPTS):
                 if self.has(index):
@@ -184,7 +187,7 @@ class CaptureLog:
     def _on_status(self, message: m.CameraCaptureStatus) -> None:
         boot_ms, count = message.time_boot_ms, message.image_count
         if 0 < self._count_boot_ms - boot_ms < REORDER_WINDOW_MS:
-            return  # This status is older than the newest one, and arrived late.
+            return  # This status was sent before the newest one, and arrived late.
         self._count_boot_ms = boot_ms
         if count < self._count:  # The camera counts from 0 again.
             self._reset()
@@ -204,7 +207,8 @@ class CaptureLog:
         """
         if previous is not None and previous.capture.success is not False:
             return not entry.reports_same_picture(previous)  # Two successful pictures cannot have the same index.
-        # A lower index shows a reset, unless the capture was requested or arrived late.
+        # A new picture with a lower index shows a reset. A capture that was requested or arrived late may have a lower
+        # index without a reset.
         index, highest = entry.capture.index, self._highest
         if highest is None or index >= highest.capture.index or index in self._requested:
             return False
@@ -230,8 +234,10 @@ class CaptureLog:
         self._store(entry)
         self._update_highest(entry)
         if isinstance(message, m.CameraImageCaptured):
-            self._count_boot_ms = message.time_boot_ms  # An older CAMERA_CAPTURE_STATUS does not count this picture.
-        # If the index is far above the count, the camera does not count as the standard says: leave the count as it is.
+            # A CAMERA_CAPTURE_STATUS that was sent before this picture does not count it, so it is ignored.
+            self._count_boot_ms = message.time_boot_ms
+        # An index far above the count shows that the camera does not count as the standard says. The count then stays
+        # as it is.
         if self._is_count_used and capture.index <= self._count + MAX_COUNT_LEAD:
             self._count = max(self._count, capture.index)
         self._publish(message, capture, is_new=is_new)
@@ -249,7 +255,7 @@ class CaptureLog:
                 self._outlier = entry
 
     def _add_failed(self, message: Message, entry: _Entry) -> None:
-        # The index of a failed picture may be used again, so such an entry never replaces a successful one.
+        # The camera may use the index of a failed picture again, so a failed picture never replaces a successful one.
         index, last_failed = entry.capture.index, self._failed
         if last_failed is not None and last_failed.capture.index == index and last_failed.reports_same_picture(entry):
             return  # The message is repeated.

@@ -155,8 +155,8 @@ class CameraLink(CameraOrders):
         return not self.information.is_known or self._was_silent
 
     async def _find_first_camera(self) -> None:
-        # A camera with its own component id takes precedence over one attached to the autopilot, so give it time to
-        # send a heartbeat.
+        # A camera with its own component id takes precedence over one that is attached to the autopilot. The wait gives
+        # such a camera time to send a heartbeat.
         connected_for_s = self.now() - self._session.transfers.began_at
         with anyio.move_on_after(max(0.0, DISCOVERY_TIMEOUT_S - connected_for_s)):
             await self._is_bound.wait()
@@ -167,7 +167,8 @@ class CameraLink(CameraOrders):
         try:
             await self.requests.request(m.CameraInformation, self.device, where=self._is_from_this_camera)
         except CommandRejected:
-            # The autopilot may have no information about its camera. Information that was received before stays valid.
+            # An autopilot may have no information about its camera. Information that was received earlier stays valid.
+            # In both cases, the refusal is no error.
             if not self.is_autopilot_attached and not self.information.is_known:
                 raise
         if not self.information.is_known and not self.is_autopilot_attached:
@@ -242,8 +243,8 @@ class CameraLink(CameraOrders):
             self._session.at_close(bus.attach(message_type, on_message, system_id=self._session.system_id))
 
     def _is_from_this_camera(self, message: Any) -> bool:
-        # Each message type has only one or two of these fields. A field that the firmware does not set is 0; the
-        # message is then from the first camera.
+        # Each message type has only one or two of these fields, and a firmware may leave them at 0. If all are 0, the
+        # message is from the first camera.
         if not self.is_autopilot_attached:
             return True
         number_from_1 = getattr(message, "camera_device_id", 0) or getattr(message, "camera_id", 0)

@@ -184,12 +184,13 @@ class CameraOrders:
         answered, errors = anyio.Event(), []
 
         async def confirm() -> None:
-            # `is_sent=True`: `send_now` below makes the first transmission.
+            # `is_sent` is True because `send_now` below makes the first transmission.
             try:
                 if order.is_newest:
                     await self.command(command, *params, order=order, is_sent=True)
             except AerokitError as error:
-                if order.is_newest:  # Otherwise a newer order has made this one obsolete, so its failure is no error.
+                # If a newer order has been given meanwhile, this order is obsolete and its failure is no error.
+                if order.is_newest:
                     errors.append(error)
             finally:
                 answered.set()
@@ -230,8 +231,8 @@ NUMBERED_MESSAGES = (
 # After these results, a message is not requested again before the next reboot. Other results are temporary.
 UNSUPPORTED = (MavResult.UNSUPPORTED, MavResult.DENIED)
 
-# FAILED means that the message is not supported (ArduPilot), or that it cannot be sent now (other firmware). A message
-# for which FAILED was answered is therefore polled rarely.
+# FAILED means that the message is not supported (ArduPilot), or that it cannot be sent now (other firmware). After
+# FAILED, the message is therefore still requested, but rarely.
 MAYBE_UNSUPPORTED = (*UNSUPPORTED, MavResult.FAILED)
 DOUBTFUL_POLL_INTERVAL_S = 60.0
 
@@ -253,8 +254,8 @@ class _PolledCell:
 
     @property
     def pending(self) -> bool:
-        # The state value reads this property on every access, so the program is using it now. The result is always
-        # False, because no message waits to be decoded.
+        # The state value reads this property on every access, so `read_at` is the last time at which the program used
+        # the value. The result is always False, because no message waits to be decoded.
         self.read_at = self._now()
         return False
 
@@ -305,7 +306,8 @@ class MessageRequests:
         try:
             answer = await self._request_legacy(message_type, params, where, timeout)
         except CommandRejected as error:
-            raise refusal or error from None  # Prefer the refusal of the standard request.
+            # If both requests were refused, the refusal of the standard request is raised.
+            raise refusal or error from None
         self._legacy_types.add(message_type)
         return answer
 

@@ -26,12 +26,13 @@ TRIGGER, TRIGGER_INTERVAL = MavCmd.DO_TRIGGER_CONTROL, MavCmd.DO_SET_CAM_TRIGG_I
 UNCHANGED = -1  # leaves the shutter time, or the sequence number of the trigger, as it is
 # Seconds without a capture after which the status of a series is requested, and seconds to wait for the status.
 CHECK_INTERVAL_S, STATUS_TIMEOUT_S = 1.0, 2.0
-# Number of status requests before an order, for a camera that has answered such a request before, and for all others.
+# Number of status requests before an order: the first number for a camera that has answered such a request before, the
+# second for all others.
 STATUS_ATTEMPTS, FIRST_STATUS_ATTEMPTS = 8, 3
 # A series has failed if this many successive status checks have shown no new capture.
 MAX_SILENT_CHECKS = 6
-# An index counts as plausible if the camera has taken at most twice as many pictures since the newest capture as its
-# interval allows, plus this many.
+# Since the newest capture, a camera may plausibly have taken twice as many pictures as its interval allows, plus this
+# many. A higher index counts as corrupt.
 MAX_EXTRA_CAPTURES = 10
 # If this many successive requests for missing captures are unanswered, the remaining gap is skipped.
 MAX_UNANSWERED = 3
@@ -58,8 +59,8 @@ class Shutter:
 
     async def reliable_status(self) -> CameraStatus | None:
         """Request the status repeatedly, because it decides whether an order was executed and may be sent again."""
-        # A camera that has never sent its status may not support the message. It gets fewer requests, and only one if
-        # it has left all requests of an earlier order unanswered.
+        # A camera that has never sent its status may not support the message, so it gets fewer requests:
+        # FIRST_STATUS_ATTEMPTS for the first order, and only one for later orders.
         attempts_before_first = 1 if self._never_answered else FIRST_STATUS_ATTEMPTS
         attempts = STATUS_ATTEMPTS if self._reports_status else attempts_before_first
         for _ in range(attempts):
@@ -81,7 +82,8 @@ class Shutter:
                 error = await self.order_photo(before)
                 while True:
                     while capture := new_captures.pop():
-                        # An unknown low index belongs to a new picture: indices of failed pictures may be used again.
+                        # The camera may use the index of a failed picture again. A low index therefore also belongs to
+                        # a new picture, unless the log already had a capture with this index.
                         is_old = before is not None and capture.index < before.image_count
                         if not is_old or capture.index not in known_indices:
                             return self._checked(capture)
@@ -95,7 +97,8 @@ class Shutter:
                     missed = await self._fetch_missed(before, status, known_indices, is_accepted=error is None)
                     if missed is not None:
                         return self._checked(missed)
-                    # The pictures of a series that was started or stopped meanwhile may have changed the image count.
+                    # If a series was started or stopped meanwhile, the image count does not show whether the ordered
+                    # picture was taken.
                     is_series_unchanged = self.link.latest_order("series") is series
                     was_lost = error is not None and is_series_unchanged and _has_taken_none(before, status)
                     if was_lost and attempts < MAX_ORDER_ATTEMPTS:
@@ -114,7 +117,8 @@ class Shutter:
             was_taken = status.image_count > before.image_count
             new_index = before.image_count  # Indices begin at 0.
             return await self.log.fetch(new_index) if was_taken else None
-        # Without a status from before an accepted order, the newest picture counts as the ordered one.
+        # Without a status from before the order, the newest picture counts as the ordered one if the camera accepted
+        # the order.
         newest = status.image_count - 1
         if is_accepted and not status.is_capturing and newest >= 0 and newest not in known_indices:
             return await self.log.fetch(newest)
@@ -132,7 +136,8 @@ class Shutter:
         """
         if not is_repeated:
             pictures = 0 if before is None else before.image_count
-            # Also above the number of pictures, because an earlier program may have used the numbers up to there.
+            # The number must also be above the number of pictures, because an earlier program may have used the numbers
+            # up to there.
             self._sequence_number = max(pictures + 1, self._sequence_number + 1)
         try:
             if self.link.is_trigger:
@@ -195,10 +200,11 @@ class PhotoInterval:
         self._new_captures = CaptureQueue(self._log.cell)
         # Index of the capture to deliver next.
         self._next_index: int | None = None
-        # Value of the log's `reset_at` to which `_next_index` belongs. After a reset, the camera counts from 0 again.
+        # `reset_at` of the log when `_next_index` was determined. After a newer reset, the camera counts from 0 again,
+        # so that `_next_index` is no longer valid.
         self._known_reset_at = self._log.reset_at
         self._possible_first: Capture | None = None
-        # True if no status was available, so that the index of the first capture counts as the start.
+        # True if the index of the first capture was taken as the start, because no status was available.
         self._is_start_guessed = False
         # The highest plausible index so far, and when it was received.
         self._newest_index = 0
@@ -309,14 +315,17 @@ class PhotoInterval:
                 self._next_index, self._is_start_guessed = first.index, False
                 self._newest_index, self._newest_at = first.index, self._link.now()
                 self._waiting = {first.index: first}
-            # Without a status, the first capture determines the start, unless a later one shows that it was corrupt.
+            # Without a status, the first capture determines the start. A later capture with a much lower index shows
+            # that the first index was corrupt, and then determines the start instead.
             if self._next_index is None or self._contradicts_guess(capture.index):
                 self._is_start_guessed = self._next_index is None
                 self._next_index = capture.index
-                self._newest_index = capture.index - 1  # so that this capture counts as the newest one below
+                # One lower than the index of this capture, so that this capture counts as the newest one below.
+                self._newest_index = capture.index - 1
             if not self._is_plausible(capture.index):
                 continue
-            if capture.success is False:  # Not stored by index, because a later picture may have the same index.
+            # A failed capture is not stored by its index, because a later picture may have the same index.
+            if capture.success is False:
                 self._failed.append(capture)
             elif capture.index >= self._next_index:
                 self._waiting[capture.index] = capture

@@ -68,11 +68,10 @@ class CommandArbiter:
         # another party armed the vehicle.
         self._armed_at = -math.inf
         self._armed_by_program: Order | None = None
-        # Three lists: the newest steering order and the auxiliary orders in progress; the posted orders; the commands
-        # that are not answered yet.
+        # The newest steering order, and the auxiliary orders in progress.
         self._orders: list[Order] = []
         self._posted: list[Order] = []
-        self._sent: list[SentCommand] = []
+        self._sent: list[SentCommand] = []  # commands whose `sending` block is active
         self._order_numbers = itertools.count(1)
         self._latest: dict[Topic, Order] = {}
         self._ordered_since_disarmed: set[Topic] = set()
@@ -122,7 +121,7 @@ class CommandArbiter:
         """
         self._notify_steering()
         self._ordered_modes.extend((self._now(), mode.custom_mode) for mode in modes)
-        if self._posted_modes():  # A posted order may still change the mode after this order.
+        if self._posted_modes():  # A posted order may change the mode later than this order does.
             self.doubt_mode()
         was_flown = self.is_flown_by_program
         order = self._create_order(modes, (STEERING,), ends_flight or self._all_end_flight(modes))
@@ -132,7 +131,7 @@ class CommandArbiter:
         self._register(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
         self.newest = order
-        self._orders = [order]  # All other actions have ended, so they need no more reports of the vehicle.
+        self._orders = [order]  # The order has ended all other actions, which need no more reports of the vehicle.
         return order
 
     def raw_order(self, subjects: Iterable[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()) -> Order:
@@ -157,7 +156,8 @@ class CommandArbiter:
         for order in (*self._orders, *self._posted):
             order.on_reboot()
         self._ordered_since_disarmed.clear()
-        # This time lets `current` ignore all orders from before the reboot until the vehicle arms again.
+        # No order was given after this time (infinity), so `current` ignores all orders from before the reboot until
+        # the vehicle arms again.
         self._armed_by_program, self._armed_at = None, math.inf
 
     # ------------------------------------------------------------------ other orders, in blocks
@@ -173,7 +173,7 @@ class CommandArbiter:
         """
         if device_order is not None and not device_order.is_newest:
             raise OperationRejected(f"{SUPERSEDED}; the rest of the order was not sent")
-        modes = () if self.newest is None else self.newest.modes  # The steering order goes on, and may change to them.
+        modes = () if self.newest is None else self.newest.modes  # The steering order may still lead to its modes.
         device_topics = () if device_order is None else device_order.ended_by
         order = self._create_order(modes, (ACTION, *device_topics), ends_flight)
         self._orders.append(order)
@@ -206,7 +206,7 @@ class CommandArbiter:
             (first_subject,),
             recent_modes,
             armed=armed,
-            # An order to disarm stays valid in every mode and during a failsafe.
+            # An order to disarm stays valid after a mode change and during a failsafe.
             ends_flight=self._all_end_flight(modes) or disarms,
             ends_on_mode_change=not disarms,
             ends_on_disarm=first_subject == "motion",
@@ -278,7 +278,7 @@ class CommandArbiter:
         no takeover.
         """
         order = self.current
-        if order is not None and order.was_refused:  # The vehicle continues its previous task.
+        if order is not None and order.was_refused:  # After a refusal, the vehicle continues its previous task.
             return order.was_flown_before
         return order is not None and not order.takeover_reason and not order.failsafe
 
@@ -303,7 +303,7 @@ class CommandArbiter:
         there was no takeover.
         """
         order, topics = self.newest, self._ordered_since_disarmed
-        # After an order without modes, such as a raw command, any mode may be its effect rather than a takeover.
+        # After an order without modes, such as a raw command, a mode change does not prove a takeover.
         was_taken_over = order is not None and order.modes and order.takeover_reason and order.is_newest
         return "arm" in topics if was_taken_over else bool(topics)
 

@@ -100,7 +100,7 @@ class ArmingActions(VehicleBase):
             return
         recent_texts = self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S)
         missing_now = self._health.missing_for_flight()
-        # Nothing is missing if the vehicle became ready just after the last check.
+        # The vehicle may have become ready just after the last check. Nothing is missing then.
         reasons = self._session.deduplicate_reasons(*recent_texts, *missing_now) or ("nothing",)
         missing = "\n  - ".join([*reasons, *self._health.unarmable_mode()])
         raise OperationTimeout(
@@ -266,7 +266,8 @@ class ArmingActions(VehicleBase):
                     f"arm: the vehicle is armed already, in {self.telemetry.mode_name}; nothing was sent"
                 )
             return arming_mode
-        # A set-point stream needs its own mode. A booting vehicle may still change its mode by itself.
+        # A set-point stream needs the mode that it has set. A booting vehicle may still change its mode by itself, so a
+        # change now may be lost.
         is_booting = self.telemetry.system_status.latest in BOOTING
         must_keep_mode = self._flight_cleanup.stop_stream is not None or is_booting
         may_arm_in_mode = not self._health.unarmable_mode() or self._is_in_optional_mode()
@@ -321,7 +322,7 @@ class ArmingActions(VehicleBase):
         if not force:
             self._session.check_disarmed("reboot")
         reboots_before = self._session.watch.reboots
-        # A reboot is recognised by a shorter time since boot, so the present one must be known.
+        # A reboot is recognised by a shorter time since boot, so the present time since boot must be known.
         self._session.link_watch.request_time()
         unanswered: CommandTimeout | None = None
         with self._session.watch.expecting_reboot():
@@ -329,7 +330,7 @@ class ArmingActions(VehicleBase):
                 await self._order_reboot(force)
             except CommandTimeout as error:
                 unanswered = error
-            # A command without an answer was probably lost, so the reboot is not awaited for the whole time-out.
+            # A command without an answer was probably lost, so a shorter wait than the whole time-out is enough.
             with anyio.move_on_after(timeout if unanswered is None else min(timeout, ARM_WATCH_S)):
                 await self._await_reboot(reboots_before)
                 return

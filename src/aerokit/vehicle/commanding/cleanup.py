@@ -94,14 +94,14 @@ class BackgroundTask:
 # Seconds to wait for the acknowledgement of a hold at the end of the vehicle's `async with` block.
 HOLD_CLOSE_TIMEOUT_S = 1.5
 
-# Maximum number of attempts to hold a vehicle that was silent. Attempts count from the end of the silence.
+# Maximum number of attempts to hold a vehicle that was silent. The first attempt follows when the silence ends.
 MAX_HOLD_ATTEMPTS = 3
 
 # A hold that was sent without waiting is repeated if it is not acknowledged within this many seconds, and at most this
 # many times.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
-# NaN means the present position. With it, the vehicle can brake instead of flying back to a point that it has passed.
+# NaN means the present position: the vehicle brakes, and does not fly back to a point that it has passed.
 STOP_HERE = (MavCmd.DO_REPOSITION, -1, MavDoRepositionFlags.CHANGE_MODE, 0, *(math.nan,) * 4)
 
 
@@ -198,7 +198,8 @@ class FlightCleanup:
                     return
                 await self._session.wait_for_heartbeat()
                 if not order.end and not self._session.telemetry.is_confirmed_disarmed:
-                    # A new steering order cancels this task, except for the order that the task gives here.
+                    # Every new steering order cancels this task. The task protects itself while it gives an order of
+                    # its own.
                     with self._task.protected():
                         order = self._arbiter.order(*order.modes, mode)
                     await self.stop_in(mode, order)

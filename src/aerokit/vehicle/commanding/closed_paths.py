@@ -127,7 +127,8 @@ class PathFlight:
             self._present_speed_m_s = 0.0
         place, tangent, second_derivative = self._path.at(self._phase)
         phase_rate = self._present_speed_m_s / math.hypot(*tangent)
-        # The part of the second derivative that is parallel to the path would change the speed, so it is subtracted.
+        # The acceleration must not change the speed. The part of the second derivative that is parallel to the path
+        # would do so, and is subtracted.
         (north_1, east_1), (north_2, east_2) = tangent, second_derivative
         parallel_factor = (north_2 * north_1 + east_2 * east_1) / (north_1**2 + east_1**2)
         centripetal = (

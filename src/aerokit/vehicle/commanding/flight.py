@@ -121,7 +121,8 @@ class FlightActions(VehicleBase):
             f"the vehicle is {state or 'probably in the air'}{height} and can only take off from the ground;"
             " go_to() climbs"
         )
-        # The text of ``error`` already lists its own reasons, so the constructor gets only the new one.
+        # The text of `error` already lists its own reasons, so the constructor gets only the new reason. The attribute
+        # has all of them.
         explained = CommandRejected(f"{error}", command=error.command, result=error.result, reasons=(reason,))
         explained.reasons = (*error.reasons, reason)
         return explained
@@ -147,7 +148,7 @@ class FlightActions(VehicleBase):
         Earlier messages may describe the previous flight.
         """
         here, landed = self.telemetry.position.latest, self.telemetry.landed_state
-        # No altitude is greater than NaN, so only the landed state counts while the position is unknown.
+        # No altitude is greater than NaN, so only the landed state can show a climb while the position is unknown.
         start_m = math.nan if here is None else self._position.altitude_relative()
         state_before = landed.latest
 
@@ -207,7 +208,8 @@ class FlightActions(VehicleBase):
         else:
             order = self._arbiter.order(mode, self.autopilot.modes.find(self.autopilot.mode_when_landed))
             with self._arbiter.changing_mode():
-                # A submarine at the surface may leave the mode before a HEARTBEAT reports it, so do not wait for it.
+                # A submarine at the surface may leave the mode before any HEARTBEAT reports the mode, so a wait for
+                # that report could fail.
                 await self._sender.request_mode(mode, order, attempt_timeout=min(1.0, MODE_TIMEOUT_S / 4))
         await self._await_ground("land", order, timeout, max_silence_s)
 
@@ -357,6 +359,7 @@ class ModeActions(VehicleBase):
             return order.failsafe
         may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR
         if may_have_landed and self.telemetry.armed.updated_at < order.mode_lost_at:
-            # PX4 leaves LAND when it disarms. CURRENT_MODE may report this before HEARTBEAT reports disarmed.
+            # PX4 leaves LAND when it disarms. CURRENT_MODE may report the new mode before HEARTBEAT reports that the
+            # vehicle is disarmed.
             return ""
         return order.takeover_reason

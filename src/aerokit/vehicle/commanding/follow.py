@@ -94,7 +94,8 @@ class FollowedTarget:
         position, velocity = telemetry.position, telemetry.velocity.latest
         if position.latest is None or not math.isfinite(position.age):
             return
-        # The target's connection may have another clock, so the time is computed from the age of the position.
+        # `position.updated_at` is on the clock of the target's connection, which may differ from ours, so the time is
+        # computed from the age of the position.
         received_at = self._now() - position.age
         speeds = ZERO if velocity is None else (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
         # The target's altitude is relative to its own home, which may be higher or lower than the follower's.
@@ -119,7 +120,8 @@ class FollowedTarget:
             self.latest = TargetState(position, ZERO, now, now)
         elif position == latest.position:
             is_change_overdue = now - latest.first_reported_at > OVERDUE_INTERVALS * self._interval_s
-            velocity = ZERO if is_change_overdue else latest.velocity  # The target has stopped if a change is overdue.
+            # If the position should have changed by now, the target has stopped.
+            velocity = ZERO if is_change_overdue else latest.velocity
             self.latest = TargetState(position, velocity, now, latest.first_reported_at)
         else:
             self._interval_s = now - latest.first_reported_at

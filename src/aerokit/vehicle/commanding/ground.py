@@ -68,7 +68,8 @@ class ImpactDetector:
         self._telemetry = telemetry
         self._updated_at = self._sank_fast_at = -math.inf
         self._max_sink_m_s = 0.0
-        # Sink rate before the impact, and height of the vehicle at the impact. Both are None without an impact.
+        # Sink rate before the impact, and height of the vehicle at the impact. The sink rate is None if there was no
+        # impact.
         self._impact_m_s: float | None = None
         self._impact_height_m: float | None = None
         # Height before the descent; None if it is unknown.
@@ -81,7 +82,8 @@ class ImpactDetector:
         velocity = cell.latest
         if velocity is None or cell.updated_at == self._updated_at:
             return
-        # An impact may take less time than passes between two velocities.
+        # An impact may be shorter than the interval between two received velocities. It then shows in two consecutive
+        # velocities, so these are compared even if the interval is long.
         interval_s = min(cell.updated_at - self._updated_at, MAX_INTERVAL_S)
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = cell.updated_at
@@ -92,12 +94,14 @@ class ImpactDetector:
             self._max_sink_m_s = max(max_sink_before_m_s, velocity.down_m_s)
             self._sank_fast_at = cell.updated_at
         elif abs(velocity.down_m_s) < STILL_M_S and has_just_sunk_fast:
-            # The vehicle has suddenly stopped. If it has lost no height, only its reported velocity has jumped.
+            # The vehicle has suddenly stopped sinking. Unless it has lost at least MIN_DROP_M of height, this is no
+            # impact, but an error of the reported velocity.
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
                 self._impact_m_s, self._impact_height_m = self._max_sink_m_s, height_above_home(self._telemetry)
         elif _has_changed(self._impact_height_m, height_above_home(self._telemetry), IMPACT_HEIGHT_M):
             self._impact_m_s = self._impact_height_m = None  # The vehicle flies on, so it did not hit the ground.
-        if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:  # A descent may begin at this height.
+        # The vehicle does not sink now, so a descent can only begin at this height.
+        if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:
             self._top_m = height_m
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S
         self._has_stopped = self._impact_m_s is not None and (self._has_stopped or is_slow)
@@ -172,12 +176,13 @@ class GroundCheck:
         """Return True if the vehicle moves as on the ground; ``updated_at`` is the time of the last velocity."""
         reported_at = now if self._reported_at is None else self._reported_at
         if now - updated_at > VELOCITY_MAX_AGE_S:
-            # Without a recent velocity, it is enough that the vehicle reports to be on the ground.
+            # Without a recent velocity, the report that the vehicle is on the ground is sufficient.
             return True
         if abs(self._down_m_s()) >= SETTLED_M_S:
             self._settled_since = math.inf
             height_m = height_above_home(self._session.telemetry)
-            # The reported velocity may be wrong: a vehicle whose height does not change stands on the ground.
+            # The reported velocity may be wrong. If the height has not changed for UNSETTLED_S, the vehicle stands on
+            # the ground although it reports a velocity.
             is_known = height_m is not None and self._reported_height_m is not None
             is_still = is_known and not _has_changed(self._reported_height_m, height_m, UNSETTLED_M)
             return is_still and now - reported_at >= UNSETTLED_S

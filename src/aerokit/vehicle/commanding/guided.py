@@ -41,8 +41,8 @@ __all__ = ["Guided", "SetpointStream"]
 
 SetpointT = TypeVar("SetpointT")
 
-# For autopilots that restart their path at each position set-point: a new set-point is sent this many times at the
-# stream's rate, because one may be lost, and then at this interval.
+# Some autopilots restart their path at each position set-point, so they get each set-point rarely: at first this many
+# times at the stream's rate, because one may be lost, and then at this interval.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 
 # Set-points that the autopilot executes with its own limits of acceleration.
@@ -265,5 +265,6 @@ class SetpointStream(SteeringStream[SetpointT]):
 
     def _stop_reason(self, lag: float) -> str | None:
         if self._mode is None or not wants_motion(self._value, self._context):
-            self._stall = StallDetector(self._session)  # While the vehicle need not move, it cannot stall.
+            # A vehicle that does not have to move cannot stall, so the detection starts again.
+            self._stall = StallDetector(self._session)
         return super()._stop_reason(lag) or self._stall()

@@ -22,6 +22,8 @@ TEXTS_S = 1.0
 HEALTH_MAX_AGE_S = 5.0
 PREARM_REPORT_INTERVAL_S = 35.0
 """ArduPilot repeats its pre-arm failures every 30 s, so each one is reported within this many seconds."""
+PREARM_REPORT_DURATION_S = 3.0
+"""Seconds within which the texts of one report about failing pre-arm checks arrive, also over a slow link."""
 CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
 """The reason for a refusal to arm if no other reason is known."""
 REPORTS_ABOUT_ARMING = ("heartbeats (", "sensors (")
@@ -73,8 +75,16 @@ class Health:
             return []
         now = self._session.connection.now()
         since = max(now - PREARM_REPORT_INTERVAL_S, self._checked_at, self._restored_at)
-        reasons = (self._autopilot.arming_reason(text) for text in self.arming_texts(since))
-        return list(dict.fromkeys(reason for reason in reasons if reason))
+        reasons = [
+            (text.at, reason)
+            for text in self._telemetry.texts_since(since)
+            if (reason := self._autopilot.arming_reason(text.text))
+        ]
+        if self._autopilot.runs_prearm_checks and reasons:
+            # ArduPilot reports all failing checks together, so older texts may be about checks that pass now.
+            report_at = max(at for at, _ in reasons) - PREARM_REPORT_DURATION_S
+            reasons = [(at, reason) for at, reason in reasons if at >= report_at]
+        return list(dict.fromkeys(reason for _, reason in reasons))
 
     def _out_of_date(self) -> list[str]:
         """Return the states that are too old to describe the present."""
@@ -199,7 +209,8 @@ class Health:
         receiver.
         """
         sensors = self._telemetry.sensors.latest
-        # In a mode that does not allow arming, PX4 reports the requirements of that mode instead of those for arming.
+        # In a mode that does not allow arming, PX4 reports what this mode requires. The report then does not show what
+        # arming in another mode requires.
         is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
         if sensors is None or sensors.prearm_checks_pass is True or is_meaningless:
             return []

@@ -256,7 +256,7 @@ class MessagingActions(VehicleBase):
             elif message.base_mode & CUSTOM_MODE_ENABLED:
                 modes = (self.autopilot.mode(message.custom_mode, message.base_mode, names),)
             self._arbiter.raw_order(subjects, modes=modes)
-        elif subjects:  # A set-point ends posted orders, but not the action in progress.
+        elif subjects:  # Any other message is a set-point, which ends posted orders, but not the action in progress.
             self._arbiter.supersede(subjects)
 
     @contextmanager

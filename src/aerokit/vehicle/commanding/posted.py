@@ -38,8 +38,8 @@ class PostedOrder:
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender, order: Order) -> None:
         self._session, self._arbiter, self._sender, self._order = session, arbiter, sender, order
-        # Collects refusals that follow the acceptance of the last command. The next command or the end of the `with`
-        # block closes it.
+        # Collects refusals that arrive after the last command was accepted. It is closed when the next command is sent,
+        # or when the `with` block ends.
         self._refusal_watch = ExitStack()
         self._refusals: list[CommandAck] = []
         self._was_left = False

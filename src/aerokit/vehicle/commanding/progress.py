@@ -154,7 +154,7 @@ class StallDetector:
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
-        # The place that the vehicle has not left, and since when it has been there.
+        # The place that the vehicle has not left recently, and the time at which it arrived there.
         self._place: Position | None = None
         self._there_since = -math.inf
         self._max_height_m, self._max_sink_m_s = -math.inf, 0.0

@@ -62,7 +62,8 @@ class RoundFlight:
         self._operation, self._center, self._counter = operation, center, counter
         self._rounds = math.inf if rounds is None else rounds
         max_distance_m, self._timeout, self._max_silence_s = limits
-        # Why the vehicle does not fly the ordered circle; empty if it does. Such a vehicle is ordered to hold.
+        # Reason why the vehicle does not fly the ordered circle; empty if it does. If there is a reason, the vehicle is
+        # ordered to hold.
         self._circle_problem = ""
         position = context.vehicle_position
         self._place = position.command_place(center, center_name)

@@ -140,14 +140,14 @@ class OrderSender:
         started = self._session.connection.now()
         was_in_doubt = self._arbiter.mode_is_in_doubt
         with self._session.refusals_of(MavCmd.DO_SET_MODE) as refusals, self._arbiter.changing_mode():
-            # All four attempts must fit into the time-out.
+            # The request is sent up to four times, and all four attempts must fit into the time-out.
             await self.request_mode(mode, order, attempt_timeout=min(1.0, timeout / 4))
             acknowledged_at = self._session.connection.now()
             if was_in_doubt:
                 reported_since = acknowledged_at
             remaining_s = timeout - (acknowledged_at - started)
             await self.await_mode(mode, order, refusals, remaining_s, reported_since)
-            # The mode is reported, so the modes of earlier orders cannot follow.
+            # Once the new mode is reported, the modes of earlier orders can no longer follow.
             self._arbiter.mode_settles_at = -math.inf
 
     async def request_mode(
@@ -179,7 +179,8 @@ class OrderSender:
             if error.result != MavResult.UNSUPPORTED:
                 raise
             self.raise_if_ended(order)
-            if not self._arbiter.is_state_recent:  # During a silence, a takeover may not have been reported yet.
+            # While the vehicle is silent, a takeover may be unreported, so the older message is not sent.
+            if not self._arbiter.is_state_recent:
                 raise
             self._session.send(request.legacy(self._session.system_id))
 
@@ -302,7 +303,9 @@ class OrderSender:
 
         def failure_reason() -> str | None:
             if order.has_lost_mode and armed.updated_at < order.mode_lost_at:
-                return None  # CURRENT_MODE came first; the next HEARTBEAT may report a landing and disarming.
+                # The mode change was reported by CURRENT_MODE. The next HEARTBEAT may report that the vehicle has
+                # landed and disarmed, so wait for it.
+                return None
             return mode_failure()
 
         return failure_reason
@@ -325,12 +328,14 @@ class OrderSender:
         """Send a raw command of the program by ``send``, a method of `CommandSender`; return the acknowledgement."""
         started = self._session.connection.now()
         if retries is None:
-            # Only requests are repeated. A repetition would execute another command twice if just its ack was lost.
+            # Only requests are repeated. A repetition would execute any other command twice if only the acknowledgement
+            # of the first transmission was lost.
             retries = MAX_ATTEMPTS - 1 if command in REQUEST_COMMANDS else 0
         check_range("retries", retries, 0, 1000)
         options["attempts"] = 1 + retries
         if options["attempt_timeout"] is None and not retries:
-            # A command that is sent once gets as much time as one with all retries.
+            # A command that is sent only once waits for its acknowledgement as long as all attempts of another command
+            # together.
             options["attempt_timeout"] = MAX_ATTEMPTS * ATTEMPT_TIMEOUT_S
         try:
             if command in REQUEST_COMMANDS:

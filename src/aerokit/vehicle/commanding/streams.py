@@ -133,7 +133,7 @@ class ValueStream(Generic[ValueT]):
         except Exception as error:
             self._stop(str(error))
             return
-        due = max(due + self._period_s, self._now())  # After a delay, ticks that were missed are not made up for.
+        due = max(due + self._period_s, self._now())  # Ticks that were missed during a delay are left out.
         self._timer = asyncio.get_running_loop().call_at(due, self._tick, due)
 
     def _send(self) -> None:
@@ -229,7 +229,8 @@ class SteeringStream(ValueStream[ValueT]):
         cleanup.check_no_stream()
         mode = self._stream_mode()
         self._was_entered = True
-        cleanup.stop_stream = self._stop  # Registered before the first await, so that there is only one stream.
+        # The stream is registered before the first await, so that no second stream can begin meanwhile.
+        cleanup.stop_stream = self._stop
         takeover_check = TakeoverCheck(self._context, mode)
         try:
             await self._check_support()
@@ -238,13 +239,15 @@ class SteeringStream(ValueStream[ValueT]):
             self._end()
             raise
         order = self._order = self._prepared_order or self._context.arbiter.order(mode)
-        # A vehicle that already is in the mode may execute the first value at once.
+        # A vehicle that is already in the stream's mode may execute the first value as soon as it is sent.
         order.may_move = order.may_move or self._session.telemetry.is_in(mode)
         try:
             await self._enter(mode, order)
         except BaseException as error:
             self._end()
-            if not isinstance(error, OperationRejected):  # The pilot or failsafe that took over keeps control.
+            # OperationRejected means that a pilot or a failsafe took over, who keeps control. After all other errors,
+            # the vehicle is ordered to hold.
+            if not isinstance(error, OperationRejected):
                 self._hold()
             self._release()
             raise
@@ -268,7 +271,7 @@ class SteeringStream(ValueStream[ValueT]):
         if exc is not None:  # An exception leaves the block at once, without waiting for the confirmation of the hold.
             self._hold()
         elif not self._context.arbiter.is_state_recent:
-            # There may have been a takeover whose report was not received yet.
+            # The vehicle is silent, so there may have been a takeover whose report was not received.
             self._stop(f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s")
             raise self._stop_error
         elif not self._session.telemetry.is_confirmed_disarmed:

@@ -112,7 +112,7 @@ class TravelActions(VehicleBase):
             self._flight_cleanup.hold_in_background(order)
             raise
         except CommandRejected:
-            if is_under_way:  # Only the speed or the heading was refused.
+            if is_under_way:  # The vehicle has accepted the target, and refused only the speed or the heading.
                 self._flight_cleanup.hold_in_background(order)
             raise
 

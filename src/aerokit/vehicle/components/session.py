@@ -173,8 +173,8 @@ class _WebDownload:
         return connect
 
     def _opener(self) -> OpenerDirector:
-        # The default opener of urllib also has handlers for file: and ftp:. This one has only those of the web, so that
-        # an address cannot make aerokit read a local file.
+        # The default opener of urllib also has handlers for file: and ftp:. The opener here has only handlers for http:
+        # and https:, so that an address cannot make aerokit read a local file.
         from http.client import HTTPConnection, HTTPSConnection
         from urllib import request
 

@@ -175,7 +175,7 @@ class Actuators(ReadOnly):
         """
         LANDING_GEAR.check_supported(self._context)
         telemetry = self._context.session.telemetry
-        # Old reports count too, because a vehicle on the ground stands on its gear until it reports a take-off.
+        # An old report is sufficient, because a vehicle on the ground stands on its gear until it reports a take-off.
         if telemetry.landed_state.latest == MavLandedState.ON_GROUND or telemetry.is_confirmed_disarmed:
             raise OperationRejected("raise_landing_gear: the vehicle is disarmed or on the ground; nothing was sent")
         await LANDING_GEAR.send(self._context, GEAR_UP, topic="landing gear")

@@ -85,7 +85,8 @@ class Winch(ReadOnly):
         check_range("length_m", length_m, -MAX_LENGTH_M, MAX_LENGTH_M)
         check_range("rate_m_s", rate_m_s, 0, MAX_RATE_M_S, above=True)
         self._check_supported(WinchActions.RELATIVE_LENGTH_CONTROL)
-        # The order begins before the wait for a status, so that a newer order given during this wait ends it.
+        # The order is created before the wait for a status. A newer order that is given during the wait then ends this
+        # order.
         order = self._context.arbiter.device_order(self._topic)
         start = await receive_once(self._context, m.WinchStatus, self._component_id)
         goal_m = None if start is None else start.line_length + length_m

@@ -188,8 +188,8 @@ class TargetLanding:
         if target is None:
             return
         check_kind("target", target, TargetMeasurement)
-        # Without PX4's attitude or local position, the target cannot be converted, so it is not sent. It then counts as
-        # not visible.
+        # Without PX4's attitude or local position, the target cannot be converted, so it is not sent. The target then
+        # counts as not visible.
         with contextlib.suppress(ValueUnknownError):
             self._stream.send(target)
             unseen_s = self._now() - self._seen_at

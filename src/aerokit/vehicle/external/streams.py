@@ -197,7 +197,8 @@ class MeasurementStream(Generic[MeasurementT]):
         if age_s > self._valid_for_s or session.watch.is_silent or not session.connection.is_open:
             self._dropped += 1
             return
-        # Periods follow each other without a gap, so that the average rate is right. After a pause, they start again.
+        # The next period begins when this one ends, even if this transmission is late, so that the average rate is
+        # right. After a longer pause, the next period is counted from now.
         next_period_at = self._next_at + self._period_s
         self._next_at = next_period_at if next_period_at > now else now + self._period_s
         for message in messages:

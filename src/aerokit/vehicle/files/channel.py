@@ -28,8 +28,8 @@ T = TypeVar("T")
 MAX_OPEN_ATTEMPTS = 3
 # Error codes with which vehicles refuse to open a file while another file is open.
 SESSION_IN_USE = (MavFtpErr.FAIL, MavFtpErr.INVALIDSESSION, MavFtpErr.NOSESSIONSAVAILABLE)
-# Seconds after the last request of any client in which the vehicle closes its open file: ArduPilot 3 s, PX4 10 s. The
-# keys are the errors with which ArduPilot and PX4 report the open file.
+# A vehicle closes its open file this many seconds after the last request of any client (ArduPilot 3 s, PX4 10 s, and a
+# margin). The keys are the errors with which ArduPilot and PX4 report that a file is open.
 SESSION_TIMEOUT_S: dict[int, float] = {MavFtpErr.INVALIDSESSION: 3.2, MavFtpErr.NOSESSIONSAVAILABLE: 10.5}
 CLOSE_TIMEOUT_S = 3.0
 
@@ -78,7 +78,7 @@ class FileChannel:
                     for session in tuple(self._closing):
                         await self._finish_closing(session, idle_timeout_s)
                     yield
-        except OperationTimeout:  # This TimeoutError is from inside the operation, not from `fail_after`.
+        except OperationTimeout:  # This TimeoutError was raised inside the operation, not by `fail_after`.
             raise
         except TimeoutError:
             raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
@@ -125,7 +125,7 @@ class FileChannel:
                 self._close_soon(file.session, path)
                 raise
             except Exception:
-                with suppress(FileTimeout):  # The first error tells more.
+                with suppress(FileTimeout):  # The error of the transfer tells more than that of closing.
                     await self._close(file.session, path, min(idle_timeout_s, CLOSE_TIMEOUT_S))
                 raise
             except BaseException:  # A cancelled call must not wait.
@@ -148,7 +148,8 @@ class FileChannel:
                 reply = await self.transfers.run(request)
             except FileError as error:
                 if may_be_own_session and request.attempts > 1 and error.code in SESSION_IN_USE:
-                    # If the reply to the first request was lost, that request may have opened the session in the way.
+                    # The file was requested more than once, and the reply to an earlier request may have been lost.
+                    # That request may then have opened the session that is now in use.
                     may_be_own_session = False
                     for session in self._possible_sessions(request):
                         await self._close(session, path, idle_timeout_s)
@@ -292,7 +293,7 @@ class LogChannel:
                     except BaseException:
                         self._end()
                         raise
-        except OperationTimeout:  # This TimeoutError is from inside the operation, not from `fail_after`.
+        except OperationTimeout:  # This TimeoutError was raised inside the operation, not by `fail_after`.
             raise
         except TimeoutError:
             raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None

@@ -115,7 +115,8 @@ class Files:
         start = part.size if resume and not is_virtual(path) else 0
         try:
             await self._fetch_to(part, path, start, idle_timeout_s, timeout, on_progress)
-            # The parts of a resumed copy may be of different files.
+            # A resumed copy may consist of parts of two different files, so its checksum is compared with that of the
+            # vehicle's file.
             is_correct = not start or await self._has_same_crc(path, part, idle_timeout_s, timeout)
         except _ShorterError:  # The vehicle's file is shorter than the part, so the download starts again.
             is_correct = False

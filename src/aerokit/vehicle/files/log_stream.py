@@ -140,7 +140,8 @@ class LogStream(ReadOnly):
         is_stopped = False
         try:
             if error is None:
-                # Before `_close`, because PX4 answers only when its last log message is acknowledged (logger.cpp).
+                # STOP is sent while log messages are still acknowledged, which `_close` ends: PX4 answers STOP only
+                # after the acknowledgement of its last log message (logger.cpp).
                 await STOP.send(self._context)
                 is_stopped = True
         finally:

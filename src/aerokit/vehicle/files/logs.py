@@ -34,13 +34,14 @@ if TYPE_CHECKING:
 __all__ = ["LogEntry", "LogMethod", "Logs"]
 
 LogMethod = Literal["auto", "ftp", "log"]
-# PX4 does not answer if it has no logs. After this many unanswered requests, MAVFTP shows whether it has any.
+# PX4 does not answer if it has no logs. After this many unanswered requests, its log directory is read by MAVFTP, which
+# shows whether there are logs.
 MAX_UNANSWERED_REQUESTS = 4
 MAX_LOG_ID = 0xFFFF
 ERASE_RETRY_INTERVAL_S = 1.0
 ERASE_PATIENCE_S = 60.0
-# The time of a log that is being written comes from the vehicle's clock, the time of a finished log from its file. The
-# two may differ by this much.
+# The time of a log that is being written comes from the vehicle's clock, the time of a finished log from its file. For
+# the same log, these times may differ by this much.
 MAX_CLOCK_DIFFERENCE = timedelta(days=1)
 ARDUPILOT_NAME = re.compile(r"(\d{8})\.BIN", re.IGNORECASE)
 PX4_LIST = "logdata.txt"
@@ -96,7 +97,7 @@ class Logs:
     def __init__(self, transfers: Transfers, files: Files, context: VehicleContext) -> None:
         self._transfers, self._files, self._context = transfers, files, context
         self._channel = LogChannel(transfers)
-        # The newest log in the last list, which may have been growing at that time.
+        # The newest log of the last list. The vehicle may still have been writing this log at that time.
         self._newest: LogEntry | None = None
 
     async def list(

@@ -245,7 +245,7 @@ class GimbalControl:
             if error is None and not self._loss_was_raised:
                 self.raise_if_taken()
             return
-        if self._is_ended:  # The vehicle's block has ended before this block.
+        if self._is_ended:  # The vehicle's `async with` block has ended before this block.
             return
         release = self._release_command()
         self._end()

@@ -128,8 +128,8 @@ def _version(number: int) -> str:
 # Gimbals without their own component id are numbered from 1 to this.
 MAX_GIMBAL_NUMBER = 6
 
-# A status whose time stamp is lower than that of the newest one by less than this arrived late. If the difference is
-# greater, the manager has rebooted.
+# If a status has a lower time stamp than the newest one, it arrived late. If it is lower by this many milliseconds or
+# more, the manager has rebooted instead.
 REORDER_WINDOW_MS = 5_000
 
 ATTITUDE_MESSAGES = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"

@@ -235,7 +235,8 @@ class GimbalOrders:
         """Return the manager. If none is known, first ask the device whether it is its own manager."""
         device = self.device
         if device.manager_id is None and device.component_id:
-            with suppress(CommandRejected, CommandTimeout):  # The autopilot then counts as the manager.
+            # Without the information, the autopilot counts as the manager.
+            with suppress(CommandRejected, CommandTimeout):
                 await self.ask(GimbalManagerInformation.ID, device.component_id, attempts=1)
                 await self.wait_for(lambda: device.manager_id, GimbalManagerInformation, MANAGER_TIMEOUT_S)
         return self.manager_id

@@ -243,7 +243,8 @@ class MissionTracker:
     def _on_reached(self, _: int | None, seq: int) -> None:
         # ArduPilot reports item 0 (home) when it has reached a guided target. `item` is then negative.
         item, now = seq - self._offset, self._session.connection.now()
-        if self._repeats_item_reached:  # Only a second approach makes the same item count again.
+        # The vehicle repeats its report, so an item counts as reached again only if it was approached again.
+        if self._repeats_item_reached:
             is_duplicate = item == self.reached and not self._is_approached_again
         else:
             is_duplicate = item == self.reached and now - self._reached_at < DUPLICATE_WINDOW_S

@@ -115,7 +115,8 @@ class MissionEndDetector:
         if may_have_this_mode and not session.telemetry.is_confirmed_disarmed:
             self._left_at = None
             return None
-        if self._left_at is None:  # The end of the mission changes the mode, and may be reported after the change.
+        # The mission's end also changes the mode. Its report may arrive after the mode change, so wait for END_GRACE_S.
+        if self._left_at is None:
             self._left_at = now
         if now - self._left_at < END_GRACE_S or now < self._grace_until:
             return None
@@ -402,7 +403,8 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             with vehicle_context.arbiter.changing_mode():
                 await vehicle_context.sender.send_long(order, MavCmd.MISSION_START, modes=(mode,))
-                # Only PX4 refuses after it has accepted, and PX4 does not get this command.
+                # No refusals are watched here. Only PX4 refuses a command that it has accepted before, and PX4 does not
+                # get MISSION_START.
                 await vehicle_context.sender.await_mode(
                     mode, order, refusals=[], timeout=timeout, reported_since=order.given_at
                 )

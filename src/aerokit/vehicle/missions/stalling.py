@@ -50,7 +50,8 @@ class MissionStallDetector:
         self._session, self._tracker, self._mode = session, tracker, mode
         self._items, self._is_paused = items or (), is_paused
         self._stall = StallDetector(session)
-        # The item because of which the vehicle had to be moving at the last call, and since when. None: it might stand.
+        # The item at which the vehicle had to be moving at the last call, and the time since which it had to move. The
+        # item is None if the vehicle was allowed to stand still.
         self._item: int | None = None
         self._should_move_since = session.connection.now()
 

@@ -42,10 +42,10 @@ DEFAULT_INTERVAL = 0
 ECHO_WINDOW_S = 3.0
 # ArduPilot answers this many reads at once. Further reads wait until it handles parameters again.
 MAX_READS_UNBOOSTED = 5
-# The rate is raised after this many seconds. Reading takes longer if the vehicle lacks a parameter, because a parameter
-# counts as missing only after several requests.
+# If reading a few parameters takes longer than this many seconds, ArduPilot's rate of answers is raised. This happens
+# if the vehicle lacks a parameter, which only several requests without an answer show.
 BOOST_DELAY_S = 0.5
-# Fewer changes than this are set one by one. That is as fast as a file, and the vehicle confirms each value.
+# Fewer changes than this are set one by one, which is as fast as a file. The vehicle then confirms each value.
 MIN_PACK_SIZE = 10
 # If more values than this must be read back, the whole list is downloaded instead.
 MAX_READ_BACK = 100
@@ -123,7 +123,7 @@ class ParameterAccess:
             except (FileError, FileTimeout, NotSupported, RemoteProtocolError) as error:
                 if method == "ftp":
                     raise
-                # A damaged file, or a vehicle with another open file, may be different next time.
+                # The next download may succeed if the file was damaged, or if the vehicle had another file open.
                 is_temporary = isinstance(error, RemoteProtocolError) or (
                     isinstance(error, FileError) and error.code == MavFtpErr.NOSESSIONSAVAILABLE
                 )
@@ -389,7 +389,7 @@ class _CachedList:
         store = self._access.store
         key = await self._key()
         since = store.updates
-        self._hash = await self._read_hash()  # With `refresh` too, because `save` needs the hash.
+        self._hash = await self._read_hash()  # The hash is also read with `refresh`, because `save` needs it.
         if refresh or self._hash is None:
             return False
         table = self._cache.load(key, self._hash)

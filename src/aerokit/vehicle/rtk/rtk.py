@@ -35,8 +35,8 @@ class _SentMessages:
         """Maps each message to the time at which it was sent, and the ids of the `Rtk` objects that passed it on."""
 
 
-# Shared by the vehicles of a connection, because GPS_RTCM_DATA reaches all of them. Weak, so that an entry ends with
-# its connection.
+# The vehicles of a connection share an entry, because GPS_RTCM_DATA reaches all of them. The dictionary is weak, so
+# that an entry ends with its connection.
 _SENT: WeakKeyDictionary[Connection, _SentMessages] = WeakKeyDictionary()
 
 

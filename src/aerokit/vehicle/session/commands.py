@@ -186,10 +186,11 @@ class CommandSender:
         order_status: OrderStatus | None,
         is_sent: bool,
     ) -> CommandAck:
-        # A command to all components (0) is answered by many; the autopilot's ack is the one that counts.
+        # Several components may answer a command to all components (0). Only the autopilot's answer ends this call.
         key = (message.target_component or self._component_id, message.command)
         self._abort_if_ended(key)
-        # Only an order that ends while this call waits prevents the command: the caller knows of an earlier end.
+        # If the order ends while this call waits for the lock, the command is not sent. An end before this call does
+        # not prevent the command, because the caller already knew of it.
         earlier_end = "" if order_status is None else order_status.end
         async with self._locks[key]:
             if self._is_closed:
@@ -269,7 +270,7 @@ class CommandSender:
         is_answer = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
         if is_answer and is_final:
             self._results[key] = ack.result
-            # An ack without a target may be for another ground station, so it does not count for `accepted_at`.
+            # An ack without a target may be for another ground station, so `accepted_at` ignores it.
             if ack.result == MavResult.ACCEPTED and ack.target_system == self._connection.source_system:
                 self._accepted_at[key] = self._connection.now()
         if run is not None:

@@ -214,12 +214,14 @@ class MessageRates:
                 return
             self._mark_refused(stream, error)
         except CommandTimeout:
-            # If `request_again` was called meanwhile, it has reset all failures, so this one does not count either.
+            # If `request_again` was called meanwhile, it has reset the number of failures, and this failure is not
+            # counted.
             if reset_count == self._reset_count:
                 stream.failures += 1
                 stream.next_attempt_at = self._connection.now() + min(2.0**stream.failures, MAX_RETRY_INTERVAL_S)
             return
-        # A refusal is an answer, too: the request is repeated only when the stream is requested again.
+        # The vehicle has accepted or refused the rate. In both cases, the request is repeated only when the stream is
+        # requested again.
         stream.failures = 0
         stream.mark_requested(self._connection.now(), hz)
 
@@ -295,7 +297,8 @@ class MessageRates:
         has_just_started = achieved_hz > 0 and stream.counts[0] == stream.counts[1]
         if has_just_started and not stream.is_slow:
             return
-        # One message fewer does not count as slow, because that message may have arrived just outside the window.
+        # A stream that lacks only one message is not slow, because that message may have arrived just outside the
+        # window.
         min_messages = SLOW_FACTOR * stream.requested_hz * WATCH_WINDOW * WATCH_PERIOD_S - 1
         received_messages = achieved_hz * WATCH_WINDOW * WATCH_PERIOD_S
         was_slow = stream.is_slow

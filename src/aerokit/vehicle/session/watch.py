@@ -34,12 +34,14 @@ if TYPE_CHECKING:
 # If the vehicle's time since boot decreases by more than this, the vehicle has rebooted. Reordered messages cause a
 # smaller decrease. A reboot soon after the previous one also causes a smaller decrease and is not detected.
 REBOOT_STEP_MS = 3000
-# A decreased time shows a reboot only if it persists for this long and in at least two messages: one may be late.
+# A decreased time shows a reboot only if it persists for this long and in at least two messages, because a single
+# message may be late.
 REBOOT_CONFIRM_S = 0.2
-# While a reboot is expected, it is detected when the vehicle's clock is behind its expected time by more than this. A
-# boot takes longer than this; messages are delayed by less.
+# An expected reboot is detected when the vehicle's clock is behind its expected time by more than this. A boot takes
+# longer than this, and messages are delayed by less.
 MIN_REBOOT_STEP_MS = 2000
-# A simulation's clock may be faster than real time. The speed is computed once the reported times span these seconds.
+# A simulation's clock may be faster than real time. Its speed is computed once the first and the last reported time
+# differ by this many seconds.
 CLOCK_SPAN_S = 5.0
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
@@ -197,7 +199,8 @@ class VehicleWatch:
         """Record a time since boot, and detect a reboot by it. ``clock`` names the message or field with the time."""
         now = self._now()
         milliseconds_before, read_at = self._last_times.get(clock, (milliseconds, now))
-        # How far the vehicle's clock is behind its expected time, or further if the earlier message was delayed.
+        # How far the vehicle's clock is behind its expected time. The result is too small if the earlier message was
+        # delayed.
         behind_ms = 1000 * (frame.received_at - read_at) - (milliseconds - milliseconds_before)
         if self._expects_reboot and behind_ms > MIN_REBOOT_STEP_MS:
             self._on_reboot_detected(clock, milliseconds)
@@ -205,7 +208,7 @@ class VehicleWatch:
             self._last_times[clock] = (milliseconds, now)
             if self._first_time is None and clock == "time_boot_ms":
                 self._first_time = (milliseconds, now)
-            if self._decreased_times:  # A decreased time that was reported before came from a late message.
+            if self._decreased_times:  # The time has increased again, so the decreased time came from a late message.
                 self._decreased_times.pop(clock, None)
         elif self._is_decrease_confirmed(clock, milliseconds):
             self._on_reboot_detected(clock, milliseconds)
@@ -221,7 +224,8 @@ class VehicleWatch:
 
     def _on_reboot_detected(self, clock: str, milliseconds: int) -> None:
         now = self._connection.now()
-        # Times of the previous boot no longer count.
+        # The times from before the reboot are discarded. Compared with them, later messages would show the same reboot
+        # again.
         self._last_times = {clock: (milliseconds, now)}
         self._decreased_times, self._first_time, self._last_answer = {}, None, (now, 0)
         self._expects_reboot = False

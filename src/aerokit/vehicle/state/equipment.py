@@ -189,7 +189,8 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
     has_fix = message.fix_type >= GpsFixType.TYPE_2D_FIX
     coordinates = valid_coordinates(message.lat, message.lon) if has_fix else None
     latitude, longitude = coordinates or (None, None)
-    # A yaw of 0 means that the receiver cannot measure it, U16 that the receiver can but does not at present.
+    # A yaw of 0 means that the receiver cannot measure the yaw. U16 means that the receiver can, but has no yaw at
+    # present.
     yaw_deg = None if message.yaw in (0, U16) else message.yaw % NORTH_CDEG / 100
     return GpsReceiver(
         index,

@@ -159,8 +159,8 @@ def divided(value: int, divisor: int, *, unknown: int) -> float | None:
     return None if value == unknown else value / divisor
 
 
-# Even if the program reads no value, a frame is decoded every this many seconds. An undecoded frame is replaced by the
-# next one, which may lack some of its values: without a fix, for example, the position is missing.
+# Even if the program reads no value, a frame is decoded at this interval. An undecoded frame is replaced by the next
+# one, which may lack some of its values: without a fix, for example, the position is missing.
 MAX_DECODE_DELAY_S = 5.0
 
 # Number of bytes before the payload in ``Frame.body``.
