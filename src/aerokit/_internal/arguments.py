@@ -29,7 +29,7 @@ from aerokit.errors import InvalidArgument, LinkOpenError
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 ClassT = TypeVar("ClassT")
 
-# A rule consists of a check and a description of the values that pass it, which completes "it must be …".
+# A rule consists of a check and of a text that describes the valid values and completes "it must be …".
 Check = Callable[[Any], bool]
 Rule = tuple[Check, str]
 

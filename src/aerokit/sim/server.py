@@ -70,7 +70,7 @@ class SimulatorServer:
         runs_several_ticks = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD  # in one callback
         self._min_wait_s = _MIN_WAIT_S if runs_several_ticks else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None
-        # Ends the event source, which replaces the timers on a `VirtualClockLoop`.
+        # Function that ends the event source. On a `VirtualClockLoop`, the event source replaces the timers.
         self._end_source: Callable[[], None] | None = None
         self._started_at = 0.0
         self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)

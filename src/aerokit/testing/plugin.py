@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from aerokit.testing.served import ServedFlight
 
 _MARKER, _PICTURES = "simulated", "--flight-pictures"
-# Name of an attribute of a test function that pytest-asyncio will run. Its value is a version of the test that opens
-# the flights.
+# Name of an attribute of a test function that pytest-asyncio will run. The value of the attribute is a version of the
+# test that opens the flights.
 _OPENING_TEST = "_aerokit_opening_test"
 # The plugin compares names instead of classes, because tests without flights must not import aerokit.
 _REPORTED_CLASSES = ("SimulatedFleet", "Flight", "ServedFlight")

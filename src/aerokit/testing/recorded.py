@@ -298,7 +298,8 @@ class RecordedVehicle(SimulatedVehicle):
         if answer is None:
             return MavResult.UNSUPPORTED
         for delay, ack in answer.acks:
-            # The recorded acknowledgement is addressed to the recorded client.
+            # The recorded acknowledgement is addressed to the recorded client. Address it to the sender of `command`
+            # instead.
             readdressed = m.CommandAck(ack.command, ack.result, ack.progress, ack.result_param2, *command.sender)
             self.call_later(delay, partial(self.send, readdressed, command.channel))
         return None  # The acknowledgements were recorded, so no further one is sent.

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 NAN = math.nan
 _CHUNK_ROWS = 1 << 9  # rows that are unpacked at once; with more rows, garbage collection would take longer
 _HEADER_SIZE = 3  # bytes before the fields of a row: A3 95 and the number of the table
-# An unknown charge, because AP_BattMonitor_Logging.cpp writes -1 as a byte.
+# The percentage of an unknown charge: AP_BattMonitor_Logging.cpp writes -1 as an unsigned byte.
 _NO_PERCENT = 255
 _FIRMWARES = {
     "ArduCopter": MavType.QUADROTOR,

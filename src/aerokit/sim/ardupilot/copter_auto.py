@@ -87,7 +87,8 @@ class _CircleLeg:
         self._angle += rate * dt
         self._turned_rad += abs(rate) * dt
         self._report_new_turn()
-        # Follow a point that moves along the circle: command its velocity, plus 1 m/s for each metre of distance.
+        # Follow a point that moves along the circle: command the velocity of the point, plus 1 m/s for each metre of
+        # distance.
         (north, east, down), speed = self._point(), rate * self._radius
         velocity_north, velocity_east = -speed * math.sin(self._angle), speed * math.cos(self._angle)
         motion.seek_velocity(

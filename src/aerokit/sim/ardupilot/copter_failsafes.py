@@ -73,7 +73,7 @@ _MODES: dict[int, tuple[int, ...]] = {
     _AUTO: (CopterMode.RTL, CopterMode.LAND),
     _BRAKE: (CopterMode.BRAKE, CopterMode.LAND),
 }
-# Texts for the case that the first mode of an action was refused.
+# Texts that are sent if the first mode of an action is refused.
 _FALLBACK_TEXTS = {
     _SMART_RTL: "SmartRTL Unavailable, Trying RTL Mode",
     _SMART_RTL_OR_LAND: "SmartRTL Unavailable, Using Land Mode",

@@ -189,7 +189,8 @@ class CopterGuided(CopterModeBase):
             else:
                 motion.seek_acceleration(*self.acceleration)
         else:
-            # Add 1 m/s towards the target position for each metre of distance to the target velocity.
+            # For each metre of distance to the target position, 1 m/s towards that position is added to the target
+            # velocity.
             offsets = (target - current for target, current in zip(self.position, motion.place, strict=True))
             north, east, down = (speed + offset for speed, offset in zip(self.velocity, offsets, strict=True))
             self._seek_velocity(north, east, down)

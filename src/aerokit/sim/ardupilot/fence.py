@@ -154,7 +154,8 @@ class ArduPilotFence(Generic[HostT]):
         self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE when they were read last.
         # By kind of fence: a breached fence is breached again if the vehicle is this many metres beyond the limit.
         self._new_breach_m: dict[int, float] = {}
-        # True or False if the last command about the lower limit enabled or disabled it; None without a command.
+        # True if the last command about the lower limit enabled the limit, False if it disabled it; None without a
+        # command.
         self._floor_enabled_by_command: bool | None = None
         self._recovering_since = -math.inf
         self._reported_at = self._checked_at = -math.inf

@@ -183,7 +183,7 @@ def _signed(value: int, bits: int) -> float:
     return float(value - (1 << bits) if value >> bits - 1 else value)
 
 
-# Functions that return a value as it is after it was stored and read again, by storage type.
+# By storage type: functions that return the value that is read after a value was stored.
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
     _NOT_STORED: lambda _: 0.0,
     "f": float32,

@@ -413,8 +413,8 @@ def _closest_approach(start1: Ned, end1: Ned, start2: Ned, end2: Ned) -> tuple[f
     are_nearly_parallel = determinant < 1e-6 * max(dot11 * dot22, 1e-9)  # 1e-9 includes segments without a length
     if are_nearly_parallel:
         return None
-    # The nearest place on each segment, as a number from 0 (start) to 1 (end). Limiting one place to its segment moves
-    # the nearest place on the other segment, so the first place is calculated again at the end.
+    # The nearest places on the two segments, from 0 (start) to 1 (end). Limiting `share2` to its segment may move the
+    # nearest place on the first segment, so `share1` is calculated again.
     share1 = max(0.0, min(1.0, (dot12 * dot2 - dot22 * dot1) / determinant))
     share2 = max(0.0, min(1.0, (dot12 * share1 + dot2) / dot22))
     share1 = max(0.0, min(1.0, (dot12 * share2 - dot1) / dot11))

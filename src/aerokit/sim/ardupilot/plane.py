@@ -74,7 +74,7 @@ class PlaneEngine(ArduPilotMotors):
 _REST_S = 1.0
 _LIFTING_MODES = range(PlaneMode.QSTABILIZE, PlaneMode.QACRO + 1)
 
-# Modes in the order of AVAILABLE_MODES. Modes of lifting rotors do not exist, as with Q_ENABLE 0.
+# Modes in the order of AVAILABLE_MODES. Modes for lifting rotors do not exist, as in the firmware with Q_ENABLE 0.
 _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     variant(
         modes.PlanePilotedMode, PlaneMode.MANUAL, "MANUAL",

@@ -146,7 +146,7 @@ def _heading(degrees: float) -> float:
     return float32(radians * _DEGREES_PER_RADIAN)
 
 
-# Functions that return a value as it is after it was stored and read again, by storage type.
+# By storage type: functions that return the value that is read after a value was stored.
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
     "-": lambda _: 0.0,
     "f": float32,

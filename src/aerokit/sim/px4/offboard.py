@@ -128,7 +128,7 @@ class Px4Offboard:
         if self._vehicle.version_number >= _VERSION_1_14:
             return
         motion = self._vehicle.motion
-        # Only the thrust is simulated, so the present attitude is held.
+        # Of the controls, only the thrust is simulated. The vehicle keeps its present attitude.
         self._attitude, self._body_rates = (motion.roll, motion.pitch, motion.yaw), None
         if target.group_mlx == _FLIGHT_CONTROL_GROUP:
             self._thrust = target.controls[_THRUST_CONTROL]
