@@ -135,7 +135,7 @@ class VideoStream:
         frame, self._latest = self._latest, None
         if frame is None:
             if isinstance(self._end, LinkLost):
-                # Each read raises a new exception, because a shared exception would collect the tracebacks of all
+                # Raise a new exception for each read, because a shared exception would collect the tracebacks of all
                 # reads.
                 raise LinkLost(*self._end.args)
             raise StopAsyncIteration

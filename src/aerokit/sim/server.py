@@ -212,8 +212,7 @@ class SimulatorServer:
             self.on_datagram(now, data, False)
         try:
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
-                # The vehicle may be ahead of `now`, because a timer fired early or another vehicle advanced this
-                # vehicle.
+                # The vehicle may be ahead of `now`: a timer fired early, or another vehicle advanced this vehicle.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
             port.reader.forget()  # All vehicles have used the decoded messages.

@@ -361,7 +361,7 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         is_hold_pending = self.aio.is_hold_pending
         self.close()
-        # `close` does not pass the exception to the asynchronous context, which would log this warning, so it is logged
+        # `close` does not pass the exception to the asynchronous context, so the warning of that context is logged
         # here.
         if exc is not None and not is_hold_pending:
             warn_if_left_flying(self.aio)

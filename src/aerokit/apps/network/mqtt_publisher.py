@@ -187,7 +187,7 @@ class MqttLink(BaseLink):
     def _read(self, client: Any, sock: Any) -> None:
         try:
             client.loop_read()
-            # TLS may hold more decrypted data, which the loop does not report because it is no longer in the socket.
+            # TLS may hold more decrypted data, which the loop does not report, because it has left the socket.
             while client.socket() is sock and isinstance(sock, ssl.SSLSocket) and sock.pending():
                 client.loop_read()
         except Exception as error:  # paho 2.1 raises arbitrary errors for malformed packets
