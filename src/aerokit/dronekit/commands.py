@@ -315,8 +315,7 @@ class CommandSequence:
             raise type(failure)(f"{failure}; call download() again, or clear()") from failure.__cause__
 
     def _wait_for_download(self) -> None:
-        # As in DroneKit, clear() and add() change the downloaded mission, so they wait for the end of a running
-        # download.
+        # As in DroneKit, clear() and add() change the downloaded mission, so they wait for a running download.
         while (download := self._download) is not None and not download.done():
             with classic_errors():
                 self._core.handler.loop.wait_for(when_done(download))

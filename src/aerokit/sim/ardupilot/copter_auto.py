@@ -81,14 +81,12 @@ class _CircleLeg:
             return
         motion = self._copter.motion
         max_rate = math.sqrt(_TURN_SHARE_OF_ACCELERATION * motion.limits.acceleration_m_s2 / max(0.5, self._radius))
-        # `max_rate` limits the acceleration, which is rate² * radius.
-        rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)
+        rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)  # `max_rate` limits the acceleration
         self._report_new_turn()  # The first turn is reported before the copter moves.
         self._angle += rate * dt
         self._turned_rad += abs(rate) * dt
         self._report_new_turn()
-        # Follow a point that moves along the circle: command the velocity of the point, plus 1 m/s for each metre of
-        # distance.
+        # Follow a point on the circle: command the velocity of the point, plus 1 m/s for each metre of distance.
         (north, east, down), speed = self._point(), rate * self._radius
         velocity_north, velocity_east = -speed * math.sin(self._angle), speed * math.cos(self._angle)
         motion.seek_velocity(

@@ -231,8 +231,7 @@ class _Flight:
         if not -1 <= command.param1 < px4.mission.count:
             return MavResult.DENIED
         if command.param1 >= 0 and whole(command.param1) != px4.mission.current:
-            # PX4 changes the current item even if it then refuses the mode (navigator_main.cpp).
-            px4.mission.set_current(whole(command.param1))
+            px4.mission.set_current(whole(command.param1))  # even if PX4 refuses the mode below (navigator_main.cpp)
         result = self._change(modes.MISSION)
         if result == MavResult.ACCEPTED and not px4.arming.arm("mission start"):
             return MavResult.TEMPORARILY_REJECTED
