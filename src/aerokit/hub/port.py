@@ -183,8 +183,8 @@ class Port:
     ``queue_above_bytes`` bytes are unsent, frames wait in a `FrameQueue`. `UNLIMITED` turns this check off.
 
     ``endpoint`` is the endpoint's name. ``period(message_id)`` is the minimum interval in seconds of a message, see
-    `Filters.period`. ``report(kind, text)`` publishes an event of the endpoint; ``on_drop(reason, frame)`` is called for
-    each frame dropped from the queue.
+    `Filters.period`. ``report(kind, text)`` publishes an event of the endpoint. ``on_drop(reason, frame)`` is called
+    for each frame dropped from the queue.
     """
 
     link: Link

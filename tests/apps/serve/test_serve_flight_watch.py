@@ -259,6 +259,16 @@ def test_crashed_vehicle_that_takes_off_slowly_is_no_longer_crashed(reports_land
     assert not flight.fly([(climb_m_s * seconds, 0.0)] * 50)
 
 
+def test_crashed_vehicle_with_changing_landed_state_stays_crashed() -> None:
+    """ArduCopter with running motors reports "on the ground" and "in the air" again and again, while it lies still."""
+    flight = FakeFlight()
+    assert flight.fly(sinking(40, 90.0, 0.0))
+    for _ in range(3):
+        flight.landed_state.set(MavLandedState.ON_GROUND, flight.now)
+        flight.landed_state.set(MavLandedState.IN_AIR, flight.now)
+        assert flight.fly([(0.0, 0.0)] * 50)
+
+
 def test_crashed_vehicle_that_is_moved_for_a_second_stays_crashed() -> None:
     flight = FakeFlight()
     assert flight.fly(sinking(40, 90.0, 0.0))

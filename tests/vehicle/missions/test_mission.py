@@ -25,6 +25,7 @@ from aerokit.mavlink.enums import CopterMode, MavCmd, MissionState
 from aerokit.missions import Mission, MissionItem
 from aerokit.missions.actions import jump
 from aerokit.missions.navigation import return_to_launch, waypoint
+from aerokit.sim import SimulatedPx4
 from aerokit.sim.ardupilot.mission_run import MissionRun
 
 pytestmark = pytest.mark.anyio
@@ -59,6 +60,24 @@ async def reaches(flight: AnyFlight, item: int) -> None:
 
 
 # ------------------------------------------------------------------------------------ completion
+
+
+async def test_mission_of_earlier_program_is_flown_to_landing() -> None:
+    """The upload sends nothing, because PX4 has the plan already. The end of the mission must be known nevertheless."""
+    px4 = SimulatedPx4(boot_time_s=1.0)
+    async with open_px4(px4) as earlier:
+        await earlier.vehicle.wait_ready()
+        mission = short_mission(earlier, return_to_launch())
+        await earlier.vehicle.mission.upload(mission)
+    async with open_px4(px4) as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.mission.progress.wait_until(lambda _: True)
+        await flight.vehicle.mission.upload(mission, only_changes=True)
+        assert flight.wire.all(m.MissionItemInt) == []
+        await flight.vehicle.arm()
+        await flight.vehicle.mission.start()
+        await flight.vehicle.mission.wait_finished(timeout=600)
+        assert px4.is_landed
 
 
 @pytest.mark.sampled(3)

@@ -44,6 +44,8 @@ example after a reboot."""
 MOVING_M_S = 2.0
 """An armed vehicle that moves at this speed after a crash flies again. At a lower speed, it must move for
 ``CRASH_STILL_S``."""
+CLIMBED_M = 0.3
+"""A vehicle flies again after a crash if it reports a take-off, and then climbs by this much."""
 CRASH_LANDED_MAX_AGE_S = 3.0
 """Maximum age in seconds of a landed state that counts as evidence of a crash."""
 _IN_AIR = (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING)
@@ -69,6 +71,7 @@ class FlightWatch:
         self._was_sudden_stop = False
         self._still_since, self._still_samples = math.inf, 0
         self._moving_since = math.inf  # Since when the crashed vehicle has been moving.
+        self._take_off_height_m: float | None = None  # where the crashed vehicle reported a take-off
         self._armed_at: float | None = None
         self._armed_until = -math.inf
         self._was_in_air = False
@@ -140,11 +143,12 @@ class FlightWatch:
     def _on_landed(self, before: int | None, landed: int) -> None:
         self._was_in_air = self._was_in_air or landed in _IN_AIR
         has_taken_off = before == MavLandedState.ON_GROUND and landed in _IN_AIR
-        velocity = self._vehicle.velocity.latest
-        # The land detector of a crashed vehicle with running motors may change again and again, although it lies still.
-        lies_still = velocity is not None and _is_still(velocity.ground_speed_m_s, abs(velocity.down_m_s))
-        if has_taken_off and self._crash is not None and self._vehicle.armed.latest and not lies_still:
-            self._dismiss_impact()
+        if has_taken_off and self._crash is not None and self._vehicle.armed.latest:
+            # The landed state of a crashed vehicle with running motors may change again and again, although it lies
+            # still. It counts as flying again once it has climbed.
+            self._take_off_height_m = height_above_home(self._vehicle.telemetry)
+            if self._take_off_height_m is None:
+                self._dismiss_impact()
 
     def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
         if self._vehicle.autopilot.vehicle_type in SURFACE_TYPES:
@@ -171,11 +175,11 @@ class FlightWatch:
     def _evaluate_impact(self, at: float, ground_speed_m_s: float, climb_m_s: float) -> None:
         if self._is_impact_dismissed or self._impact_at is None:
             return
-        is_still = _is_still(ground_speed_m_s, climb_m_s)
+        is_still = ground_speed_m_s < STILL_M_S and climb_m_s < CRASH_STILL_CLIMB_M_S
         if self._crash is not None:
             self._moving_since = math.inf if is_still else min(self._moving_since, at)
             is_moving = max(ground_speed_m_s, climb_m_s) >= MOVING_M_S or at - self._moving_since >= CRASH_STILL_S
-            if self._vehicle.armed.latest and is_moving:
+            if self._vehicle.armed.latest and (is_moving or self._has_climbed):
                 self._dismiss_impact()  # the vehicle flies again
             return
         if is_still and self._is_at_impact_height():
@@ -194,6 +198,14 @@ class FlightWatch:
                 "text": self._impact.describe(),
                 "at_unix_s": round(self._vehicle.connection.unix_time() - ago_s, 1),
             }
+
+    @property
+    def _has_climbed(self) -> bool:
+        """True if the vehicle has climbed since it reported, after a crash, that it took off."""
+        height_m, take_off_height_m = height_above_home(self._vehicle.telemetry), self._take_off_height_m
+        if height_m is None or take_off_height_m is None:
+            return False
+        return height_m - take_off_height_m >= CLIMBED_M
 
     def _has_crashed(self, at: float) -> bool:
         if at - self._still_since < CRASH_STILL_S or self._still_samples < CRASH_STILL_SAMPLES:
@@ -216,7 +228,7 @@ class FlightWatch:
     def _forget_impact(self) -> None:
         self._crash = self._impact_at = self._impact_height_m = None
         self._still_since, self._still_samples, self._is_impact_dismissed = math.inf, 0, False
-        self._moving_since = math.inf
+        self._moving_since, self._take_off_height_m = math.inf, None
 
     def _reset(self) -> None:
         self._forget_impact()
@@ -224,7 +236,3 @@ class FlightWatch:
 
     def _now(self) -> float:
         return self._vehicle.connection.now()
-
-
-def _is_still(ground_speed_m_s: float, climb_m_s: float) -> bool:
-    return ground_speed_m_s < STILL_M_S and climb_m_s < CRASH_STILL_CLIMB_M_S

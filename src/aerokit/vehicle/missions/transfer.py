@@ -332,6 +332,7 @@ class PlanTransfer(Generic[PlanT]):
             checksum = mission_checksum(items)
             # Another station may have just replaced the plan, so the next report must have the same checksum.
             if reported == checksum and await self._context.wait_for_plan_id(self._type, checksum):
+                self._cache.set(items, self._context.now())
                 return True
         if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changed_seqs(items), len(items)):
             return False
