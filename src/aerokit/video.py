@@ -135,7 +135,8 @@ class VideoStream:
         frame, self._latest = self._latest, None
         if frame is None:
             if isinstance(self._end, LinkLost):
-                # Each read raises a new exception, because a single one would collect the tracebacks of all reads.
+                # Raise a new exception for each read, because a shared exception would collect the tracebacks of all
+                # reads.
                 raise LinkLost(*self._end.args)
             raise StopAsyncIteration
         return frame
@@ -150,7 +151,7 @@ class VideoStream:
             self._changed.clear()
             await self._changed.wait()
 
-    # The reader's thread lets the event loop call these methods.
+    # The reader's thread schedules calls of these methods on the event loop.
 
     def _on_open(self) -> None:
         self._is_open = True

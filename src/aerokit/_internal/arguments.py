@@ -29,7 +29,7 @@ from aerokit.errors import InvalidArgument, LinkOpenError
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 ClassT = TypeVar("ClassT")
 
-# A rule consists of a check and a description of the values that pass it, which completes "it must be …".
+# A rule consists of a check and of a text that describes the valid values and completes "it must be …".
 Check = Callable[[Any], bool]
 Rule = tuple[Check, str]
 
@@ -114,7 +114,8 @@ class _Rules:
         names = self._positional
         if self._var_positional:
             names += (self._var_positional,) * (len(args) - len(names))
-        # Each message that a program sends or reads is checked here, so nothing is copied unless a value is wrong.
+        # This loop runs for each message that a program sends or reads. To be fast, it copies nothing unless a value is
+        # wrong.
         for name, value in chain(zip(names, args), kwargs.items()):  # noqa: B905 - Python rejects surplus arguments
             if name in rules and not rules[name][0](value):
                 vehicle_parameter = {**dict(zip(names, args)), **kwargs}.get("name")  # noqa: B905 - as above
@@ -199,7 +200,7 @@ def _named_rule(name: str, names: Mapping[str, Any]) -> Rule:
         return (lambda value: isinstance(value, types)), " or ".join(allowed.__name__ for allowed in types)
     if name in ("Any", "object") or isinstance(annotated, TypeVar):
         return (lambda _: True), "anything"
-    # The module imports this class only for type checking, so that just its name is known.
+    # The module imports this class only for type checking, so only the name of the class is known.
     return partial(_has_class_name, name), with_article(name)
 
 

@@ -51,7 +51,7 @@ def to_jsonable(value: object) -> Any:
 
 
 def _names(member: Enum) -> Any:
-    # The members of a Flag class are single flags, so that a value that is not among them is a combination.
+    # `tuple(type(member))` has the single flags, so a value that is not among them is a combination of flags.
     if isinstance(member, Flag) and member not in tuple(type(member)):
         return [flag.name for flag in type(member) if flag in member]
     return member.name

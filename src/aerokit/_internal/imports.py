@@ -10,7 +10,7 @@ from importlib import import_module
 # Packages that only the other project called aerokit has: ``aerokit.aero`` and so on.
 _OTHER_PACKAGES = ("aero", "engine", "stability")
 
-# Users often look in the package for the contents of these modules: aerokit.LinkLost, not aerokit.errors.LinkLost.
+# Modules whose names users often look up in the package: aerokit.LinkLost instead of aerokit.errors.LinkLost.
 _NAMED_MODULES = ("aerokit.errors", "aerokit.events")
 
 

@@ -45,11 +45,12 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None) -> Readine
     checks_pass = sensors is not None and sensors.prearm_checks_pass is True
     against = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)
     if checks_pass and all(map(_is_about_estimates, against)):
-        # For example, ArduCopter without a position arms in STABILIZE, but not in GUIDED.
+        # The checks pass although estimates are missing, so the mode decides: for example, ArduCopter without a
+        # position arms in STABILIZE, but not in GUIDED.
         refused = tuple(not_armable(vehicle, missing)) if reasons is None else ()
         return Readiness(refused, tuple(text for text in dict.fromkeys([*missing, *against]) if text not in refused))
     is_known = not any(text.startswith(REPORTS_ABOUT_ARMING) for text in against)
-    # The same reason may be in a status text of the autopilot, there with a prefix.
+    # `against` may contain a status text that consists of a prefix and a reason from `missing`.
     without_prefix = {vehicle.autopilot.arming_reason(text) for text in against}
     others = tuple(text for text in missing if text not in against and text not in without_prefix)
     return Readiness(against, others, is_known)

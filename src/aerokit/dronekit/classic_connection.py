@@ -30,7 +30,7 @@ vehicle_logger: logging.Logger = logging.getLogger("dronekit")
 
 CLOSE_TIMEOUT_S = 2.0  # maximum time that close() waits for the answers to recent orders
 
-# A new call replaces the previous call of its kind. Disarming also replaces arming, and vice versa.
+# A new call replaces the previous call of its kind. "disarm" and "arm" share one kind, so they replace each other.
 SHARED_KINDS = {"disarm": "arm"}
 
 CoroutineFunction = Callable[..., Awaitable[object]]
@@ -50,7 +50,7 @@ class ClassicConnection:
         self.target_system = target_system
         """System id of the vehicle, 0 until it is found."""
         self.listener_thread: ListenerThread = ListenerThread()
-        self.listener_thread.on_called = loop.activity.feed  # a callback that returns shows that the program is running
+        self.listener_thread.on_called = loop.activity.feed  # each callback shows that the program does not hang
         self.loop = loop
         self._context = context
         self.connection: Connection = context.value
@@ -245,7 +245,8 @@ class BackgroundCalls:
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
-    # Called one iteration later, so that tasks of earlier calls, which were just created, send their messages before.
+    # `call_soon` calls the function in the next iteration, so that tasks that were just created for earlier calls send
+    # their messages first.
     asyncio.get_running_loop().call_soon(function, *args)
 
 

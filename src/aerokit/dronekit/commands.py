@@ -177,7 +177,7 @@ class CommandSequence:
             content = _content_of(self._state.items)
             if not self._state.is_changed and content == self._vehicle_content:
                 return
-            uploaded = self._state = self._state.replace(is_changed=True)  # stays True unless the vehicle confirms
+            uploaded = self._state = self._state.replace(is_changed=True)  # stays True unless the upload succeeds
         aio = self._core.check_link()
         # DroneKit does not limit the distance of waypoints, and its programs must run unchanged.
         options = {"timeout": timeout, "max_distance_m": math.inf}
@@ -315,7 +315,7 @@ class CommandSequence:
             raise type(failure)(f"{failure}; call download() again, or clear()") from failure.__cause__
 
     def _wait_for_download(self) -> None:
-        # As in DroneKit, clear() and add() change the mission that a running download yields.
+        # As in DroneKit, clear() and add() change the downloaded mission, so they wait for a running download.
         while (download := self._download) is not None and not download.done():
             with classic_errors():
                 self._core.handler.loop.wait_for(when_done(download))

@@ -254,7 +254,7 @@ class Core:
             else:
                 post(self.logger.info, "...link restored.")
         wait_s = TICK_INTERVAL_S
-        # Without a listener, waits longer, because each wake-up costs as much as a few messages.
+        # Each wake-up costs as much as a few messages, so the wait is longer if no listener needs `last_heartbeat`.
         if not self._is_silent and not self.listeners.has_listener("last_heartbeat"):
             wait_s = max(wait_s, min(IDLE_TICK_INTERVAL_S, SILENCE_WARNING_S - age))
         asyncio.get_running_loop().call_later(wait_s, weak_callback(self.watch_link))

@@ -115,7 +115,8 @@ class FlightMethods(VehicleAttributes):
         if wait:
 
             def is_done() -> bool:
-                # A HEARTBEAT may still report `value` although the overruled opposite order is about to change it.
+                # If an opposite order was overruled, HEARTBEAT may still report the state from before that order. In
+                # this case, `_armed` is reliable only after `order` is done.
                 return self._armed == value and (order.done() or not is_overruling)
 
             self._dk_wait_for_order(order, is_done, timeout, failure_text)
@@ -176,7 +177,7 @@ class FlightMethods(VehicleAttributes):
         """
         aio = self._dk.check_link()
         modes = flight_orders.reposition_modes(aio)
-        # Autopilots without such modes take the altitude above home.
+        # Autopilots without reposition modes take the altitude above home.
         target = self._dk_target(location, is_relative=not modes)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
             flight_orders.check_speed(name, speed)  # before anything is sent

@@ -131,7 +131,9 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
             )
         except CommandRejected as error:
             is_unsupported = error.result == MavResult.UNSUPPORTED and not is_amsl
-            # The second message is sent only if no newer order or mode change has ended this order.
+            # A set-point replaces the unsupported command, unless a newer order or mode change has ended this order or
+            # the
+            # vehicle is silent.
             may_still_order = not order.end and vehicle.heartbeat_age <= MODE_MAX_AGE_S
             if not is_unsupported or not may_still_order:
                 raise
@@ -233,10 +235,10 @@ class CurrentCommand:
         with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):
             await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
             return
-        # The vehicle has not confirmed the item in time.
+        # MISSION_SET_CURRENT was not confirmed in time, so a command, which the vehicle acknowledges, sets the item.
         if aio.heartbeat_age > MODE_MAX_AGE_S:
             raise APIException(f"the vehicle is silent; it may or may not have set the next command to {seq}")
-        if seq == 0:  # home, which mission.set_current() cannot set, because it counts the items after home
+        if seq == 0:  # home, for which mission.set_current() has no number: its 0 is the first item after home
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:
             await aio.mission.set_current(seq - 1)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 MAX_MESSAGES = 1000
 MESSAGE_MAX_AGE_S = 5.0  # drops older messages, so that a program that reads rarely gets recent ones
-# A look-up waits for its message until this long after the first access, because none is stored before.
+# Messages are stored from the first access on. Until this long after the first access, a look-up waits for its message.
 FIRST_LOOKUP_TIMEOUT_S = 1.0
 SIGNAL_CHECK_INTERVAL_S = 0.2  # longer waits are split into steps, so that Ctrl-C and a closed connection end them
 
@@ -223,7 +223,7 @@ class Master:
         ``alt`` is in metres above home with ``relative_alt``, otherwise above sea level.
         """
         gps = self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
-        hud = self.recv_match(type="VFR_HUD", blocking=True)  # like pymavlink, which takes the altitude from it
+        hud = self.recv_match(type="VFR_HUD", blocking=True)  # like pymavlink, take the altitude from VFR_HUD
         position = self.recv_match(type="GLOBAL_POSITION_INT", blocking=True)
         alt = position.relative_alt * 1e-3 if relative_alt else hud.alt
         return mavutil.location(gps.lat * 1e-7, gps.lon * 1e-7, alt, hud.heading)

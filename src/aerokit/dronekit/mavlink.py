@@ -135,7 +135,7 @@ class MAVConnection(ClassicConnection):
     @_accept_input.setter
     def _accept_input(self, value: bool) -> None:
         """Discard received bytes if False, so that programs can test a silent link."""
-        # The instance attribute takes the place of the method that the link calls with received bytes.
+        # The link calls `bytes_received` with received bytes. An instance attribute of this name hides the method.
         if value:
             vars(self.connection).pop("bytes_received", None)
         else:

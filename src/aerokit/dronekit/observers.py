@@ -118,7 +118,7 @@ class Listeners:
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
     def _keep_owner(self) -> None:
-        # Keeps the owner alive while it has listeners, even if the program has dropped it: they get it as an argument.
+        # Listeners get the owner as an argument, so they keep the owner alive even if the program has dropped it.
         if self._thread is not None:
             self._thread.keep(self, has_listeners=bool(self.by_name))
 

@@ -118,7 +118,7 @@ class ParameterDownload:
             return False
         if any(isinstance(answer, Parameter) for answer in answers):
             return True
-        # A rejection with a code is the vehicle's answer that the parameter is missing; without a code, no answer came.
+        # A rejection with a code is the answer that the parameter is missing. A rejection without a code is no answer.
         return all(isinstance(answer, ParameterRejected) and answer.code is not None for answer in answers)
 
 
@@ -135,7 +135,7 @@ async def _download(
         return
     except AerokitError as error:
         on_failure(error)
-        # A program that waits for parameters starts the next download as soon as this one has ended.
+        # The pause limits the attempts, because a waiting program starts the next download as soon as this one ends.
         await anyio.sleep(RETRY_DELAY_S)
     finally:
         on_ended()

@@ -51,7 +51,7 @@ class ServedVehicle:
         self._vehicle = simulated(kind, home=home)
         self._requested_addresses = tuple(addresses)
         self._error: Exception | None = None
-        self._startup_ended = threading.Event()  # set when the vehicle is served, or when that has failed
+        self._startup_ended = threading.Event()  # set when the vehicle is served, or when the start has failed
         self._loop = asyncio.new_event_loop()
         self._stop_requested = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="aerokit simulated vehicle", daemon=True)
@@ -163,7 +163,7 @@ class SITL:
         if _vehicle_for_program is not None:
             kind = kind or _vehicle_for_program.kind
             speedup = speedup or _vehicle_for_program.speedup
-            addresses += USUAL_ADDRESSES[1:]  # the UDP port; the TCP port is that of this instance
+            addresses += USUAL_ADDRESSES[1:]  # the UDP address; `_address` is the TCP address
             _vehicle_for_program.stop()
             _vehicle_for_program = None
         kind = kind or KINDS.get(options.model or "", "copter")

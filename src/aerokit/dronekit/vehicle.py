@@ -50,8 +50,9 @@ if TYPE_CHECKING:
 
 FIRST_VALUES = ("attitude", "location.global_relative_frame", "heading", "gps_0", "battery")
 
-# connect() waits this long for the first telemetry, because DroneKit programs read attributes right after it. Not every
-# vehicle reports every value, so connect() also returns if no further value arrives for NEXT_VALUE_TIMEOUT_S.
+# DroneKit programs read attributes right after connect(), which therefore waits up to FIRST_VALUES_TIMEOUT_S for the
+# first telemetry. Not every vehicle reports every value, so the wait also ends if no value arrives for
+# NEXT_VALUE_TIMEOUT_S.
 FIRST_VALUES_TIMEOUT_S, NEXT_VALUE_TIMEOUT_S = 1.0, 0.4
 
 CONNECT_TIMEOUT_S = 30.0

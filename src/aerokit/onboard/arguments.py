@@ -95,7 +95,7 @@ def arguments_of(function: Callable[..., Any]) -> tuple[CommandArgument, ...]:
 def _hint(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
     """Return the annotation of one parameter, evaluated in the scope of its function."""
     inner = inspect.unwrap(getattr(function, "__func__", function))
-    # get_type_hints would evaluate all annotations of the function, so it gets an object that has only this one.
+    # get_type_hints would evaluate all annotations of the function. `holder` has only the annotation of this parameter.
     holder = types.SimpleNamespace(__annotations__={"hint": parameter.annotation})
     cells = zip(inner.__code__.co_freevars, inner.__closure__ or ())  # noqa: B905 - equal lengths
     closure = {name: cell.cell_contents for name, cell in cells}

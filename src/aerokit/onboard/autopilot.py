@@ -75,7 +75,7 @@ def add_autopilot(
             raise NotSupported(f"this vehicle does not support {name}")
         await services.commands.call(getattr(driver, name), *arguments)
 
-    # The arguments of each handler after the first are the parameters of its command, in order.
+    # The first argument of each handler is the request. The others are the parameters of the command, in order.
 
     async def arm_disarm(_: CommandRequest, is_armed: bool, force: float | None) -> None:
         is_forced = force == FORCE or (is_armed and force == FORCE_ARM)

@@ -369,5 +369,5 @@ def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
         relative_alt=0 if relative_m is None else round(relative_m * 1000),
         q=UNKNOWN_ATTITUDE if len(known_angles) < 3 else quaternion_from_euler(*known_angles),
     )
-    # The caller may replace the URL.
+    # A caller can pass `file_url` to replace the URL of the photo.
     return lambda **fields: message(**{"file_url": photo.url, **fields})

@@ -127,7 +127,8 @@ class ComponentCommands:
         self.server: CommandDispatcher = CommandDispatcher(host, self.handlers)
         self._running = RunningCommands(host, self.server)
         self._host, self._tasks = host, tasks
-        # Tasks of commands whose code runs in a thread now. A thread cannot be stopped.
+        # Tasks of commands whose code runs in a thread now. They cannot be cancelled, because a thread cannot be
+        # stopped.
         self._tasks_in_threads: set[asyncio.Task[Any] | None] = set()
         host.knows_command = self.handlers.__contains__
 

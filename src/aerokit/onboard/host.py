@@ -44,8 +44,8 @@ class ComponentHost:
         self.component_id = component_id
         self.knows_command: Callable[[int], bool] = lambda _: True
         self._accepts = None if accepts is None else frozenset(accepts)
-        # A component with the ids of the connection has no encoder of its own. It uses that of the connection, so that
-        # their frames have one common sequence of numbers.
+        # A component with the ids of the connection uses the encoder of the connection, because all frames with the
+        # same ids need a common sequence of numbers.
         has_ids_of_connection = (system_id, component_id) == (connection.source_system, connection.source_component)
         self._encoder = None if has_ids_of_connection else FrameEncoder(system_id, component_id)
         self._started_at = connection.now()
@@ -74,7 +74,7 @@ class ComponentHost:
         self._detachments.append(self.connection.bus.attach(message_class, on_message))
 
     def _is_addressed(self, message: Message, sender: tuple[int, int]) -> bool:
-        # A message without these fields is for all (0).
+        # A message without target fields is for all systems and components (0).
         target_system, target_component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         if sender == (self.system_id, self.component_id) or sender[0] == 0:  # System id 0 is not a valid sender.
             return False
@@ -82,7 +82,7 @@ class ComponentHost:
             return False
         if target_system not in (0, self.system_id) or target_component not in (0, self.component_id):
             return False
-        # A command that this component does not know may be meant for another one, so do not refuse it.
+        # If this component does not know a command to all components, it ignores the command, which another may know.
         is_command_to_all = target_component == 0 and message.ID in _COMMANDS
         return not is_command_to_all or self.knows_command(message.command)  # type: ignore[attr-defined]
 

@@ -185,8 +185,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             raise InvalidArgument(
                 f"{name} = {checked:g} is not allowed: it must be {', '.join(map(str, metadata.values))}"
             )
-        # `problem` need not check the allowed values, which are checked above, or whether the parameter is read-only:
-        # this program may change it.
+        # The allowed values are checked above, and this program may change read-only parameters, so `problem` checks
+        # neither.
         problem = metadata.replace(read_only=False, values={}).problem(checked)
         if problem is not None:
             raise InvalidArgument(problem)

@@ -60,7 +60,7 @@ class VehicleSigning:
             timestamp=first_timestamp,
             allow_unsigned=self.unsigned_on(link_id),
         )
-        signing.streams = self._streams  # The last time stamps of all senders, which the ports share.
+        signing.streams = self._streams  # The ports share the last time stamps of all senders.
         channel.sign_with(signing)
 
     def is_for(self, link_id: int) -> bool:
@@ -129,8 +129,8 @@ class ReceivedCorrections:
         if sequence != self._sequence or fragment_id in self._fragments:  # A new message begins.
             self._fragments.clear()
         self._sequence, self._fragments[fragment_id] = sequence, data
-        # Only the last fragment is shorter than FRAGMENT_SIZE. A message that fills all MAX_FRAGMENTS fragments has no
-        # short fragment.
+        # A fragment that is shorter than FRAGMENT_SIZE is the last one. If the message fills all MAX_FRAGMENTS
+        # fragments, no fragment is short.
         has_short = any(len(fragment) < FRAGMENT_SIZE for fragment in self._fragments.values())
         has_last = has_short or len(self._fragments) == MAX_FRAGMENTS
         has_all = len(self._fragments) == max(self._fragments) + 1  # The ids of the fragments count from 0.

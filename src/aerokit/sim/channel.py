@@ -119,7 +119,7 @@ class Streams:
         self.next_due: float = math.inf
         """Time of the next message; infinity if no message is streamed."""
         self._groups: dict[int, _StreamGroup] = {}  # by message id
-        # Heap entries: (due time, number of the group, group). The group is empty if its streams have stopped.
+        # Heap entries: (due time, number of the group, group). A group without ids stays until it is due.
         self._heap: list[tuple[float, int, _StreamGroup]] = []
         self._group_count = 0
 
@@ -160,7 +160,7 @@ class Streams:
         self._update_next_due()
 
     def _update_next_due(self) -> None:
-        self.take_due(-math.inf)  # No message is due at this time, so the call only updates `next_due`.
+        self.take_due(-math.inf)  # No message is due at -inf, so the call only updates `next_due`.
 
     def take_due(self, now: float) -> list[int]:
         """Return the ids of the messages that are due, and schedule the next message of each stream."""
@@ -177,7 +177,7 @@ class Streams:
             ids += group.ids
             group.count += 1
             following = round((group.start + group.count * group.interval_s) * NS_PER_S) / NS_PER_S
-            if following <= now:  # The streams are late by more than an interval, so they start again now.
+            if following <= now:  # The next message is late, too, so the streams start again now.
                 following, group.start, group.count = now + group.interval_s, now, 1
             heapreplace(heap, (following, number, group))
         self.next_due = math.inf

@@ -54,7 +54,7 @@ class CommandServer(commands.CommandDispatcher):
         """Send the acknowledgement as ``fault`` changes it: with progress, repeated, delayed or not at all."""
         fault = CommandFault() if fault is None else fault
         if fault.progress:
-            # After the progress, the remaining faults apply to the final acknowledgement.
+            # The final acknowledgement follows the progress. `final_fault` repeats, delays or drops it.
             final_fault = CommandFault(acks=fault.acks, delay_s=fault.delay_s)
             progress = CommandProgress(fault.progress, fault.progress_interval_s, result)
             self.report(command, progress, lambda: self._answer_with(command, result, final_fault))

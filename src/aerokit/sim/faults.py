@@ -76,7 +76,7 @@ class Faults:
     if not TYPE_CHECKING:  # If a type checker saw this method, it would no longer report misspelled names.
 
         def __setattr__(self, name: str, value: object) -> None:
-            # A misspelled fault would otherwise be accepted and change nothing.
+            # Without this check, a misspelled fault would be accepted without an effect.
             if name not in self.__dataclass_fields__:
                 raise AttributeError(f"Faults has no fault {name!r}; faults: {', '.join(self.__dataclass_fields__)}")
             super().__setattr__(name, value)

@@ -55,7 +55,7 @@ _FILES = {
     "fence.dat": MavMissionType.FENCE,
     "rally.dat": MavMissionType.RALLY,
 }
-# The parts of a file that were not received consist of zero bytes. These bytes decode as this item.
+# Parts of an upload that were not received are zero bytes, which decode as this item.
 _EMPTY = MissionItem(0, 0, autocontinue=False)
 _PLACEHOLDER_SIZE = 1 << 20
 
@@ -112,7 +112,7 @@ class _Writer(UploadedFile):
             items = unpack_items(bytes(self.content[: header.length]))
         except (RemoteProtocolError, InvalidArgument):
             raise FileFault(EINVAL) from None
-        # ArduPilot counts the items by the length of the file, and rejects an item of zero bytes
+        # ArduPilot rejects a file that has room for more items than its header announces, or an item of zero bytes
         # (AP_Filesystem_Mission.cpp, finish_upload).
         has_extra_item = len(self.content) >= header.length + MissionItemInt.LENGTH
         if has_extra_item or _EMPTY in items:

@@ -86,9 +86,9 @@ _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
 BRAKING_SHARE = 0.7  # A vehicle plans to brake with 70 % of the acceleration limit, and keeps the rest in reserve.
 _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
-# Motion within these limits counts as steady, and steps of 0.12 s suffice. In such a step, a constant jerk of 4 m/s³
-# changes the position by jerk · 0.12³ / 6, which is 1.2 mm. Motion near the ground is not steady, so that short steps
-# determine the time and speed of a touchdown.
+# Motion within these limits counts as steady, so steps of 0.12 s are exact enough: a jerk of 4 m/s³ changes the
+# position by only 4 · 0.12³ / 6 m, which is 1.2 mm. Motion near the ground does not count as steady, because the time
+# and speed of a touchdown need short steps.
 _STEADY_JERK_M_S3 = 4.0
 _STEADY_LEAN_RATE_RAD_S = 0.6
 _STEADY_ABOVE_GROUND_S = 0.3
@@ -183,7 +183,7 @@ class Motion:
         """Vertical speed at the last touchdown."""
         self._gust_north = self._gust_east = 0.0
         self._jerk_m_s3 = math.inf
-        # The target velocity or target acceleration (north, east, down).
+        # The target velocity (north, east, down), or the target acceleration if `_target_is_acceleration` is True.
         self._target = (0.0, 0.0, 0.0)
         self._target_is_acceleration = False
         # The target roll and pitch, which replace the horizontal components of `_target`; None without such a target.

@@ -107,7 +107,7 @@ class ArduPilotParameterServer(ParameterServer):
             names = self._parameters.names
             name = names[index] if 0 <= index < len(names) else ""
         if name in self._parameters:
-            self.send(name, index & 0xFFFF, channel)  # The index -1 of a read by name becomes 65535.
+            self.send(name, index & 0xFFFF, channel)  # In a read by name, the index is -1, which becomes 65535.
         elif self.errors:
             self.send_error(sender_of(request), name, index, MavParamError.DOES_NOT_EXIST, channel)
 
@@ -124,7 +124,8 @@ class ArduPilotParameterServer(ParameterServer):
         else:
             value = self.clamped(name, request.param_value)
             self._parameters[name] = rounded(value, self._parameters.type(name))
-            # The released firmware also confirms the value on the sender's port, before the broadcast.
+            # With `errors`, the released firmware is simulated, which also confirms the value on the sender's port,
+            # before the broadcast.
             if self.errors:
                 self.send(name, UNKNOWN_INDEX, channel)
             self._vehicle.call_later(0.0, lambda: self.send(name, UNKNOWN_INDEX, None))
@@ -143,7 +144,7 @@ def rounded(value: float, type_: int) -> float:
 
 
 _SECOND_ECHO_S = 0.02
-# PX4's PARAM_ERROR does not use its index field; PX4 was observed to send this value.
+# PX4 does not set the index field of PARAM_ERROR. The field was observed to contain this value.
 _UNUSED_INDEX = 24400
 
 
@@ -191,7 +192,7 @@ class Px4ParameterServer(ParameterServer):
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
         name, parameters = request.param_id, self._parameters
-        if name == HASH_NAME:  # The client knows the parameters already, so the running list is not needed.
+        if name == HASH_NAME:  # By this request, the client stops the running list, because it knows the parameters.
             self.stop_list(channel)
         code = self._error_for(name, request.param_type)
         if code is not None:

@@ -79,7 +79,7 @@ class SimParameters:
     def __getitem__(self, name: str) -> float:
         try:
             return self._rows[name].value  # type: ignore[union-attr]
-        except AttributeError:  # The row is still a line of text, which `row` parses.
+        except AttributeError:  # The row is a line of text that `row` has not parsed yet.
             return self.row(name).value
 
     def get(self, name: str, default: float) -> float:
@@ -90,7 +90,7 @@ class SimParameters:
         row = self.row(name)
         row.value = stored(value, row.type)
         if name in self._switches.values():
-            self._names = None  # The switch may have shown or hidden parameters, so the list is made again.
+            self._names = None  # `names` is made again, because the switch may show or hide parameters.
 
     def change(self, values: Mapping[str, float]) -> None:
         """Set several parameters.
@@ -247,7 +247,7 @@ class _Reader(FileHandle):
         if self._with_defaults > 1 or max(self._start, self._count) >= 0xFFFF:
             raise FileFault(EINVAL)
         self._block = block or 0  # The block size; 0 means that the first read determines the size.
-        # PX4, which is recognised by its fixed block size, keeps a value and its default in one block.
+        # Only PX4 has a fixed block size. PX4 does not divide a value and its default between two blocks.
         self._whole_defaults = block is not None
         self._content: bytes | None = None
 
@@ -305,7 +305,7 @@ class _Writer(UploadedFile):
             raise FileFault(EINVAL) from None
 
     def _read_rows(self, content: bytes, count: int) -> None:
-        # An entry omits the beginning of its name that is equal to that of the previous name.
+        # An entry omits the beginning of its name that the previous name has, too, so `read_entry` needs that name.
         position, previous_name = HEADER.size, b""
         for _ in range(count):
             entry = read_entry(content, position, previous_name) if position < len(content) else None

@@ -17,14 +17,14 @@ from aerokit.sim.channel import Channel, SharedMessageReader, datagrams
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
 from aerokit.transport import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 
-# Minimum delay of a timer in loop time, so that with many vehicles, or faster than real time, one callback runs several
-# ticks.
+# Minimum delay of a timer in loop time with many vehicles, or if the simulation is faster than real time. One callback
+# then runs several ticks.
 _MIN_WAIT_S = 0.001
 _BATCH_THRESHOLD = 10
-# With more than `_BATCH_THRESHOLD` vehicles, the output of this many simulated seconds is sent together.
+# With more than `_BATCH_THRESHOLD` vehicles, the output of `_BATCH_INTERVAL_S` simulated seconds is sent together.
 _BATCH_INTERVAL_S = TICK_S
-# After the loop was blocked, the server catches up this many simulated seconds and skips the rest. In real time, it
-# catches up everything.
+# After the event loop was blocked, a simulation that does not run in real time executes at most this many of the missed
+# simulated seconds, and skips the others. In real time, it executes all of them.
 _MAX_CATCH_UP_S = 0.5
 
 
@@ -70,7 +70,7 @@ class SimulatorServer:
         runs_several_ticks = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD  # in one callback
         self._min_wait_s = _MIN_WAIT_S if runs_several_ticks else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None
-        # Ends the event source, which replaces the timers on a `VirtualClockLoop`.
+        # Function that ends the event source. On a `VirtualClockLoop`, the event source replaces the timers.
         self._end_source: Callable[[], None] | None = None
         self._started_at = 0.0
         self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)
@@ -177,7 +177,7 @@ class SimulatorServer:
         for link in self._links:
             link.close()
         owner = self._owner
-        # The task may have ended, because a fixture can enter the block in one task and leave it in another.
+        # A fixture can enter the `async with` block in one task and leave it in another, so the owner may be done.
         if owner is not None and not owner.done() and owner is not asyncio.current_task():
             self._cancels_owner = owner.cancel()
 
@@ -212,7 +212,7 @@ class SimulatorServer:
             self.on_datagram(now, data, False)
         try:
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
-                # This vehicle may be ahead of `now`, because a timer fired early or another vehicle advanced it.
+                # The vehicle may be ahead of `now`: a timer fired early, or another vehicle advanced this vehicle.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
             port.reader.forget()  # All vehicles have used the decoded messages.
@@ -253,7 +253,7 @@ class SimulatorServer:
             return
         due_at = self._next_loop_time() if self._timer is None else self._timer_at
         skipped_s = self._loop.time() - due_at - _MAX_CATCH_UP_S / self._speedup
-        if skipped_s > 0:  # A later start of the simulation makes its present time earlier.
+        if skipped_s > 0:  # `now` counts from `_started_at`, so a later start skips time.
             self._started_at += skipped_s
             self._timer_at += skipped_s
 

@@ -142,7 +142,8 @@ class SimulatedVehicle:
         messages = channel.messages(data, now, peer)
         if not messages:
             return
-        # A message may end a steady flight, so a long tick must end before the message, and a short tick must follow.
+        # In steady flight, the running tick may be long. Finish the tick before the messages change the targets, and
+        # let the next tick be short.
         self._tick_until(now)
         for message in messages:
             if sender_of(message) != (self.system_id, self.component_id):

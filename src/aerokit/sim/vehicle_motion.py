@@ -75,7 +75,7 @@ class FixedWing(Motion):
         speed = max(self._speed, self.wing_limits.airspeed_min_m_s)
         wind_north, wind_east = self._air_movement()
         crosswind = -wind_north * math.sin(course) + wind_east * math.cos(course)
-        # The argument of asin is limited, because the crosswind may be faster than the plane.
+        # The crosswind may be faster than the plane, but the argument of asin must not exceed 1.
         wind_correction = math.asin(max(-0.9, min(0.9, crosswind / speed)))
         heading = course - wind_correction
         heading_rate = turn_rate + _TURN_GAIN_PER_S * wrap_pi(heading - self.yaw)
@@ -92,8 +92,8 @@ class FixedWing(Motion):
         radius, turn_sign = max(1.0, abs(radius)), math.copysign(1.0, radius)
         distance = math.hypot(north - self.north, east - self.east)
         course_to_centre = math.atan2(east - self.east, north - self.north)
-        # Far away, the plane flies straight to the centre. On the circle, it flies along the tangent. In between, the
-        # course is a mixture of both.
+        # Far away, the course points to the centre. On the circle, the course is the tangent. In between, the course
+        # changes gradually from the direction of the centre to the tangent.
         share_to_centre = max(-1.0, min(1.0, (distance - radius) / radius))
         course = course_to_centre - turn_sign * (math.pi / 2) * (1.0 - share_to_centre)
         is_near_circle = distance < 1.5 * radius
@@ -265,7 +265,7 @@ class GroundMotion(Motion):
             speed = min(speed, approach_speed(distance, 1.0, self.wheels.acceleration_m_s2))
         course = math.atan2(offset_east, offset_north)
         if backwards:
-            self.head(-speed, course + math.pi)  # The nose points away from the point.
+            self.head(-speed, course + math.pi)  # The nose points away from the target.
             return
         if abs(wrap_pi(course - self.yaw)) > _SLOW_TURN_ERROR_RAD:  # Drive slowly until the rover has turned.
             speed = min(speed, _SLOW_M_S)

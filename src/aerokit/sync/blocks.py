@@ -171,7 +171,8 @@ class IteratorTwin(TwinOf[IteratorT], Generic[IteratorT, ItemT]):
     def __next__(self) -> ItemT:
         items = self.aio
 
-        # The coroutine returns an empty tuple at the end, because a coroutine cannot raise StopAsyncIteration.
+        # At the end of the iteration, the coroutine returns an empty tuple, because a coroutine cannot raise
+        # StopAsyncIteration.
         async def read() -> tuple[ItemT, ...]:
             try:
                 return (await items.__anext__(),)
@@ -196,7 +197,7 @@ class SubscriptionTwin(IteratorTwin["Subscription[T]", T], Generic[T]):
         return self
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
-        with contextlib.suppress(ConnectionClosed):  # With the connection, the subscription is closed already.
+        with contextlib.suppress(ConnectionClosed):  # A closed connection has closed the subscription, too.
             self._loop.call(self.aio.close)
 
 
@@ -293,7 +294,7 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
         """
         discoveries = self.aio.vehicles()
         try:
-            while True:  # The loop ends by an exception, when the connection ends.
+            while True:  # The end of the connection raises an exception, which ends this loop.
                 yield self._loop.run(discoveries.__anext__)
         finally:
             with contextlib.suppress(ConnectionClosed):
@@ -360,7 +361,8 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         is_hold_pending = self.aio.is_hold_pending
         self.close()
-        # The asynchronous context would warn about an exception, but `close` does not pass it on, so it is done here.
+        # `close` does not pass the exception to the asynchronous context, so the warning of that context is logged
+        # here.
         if exc is not None and not is_hold_pending:
             warn_if_left_flying(self.aio)
 

@@ -75,7 +75,8 @@ class FleetTwin(OpenedTwin["AsyncFleet"]):
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         without_hold = [vehicle for vehicle in self.aio.vehicles.values() if not vehicle.is_hold_pending]
         self.close()
-        # The asynchronous context would warn about an exception, but `close` does not pass it on, so it is done here.
+        # `close` does not pass the exception to the asynchronous context, so the warning of that context is logged
+        # here.
         if exc is not None:
             for vehicle in without_hold:
                 warn_if_left_flying(vehicle)

@@ -202,8 +202,8 @@ class Page:
             return
         imports = (imports_of(module) for module in modules)
         origin = next((imported[name] for imported in imports if name in imported), (modules[0], name))
-        # Several modules may export a name. It is always imported from the first of them. The name in its module is
-        # empty for a module that is imported itself.
+        # If several modules export a name, it is always imported from the module that was found first. `origin[1]` is
+        # empty if the name is that of a module, which is imported itself.
         origin = self._import_sources.setdefault(origin[1] or name, origin)
         if at_run_time:
             self.at_run_time.add(origin)
@@ -302,7 +302,7 @@ def generate(name: str = "twins") -> str:
     functions = [_opener(page, path) for path in FUNCTIONS[name]]
     function_names = [path.rpartition(".")[2] for path in FUNCTIONS[name]]
     exports = sorted([*(twin.name for twin in twins), *function_names])
-    # `_class` and `_opener` have added the imports of the code. These are the imports that every file needs.
+    # `_class` and `_opener` have added the imports that their code needs. The following imports are needed in any case.
     page.at_run_time |= {(f"aerokit.sync.{BASE_MODULES.get(twin.base, 'blocks')}", twin.base) for twin in twins}
     page.at_run_time |= {OPENERS[name], ("aerokit._internal.arguments", "checked")}
     page.for_types |= {
@@ -376,8 +376,8 @@ def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
 def _from_lines(module: str, names: set[tuple[str, str]], indent: str) -> str:
     imported = sorted((name for name_module, name in names if name_module == module and name), key=_by_kind)
     plain_names = [name for name in imported if " as " not in name]
-    # Maps the first name of an import statement, by which statements are sorted, to the statement. As in ruff's format,
-    # each name with "as" has its own statement.
+    # Statements are sorted by their first imported name, which is the key in `statements`. As in ruff's format, each
+    # name with "as" has its own statement.
     statements = {name: f"{indent}from {module} import {name}\n" for name in imported if name not in plain_names}
     if plain_names:
         statement = f"{indent}from {module} import {', '.join(plain_names)}\n"

@@ -48,8 +48,8 @@ class LoopThread:
         """Monitor of the program's calls, which show that the program does not hang."""
         self._calls = _Calls()
         started: ThreadFuture[asyncio.AbstractEventLoop] = ThreadFuture()
-        # The thread starts with an empty context, because the caller's context may name another async library, which
-        # sniffio would then report.
+        # The caller's context may name another async library, which sniffio would then report in the thread. The thread
+        # therefore starts with an empty context.
         self._thread = threading.Thread(
             target=contextvars.Context().run,
             args=(_run, self._calls, started),
@@ -67,7 +67,8 @@ class LoopThread:
             atexit.register(self._calls.finish, self._thread)
         except (OSError, RuntimeError) as error:
             self._abort()
-            # Ctrl-C during Thread.start() becomes a RuntimeError, because it waits with a Condition; see ThreadFuture.
+            # Ctrl-C during Thread.start() becomes a RuntimeError, because start() waits with a Condition (see
+            # ThreadFuture).
             if isinstance(error.__context__, KeyboardInterrupt):
                 raise error.__context__ from None
             raise _not_started(error) from error
@@ -112,7 +113,7 @@ class LoopThread:
         except BaseException as error:
             is_shielded = interrupt_timeout_s is None
             if is_shielded and isinstance(error, KeyboardInterrupt):
-                # Clean-up must run even if Ctrl-C came before the call was started. Starting it twice has no effect.
+                # Clean-up must run even if Ctrl-C came before the call was started. A second start has no effect.
                 call = call or _Call(functools.partial(function, *args, **kwargs))
                 with contextlib.suppress(AerokitError):
                     self._start(call)
@@ -331,7 +332,7 @@ class _Calls:
         call.has_started = True
         task = asyncio.get_running_loop().create_task(call.run())
         self._tasks[task] = call
-        # The callback finishes a call whose task was cancelled before its first step. Other calls finish by themselves.
+        # The callback finishes a call whose task was cancelled before its first step. `run` finishes all other calls.
         task.add_done_callback(lambda task: self._tasks.pop(task).finish())
 
     def end_soon(self, function: Callable[[], object] | None = None) -> None:

@@ -47,7 +47,7 @@ class ThreadFuture(Generic[T]):
     def wait(self, timeout: float) -> bool:
         """Wait at most ``timeout`` seconds and return True if done."""
         if not self.is_done and self._gate.acquire(timeout=timeout):
-            self._gate.release()  # Another thread may wait, too.
+            self._gate.release()  # Let the next waiting thread continue.
         return self.is_done
 
     def result(self) -> T:

@@ -45,7 +45,7 @@ import anyio
 
 T = TypeVar("T")
 
-# The selector is polled once in this many steps. A step is an iteration of the loop or the run of an event source.
+# The selector is polled at least once in this many steps: iterations of the loop or runs of an event source.
 _POLL_EVERY = 64
 # With more timers than this, cancelled timers are discarded if they are more than half of the timers.
 _MANY_TIMERS = 100
@@ -73,8 +73,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         selector: selectors.BaseSelector = self._selector  # type: ignore[attr-defined]
         self._registered: Mapping[Any, Any] = selector.get_map()
         self._own_registered_count = len(self._registered)  # The loop itself has registered its self-pipe.
-        # asyncio waits for `when - now`. Because of rounding, the clock may then be slightly before `when`. With this
-        # resolution, the timer is due nevertheless.
+        # After a wait of `when - now`, rounding may leave the clock slightly before `when`. asyncio runs timers that
+        # are due within this resolution.
         self._clock_resolution = 1e-9
 
     def time(self) -> float:
@@ -107,7 +107,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             super()._run_once()  # type: ignore[misc]
             return
         if not ready:
-            # The event sources have run, but no callback is ready. The next iteration polls or runs them again.
+            # No callback is ready although the event sources have run. If a poll is due or there is no timer to jump
+            # to, the next iteration polls or runs the event sources again.
             if self._iterations >= _POLL_EVERY or self._next_timer() == math.inf:
                 return
             self._now = max(self._now, self._next_timer())
@@ -149,7 +150,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
                 due = next_due()
                 if due < earliest_due:
                     earliest_due, earliest = due, handle
-            # The iteration that runs a timer also runs the event sources of the same instant.
+            # If a timer is due earlier or at the same instant, stop here: the iteration that runs the timer also runs
+            # the event sources of its instant.
             if earliest_due + self._clock_resolution >= self._next_timer():
                 break
             self._now = max(self._now, earliest_due)

@@ -109,8 +109,8 @@ class FaultyPath:
         return arrivals
 
     def _carry_frame(self, frame: bytes, now: float) -> list[tuple[float, bytes]]:
-        # Five random numbers are drawn for every frame, even for a lost one. A change of one share therefore does not
-        # change which frames the other faults hit.
+        # Draw five random numbers for every frame, even for a lost frame. A change of one share then does not change
+        # which frames the other faults affect.
         model, chance = self.model, self._chance
         is_lost, is_duplicated = chance() < model.loss, chance() < model.duplication
         is_reordered, is_corrupted = chance() < model.reordering, chance() < model.corruption
@@ -172,7 +172,7 @@ def split_frames(data: bytes) -> Sequence[bytes]:
     begin, size = 0, len(data)
     while begin < size:
         end_of_frame = _end_of_frame(data, begin)
-        # Bytes that begin no frame, and an incomplete frame, extend to the end of the data.
+        # If no complete frame begins here, the piece extends to the end of the data.
         end = size if end_of_frame is None else min(end_of_frame, size)
         pieces.append(data[begin:end])
         begin = end

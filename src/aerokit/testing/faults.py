@@ -25,7 +25,7 @@ class FaultInjector:
     reboot of the vehicle. Raises InvalidArgument for a time or share out of range.
     """
 
-    # The slots make it an AttributeError to set an attribute of `Faults` on this object by mistake.
+    # With these slots, setting an attribute of `Faults` on this object by mistake raises AttributeError.
     __slots__ = ("_schedule_with", "_vehicle")
 
     def __init__(self, vehicle: Any, schedule_with: ScheduleWith) -> None:

@@ -362,7 +362,7 @@ class _DeliveryQueue:
         self._waiting: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
         self._timer: asyncio.TimerHandle | None = None
-        # The time of `_timer`, which is kept because uvloop's TimerHandle.when() fails after this time.
+        # The due time of `_timer`. It is stored, because TimerHandle.when() of uvloop fails after this time.
         self._timer_at = 0.0
 
     def __bool__(self) -> bool:

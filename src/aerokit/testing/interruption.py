@@ -52,7 +52,7 @@ class Interruption:
         try:
             yield
         except Exception:
-            # A signal that arrives in context-manager code is ignored (`_on_signal`), so it is repeated.
+            # `_on_signal` ignores a signal that arrives in context-manager code, so the signal is sent again.
             while self._send_signal():
                 time.sleep(_RETRY_INTERVAL_S)
             raise

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from aerokit.testing.served import ServedFlight
 
 _MARKER, _PICTURES = "simulated", "--flight-pictures"
-# Name of an attribute of a test function that pytest-asyncio will run. Its value is a version of the test that opens
-# the flights.
+# Name of an attribute of a test function that pytest-asyncio will run. The value of the attribute is a version of the
+# test that opens the flights.
 _OPENING_TEST = "_aerokit_opening_test"
 # The plugin compares names instead of classes, because tests without flights must not import aerokit.
 _REPORTED_CLASSES = ("SimulatedFleet", "Flight", "ServedFlight")
@@ -202,7 +202,7 @@ def _runnable_function(item: pytest.Function) -> Callable[..., Any]:
     test: Callable[..., Any] = item.obj
     opening_test = getattr(test, _OPENING_TEST, None)
     if opening_test is not None:  # The test has the asyncio marker.
-        # pytest-asyncio replaces the `async def` by a plain function that runs it on its loop.
+        # If `test` is a plain function, it is the wrapper with which pytest-asyncio runs the test on its own loop.
         wrapped_by_pytest_asyncio = None if inspect.iscoroutinefunction(test) else test
         return _on_virtual_time(opening_test, try_first=wrapped_by_pytest_asyncio)
     if not fleets or not inspect.iscoroutinefunction(test):

@@ -87,7 +87,7 @@ class RecordedParameters(ParameterProtocolServer):
         if name not in self.names:
             self._refuse(request, -1, channel)
             return
-        # Without a successful write in the recording, the vehicle answers with the present value.
+        # If the recording has no successful write of the parameter, the vehicle keeps and answers the present value.
         if name in self._vehicle.recording.settable:
             self._written[name] = request.param_value
         self.send(name, self.names.index(name), None)
@@ -298,7 +298,8 @@ class RecordedVehicle(SimulatedVehicle):
         if answer is None:
             return MavResult.UNSUPPORTED
         for delay, ack in answer.acks:
-            # The recorded acknowledgement is addressed to the recorded client.
+            # The recorded acknowledgement is addressed to the recorded client. Address it to the sender of `command`
+            # instead.
             readdressed = m.CommandAck(ack.command, ack.result, ack.progress, ack.result_param2, *command.sender)
             self.call_later(delay, partial(self.send, readdressed, command.channel))
         return None  # The acknowledgements were recorded, so no further one is sent.
@@ -312,11 +313,11 @@ class RecordedVehicle(SimulatedVehicle):
         # A message request matches an answer for the same message, whose id is param 1.
         if not candidates and command.command in _MESSAGE_REQUESTS:
             candidates = [answer for answer in answers if answer.params[:1] == params[:1]]
-        elif not candidates:  # Any other command gets the answers to the command with other params.
+        elif not candidates:  # Use the answers to the same command with other params.
             candidates = answers
         if not candidates:
             return None
-        # Count per list of candidates, which its first answer identifies.
+        # Count the answers from each list of candidates. The first candidate identifies the list.
         list_id = id(candidates[0])
         count = self._answered_counts.get(list_id, 0)
         self._answered_counts[list_id] = count + 1

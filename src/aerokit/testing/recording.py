@@ -124,7 +124,7 @@ class RecordedFlight:
         if isinstance(message, _COMMANDS):
             is_repetition = isinstance(message, m.CommandLong) and message.confirmation > 0
             answers = self.answers.setdefault(message.command, [])
-            if not answers or not is_repetition:  # The acknowledgement of a repetition belongs to the first request.
+            if not answers or not is_repetition:  # A repetition has no answer of its own.
                 params = (message.param1, message.param2, message.param3, message.param4)
                 answers.append(RecordedAnswer(params, now))
         elif isinstance(message, m.ParamSet):
@@ -176,7 +176,7 @@ class RecordedFlight:
             self._add_plan(item.mission_type, items, now)
 
     def _read_mission_ack(self, ack: m.MissionAck, now: float) -> None:
-        # The acknowledgement ends an upload, if there is one, otherwise a deletion.
+        # If an upload is in progress, the acknowledgement ends the upload, and otherwise a deletion.
         if ack.mission_type in self._uploads:
             items = self._uploads.pop(ack.mission_type)
             self.uploads.setdefault(ack.mission_type, []).append(ack.type)

@@ -28,8 +28,7 @@ _BAR_WIDTH = 30
 _CANCEL_TIMEOUT_S = 20.0
 
 _GROUND = "    ~~~~~~~~~~~~~~~~~~~~~~~~~~~~"
-# The pictures show a vehicle from its right side, with its nose to the right. In the poses with a side down, they show
-# it from behind.
+# Poses whose pictures show the vehicle from behind. The other pictures show its right side, with the nose to the right.
 _FROM_BEHIND = (CalibrationPose.LEFT, CalibrationPose.RIGHT)
 PICTURES: dict[CalibrationPose, str] = {
     CalibrationPose.LEVEL: r"""

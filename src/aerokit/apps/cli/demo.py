@@ -160,7 +160,8 @@ class _SquareFlight(SupervisedFlight):
         self._print("at altitude; flying the square")
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # The modes for hold and land are this program's, too, unless another party has changed the mode.
+        # After another party has changed the mode, that party may also have commanded a hold or a landing, so these
+        # modes no longer show that this program has control.
         return ("take_off", "setpoint") if self._was_overruled else ("take_off", "setpoint", "hold", "land")
 
     async def _after_failure(self, error: Exception) -> int:

@@ -124,8 +124,8 @@ class LinkExamination:
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._own_ids = (connection.source_system, connection.source_component)
-        # The keys are system and component ids. If they have several vehicle types or autopilots, several senders use
-        # the same ids.
+        # The keys are pairs of system and component id. Several `_types_and_autopilots` of a pair show that several
+        # senders use the same ids.
         self._versions: dict[tuple[int, int], set[int]] = {}
         self._signed: Counter[tuple[int, int]] = Counter()
         self._frames: Counter[tuple[int, int]] = Counter()

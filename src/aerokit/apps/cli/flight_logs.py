@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from aerokit.logs.report import Report
 
-# Maps suffixes to the noun for `Conversion.written`; others are rows. An .mcap has more messages than the log has
-# entries, because each changed state is a message, too.
+# Maps suffixes of written files to the noun for the number `Conversion.written`. For other suffixes, the noun is "row".
+# An .mcap has more messages than the log has entries, because it also has a message for each changed state.
 _WRITTEN_NOUNS = {".mcap": "message", ".gpx": "point", ".kml": "point"}
 _REQUIRED_MODULES = {".mcap": "mcap", ".parquet": "pyarrow", ".gpx": "gpxpy", ".kml": "simplekml"}
 
@@ -109,7 +109,7 @@ async def _report(options: argparse.Namespace) -> int:
 
     target = options.output or options.log.with_suffix(".html")
     for log in logs:
-        check_log_name(log)  # before the target, whose default is derived from the name of the log
+        check_log_name(log)  # before the target is checked, because its default is derived from this name
     check_not_existing(target, options)
     with progress_bar(options.log.name, "B") as on_progress:
         report = write_report(

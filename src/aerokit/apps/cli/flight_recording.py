@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from aerokit.apps.cli.terminal import InterruptStack
     from aerokit.vehicle.vehicle import Vehicle
 
-# After this time, the flight begins without the remaining parameters. Over a slow radio, all may take longer.
+# Over a slow radio, reading all parameters may take longer. The flight then begins without the remaining parameters.
 _PARAMETERS_TIMEOUT_S = 10.0
 MAX_SILENCE_S = 10.0
 """A recording ends after this many seconds without a heartbeat, because no more data is expected."""

@@ -183,7 +183,7 @@ class PlanFlight(SupervisedFlight):
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
         # Modes for landing and returning are not included, because a failsafe may have set them. The mode for holding
-        # is included only before the start, because a cancelled start of the mission ends in it.
+        # is included only before the start, because a cancelled start of the mission ends in this mode.
         return ("mission",) if self._has_started else ("mission", "hold")
 
 
@@ -283,7 +283,8 @@ async def _connect_and_fly(
             flights.append(PlanFlight(vehicle, plan, report, interrupts, options))
             try:
                 code = await flights[-1].fly()
-                # A simulated vehicle is not followed: if its mission ended in the air, no pilot would land it.
+                # The recording of a real vehicle continues until the end of the flight. If a simulated mission ended in
+                # the air, no pilot would land the vehicle, and the recording would not end.
                 is_followed = code == DONE and not options.sim
                 if is_followed and options.record is not None and flights[-1].armed_by_us:
                     await record_to_end(vehicle, interrupts, report.print_line, report.speedup)

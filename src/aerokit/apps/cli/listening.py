@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 # If more events wait because the terminal prints slowly, the oldest are dropped and counted.
 _MAX_WAITING_EVENTS = 1000
 _SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "INFO", "DEBUG")
-# The countdown ends after this time; the command continues to wait without it.
+# The countdown ends after this time. The command then continues to wait without a countdown.
 _COUNTDOWN_S = 30.0
 EXIT_TIMEOUT_S = 3.0
 """Seconds after a signal at which the process is ended by force, in case Textual does not exit."""
@@ -116,7 +116,7 @@ def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], 
         message = STANDARD.get(message_id)
         messages[str(message_id) if message is None else message.NAME] += count
     systems = sorted({system_id for system_id, _ in counts})
-    # Without a frame no file was created, and a file with this name is an earlier recording.
+    # If no frame was received, no file was created. A file with this name then is an earlier recording.
     size = os.path.getsize(options.file) if counts else 0
     record = {
         "file": options.file,

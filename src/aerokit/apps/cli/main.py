@@ -182,8 +182,8 @@ class Parser(argparse.ArgumentParser):
         return namespace, unknown
 
     def _check_option_names(self, args: Sequence[str]) -> None:
-        # Unknown options are reported first, because argparse takes the value after an unknown option for a positional
-        # argument. For --connect, misplaced_address() reports the right command line.
+        # Report unknown options before argparse does, because argparse would take the value after an unknown option for
+        # a positional argument. --connect is skipped, because misplaced_address() reports the right command line.
         options = list(args[: args.index("--")] if "--" in args else args)
         names = [option.partition("=")[0] for option in options if option.startswith("--")]
         for name in names:
@@ -197,7 +197,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and the message, and exit with code 2."""
-        # argparse's message about an unknown choice gets a suggestion.
+        # Add a suggestion to argparse's message about an unknown choice.
         match = re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message)
         if match is not None:
             choice, choices = match.groups()
@@ -259,7 +259,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with plain_warnings():
             code: int = asyncio.run(options.run(options))
     except BrokenPipeError:
-        # Otherwise the interpreter reports another BrokenPipeError when it flushes stdout at exit.
+        # At exit, the interpreter flushes stdout. With the old stdout, it would report another BrokenPipeError.
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         return FAILED
     except KeyboardInterrupt:

@@ -37,7 +37,7 @@ def misplaced_file(word: str) -> str | None:
     path = Path(word)
     suffix = path.suffix.lower()
     advice = _COMMANDS_BY_SUFFIX.get(suffix)
-    is_other_file = path.is_file() and suffix != ".tlog"  # a recording can be an address: it is replayed
+    is_other_file = path.is_file() and suffix != ".tlog"  # a recording (.tlog) is a valid address
     if advice is None and not is_other_file:
         return None
     text = f"{word!r} is a file; an address is expected, such as udpin:0.0.0.0:14550"

@@ -155,7 +155,7 @@ def _rewrite_for_commands(record: logging.LogRecord) -> bool:
 
 DONE, FAILED, WRONG_ARGUMENTS, NO_VEHICLE, TIMED_OUT, REFUSED, UNREADABLE, NOT_INSTALLED = range(8)
 INTERRUPTED = 130
-# Two names count as similar from this SequenceMatcher.ratio() on. Names of four letters may have one wrong letter.
+# Minimum SequenceMatcher.ratio() of similar names. It allows one wrong letter in a name of four letters.
 _MIN_SIMILARITY = 0.75
 
 _MEANINGS = {

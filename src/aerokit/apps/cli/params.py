@@ -175,7 +175,8 @@ async def _set(options: argparse.Namespace) -> int:
             check_allowed(metadata, dict(options.values))
         results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
         known = await _names_for_hints(vehicle, results.values())
-    if not options.force and (metadata is not None or options.json):  # without metadata, one line says it for all
+    # Without metadata, a single line below replaces the notes on the results.
+    if not options.force and (metadata is not None or options.json):
         results = {name: with_range_note(metadata, result, "--metadata FILE") for name, result in results.items()}
     code = _emit_results(options, results.values(), known, metadata)
     was_set = any(result.error is None and result.outcome != "unchanged" for result in results.values())
@@ -273,7 +274,7 @@ def _with_hint(name: str, error: Exception, known: Collection[str]) -> str:
     The hint is similar names or, if there are none, the command that lists the names.
     """
     text = str(error)
-    # The texts with "replaced by" and "its name on" already contain the right name.
+    # A text with "replaced by" or "its name on" already contains the right name.
     if not _is_unknown_name(error) or "replaced by" in text or "its name on" in text:
         return text
     bare = text.partition(" (did you mean")[0]  # the error suggests only parameters that were already read

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # Parameters with the system id. ArduPilot uses a new id at once (GCS_Common.cpp, update_send); PX4 and old versions of
 # ArduPilot use it after a reboot.
 _SYSTEM_ID_NAMES = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
-# How long to read the metadata from the vehicle. Over a slow radio reading may take longer; it is then given up.
+# How long to read the metadata from the vehicle. Over a slow radio, the time may end before all is read.
 _READ_TIMEOUT_S = 10.0
 
 

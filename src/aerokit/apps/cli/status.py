@@ -38,7 +38,7 @@ _REQUESTED = (
     ("batteries", BatteryStatus),
     ("position", GlobalPositionInt),
 )
-# How long to wait before the connection is closed, until the rates of changed streams are restored.
+# How long to wait for the restoration of changed stream rates before the connection is closed.
 _RELEASE_TIME_S = 0.5
 # How long to wait for a requested message after the vehicle has accepted the request.
 _MESSAGE_TIMEOUT_S = 0.3

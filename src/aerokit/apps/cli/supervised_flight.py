@@ -63,7 +63,7 @@ class SupervisedFlight(ABC):
     Never commands a vehicle that was already armed before, or whose mode another party has changed.
     """
 
-    _prints_reasons = True  # False if the command prints the error, with its reasons, at its end
+    _prints_reasons = True  # False if the command prints the error with its reasons when it ends
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack, on_interrupt: str) -> None:
         self._vehicle, self._print, self._interrupts = vehicle, report.print_line, interrupts
@@ -80,7 +80,7 @@ class SupervisedFlight(ABC):
         try:
             code = await self._interrupts.run(self._fly)
         except Exception as error:
-            # After any error, if this program has armed the vehicle, it must not stay armed on the ground.
+            # All errors are caught, because a vehicle that this program has armed must not stay armed on the ground.
             text = plain_text(error)
             if not self._prints_reasons:
                 text = text.partition("\n")[0].removesuffix("; still missing:")
@@ -231,7 +231,7 @@ class FlightReport:
         # Seconds of this computer's clock, not of the vehicle's, which a simulation may speed up.
         self._armed_at: float | None = None
         self._armed_s = 0.0
-        self._impact_s: float | None = None  # armed until an impact on the ground
+        self._impact_s: float | None = None  # seconds from arming to an impact on the ground
         self._started_at = self._last_line_at = vehicle.connection.now()
         self._highest_m = self._fastest_m_s = self._flown_m = 0.0
         self._previous_position: Position | None = None
@@ -315,7 +315,8 @@ class FlightReport:
         ]
         frames = f"{received} frames received, {lost} lost"
         if recorded_in:
-            force = "--force " if Path(recorded_in).with_suffix(".html").exists() else ""  # of an earlier flight
+            # A report of an earlier flight is replaced only with --force.
+            force = "--force " if Path(recorded_in).with_suffix(".html").exists() else ""
             lines.append(f"{frames}; recorded in {recorded_in}")
             lines.append(f"next: aerokit report {force}{shlex.quote(recorded_in)}")
         else:

@@ -37,7 +37,7 @@ async def confirm(question: str) -> bool:
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
     try:
         answer = await _read_line()
-    except asyncio.CancelledError:  # by Ctrl-C; ends the line of the question
+    except asyncio.CancelledError:  # Ctrl-C was pressed: end the line of the question
         print(file=sys.stderr, flush=True)
         raise
     return answer.strip().lower() in ("y", "yes")

@@ -276,7 +276,7 @@ class Monitor(App[None]):
         except AerokitError as error:
             add_line(f"{command} failed: {error}", "bold red")
         else:
-            # A hold has ended when its mode is reported. PX4 then still moves.
+            # `hold` returns when the vehicle reports the mode. A vehicle with PX4 may then still be moving.
             done = f"in {vehicle.mode_name}, may still be stopping" if method == "hold" else "done"
             add_line(f"{command}: {done}", "bold green")
 

@@ -63,7 +63,7 @@ class VehicleText:
         if not cell.is_known:
             return Text(UNKNOWN, "dim")
         text = printable(show(cell.value))
-        # While the vehicle is silent, this is the age that the value had when the silence began.
+        # For a silent vehicle, `age_s` is the age that the value had when the silence began.
         age_s = cell.age - self._silent_s
         if age_s > MAX_AGE_S:
             return Text(f"{text} ({age(age_s)} old)", "dim italic")

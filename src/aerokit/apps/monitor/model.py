@@ -66,7 +66,7 @@ class MonitorModel:
         now = self.connection.now()
         if now - self._count_samples[-1][0] >= 1.0:
             self._count_samples.append((now, self._counts.copy()))
-            # The oldest sample stays until the next one is old enough to be the start of the window.
+            # Drop the oldest sample once the second oldest is at least as old as the window.
             while now - self._count_samples[1][0] >= RATE_WINDOW_S:
                 self._count_samples.popleft()
         for system_id, vehicle in self.vehicles.items():

@@ -110,7 +110,7 @@ class MqttLink(BaseLink):
         self._unsent: dict[str, bytes] = {}
         self._client: Any = None
         self._timer: asyncio.TimerHandle | None = None
-        self._connect_result: asyncio.Future[str] | None = None  # why connecting failed; an empty string: connected
+        self._connect_result: asyncio.Future[str] | None = None  # the reason of a failure; "" for success
         self._is_accepted = False  # True when the broker has accepted the connection
         self._alive_topic = broker.key_space.root + "/alive"
 
@@ -187,7 +187,7 @@ class MqttLink(BaseLink):
     def _read(self, client: Any, sock: Any) -> None:
         try:
             client.loop_read()
-            # TLS may have more decrypted data, for which the loop does not report the socket as readable.
+            # TLS may hold more decrypted data, which the loop does not report, because it has left the socket.
             while client.socket() is sock and isinstance(sock, ssl.SSLSocket) and sock.pending():
                 client.loop_read()
         except Exception as error:  # paho 2.1 raises arbitrary errors for malformed packets
@@ -226,7 +226,7 @@ class MqttLink(BaseLink):
         if self._timer is not None:
             self._timer.cancel()
         if client is not None and client.socket() is not None:
-            # Without a DISCONNECT, the broker itself publishes "offline" (will_set).
+            # If this condition is False, no DISCONNECT is sent, and the broker publishes "offline" itself (will_set).
             if client.is_connected() and not client.want_write():
                 client.publish(self._alive_topic, b"offline", retain=True)
                 client.disconnect()

@@ -101,7 +101,7 @@ class Publishing:
         }
         try:
             self._publisher.put(f"{system_id}/{name}", _JSON.encode(message).encode())
-        except Exception:  # it would end this background task and close the connection, perhaps during a flight
+        except Exception:  # an error would end this task and close the connection, perhaps during a flight
             if not self._has_logged_error:
                 self._has_logged_error = True
                 logger.exception("publisher %r raised an error; publishing continues", self._publisher)

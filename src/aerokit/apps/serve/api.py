@@ -131,7 +131,7 @@ _BITS = {
         "ESTIMATOR_STATUS": EstimatorStatusFlags,
     }.items()
 }
-# With wait=false, the answer waits this long, so that it contains the reason if the library refuses the order.
+# With wait=false, an order is answered after this time or, if the library refuses it sooner, with the reason.
 _REFUSAL_TIMEOUT_S = 0.2
 
 
@@ -464,7 +464,7 @@ class HttpApi:
         return is_refresh
 
     def _lock(self, vehicle: Vehicle) -> asyncio.Lock:
-        # Requests wait for a running transfer, and then share its result.
+        # With this lock, a request waits for a running transfer of the vehicle, and then uses its result.
         return self._locks.setdefault(vehicle, asyncio.Lock())
 
 

@@ -347,7 +347,7 @@ class OrderRunner:
         """Raise the error that applies if the order must not be sent now."""
         vehicle.connection.raise_if_ended()
         now = asyncio.get_running_loop().time()
-        # While the computer sleeps, the loop's clock stands still, and the page still shows the state from before.
+        # The clock of the loop stands still while the computer sleeps, so the sleep is added to the age of the state.
         slept_s = 0.0 if seen_at_s is None else vehicle.connection._slept_since(seen_at_s)
         if seen_at_s is not None and not 0 <= now - seen_at_s + slept_s <= STATE_MAX_AGE_S:
             raise HttpProblem(
@@ -363,7 +363,7 @@ class OrderRunner:
                 "disarm: force is allowed only after the server has seen the vehicle hit the ground and stay there;"
                 " nothing was sent",
             )
-        if order_type.is_safe:  # may be sent to a silent vehicle, and in any number
+        if order_type.is_safe:  # the following checks do not apply to safe orders
             return
         if vehicle.link_state.latest is not LinkState.CONNECTED:
             raise HeartbeatTimeout(

@@ -214,7 +214,8 @@ class ServedVehicles:
             **overview(vehicle),
             "missing_for_flight": missing,
             "not_armable": not_armable(vehicle, missing),
-            # A silent vehicle gets no orders, so the page may show its last known crash.
+            # `self.crash` is None for a silent vehicle, because orders must not rely on it. The page shows the last
+            # known crash.
             "crash": self.crash(vehicle) if is_connected else watch.crash,
             "disarming": watch.disarming,
             "unread": _unread(vehicle, watch.disarm_parameter),

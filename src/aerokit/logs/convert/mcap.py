@@ -71,7 +71,7 @@ class McapWriter:
             if state == "status_text":
                 fields = topics.log_entry(unix_s, system_id, value)
                 self._put_foxglove(unix_s, system_id, "log", fields, topics.LOG)
-        # The pose combines the position and the attitude, so a change of either makes a new pose.
+        # A pose has a position and an attitude, so a new pose is written if the record changes at least one of them.
         changed_pose_states = {state for state, _ in record.states} & _POSE_STATES
         position, attitude = latest.get("position"), latest.get("attitude")
         if not changed_pose_states or position is None:

@@ -53,8 +53,8 @@ FLIGHT = (
 """Columns of the flight table after the time and the system id. A row has the newest values at one position."""
 
 
-# Matches the places in a text where spreadsheets recognise a formula (owasp.org/www-community/attacks/CSV_Injection):
-# the beginning, also after white space, and the places after other locales' separators, also in quotes.
+# Matches the places where spreadsheets may recognise a formula (owasp.org/www-community/attacks/CSV_Injection): before
+# an operator at the beginning of a text or after a separator of another locale, and before a leading control character.
 _FORMULA = re.compile(r"(^|[;\t])(?=[\s\0]*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n\0])")
 
 
@@ -184,7 +184,7 @@ class MessageTablesWriter:
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
         self._path, self._log, self._kind = path, log, kind
         log.needs_states = False
-        # Maps record types to their table and the function that makes its rows.
+        # Maps each record type to its table and to the function that converts a record to a row.
         self._tables: dict[str, tuple[Table, Callable[[LogRecord], list[Any]]]] = {}
         self.written: int = 0
 
@@ -232,7 +232,7 @@ def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[L
         names = [column.field for column in columns]
         return lambda record: [_cell(record.fields.get(name)) for name in names]
     parts = [column.field.partition(".") for column in columns]
-    # With NAME there are at least two names, because attrgetter returns a tuple only for several names.
+    # NAME is a second name even if there is only one column. For a single name, attrgetter would not return a tuple.
     get_fields = attrgetter("NAME", *(name for name, _, _ in parts))
     array_elements = [(position, int(index)) for position, (_, _, index) in enumerate(parts) if index]
     texts = [position for position, column in enumerate(columns) if column.kind == "str"]

@@ -140,8 +140,8 @@ class KmlWriter(_TrackWriter):
         file = kml.Kml(name=self._log.path.name)
         for system_id, track in self._tracks.items():
             folder = file.newfolder(name=f"vehicle {system_id}")
-            # Altitudes above sea level are used if all are known. Otherwise altitudes above home are used as KML's
-            # "relativeToGround", which is the closest to them.
+            # If an altitude above sea level is unknown, altitudes above home are used. KML has no mode for them, but
+            # "relativeToGround" is similar.
             is_absolute = all(position.altitude_amsl_m is not None for _, position in track.points)
             mode = kml.AltitudeMode.absolute if is_absolute else kml.AltitudeMode.relativetoground
             line = folder.newgxtrack(name="track", altitudemode=mode)

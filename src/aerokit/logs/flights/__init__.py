@@ -52,9 +52,9 @@ LOG_READERS: dict[str, Callable[[FlightLog, int | None, Callable[[int], object]]
     ".ulg": read_ulog_flight,
 }
 """Maps the suffix of a log to the function that reads it."""
-# A vehicle below this height above home may be on the ground. Sinking more slowly than this is noise.
+# A vehicle less than `_FLYING_HEIGHT_M` above home may be on the ground. A sink rate below `_SINKING_M_S` is noise.
 _FLYING_HEIGHT_M, _SINKING_M_S = 1.0, 0.3
-_SAME_ALTITUDE_M = 5.0  # both logged altitudes count as the same value if they differ by less than this
+_SAME_ALTITUDE_M = 5.0  # maximum difference of two logged altitudes that are the same value
 
 
 def check_log_name(path: Path) -> None:
@@ -145,10 +145,11 @@ def _complete_altitudes(flight: FlightLog) -> None:
             amsl_m = amsl[row]
             if math.isnan(relative_m):
                 relative[row] = amsl_m - home_amsl_m
-            # If home is near sea level, both altitudes are nearly the same anyway.
+            # Home is not near sea level, so the altitudes above sea level and above home must differ. If they do not,
+            # the log has the same altitude in both columns.
             elif abs(home_amsl_m) > _SAME_ALTITUDE_M and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
-                # The value is the altitude above sea level if it is closer to that of home than to 0; otherwise it is
-                # the altitude above home.
+                # An altitude that is closer to home's altitude above sea level than to 0 is above sea level. Any other
+                # altitude is above home.
                 if abs(amsl_m - home_amsl_m) < abs(amsl_m):
                     relative[row] = amsl_m - home_amsl_m
                 else:

@@ -110,8 +110,8 @@ _ERROR_DETAILS: Mapping[tuple[int, int], str] = {
     (18, 2): "glitch",
 }
 
-# Subsystems with special error codes: the number of the refused mode, the number of the new estimator, and bits of
-# AC_FENCE_TYPE.
+# Subsystems with special error codes. In this order, the code is the number of the refused mode, the number of the new
+# estimator, and bits of AC_FENCE_TYPE.
 _MODE_CHANGE, _ESTIMATOR_SWITCH, _FENCE = 10, 24, 9
 # Bits of AC_FENCE_TYPE.
 _FENCE_TYPES = {

@@ -24,7 +24,7 @@ _GENERAL_GAP_S = 3.0
 # seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
 _DELAYED_REACTION_GAP_S = 10.0
 _REACTION_TIMEOUT_S = 12.0
-# Values measured at most this time before a failsafe are shown with it.
+# A failsafe is shown with values that were measured in this time before it.
 _BEFORE_S = 10.0
 # A mode change within this time after a failsafe is attributed to the autopilot, even if the log has no cause.
 _AUTOPILOT_REACTION_S = 3.0

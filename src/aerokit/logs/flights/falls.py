@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
     from aerokit.logs.flights.flight import FlightLog
 
-# Slower descents do not count, and a descent ends below _STOPPED_M_S. Autopilots land at 0.5 to 2 m/s, and descend at
-# 1.5 m/s by default (ArduPilot WP_SPD_DN, PX4 MPC_Z_VEL_MAX_DN).
+# Only descents faster than _MIN_SINK_M_S can be falls, because autopilots land at 0.5 to 2 m/s, and descend at 1.5 m/s
+# by default (ArduPilot WP_SPD_DN, PX4 MPC_Z_VEL_MAX_DN). A descent ends when the sink rate is below _STOPPED_M_S.
 _MIN_SINK_M_S, _STOPPED_M_S = 3.0, 1.0
 _MIN_HEIGHT_M = 2.0
 # With a higher sink rate, an impact is a fall, not a hard landing. Free fall reaches this speed after two metres.
@@ -94,7 +94,8 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
     if not lost_height_m >= _MIN_HEIGHT_M:  # `not >=` is also true if a height is NaN
         return None
     reasons = _reasons(flight, begin_s, end_s)
-    # If the log ends during the descent, the vehicle must be so low that it would hit the ground within two seconds.
+    # Without an impact, the log ends during the descent. If the vehicle would have hit the ground within two seconds,
+    # the descent is treated as a fall.
     is_on_ground = _stays_at_height(flight, end_s, end_height_m) if has_impact else end_height_m < 2 * sink_m_s
     if not (is_on_ground or reasons):
         return None
@@ -115,7 +116,8 @@ def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
 
 def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
     """Return the log's evidence of a fall: disarming in the air, and texts."""
-    # Disarming counts only if it may have caused the descent. At the end of the descent, the impact disarms.
+    # Disarming is a reason only if it may have caused the descent. Just before the end of the descent or later, the
+    # impact may have caused the disarming.
     reasons = [
         "disarmed in the air"
         for armed_s, disarmed_s in flight.armed

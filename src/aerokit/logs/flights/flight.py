@@ -98,7 +98,7 @@ class TangentPlane:
         latitude = max(-89.9, min(89.9, latitude_deg))  # so that the points 0.005° north and south are valid
         north_m = geo.distance_m(latitude - 0.005, longitude_deg, latitude + 0.005, longitude_deg)
         east_m = geo.distance_m(latitude, longitude_deg - 0.005, latitude, longitude_deg + 0.005)
-        self.north_m_per_deg: float = north_m * 100  # the distances above are those of 0.01 degrees
+        self.north_m_per_deg: float = north_m * 100  # `north_m` and `east_m` are the lengths of 0.01 degrees
         self.east_m_per_deg: float = east_m * 100
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:

@@ -63,7 +63,7 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
 def close_bin(reader: Any) -> None:
     """Close the files of a ``DFReader_binary``, even if its constructor has failed."""
     for name in ("data_map", "filehandle"):
-        with suppress(AttributeError, BufferError):  # it was never opened, or a traceback still refers to it
+        with suppress(AttributeError, BufferError):  # the file was never opened, or a traceback still uses it
             getattr(reader, name).close()
 
 

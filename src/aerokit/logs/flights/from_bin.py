@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 NAN = math.nan
 _CHUNK_ROWS = 1 << 9  # rows that are unpacked at once; with more rows, garbage collection would take longer
 _HEADER_SIZE = 3  # bytes before the fields of a row: A3 95 and the number of the table
-# An unknown charge, because AP_BattMonitor_Logging.cpp writes -1 as a byte.
+# The percentage of an unknown charge: AP_BattMonitor_Logging.cpp writes -1 as an unsigned byte.
 _NO_PERCENT = 255
 _FIRMWARES = {
     "ArduCopter": MavType.QUADROTOR,
@@ -99,7 +99,7 @@ class _Tables:
         row_format = reader.formats[reader.name_to_id[table]]
         indices = [row_format.columns.index(name) for name in ("TimeUS", *columns)]
         unpack = struct.Struct(_struct_pattern(row_format, indices)).unpack_from
-        # Rows are unpacked in the order of the file. `positions` are the places of the requested columns in this order.
+        # Unpacked rows have the order of the file. `positions` are the places of TimeUS and of `columns` in such a row.
         positions = [sorted(indices).index(index) for index in indices]
         scales = [row_format.msg_mults[index] for index in indices]
         data, offsets = reader.data_map, reader.offsets[row_format.type]
@@ -159,7 +159,7 @@ def _scaled(values: Sequence[Any], scale: float | None) -> list[Any]:
         return [value.split(b"\0", 1)[0].decode("utf-8", "replace") for value in values]
     if scale is None:
         return list(values)
-    if 0 < scale < 1:  # divides, because 100 is an exact binary number, but 0.01 is not
+    if 0 < scale < 1:  # division is more exact: 100 is a binary number, 0.01 is not
         divisor = round(1 / scale)
         return [value / divisor for value in values]
     return [value * scale for value in values]
@@ -330,7 +330,8 @@ class _Reader:
         table = "XKF4" if self._tables.has("XKF4", "SV") else "NKF4"
         for time_s, *values in self._tables.rows(table, *columns, *(("C", "PI") if has_cores else ())):
             ratios, core_and_primary = values[:5], values[5:]
-            # With several estimators (cores), only the row of the primary one (PI) counts. A negative PI counts as 0.
+            # With several estimators, each row belongs to one of them (C), and PI is the number of the primary
+            # estimator. Only rows of the primary estimator are used. A negative PI stands for 0.
             if not has_cores or core_and_primary[0] == max(core_and_primary[1], 0):
                 self._flight.estimator.add(time_s, *ratios)
 

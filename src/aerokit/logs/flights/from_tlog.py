@@ -99,7 +99,8 @@ class _Reader:
         self._destinations = TimeSeries(*flight.position_target.names)
         self._link = LinkCounter(flight)
         self._mission = RecordedMission(flight)
-        # The vehicle's own commands are for its components: PX4 informs them about a return that it has decided itself.
+        # `commands` are not handled if the vehicle has sent them, because it sends them to its components. For example,
+        # PX4 informs its components when it has itself decided to return.
         commands: dict[type[Message], Callable[[float, Any], None]] = {
             m.CommandLong: self._mode_commands.on_command,
             m.CommandInt: self._mode_commands.on_command,

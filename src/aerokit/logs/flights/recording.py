@@ -16,8 +16,8 @@ _MAX_SEQUENCE_GAP = 200
 MIN_SILENCE_S = 3.0
 """Minimum seconds without a message that count as a silence. Autopilots send HEARTBEAT once a second."""
 
-# Real clocks differ by less than _MAX_CLOCK_DRIFT (0.2 is 20 %). If they differ by more, the vehicle is a simulation
-# that did not run in real time. They are compared over at least _MIN_CLOCK_COMPARISON_S, because of the link's delays.
+# If the clocks drift apart by more than _MAX_CLOCK_DRIFT (0.2 is 20 %), the vehicle is a simulation that did not run in
+# real time. In less than _MIN_CLOCK_COMPARISON_S, the delays of the link would distort the comparison.
 _MAX_CLOCK_DRIFT, _MIN_CLOCK_COMPARISON_S, _MAX_CLOCK_GAP_S = 0.2, 1.0, 10.0
 
 
@@ -31,7 +31,7 @@ class ClockComparison:
     def compare(self, time_s: float, boot_ms: int) -> None:
         previous_s, previous_ms = self._previous
         self._previous = time_s, boot_ms
-        # Intervals with a reboot, or with a pause of the recording or its clock, do not count.
+        # Ignore an interval if the vehicle rebooted, the recording paused, or the recording's clock was set back.
         if boot_ms >= previous_ms and 0 <= time_s - previous_s < _MAX_CLOCK_GAP_S:
             self._recorded_s += time_s - previous_s
             self._vehicle_s += (boot_ms - previous_ms) / 1e3
@@ -61,7 +61,7 @@ class LinkCounter:
         missing = (sequence - expected) & 0xFF if expected >= 0 else 0
         if missing > _MAX_SEQUENCE_GAP:  # not a loss, but a late frame or a frame of another link
             missing = 0
-        if time_s >= self._second + 1:  # the last frame begins a new second; the others belong to the old one
+        if time_s >= self._second + 1:  # the last frame is the first frame of a new second
             self._received += received - 1
             received = 1
             if int(time_s) - self._second > 1:  # _add_row() records such a silence as 100 % loss
@@ -89,7 +89,7 @@ class LinkCounter:
     def _add_row(self, second: int) -> None:
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
-        if second - self._second > 1:  # two rows stand for all seconds without frames
+        if second - self._second > 1:  # the first and the last second without frames
             self._series.add(self._second + 1, 100.0, 0)
             self._series.add(second - 1, 100.0, 0)
         self._second, self._received, self._lost = second, 0, 0

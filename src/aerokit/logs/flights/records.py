@@ -87,7 +87,7 @@ class TlogReader(LogReader):
         super().__init__(path)
         self._vehicles: dict[int, _VehicleStates] = {}
         self._framer = Framer()
-        # By system id: the autopilot and its capabilities, which tell how it encodes parameters.
+        # By system id: the autopilot, and its capabilities, which show how it encodes parameters.
         self._autopilots: dict[int, Autopilot] = {}
         self._capabilities: dict[int, int] = {}
 

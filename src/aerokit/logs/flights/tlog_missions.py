@@ -30,8 +30,8 @@ class RecordedMission:
         self._flight = flight
         self._items: dict[int, Waypoint] = {}
         self._is_file_open = False  # True while a program writes or reads the mission file
-        self._file = bytearray()  # its beginning, up to the first block that is missing
-        self._later_blocks: dict[int, bytes] = {}  # the blocks after that, by their offset
+        self._file = bytearray()  # the mission file, up to the first missing block
+        self._later_blocks: dict[int, bytes] = {}  # the blocks after the missing block, by their offset
 
     @property
     def waypoints(self) -> list[Waypoint]:
@@ -73,7 +73,7 @@ class RecordedMission:
             if len(self._file) < header.length:
                 return
             items = unpack_items(bytes(self._file[: header.length]), MavMissionType.MISSION)
-        except RemoteProtocolError:  # Another program wrote something else to this file.
+        except RemoteProtocolError:  # The file contains something else than a mission.
             self._is_file_open = False
             return
         self._is_file_open = False

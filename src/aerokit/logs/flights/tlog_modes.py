@@ -34,7 +34,8 @@ class RecordedModeCommands:
 
     def __init__(self, flight: FlightLog, autopilot: Autopilot) -> None:
         self._flight, self._autopilot = flight, autopilot
-        # Maps modes to the times of commands that may change to them; "" to those that may change to any mode.
+        # Maps a mode to the times of commands that may change to this mode. The key "" is for commands that may change
+        # to any mode.
         self._command_times: dict[str, list[float]] = defaultdict(list)
         self.has_commands: bool = False
         """True if the recording contains any command to the vehicle."""

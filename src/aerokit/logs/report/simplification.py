@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-# At least one of this many consecutive points is selected. Otherwise spirals and repeated figures take quadratic time.
+# At least one of this many consecutive points is selected. Without this limit, spirals and repeated figures would take
+# quadratic time.
 _MAX_SEGMENT = 1024
 MAX_COORDINATE = 1e9
 """Larger coordinates are damaged data. They are ignored, because their squares could overflow."""
@@ -43,8 +44,9 @@ def simplify(
             selected.add(index)
         elif not is_known and index and known[index - 1]:
             gaps.append(index)
-    # A heap of (negative square of the largest deviation, its index, first and last index of the segment). The square
-    # is negative, because heapq returns the smallest item first.
+    # Heap entries: the negative square of the largest deviation from a segment, the index of the point with this
+    # deviation, and the first and last index of the segment. The square is negative, because heapq returns the smallest
+    # item first.
     segments = [
         (*_deviation(places, first, last), first, last)
         for first, last in pairwise(sorted(selected))

@@ -26,12 +26,12 @@ _MIN_STEP_M = 1.0
 _MAX_LISTED = 5
 # A hovering multicopter needs 20 to 60 % throttle, so 90 % in a descent is unusual.
 _HIGH_THROTTLE_PERCENT, _HIGH_ATTITUDE_ERROR_DEG = 90.0, 20.0
-# If the throttle or current in a descent is below this share of the value before, the motors have less power than a
-# controlled descent needs.
+# If the throttle or current in a descent is below this share of its value before the descent, the motors have less
+# power than a controlled descent needs.
 _LOW_POWER_SHARE = 0.5
 _STOPPED = ", so look at what stopped the motors: ESCs, their supply, a command"
-# If the pulse of an output rises by the first value from before arming to flying, the output drives a motor. If the
-# motors' pulses in a descent differ by the second value, the autopilot tried to lift one side.
+# If the pulse of an output is _MOTOR_RAISED_US longer in flight than before arming, the output drives a motor. If the
+# motors' pulses in a descent differ by _UNEQUAL_US, the autopilot tried to lift one side.
 _MOTOR_RAISED_US, _UNEQUAL_US = 200.0, 300.0
 _BEFORE_FALL_S = 5.0
 
@@ -177,7 +177,7 @@ def _max(values: list[float]) -> float | None:
 def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> float:
     """Return the length in metres of the track's parts in these rows, without steps that are noise."""
     length_m = 0.0
-    counted: tuple[float, float] | None = None  # the point up to which `length_m` counts
+    counted: tuple[float, float] | None = None  # the end of the last step that `length_m` includes
     for previous_row, row in pairwise([-2, *rows]):  # -2: the first row has no previous row
         point = north_east[row]
         if math.isnan(point[0]):

@@ -159,7 +159,7 @@ class CompassCalibration:
             return None
         self._progress_compass = self._next_compass(self._progress_compass)
         percent = self.percent
-        # In the simulation, both steps of the calibration take the same time.
+        # The simulation spends half of the time in each of the two steps.
         status = MagCalStatus.RUNNING_STEP_ONE if percent < 50 else MagCalStatus.RUNNING_STEP_TWO
         # The mask of ten bytes has one bit for each of 80 directions in which the vehicle can point.
         direction_count = percent * 80 // 100
@@ -188,7 +188,7 @@ class CompassCalibration:
 
 _GYROS_S, _TRIM_S, _ACCELEROMETERS_S = 0.5, 1.0, 1.0
 _MIN_ACCELEROMETERS_INTERVAL_S = 5.0
-# This param value accepts the present calibration (GCS_Common.cpp, _handle_command_preflight_calibration).
+# A param with this value accepts the present calibration (GCS_Common.cpp, _handle_command_preflight_calibration).
 _ACCEPTS_PRESENT_CALIBRATION = 76
 _Accelerometers = PreflightCalibrationAccelerometer
 

@@ -216,7 +216,7 @@ class ArduPilotCamera:
     def capture_status(self) -> m.CameraCaptureStatus | None:
         if not self.is_fitted:
             return None
-        # Like the firmware, report even an unlimited series (-1) as idle (AP_Camera_Backend.cpp).
+        # `remaining` is -1 during an unlimited series, which the firmware reports as idle (AP_Camera_Backend.cpp).
         is_series_reported = self.remaining > 0
         return m.CameraCaptureStatus(
             time_boot_ms=self._vehicle.time_boot_ms,

@@ -36,7 +36,7 @@ _FIXED_TEXTS: dict[tuple[int, Kind], tuple[tuple[int, str], ...]] = {
 def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     """Return the common handlers by MAV_CMD. Each kind of vehicle adds handlers and replaces some of these."""
     common, requests = _CommonCommands(vehicle), vehicle.requests
-    # Commands of devices that no simulated vehicle has fail.
+    # The table lists commands that the simulation does not execute, and the MAV_RESULT that answers each of them.
     handlers: dict[int, CommandHandler] = {
         Cmd[command]: common.fixed(Result[result], _FIXED_TEXTS.get((Cmd[command], vehicle.KIND), ()))
         for command, result in rows_of(vehicle.KIND, "fixed_results.csv")
@@ -144,7 +144,7 @@ class _CommonCommands:
         if not vehicle.mission.set_current(whole(command.param1)):
             return Result.FAILED
         if resets_mission:
-            vehicle.mission.start_or_resume()  # A reset restarts a complete mission, too.
+            vehicle.mission.start_or_resume()  # After a reset, even a complete mission starts again.
         vehicle.requests.send_soon(m.MissionCurrent.ID, command.channel)
         return Result.ACCEPTED
 
@@ -169,7 +169,7 @@ class _CommonCommands:
         point = vehicle.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:
             return Result.DENIED
-        # Like Copter, Plane and Sub, change the mode only if the vehicle may fly to the target.
+        # Check the target first, so that the mode stays unchanged if the vehicle may not fly to the target.
         if not vehicle.may_go_to(point) or not vehicle.set_mode(guided.number):
             return Result.FAILED
         guided.go_to(point)
@@ -348,7 +348,8 @@ class GimbalCommands:
                 return Result.FAILED
             gimbal.point(roll, pitch, yaw, from_north=False)
             return Result.ACCEPTED
-        # Params 1 and 2 held the position until AP 4.2. Newer firmware refuses such a command (AP_Mount_Backend.cpp).
+        # Before AP 4.2, params 1 and 2 contained the position. Newer firmware refuses such a command
+        # (AP_Mount_Backend.cpp).
         has_place_in_params = command.param1 and command.param2 and not command.x and not command.y
         if mode == MavMountMode.GPS_POINT and not has_place_in_params:
             altitude = float(whole(command.param4))  # The firmware uses whole metres (AP_Mount_Backend.cpp).

@@ -60,7 +60,7 @@ class MotorTest:
             self._copter.info("starting motor test")
         self.is_running = True
         self._test_number += 1
-        # The number identifies the test: the end of a replaced test has no effect.
+        # `_stop` compares the number, so that the end of this test does not stop a newer test.
         self._copter.call_later(self._duration_s(command), partial(self._stop, self._test_number))
         return MavResult.ACCEPTED
 
@@ -72,7 +72,7 @@ class MotorTest:
         elif throttle_type == MotorTestThrottleType.THROTTLE_PWM:
             is_valid = _MIN_PWM <= throttle <= _MAX_PWM
         else:
-            # A compass calibration during the test also has its throttle in percent (motor_test.cpp).
+            # COMPASS_CAL also calibrates the compass, and its throttle is in percent (motor_test.cpp).
             in_percent = (MotorTestThrottleType.THROTTLE_PERCENT, MotorTestThrottleType.COMPASS_CAL)
             is_valid = throttle_type in in_percent and throttle <= 100.0
         if not is_valid:
@@ -144,7 +144,7 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     variant(modes.CopterStabilize, CopterMode.ACRO, "ACRO"),
     variant(modes.CopterStabilize, CopterMode.STABILIZE, "STABILIZE"),
     variant(modes.CopterPilotedMode, CopterMode.ALT_HOLD, "ALT_HOLD", needs_position=False),
-    # Even on the ground, CIRCLE commands a movement to its circle. The land detector therefore never triggers.
+    # CIRCLE commands a movement to its circle even on the ground, so the land detector does not notice a landing.
     variant(
         modes.CopterLoiter, CopterMode.CIRCLE, "CIRCLE", takes_off=False, can_arm=False, notices_landing=False
     ),
@@ -286,7 +286,8 @@ class SimulatedCopter(CopterHost):
         if heading is None:
             return MavResult.FAILED
         is_relative = command.param4 == 1.0
-        # `commanded_heading` has already applied the direction to a relative angle. 0 is the shorter way.
+        # Param 3 is the direction. For a relative angle, `commanded_heading` has already applied it, so the copter
+        # turns the shorter way (0).
         direction = 0 if is_relative else int(command.param3)
         self.yaw.turn_to(heading, math.radians(command.param2), direction)
         return MavResult.ACCEPTED

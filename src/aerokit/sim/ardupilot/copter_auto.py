@@ -81,12 +81,12 @@ class _CircleLeg:
             return
         motion = self._copter.motion
         max_rate = math.sqrt(_TURN_SHARE_OF_ACCELERATION * motion.limits.acceleration_m_s2 / max(0.5, self._radius))
-        rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)  # limits rate² * radius
+        rate = math.copysign(min(abs(self._turn_rate), max_rate), self._turn_rate)  # `max_rate` limits the acceleration
         self._report_new_turn()  # The first turn is reported before the copter moves.
         self._angle += rate * dt
         self._turned_rad += abs(rate) * dt
         self._report_new_turn()
-        # Follow a point that moves along the circle: command its velocity, plus 1 m/s for each metre of distance.
+        # Follow a point on the circle: command the velocity of the point, plus 1 m/s for each metre of distance.
         (north, east, down), speed = self._point(), rate * self._radius
         velocity_north, velocity_east = -speed * math.sin(self._angle), speed * math.cos(self._angle)
         motion.seek_velocity(
@@ -145,7 +145,7 @@ class _DescendLeg:
 _ALLOW_ARMING, _CONTINUE_AFTER_LAND = 1, 4  # bits of AUTO_OPTIONS and of MIS_OPTIONS
 _HEADING_REACHED_RAD, _MIN_TAKE_OFF_M = math.radians(2.0), 1.0
 _CHECKED_COMMANDS = 3  # An upload that changes one of this many next commands restarts the current command.
-# The copter does not stop at a waypoint without delay if one of these commands follows.
+# If one of these commands follows a waypoint, the copter does not stop there, unless the waypoint has a delay.
 _PASSED_BEFORE = frozenset(
     {Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_PAYLOAD_PLACE}
 )
@@ -245,7 +245,7 @@ class CopterAuto(MissionMode):
     def update(self, dt: float) -> None:
         self.start_if_waiting()
         if not self.is_waiting:
-            if self._check_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the route.
+            if self._check_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the next commands.
                 self._restart_command()
             self.vehicle.mission.update()
             self._check_upcoming()  # `mission.update` may have started the next command

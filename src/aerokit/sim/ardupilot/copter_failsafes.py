@@ -22,7 +22,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
 
     def ahrs_reasons(self) -> Sequence[str]:
-        return ()  # `position_reasons` checks the estimator after GPS.
+        return ()  # `position_reasons` includes these checks, because ArduCopter runs them after those of GPS.
 
     def position_reasons(self) -> Sequence[str]:
         """Return the failures of the checks of GPS and of the estimator, and of the mandatory checks."""
@@ -55,7 +55,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
         mode = self.vehicle.mode
         if not mode.can_arm:
             return [f"{mode.name} mode not armable"]
-        # In modes that control the climb rate, a centred stick holds the altitude.
+        # In modes without manual throttle, the stick sets a climb rate, and its centre holds the altitude.
         max_throttle = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
         if not mode.arms_with_raised_throttle and self.vehicle.rc[RC_THROTTLE] > max_throttle:
             return ["Throttle too high"]
@@ -73,13 +73,14 @@ _MODES: dict[int, tuple[int, ...]] = {
     _AUTO: (CopterMode.RTL, CopterMode.LAND),
     _BRAKE: (CopterMode.BRAKE, CopterMode.LAND),
 }
-# Texts for the case that the first mode of an action was refused.
+# Texts that are sent if the first mode of an action is refused.
 _FALLBACK_TEXTS = {
     _SMART_RTL: "SmartRTL Unavailable, Trying RTL Mode",
     _SMART_RTL_OR_LAND: "SmartRTL Unavailable, Using Land Mode",
     _BRAKE: "Trying Land Mode",
 }
-# Bits of FS_OPTIONS that let a flight continue in spite of a failsafe. A table row has the modes, the bit and the text.
+# Bits of FS_OPTIONS that let a flight continue in spite of a failsafe. The rows of the tables have the modes in which
+# the bit applies, the bit, and the status text.
 _IF_LANDING = 8
 _RADIO_OPTIONS = (
     (frozenset({"AUTO"}), 1, "Continuing Auto"),
@@ -138,7 +139,8 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             return
         is_silent = copter.now - self.radio_received_at >= parameters["RC_FS_TIMEOUT"]
         self._radio_good_at = math.nan
-        # Pulses with a low throttle trigger the failsafe at once, missing pulses only after RC_FS_TIMEOUT.
+        # The radio is bad here. If pulses arrive (with a low throttle), the failsafe starts at once. If no pulses
+        # arrive, it starts after RC_FS_TIMEOUT.
         if is_receiving or is_silent:
             self._set_radio_lost(is_lost=True)
 
@@ -185,7 +187,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         if self._disarm_if_landed(name):
             return _NONE
         if mode.is_landing:
-            # A smaller priority is more severe: landing, or the termination that is worse.
+            # `BATTERY_PRIORITIES` begins with the most severe actions, TERMINATE and LAND.
             is_landing_for_battery = self.battery.priority <= self.BATTERY_PRIORITIES.index(_LAND)
             if self.battery_is_low and is_landing_for_battery:
                 return self._report_continuation(f"{name} + Battery", "Continuing Landing", _LAND)
@@ -218,7 +220,8 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
                 self.warn("EKF Failsafe Cleared", MavSeverity.CRITICAL)
             self.has_estimator_failed = self._acted_on_estimator = False
             return
-        # A position that was never known is not lost, and each loss is handled once.
+        # The failsafe needs a position that was known before. While `has_estimator_failed` is True, the loss has
+        # been handled already.
         if not self._had_position or self.has_estimator_failed:
             return
         lost_for_s = self._position_lost.seconds(condition=True, now=copter.now)
@@ -229,7 +232,8 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         copter = self.vehicle
         self.warn("EKF variance", MavSeverity.CRITICAL)
         self.has_estimator_failed: bool = True
-        self._acted_on_estimator = copter.is_armed  # Only then, the end of the failsafe is reported.
+        # The end of the failsafe is reported only if the copter was armed at its start.
+        self._acted_on_estimator = copter.is_armed
         if not copter.is_armed:
             return
         if not copter.mode.needs_position:

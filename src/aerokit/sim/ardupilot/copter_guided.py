@@ -161,7 +161,7 @@ class CopterGuided(CopterModeBase):
 
     def _run_attitude(self, dt: float) -> None:
         copter = self.vehicle
-        if self._body_rates is not None and not copter.is_landed:  # Rates turn the attitude that was set last.
+        if self._body_rates is not None and not copter.is_landed:  # The body rates change the commanded attitude.
             roll, pitch = (angle + rate * dt for angle, rate in zip(self._attitude, self._body_rates, strict=True))
             self._attitude = (roll, pitch)
         (roll, pitch), climb = self._attitude, self._attitude_climb
@@ -189,7 +189,8 @@ class CopterGuided(CopterModeBase):
             else:
                 motion.seek_acceleration(*self.acceleration)
         else:
-            # Add 1 m/s towards the target position for each metre of distance to the target velocity.
+            # For each metre of distance to the target position, 1 m/s towards that position is added to the target
+            # velocity.
             offsets = (target - current for target, current in zip(self.position, motion.place, strict=True))
             north, east, down = (speed + offset for speed, offset in zip(self.velocity, offsets, strict=True))
             self._seek_velocity(north, east, down)
@@ -286,8 +287,8 @@ class CopterSetpoints:
             copter.motion.face(yaw)
         elif not ignored_rates:
             copter.motion.turn(target.body_yaw_rate)
-        # The field thrust sets a climb rate: 0.5 holds the altitude. GUID_OPTIONS bit 3, with which the field sets the
-        # throttle, is not simulated.
+        # The field `thrust` sets a climb rate, and 0.5 holds the altitude. The simulation ignores bit 3 of
+        # GUID_OPTIONS, which makes the field set the throttle instead.
         climb_share = (max(0.0, min(1.0, target.thrust)) - 0.5) * 2.0
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * copter.parameters[max_climb_parameter] / 100.0

@@ -52,7 +52,7 @@ class AutoYaw:
         self._rate = 0.0
         offset = wrap_pi(self._heading - motion.yaw)
         is_longer_way = direction != 0 and math.copysign(1, offset) != direction
-        # `Motion.face` turns the shorter way, so the longer way needs a turn rate.
+        # `Motion.face` always turns the shorter way. `_go_to_heading` uses `_rate` to turn the longer way.
         if is_longer_way and abs(offset) > _HEADING_TOLERANCE_RAD:
             self._rate = direction * (rate or motion.limits.turn_rate_rad_s)
 
@@ -102,7 +102,7 @@ class AutoYaw:
         motion = self._copter.motion
         offset = wrap_pi(self._heading - motion.yaw)
         if self._rate and math.copysign(1, offset) != math.copysign(1, self._rate):
-            motion.turn(self._rate)  # The commanded direction is still the longer way.
+            motion.turn(self._rate)  # The commanded direction is still the longer way to the heading.
             return
         self._rate = 0.0
         motion.face(self._heading)
@@ -253,7 +253,7 @@ class CopterPilotedMode(CopterModeBase):
         self.vehicle.motion.seek_attitude(roll * _FULL_STICK_LEAN_RAD, pitch * _FULL_STICK_LEAN_RAD, -climb)
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        # In a mode without position control, only a take-off that the pilot may steer is accepted.
+        # With `must_navigate`, the mode must hold the horizontal position by itself: `needs_position` must be True.
         if not self.takes_off or (must_navigate and not self.needs_position):
             return False
         self._take_off = CopterTakeOff(self.vehicle, altitude_m)
@@ -328,7 +328,8 @@ class CopterRtl(CopterModeBase):
         self._place = best_return_place(copter, home, is_allowed=copter.fence.contains)
         north, east, down = self._place
         distance = math.hypot(north - copter.motion.north, east - copter.motion.east)
-        # A smaller down coordinate is higher. The copter returns at the altitude of the place if that is higher.
+        # The copter returns at the return altitude or at the altitude of `_place`, whichever is higher: `min`, because
+        # a smaller down coordinate is higher.
         self._return_down = min(down, home[2] - self._return_altitude(distance))
         copter.yaw.apply_default(returning=True)
         return True
@@ -339,7 +340,7 @@ class CopterRtl(CopterModeBase):
         current = self.vehicle.navigation.altitude_above_home
         after_min_climb = current + parameters["RTL_CLIMB_MIN"] / 100.0
         target = max(after_min_climb, parameters["RTL_ALT"] / 100.0, _RTL_MIN_ALTITUDE_M)
-        if parameters["RTL_CONE_SLOPE"] > 0:  # A short return needs less altitude.
+        if parameters["RTL_CONE_SLOPE"] > 0:  # Close to the destination, a lower altitude suffices.
             altitude_of_cone = distance * parameters["RTL_CONE_SLOPE"]
             target = min(target, max(altitude_of_cone, _RTL_MIN_ALTITUDE_M))
         return max(target, current)  # A return never begins with a descent.

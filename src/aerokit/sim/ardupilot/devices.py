@@ -27,7 +27,7 @@ class ArduPilotDevices:
         self.chute_is_released: bool = False
         self.line_m: float = 0.0  # Length of the winch's line.
         self.line_rate_m_s: float = 0.0  # Above 0 while the winch lets out line.
-        self._goal_m: float | None = None  # Length at which the winch stops; None without such a length.
+        self._goal_m: float | None = None  # Length at which the winch stops; None if it stops only on command.
 
     def _is_set(self, name: str) -> bool:
         return bool(self._vehicle.parameters.get(name, 0))
@@ -82,7 +82,7 @@ class ArduPilotDevices:
         if not self._is_set("WINCH_TYPE") or action > WinchActions.RATE_CONTROL:
             return Result.FAILED
         was_moving = self.line_rate_m_s != 0.0
-        self._goal_m, self.line_rate_m_s = None, 0.0  # The action RELAXED does only this.
+        self._goal_m, self.line_rate_m_s = None, 0.0  # This line is the whole action RELAXED.
         if action == WinchActions.RATE_CONTROL:
             self.line_rate_m_s = max(-_WINCH_RATE_M_S, min(_WINCH_RATE_M_S, rate_m_s))
         elif action == WinchActions.RELATIVE_LENGTH_CONTROL:

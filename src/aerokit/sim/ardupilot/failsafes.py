@@ -11,7 +11,7 @@ from aerokit.mavlink.enums import GpsFixType, MavSeverity
 from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotHost, ConditionTimer, HostT
 
 _OK, _LOW, _CRITICAL = 0, 1, 2
-# The levels in names of parameters, and in texts.
+# Names of the levels: `_NAMES` in parameter names, `_WORDS` in status texts.
 _NAMES = {_LOW: "LOW", _CRITICAL: "CRT"}
 _WORDS = {_LOW: "low", _CRITICAL: "critical"}
 _PERIOD_S = 0.1
@@ -275,7 +275,7 @@ class ArduPilotArming(Generic[HostT]):
             return
         reasons = self.reasons()
         passes_common = not self.common_reasons()
-        # A new failure is reported earlier than a failure that was reported before.
+        # After a new failure, the next report is due after `_MIN_REPORT_INTERVAL_S` instead of `_REPORT_INTERVAL_S`.
         self._has_new_failure |= self._passed_common and not passes_common
         self._passed_common, self.passes = passes_common, not reasons
         waited = vehicle.now - self._reported_at
@@ -327,7 +327,7 @@ class ArduPilotArming(Generic[HostT]):
             vehicle.navigation.set_home(vehicle.motion.place, lock=False)
         vehicle.info(self.ARMED_TEXT)
         vehicle.motors.set_armed(True, vehicle.now)
-        vehicle.mode.enter(force=False)  # again, because the mode was entered while disarmed
+        vehicle.mode.enter(force=False)  # starts the mode, which was entered while the vehicle was disarmed
         vehicle.set_ticking(True)
         self.on_armed()
         return True

@@ -154,7 +154,8 @@ class ArduPilotFence(Generic[HostT]):
         self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE when they were read last.
         # By kind of fence: a breached fence is breached again if the vehicle is this many metres beyond the limit.
         self._new_breach_m: dict[int, float] = {}
-        # True or False if the last command about the lower limit enabled or disabled it; None without a command.
+        # True if the last command about the lower limit enabled the limit, False if it disabled it; None without a
+        # command.
         self._floor_enabled_by_command: bool | None = None
         self._recovering_since = -math.inf
         self._reported_at = self._checked_at = -math.inf
@@ -242,7 +243,7 @@ class ArduPilotFence(Generic[HostT]):
         """Check the position and react to a new breach."""
         vehicle = self.vehicle
         self._follow_parameters()
-        # A configured lower limit is checked even while disabled, because it may be enabled automatically in flight.
+        # Continue if only a disabled lower limit (`_MIN_ALT`) is configured, because `_check` may enable it in flight.
         if not self.enabled and not self.configured & _MIN_ALT:
             return
         is_due = vehicle.now - self._checked_at > self.PERIOD_S - 1e-6  # tolerates rounding errors
@@ -260,7 +261,7 @@ class ArduPilotFence(Generic[HostT]):
         """Compare the position with all active limits, and return the kinds of fences with a new breach."""
         vehicle = self.vehicle
         may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed  # near the ground on purpose
-        is_floor_kept = self._floor_enabled_by_command is True  # A command has precedence.
+        is_floor_kept = self._floor_enabled_by_command is True  # A command has precedence over automatic disabling.
         if may_be_low and not is_floor_kept and self.enabled & _MIN_ALT:
             self.report("auto-disabled", self.enable(False, _MIN_ALT, by_command=False))
         new_breaches = 0
@@ -320,7 +321,7 @@ class ArduPilotFence(Generic[HostT]):
         self.breach_count += 1
         was_any_breached = self.breached != 0
         self.breached |= kind
-        if was_any_breached:  # The time and FENCE_STATUS are those of the first breach.
+        if was_any_breached:  # Only the first breach sets the time and sends FENCE_STATUS.
             return
         self.breach_time_ms = vehicle.time_boot_ms
         if vehicle.now - self._reported_at > _STATUS_INTERVAL_S:

@@ -169,7 +169,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         if peer.sessions:
             raise Refused(MavFtpErr.FAIL)
         answer = super()._open(peer, request)
-        # As in the older protocol, a client that reads the parameters also gets the banner (GCS_FTP.cpp).
+        # A client that reads the parameter file also gets the banner, as after PARAM_REQUEST_LIST (GCS_FTP.cpp).
         self._is_banner_due = is_reading and self._path(request).startswith("@PARAM/param.pck")
         return answer
 
@@ -187,7 +187,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         block_size = request.size or DATA_SIZE
         offset = request.offset + block_number * block_size
         sequence = (request.sequence + 1 + block_number) & 0xFFFF
-        refusal = request.refuse(MavFtpErr.EOF)  # sent if no data are left
+        refusal = request.refuse(MavFtpErr.EOF)  # sent if there is no data at `offset`
         try:
             data = session.file.read(offset, block_size)
         except FileFault as fault:
@@ -203,8 +203,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         block = request.acknowledge(data, offset=offset)
         block = block.replace(sequence=sequence, burst_complete=is_short or is_last)
         self._reply(peer, block)
-        # The firmware uses one reply for the whole burst. After a block, it increments the sequence number. After a
-        # short block, it also advances the offset, for the refusal that follows (GCS_FTP.cpp).
+        # The firmware changes and sends the same reply for the whole burst (GCS_FTP.cpp). After each block, it
+        # increments the sequence number. After a short block, it also advances the offset for the refusal.
         next_offset = offset + len(data) if is_short else offset
         peer.reply = block.replace(sequence=(sequence + 1) & 0xFFFF, offset=next_offset)
         next_step = self._end_burst if is_last else partial(self._send_next, peer, session, request, block_number + 1)

@@ -225,7 +225,7 @@ class ArduPilotGimbal:
             self.point(*angles, from_north=from_north)
         elif not any(map(math.isnan, rates)):
             self.turn(*rates, from_north=from_north)
-        elif all(map(math.isnan, (*angles[1:], *rates[1:]))):  # Without pitch and yaw, the client changes the lock.
+        elif all(map(math.isnan, (*angles[1:], *rates[1:]))):  # Only the yaw lock changes.
             self.is_yaw_locked = from_north
         else:
             return MavResult.FAILED

@@ -154,7 +154,7 @@ def _stored_turns(item: MissionItem) -> tuple[float, float, float, float]:
     """
     turns, radius = item.param1, abs(item.param3)
     turn_unit = 1 / 256 if 0 < turns < 1 else 1
-    turn_byte = int(min(255.0, turns / turn_unit)) & 0xFF  # A negative number keeps only its lowest byte.
+    turn_byte = int(min(255.0, turns / turn_unit)) & 0xFF  # The mask keeps only the lowest byte of a negative number.
     radius_unit = 1 if radius <= 255 else 10
     radius_byte = int(min(255.0, radius / radius_unit))
     sign = -1.0 if item.param3 < 0 else 1.0
@@ -183,7 +183,7 @@ def _signed(value: int, bits: int) -> float:
     return float(value - (1 << bits) if value >> bits - 1 else value)
 
 
-# Functions that return a value as it is after it was stored and read again, by storage type.
+# By storage type: functions that return the value that is read after a value was stored.
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
     _NOT_STORED: lambda _: 0.0,
     "f": float32,

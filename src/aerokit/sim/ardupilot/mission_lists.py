@@ -118,7 +118,7 @@ class CommandList(ItemList):
 
     def _write(self, seq: int, stored_item: MissionItem) -> int:
         count = len(self._commands)
-        # A list that has space only for home refuses every item, even item 0, which it would ignore.
+        # A list with space only for home refuses every item. With `max`, it refuses even item 0, which is never stored.
         if seq > count or max(seq, 1) >= self.capacity:
             return MavMissionResult.ERROR
         if seq == count:

@@ -54,7 +54,8 @@ class MissionMode(ArduPilotMode):
 
     def on_disarmed(self) -> None:
         """Called after the motors have stopped."""
-        # Disarming restarts an unfinished mission. The vehicle then waits on the ground.
+        # Disarming has reset the progress. If the mission is unfinished, `update` starts its first command again, and
+        # the disarmed vehicle waits on the ground.
         if self.vehicle.mode is self:
             self.vehicle.mission.update()
 
@@ -188,7 +189,7 @@ class MissionRun:
             self._start()
         else:
             self._state = MissionState.ACTIVE
-            # Resume at the "do" command that was running, which precedes the navigation command.
+            # A running "do" command precedes the navigation command, so the mission resumes at the "do" command.
             resume_index = self.nav_index if self._running_do is None else self._running_do[0]
             self.set_current(resume_index)
 
@@ -244,7 +245,8 @@ class MissionRun:
                 self.nav_index, self._running_nav = command
                 self._state = MissionState.NOT_STARTED
                 return True
-            if self._running_do is None:  # The mission resumes at the first "do" command before the navigation command.
+            # Store the first "do" command before the navigation command, because the mission resumes there.
+            if self._running_do is None:
                 self._running_do, self._last_do_index = command, command_index
             index = command_index + 1
         self.nav_index = 0
@@ -327,7 +329,7 @@ class MissionRun:
             if item.command not in (Cmd.DO_JUMP, Cmd.DO_JUMP_TAG):
                 return index, item
             target = self._jump_target(item)
-            # Without counting, a jump that is met again would be followed for ever.
+            # Without `count_jumps`, no jump is used up, so the loop is endless if the first jump is reached again.
             is_endless = not count_jumps and first_jump == index
             if self._list.command(target) is None or is_endless:
                 return None

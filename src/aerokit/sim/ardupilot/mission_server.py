@@ -123,8 +123,8 @@ class ArduPilotMissionServer(MissionServer):
         if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
             return Result.UNSUPPORTED
-        # During an upload, requests for a list are denied. The base class decides on MISSION_COUNT, and requests for
-        # single items are served.
+        # During an upload, only two messages are not denied here: the base class decides on MISSION_COUNT, and requests
+        # for single items are served.
         if kind in self._uploads and not isinstance(message, (m.MissionCount, m.MissionRequest)):
             return Result.DENIED
         return None if kind in self._lists else Result.UNSUPPORTED
@@ -144,14 +144,14 @@ class ArduPilotMissionServer(MissionServer):
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         client, kind = sender_of(request), request.mission_type
-        # A bug of the firmware: it compares the command of the item, instead of the index of the item, with the index
+        # Reproduces a bug of the firmware, which compares the command of the item (instead of its index) with the index
         # of the current item.
         current = kind == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
         if isinstance(request, m.MissionRequestInt):
             return item_message_int(item, request.seq, client, kind, current=current)
         place: tuple[float, float] = (item.x, item.y)
         if has_location(item.command):
-            # Degrees. Like the firmware, convert them in single precision.
+            # The position in degrees, converted in single precision like in the firmware.
             place = (float32(item.x * float32(1e-7)), float32(item.y * float32(1e-7)))
         self._warn_once(request, "got MISSION_REQUEST; use MISSION_REQUEST_INT!")
         return item_message_float(item, place, request.seq, client, kind, int(current))
@@ -168,7 +168,7 @@ class ArduPilotMissionServer(MissionServer):
     def _on_write_partial_list(self, request: m.MissionWritePartialList, channel: Channel) -> None:
         kind, start, end = request.mission_type, request.start_index, request.end_index
         refusal = self._refusal(request, channel)
-        # The last index may be equal to the number of items: this item is appended.
+        # `end` may be equal to the number of items, because the item with this index is appended to the list.
         if refusal is None and not 0 <= start <= end <= self.count(kind):
             self._warn("Flight plan update rejected")
             refusal = Result.ERROR
@@ -201,7 +201,7 @@ class ArduPilotMissionServer(MissionServer):
         if isinstance(item, int):  # The position is refused with this MAV_MISSION_RESULT.
             self._answer_item(message, item, channel)
         elif kind == MavMissionType.MISSION and message.current in (_GUIDED_TARGET, _ALTITUDE_CHANGE):
-            result = self._guide(item, message.current)  # The item is a target, and not part of a list.
+            result = self._guide(item, message.current)  # The item is a target, and is not stored in a list.
             self._answer_item(message, result, channel)
         elif kind not in self._lists:
             self._answer_item(message, Result.UNSUPPORTED, channel)

@@ -212,7 +212,7 @@ class ArduPilotNavigation:
         if self.uses_external:  # External navigation provides the position, even without GPS.
             return
         if self.has_position and lost_for >= _POSITION_TIMEOUT_S:
-            # On the ground, the velocity stays known.
+            # On the ground, the estimator still knows the velocity.
             velocity_flag = Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0
             self.flags = _DEAD_RECKONING | velocity_flag
         elif self.flags != _ATTITUDE_ONLY and lost_for >= _AIDING_TIMEOUT_S:
@@ -359,7 +359,7 @@ def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
     if distances[farthest] <= tolerance:
         return [path[0], path[-1]]
     middle = farthest + 1  # Index in `path`. The first point of `path` has no distance.
-    # Both halves contain the middle point, which is used once.
+    # Both halves contain the middle point, so `[:-1]` removes it from the first half.
     return simplify(path[: middle + 1], tolerance)[:-1] + simplify(path[middle:], tolerance)
 
 
@@ -410,11 +410,11 @@ def _closest_approach(start1: Ned, end1: Ned, start2: Ned, end2: Ned) -> tuple[f
     dot11, dot12, dot22 = _dot(line1, line1), _dot(line1, line2), _dot(line2, line2)
     dot1, dot2 = _dot(line1, between), _dot(line2, between)
     determinant = dot11 * dot22 - dot12 * dot12
-    are_nearly_parallel = determinant < 1e-6 * max(dot11 * dot22, 1e-9)  # 1e-9: segments without a length
+    are_nearly_parallel = determinant < 1e-6 * max(dot11 * dot22, 1e-9)  # 1e-9 includes segments without a length
     if are_nearly_parallel:
         return None
-    # The nearest place on each segment, as a number from 0 (start) to 1 (end). Limiting one place to its segment moves
-    # the nearest place on the other segment, so the first place is calculated again at the end.
+    # The nearest places on the two segments, from 0 (start) to 1 (end). Limiting `share2` to its segment may move the
+    # nearest place on the first segment, so `share1` is calculated again.
     share1 = max(0.0, min(1.0, (dot12 * dot2 - dot22 * dot1) / determinant))
     share2 = max(0.0, min(1.0, (dot12 * share1 + dot2) / dot22))
     share1 = max(0.0, min(1.0, (dot12 * share2 - dot1) / dot11))

@@ -40,7 +40,7 @@ class PlaneArming(ArduPilotArming[PlaneHost]):
         max_roll = parameters["ROLL_LIMIT_DEG"]
         max_pitch, min_pitch = parameters["PTCH_LIM_MAX_DEG"], parameters["PTCH_LIM_MIN_DEG"]
         airspeed = int(parameters["AIRSPEED_MIN"])
-        # The long failsafe follows the short one, so its timeout must not be shorter.
+        # The long failsafe follows the short failsafe, so FS_LONG_TIMEOUT must not be shorter than FS_SHORT_TIMEOUT.
         is_long_shorter = parameters["FS_LONG_TIMEOUT"] < parameters["FS_SHORT_TIMEOUT"]
         checks = (
             (
@@ -74,7 +74,7 @@ class PlaneEngine(ArduPilotMotors):
 _REST_S = 1.0
 _LIFTING_MODES = range(PlaneMode.QSTABILIZE, PlaneMode.QACRO + 1)
 
-# Modes in the order of AVAILABLE_MODES. Modes of lifting rotors do not exist, as with Q_ENABLE 0.
+# Modes in the order of AVAILABLE_MODES. Modes for lifting rotors do not exist, as in the firmware with Q_ENABLE 0.
 _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     variant(
         modes.PlanePilotedMode, PlaneMode.MANUAL, "MANUAL",
@@ -196,7 +196,7 @@ class SimulatedPlane(PlaneHost):
             return MavResult.FAILED
         self.guided.go_to(point)
         radius = command.param3
-        if radius > 0:  # Otherwise the radius is WP_LOITER_RAD.
+        if radius > 0:  # Without a positive radius, WP_LOITER_RAD applies.
             is_anticlockwise = not math.isnan(command.param4) and command.param4 != 0
             self.guided.radius = -radius if is_anticlockwise else radius
         return MavResult.ACCEPTED

@@ -70,7 +70,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             return True  # Arming enters the current mode again, which must not restart the mission.
         super().enter(force=force)
         self._manoeuvre = _LOITER
-        # Later, because the mission or RTL may change the mode again, and this change must be complete before.
+        # The mission or RTL may change the mode again. `call_later` lets the present mode change complete first.
         plane.call_later(0.0, self._begin if plane.mission.is_present else self._return_at_once)
         return True
 
@@ -169,7 +169,8 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         distance = horizontal_distance(self.vehicle, self._place)
         if distance <= self.vehicle.parameters["WP_RADIUS"]:
             return self._report(f"Reached waypoint #{index} dist {int(distance)}m")
-        # The plane has passed the waypoint if its offset from there points along the leg. `_report` returns True.
+        # The plane has passed the waypoint if its offset from the waypoint points in the direction of the leg.
+        # `_report` returns True.
         dot_product = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
         return dot_product > 0 and self._report(f"Passed waypoint #{index} dist {int(distance)}m")
 
@@ -270,8 +271,8 @@ class PlaneGuided(PlaneNavigatingMode):
         """
         mask, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
-        # Without rates, the attitude has all angles. Otherwise, the bits of the rates select angles (the firmware reads
-        # them in this way, see GCS_MAVLink_Plane.cpp).
+        # If the mask ignores all rates but not the attitude, roll and pitch are used. Otherwise, the firmware uses each
+        # angle whose rate is not ignored (GCS_MAVLink_Plane.cpp).
         selects_all_angles = not mask & Mask.ATTITUDE_IGNORE and mask & _RATES == _RATES
         if selects_all_angles or not mask & Mask.BODY_ROLL_RATE_IGNORE:
             self._bank = _TimedValue(roll, now)

@@ -14,7 +14,7 @@ from aerokit.sim.ardupilot.plane_modes import PlaneHost
 from aerokit.sim.motion import Ned
 
 _NONE, _SHORT, _LONG, _GCS = range(4)
-# The throttle failsafe starts 0.2 s after the throttle is low, or after 1 s without pulses.
+# The throttle failsafe starts after `_SILENT_S` without pulses, or after the throttle was low for `_COUNT_S`.
 _SILENT_S, _COUNT_S = 1.0, 0.2
 # Values of FS_SHORT_ACTN, FS_LONG_ACTN and FS_GCS_ENABL, and of the battery actions.
 _SHORT_BEST_GUESS, _SHORT_FBWA, _SHORT_DISABLED, _SHORT_FBWB = 0, 2, 3, 4
@@ -106,11 +106,11 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         plane = self.vehicle
         self.state, self._short_since = _SHORT, plane.now
         mode = self._mode_before = plane.mode.number
-        # With the action "best guess", the modes that navigate continue (events.cpp).
+        # A mode in `_NAVIGATING` continues if the action is "best guess" (events.cpp).
         if mode in _PILOTED or (mode in _NAVIGATING and action != _SHORT_BEST_GUESS):
-            plane.set_mode(_SHORT_MODES.get(action, PlaneMode.CIRCLE))  # Every other action circles.
+            plane.set_mode(_SHORT_MODES.get(action, PlaneMode.CIRCLE))  # All other actions select CIRCLE.
         self._mode_after = plane.mode.number
-        if self._mode_after != self._mode_before:  # Some modes continue, and a mode change may be refused.
+        if self._mode_after != self._mode_before:  # Some modes continue, and the mode change may fail.
             self.warn(f"RC Short Failsafe: switched to {plane.mode.name}")
         else:
             self.warn("RC Short Failsafe On")
@@ -130,7 +130,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         plane = self.vehicle
         if plane.mode.is_landing:
             return
-        # The long failsafe counts from the start of the short one.
+        # During the short failsafe, FS_LONG_TIMEOUT counts from the start of the short failsafe.
         lost_since = self._short_since if self.state == _SHORT else self.radio_received_at
         timeout = plane.parameters["FS_LONG_TIMEOUT"]
         gcs_option = int(plane.parameters["FS_GCS_ENABL"])
@@ -161,7 +161,8 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     def _start_long(self, state: int) -> None:
         """Execute FS_LONG_ACTN. Its effect depends on the mode: a piloted mode, RTL, or AUTO and GUIDED."""
         plane = self.vehicle
-        # The ground station may hang, so the radio takes over from its overrides (events.cpp).
+        # The ground station may hang while its overrides are active, so the firmware gives control to the radio
+        # (events.cpp).
         plane.rc.release_overrides()
         self.state = state
         mode = plane.mode.number
@@ -169,10 +170,10 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         if mode in _LONG_AS_PILOTED:
             acts_in_take_off = action in (_LONG_GLIDE, _LONG_PARACHUTE)
             if self._is_in_take_off and not acts_in_take_off:
-                self._is_long_pending = True  # The action follows after the initial climb.
-            else:  # In these modes, action 0 returns to launch; only in AUTO and GUIDED it continues.
+                self._is_long_pending = True  # `FS_LONG_ACTN` is executed after the initial climb.
+            else:  # In piloted modes, action 0 returns to launch. In AUTO and GUIDED, action 0 changes nothing.
                 self.change_to(*_LONG_MODES.get(action or _LONG_RTL, ()))
-        elif mode == PlaneMode.RTL:  # The plane returns already, so only a landing changes anything.
+        elif mode == PlaneMode.RTL:  # The plane returns already, so only actions that land change the mode.
             if action in (_LONG_AUTO, _LONG_AUTOLAND):
                 self.change_to(*_LONG_MODES[action])
         elif mode in (PlaneMode.AUTO, PlaneMode.GUIDED) and not plane.mode.is_landing:
@@ -192,7 +193,8 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def act_on_battery(self, action: int) -> None:
         is_landing = self.vehicle.mode.is_landing
-        lands = action in (_LAND, _QLAND, _LOITER_QLAND)  # A plane without lifting rotors treats all three alike.
+        # The Q modes need lifting rotors. A plane without them executes all three actions as LAND.
+        lands = action in (_LAND, _QLAND, _LOITER_QLAND)
         if action == _TERMINATE:
             self.refuse_termination()
         elif not is_landing and (lands or action in (_BATTERY_RTL, _AUTOLAND_OR_RTL)):

@@ -153,9 +153,9 @@ class PlaneLanding:
 
 
 _MID_STICK, _STICK_RANGE, _LOW_THROTTLE = 1500, 500, 1100
-_CENTRED_STICK = 0.05  # A stick deflection of up to this share counts as centred.
+_CENTRED_STICK = 0.05  # A stick with at most this deflection counts as centred.
 _CIRCLE_BANK_SHARE = 1 / 3
-# The climb of a take-off ends this many metres below the altitude of the take-off.
+# A take-off is complete when the plane is this many metres below the target altitude.
 _TAKE_OFF_DONE_M = 5.0
 _NAVIGATES = MavModeFlag.GUIDED_ENABLED | MavModeFlag.STABILIZE_ENABLED
 
@@ -232,7 +232,7 @@ class PlaneCruise(PlaneAltitudeMode):
 
     def steer(self, climb: float) -> None:
         wing = self.vehicle.wing
-        if abs(self.stick(RC_ROLL)) > _CENTRED_STICK:  # The pilot turns, so the present course is not held.
+        if abs(self.stick(RC_ROLL)) > _CENTRED_STICK:  # The pilot turns, so no course is held.
             self._course = None
             super().steer(climb)
             return

@@ -28,7 +28,7 @@ _OVERRIDABLE, _CHANNELS = 16, 18
 # Values of SIM_RC_FAIL.
 _NO_PULSES, _LOW_THROTTLE = 1, 2
 _LOW_THROTTLE_PWM = 950
-# Special values of channels in RC_CHANNELS_OVERRIDE. `_RELEASE_UPPER` releases one of the channels 9 to 18.
+# Values of RC_CHANNELS_OVERRIDE: `_UNCHANGED` keeps a channel, `_RELEASE_UPPER` releases a channel from 9 to 18.
 _UNCHANGED, _RELEASE_UPPER = 0xFFFF, 0xFFFE
 
 
@@ -107,10 +107,10 @@ class ArduPilotRadio:
         for index in range(_OVERRIDABLE):
             value = getattr(override, f"chan{index + 1}_raw")
             is_upper = index >= len(self._sticks)  # one of the channels 9 to 16
-            if value == _UNCHANGED or (value == 0 and is_upper):  # In an upper channel, 0 also means unchanged.
+            if value == _UNCHANGED or (value == 0 and is_upper):  # For channels above 8, 0 means unchanged, too.
                 continue
             if value == _RELEASE_UPPER and is_upper:
-                value = 0  # The stored value 0 releases a channel.
+                value = 0  # `_overrides` stores 0 for a released channel.
             self._overrides[index] = (value, vehicle.now)
 
 
@@ -155,7 +155,7 @@ class ArduPilotJoystick:
         if reverse:
             value = -value
         share = (value - lowest) / (1000 - lowest)
-        # The result may be out of range, because the firmware does not check the range of an axis.
+        # Like the firmware, do not limit an axis that is out of range. The mask keeps the 16 bits of a pulse.
         return int(low + (high - low) * share) & 0xFFFF
 
     def setting(self, name: str, default: float) -> float:

@@ -12,7 +12,7 @@ from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import ReceivedCommand, whole
 
-# Suffixes of the parameters that hold the stream rates. On the first port, EXTRA1 stands for MAV1_EXTRA1.
+# Suffixes of the parameters with the stream rates. The prefix is that of the port: MAV1_EXTRA1 on the first port.
 _RATE_PARAMETERS: dict[int, str] = {
     Stream.RAW_SENSORS: "RAW_SENS", Stream.EXTENDED_STATUS: "EXT_STAT", Stream.RC_CHANNELS: "RC_CHAN",
     Stream.RAW_CONTROLLER: "RAW_CTRL", Stream.POSITION: "POSITION", Stream.EXTRA1: "EXTRA1",
@@ -39,7 +39,7 @@ _SUPPORTED_MESSAGES: dict[Kind, frozenset[int]] = {
 # A stream may have at most 80 % of the rate of the main loop, which is 400 Hz (GCS_Common.cpp, cap_message_interval).
 _MIN_INTERVAL_S, _MAX_INTERVAL_S = 0.0025 / 0.8, 60.0
 _MODES_MONITOR_INTERVAL_S = 5.0
-_MESSAGE_INTERVAL_IDS = 1 << 16  # The 16-bit message id in MESSAGE_INTERVAL is below this number.
+_MESSAGE_INTERVAL_IDS = 1 << 16  # Number of message ids that fit into the 16 bits of MESSAGE_INTERVAL.message_id.
 _MIN_TERRAIN_REQUEST_INTERVAL_S = 2.0
 
 DISPLAY_VALUES: dict[str, float] = {
@@ -63,7 +63,7 @@ class ArduPilotMessageRequests:
         self._groups: dict[int, tuple[int, ...]] = dict.fromkeys(_RATE_PARAMETERS, ())
         for stream, message_id, _ in rows_of(vehicle.KIND, "stream_groups.csv"):
             self._groups[Stream[stream]] += (int(message_id),)
-        # Two values by rate parameter: the value after the next reboot, and the value until then.
+        # By rate parameter: the value after the next reboot, and the value that REQUEST_DATA_STREAM has set until then.
         self._saved: dict[str, tuple[float, int]] = {}
         if stream_groups:
             vehicle.on(m.RequestDataStream, self._on_group)
@@ -164,7 +164,7 @@ class ArduPilotMessageRequests:
         """Restore the stream rates that REQUEST_DATA_STREAM has changed, because of a reboot."""
         parameters = self._vehicle.parameters
         for name, (saved, changed) in self._saved.items():
-            if parameters[name] == changed:  # A value that PARAM_SET has set in the meantime stays.
+            if parameters[name] == changed:  # False if PARAM_SET has set another value, which is kept.
                 parameters[name] = saved
         self._saved.clear()
 
@@ -172,7 +172,7 @@ class ArduPilotMessageRequests:
         vehicle, parameters = self._vehicle, self._vehicle.parameters
         if name not in parameters or parameters[name] == rate:
             return
-        # After the next reboot, the parameter has the value that it had before the first change since boot.
+        # A reboot restores the value from before the first change, so a second change keeps the stored value.
         value_after_reboot, _ = self._saved.get(name, (parameters[name], rate))
         parameters[name] = rate
         if vehicle.KIND == "plane":  # Only ArduPlane saves stream rates beyond a reboot (persist_streamrates).
@@ -186,7 +186,8 @@ class ArduPilotMessageRequests:
             interval = group_interval
             if message_id == m.TerrainRequest.ID and rate > 0:
                 interval = max(interval, _MIN_TERRAIN_REQUEST_INTERVAL_S)
-            elif message_id == m.NamedValueFloat.ID:  # Each message has one value, and each value has the group's rate.
+            # A NAMED_VALUE_FLOAT has one of the values. Each value is sent at the rate of the group.
+            elif message_id == m.NamedValueFloat.ID:
                 interval /= len(DISPLAY_VALUES)
             self._stream(message_id, interval, channel, first)
 

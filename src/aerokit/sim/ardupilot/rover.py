@@ -113,7 +113,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     @property
     def is_any_active(self) -> bool:
-        # A low battery does not count, because it does not cause MAV_STATE_CRITICAL on Rover.
+        # A low battery is not included, because it does not cause MAV_STATE_CRITICAL on Rover.
         return bool(self._triggered) or self.has_estimator_failed
 
     def update(self) -> None:
@@ -149,7 +149,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self._lost_since = rover.now
         if self._triggered and not self._lost:
             self.warn(f"{name} Failsafe Cleared", MavSeverity.INFO)
-        self._triggered &= self._lost  # A failsafe is over for each link that has returned.
+        self._triggered &= self._lost  # Remove the links that have returned, because their failsafe has ended.
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
         if not self._lost or self._triggered or is_waiting or not self._may_act():
             return
@@ -160,7 +160,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         if rover.mode.number == RoverMode.AUTO and enabled == _CONTINUE_MISSION:
             self.warn("Failsafe - Continuing Auto Mode")
         else:
-            # The values of FS_ACTION have the same meanings as the battery actions.
+            # FS_ACTION has the same values as the battery actions, so `act_on_battery` executes it.
             self.act_on_battery(int(rover.parameters["FS_ACTION"]))
 
     def _may_act(self) -> bool:
@@ -185,12 +185,12 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
                 self.has_estimator_failed = False
                 self.warn("EKF failsafe cleared", MavSeverity.CRITICAL)
             return
-        if self.has_estimator_failed or lost_for < _ESTIMATOR_TIMEOUT_S:  # Act only once, after the timeout.
+        if self.has_estimator_failed or lost_for < _ESTIMATOR_TIMEOUT_S:  # Act once, after the timeout.
             return
         self.has_estimator_failed: bool = True
         self.warn("EKF variance", MavSeverity.CRITICAL)
         action = int(rover.parameters["FS_EKF_ACTION"])
-        if action and rover.mode.needs_position:  # Other modes can continue.
+        if action and rover.mode.needs_position:  # Modes that need no position continue.
             if action != _EKF_REPORT_ONLY:
                 rover.set_mode(RoverMode.HOLD)
             self.warn("EKF failsafe", MavSeverity.CRITICAL)
@@ -198,7 +198,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     def _check_wheels(self) -> None:
         """Detect that the rover does not move although its mode drives (FS_CRASH_CHECK)."""
         rover, action = self.vehicle, int(self.vehicle.parameters["FS_CRASH_CHECK"])
-        # In the simulation, only a failed motor keeps the rover from driving.
+        # The simulation has no obstacles: only a failed motor keeps the rover from driving.
         is_blocked = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
         is_stuck = bool(action) and is_blocked and rover.motion.ground_speed_m_s < _STUCK_M_S
         if self._stuck.seconds(is_stuck, rover.now) >= _STUCK_S:
@@ -319,7 +319,7 @@ class SimulatedRover(RoverHost):
     def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
         """Create the motion model with limits from the parameters. Wind is reported, but does not move the rover."""
         parameters = self.parameters
-        # The value 0 means that there is no limit, but the motion model needs one.
+        # The value 0 means that there is no limit. The motion model needs a limit, so `or` replaces the 0.
         limits = GroundLimits(
             acceleration_m_s2=parameters["ATC_ACCEL_MAX"] or 1.0,
             top_speed_m_s=self.top_speed,

@@ -243,7 +243,7 @@ class RoverGuided(_Mode):
         elif speed == 0.0:
             motion.stop()
         else:
-            # Backwards, the nose points away from the direction of travel.
+            # When the rover drives backwards, its nose points away from the direction of travel.
             heading = math.atan2(east, north) + (math.pi if target.backwards else 0.0)
             motion.head(speed, heading if target.yaw is None else target.yaw)
 

@@ -110,7 +110,8 @@ class GuidedSetpoints:
             yaw, yaw_rate = setpoint.yaw, setpoint.yaw_rate
         if yaw is not None and frame in self.RELATIVE_YAW_FRAMES:
             yaw += self.vehicle.motion.yaw
-        # Without a yaw or a yaw rate, the vehicle turns to the direction of travel, and never moves backwards.
+        # Only a target with a yaw or a yaw rate can move the vehicle backwards. Without them, the vehicle turns to the
+        # direction of travel.
         backwards = message.vx < 0 and (yaw is not None or yaw_rate is not None)
         if velocity is not None and frame in self.BODY_FRAMES:
             velocity = rotated(velocity, self.vehicle.motion.yaw)
@@ -290,7 +291,7 @@ class RoverSubAuto(MissionMode):
         if item.command == Cmd.NAV_RETURN_TO_LAUNCH:
             self._place, self._stops = vehicle.navigation.home or current, True
             return
-        # An invalid position, or zero coordinates, mean the place at which the previous command ended.
+        # If the position is invalid or the coordinates are 0, use `current`, where the previous command ended.
         point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or current
         north, east = current[:2] if (item.x, item.y) == (0, 0) else point[:2]
         self._place = (north, east, current[2] if item.z == 0 else point[2])

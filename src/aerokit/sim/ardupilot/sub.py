@@ -91,7 +91,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
 
     @property
     def is_any_active(self) -> bool:
-        # A lost radio is missing here, because it alone does not cause MAV_STATE_CRITICAL on Sub.
+        # A lost radio is not included, because it alone does not cause MAV_STATE_CRITICAL on Sub.
         hull = self.pressure.is_exceeded or self.temperature.is_exceeded
         return self.is_pilot_lost or self.battery_is_low or self.is_ground_station_lost or self.is_leak_detected or hull
 
@@ -114,7 +114,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         is_lost = is_throttle_low or sub.now - self.radio_received_at >= _SILENT_S
         if not enabled:
             is_lost = False
-        elif not is_receiving and not is_lost:  # A short silence neither starts nor ends the failsafe.
+        elif not is_receiving and not is_lost:  # A silence below `_SILENT_S` changes nothing.
             return
         if is_lost == self.is_radio_lost:
             return
@@ -134,7 +134,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
             return
         self.is_pilot_lost = True
         self.warn("Lost manual control", MavSeverity.CRITICAL)
-        for index in range(_STICKS):  # Otherwise the last stick positions would still control the vehicle.
+        for index in range(_STICKS):  # Centre the sticks, so that their last positions no longer move the vehicle.
             sub.rc[index] = _STICK_MIDDLE
         if enabled == _PILOT_DISARM:
             sub.arming.disarm()

@@ -46,8 +46,8 @@ class SubHost(RoverSubVehicle):
         if looks_ahead and distance > _MIN_LOOK_AHEAD_M:
             motion.face(math.atan2(east - motion.east, north - motion.north))
         depth_difference = abs(down - motion.down)
-        # The longer of the two distances is covered at full speed, and the other at a share of the speed, so that the
-        # path is straight. The limit of 1 mm avoids a division by zero.
+        # The longer of the two distances is covered at `speed`, and the shorter one more slowly, so that the path is
+        # straight. 1e-3 avoids a division by zero.
         horizontal = speed * min(1.0, distance / max(depth_difference, 1e-3))
         vertical = speed * min(1.0, depth_difference / max(distance, 1e-3))
         horizontal = max(horizontal, _MIN_TRAVEL_M_S)

@@ -75,7 +75,7 @@ _SENSORS: dict[Kind, _Sensors] = {
     "sub": _Sensors(_BODY | _LASER, always=_RATE | _ATTITUDE | _YAW),
 }
 
-# By firmware: control bits of SYS_STATUS, and the modes in which these kinds of control are off.
+# For each kind of vehicle: bits of SYS_STATUS for kinds of control, and the modes in which these are off.
 _UNCONTROLLED: dict[Kind, tuple[tuple[int, tuple[int, ...]], ...]] = {
     "copter": (
         (_HEIGHT | _PLACE, (CopterMode.STABILIZE, CopterMode.ACRO)),
@@ -121,7 +121,7 @@ def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
         enabled |= _AHRS
         is_estimator_in_use = vehicle.timeline.estimator_leads_early or nav.has_position
         health |= _AHRS if is_estimator_in_use else 0
-    # The firmware continues its log for some seconds after disarming.
+    # The firmware continues its log for `_LOG_AFTER_DISARMING_S` after disarming.
     if vehicle.motors.is_armed or vehicle.now - vehicle.motors.disarmed_at < _LOG_AFTER_DISARMING_S:
         enabled |= _LOGGING
     if vehicle.rangefinder_reach_m > 0.0:

@@ -135,7 +135,8 @@ _VELOCITY_ONLY = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE | _NO_YAW
 _POSITION_ONLY = (
     Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE | Mask.AX_IGNORE | Mask.AY_IGNORE | Mask.AZ_IGNORE | _NO_YAW
 )  # fmt: skip
-# ArduPilot sets these undefined mask bits in the global message, but not in the local one (GCS_MAVLink_Copter.cpp).
+# Four undefined bits of the type mask, which ArduPilot sets in POSITION_TARGET_GLOBAL_INT, but not in
+# POSITION_TARGET_LOCAL_NED (GCS_MAVLink_Copter.cpp).
 _LAST_BYTE = 0xF000
 # Spacing of the terrain grid in metres, and the offset in degrees from the vehicle to the corner of its terrain block.
 _GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
@@ -144,7 +145,7 @@ _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which th
 
 def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
     motion, nav = vehicle.motion, vehicle.navigation
-    place, time = nav.position, vehicle.time_boot_ms  # The position is None until the estimator knows it.
+    place, time = nav.position, vehicle.time_boot_ms  # `place` is None until the estimator knows the position.
     relative = round(nav.altitude_above_home * 1000)
     heading = centidegrees(motion.yaw) if nav.has_attitude else 0
     if place is None:
@@ -215,7 +216,7 @@ def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | Non
         return None
     place = vehicle.navigation.frame.to_global(*target)
     position = (place.latitude_e7, place.longitude_e7, place.altitude_m)
-    mask = _POSITION_ONLY | _LAST_BYTE  # The firmware also sets the four unused bits.
+    mask = _POSITION_ONLY | _LAST_BYTE
     return m.PositionTargetGlobalInt(vehicle.time_boot_ms, MavFrame.GLOBAL, mask, *position, *(0.0,) * 8)
 
 

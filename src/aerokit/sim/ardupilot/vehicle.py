@@ -256,7 +256,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.info("AHRS: DCM active")
         self.arming.start()
         self.failsafes.start()
-        # This takes half a second with SITL's boot timeline; a shorter timeline shortens the delay, too.
+        # With SITL's boot timeline, the delay is half a second. With a shorter timeline, the delay is also shorter.
         self.call_later(0.25 * self.timeline.ready, self._leave_boot)
 
     def _leave_boot(self) -> None:
@@ -306,7 +306,7 @@ class ArduPilotVehicle(ArduPilotHost):
         if not is_entered:
             self.send_text(MavSeverity.WARNING, self.refusal(mode, mode.refused_because))
             return False
-        self.mode.leave()  # Like the firmware, leave the previous mode only after the new mode was entered.
+        self.mode.leave()  # Like the firmware, leave the old mode after entering the new one.
         self.mode = mode
         self.fence.on_mode_changed()
         self.call_later(0.0, lambda: self.send_built(m.Heartbeat.ID))  # The firmware reports a new mode at once.

@@ -74,8 +74,8 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         """Position to point at; None without a region of interest."""
         self.followed: int = 0
         """System id of the followed vehicle; 0 if none."""
-        # The gimbal had the angles `_from` at the time `_since`. Since then, it turns towards `_target`, and the
-        # target itself turns at `_rates`.
+        # At the time `_since`, the gimbal had the angles `_from`. From then on, the gimbal turns towards `_target`, and
+        # `_target` turns at `_rates`.
         self._from: Angles = _ZERO
         self._since = 0.0
         self._target: Angles = _ZERO

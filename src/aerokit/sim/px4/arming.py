@@ -28,7 +28,7 @@ _PERCENT_PER_SIDE = 17
 
 def _side_texts(sensor: str, sides_done: int) -> list[str]:
     """Return the texts before the measurement of a side, after ``sides_done`` sides (calibration_routines.cpp)."""
-    side = _SIDES[-1 - sides_done]  # The simulated user measures the sides from the last to the first.
+    side = _SIDES[-1 - sides_done]  # The simulated user rotates the vehicle to the last side first.
     return [
         f"pending: {' '.join(_SIDES[: len(_SIDES) - sides_done])}",
         "hold vehicle still on a pending side",
@@ -73,7 +73,7 @@ class Px4Calibration:
             self._start(sensor)
             self._begin_side(0, self._run_number)
         elif sensor == "esc":
-            # The simulated battery is always connected, so the check fails (esc_calibration.cpp,
+            # PX4 requires a disconnected battery, but the simulated battery is always connected (esc_calibration.cpp,
             # check_battery_disconnected).
             self._px4.send_text(MavSeverity.CRITICAL, "[cal] calibration failed: Disconnect battery and try again")
             return MavResult.DENIED
@@ -108,7 +108,7 @@ class Px4Calibration:
             return
         texts = _side_texts(self._sensor, sides_done)
         self._send_later(texts, _SIDE_INTERVAL_S)
-        if math.isfinite(self.side_s):  # Otherwise the measurement of this side never ends.
+        if math.isfinite(self.side_s):  # With an infinite `side_s`, the measurement of a side never ends.
             delay_s = len(texts) * _SIDE_INTERVAL_S + self.side_s
             self._px4.call_later(delay_s, lambda: self._end_side(sides_done, run_number))
 

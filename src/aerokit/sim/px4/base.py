@@ -149,7 +149,7 @@ class Px4Vehicle(Px4Host):
         self.calibration: Px4Calibration = Px4Calibration(self)
         self.arming: Px4Arming = Px4Arming(self, self.calibration)
         self.throttle: float = 0.0
-        # True if a client has set home. Arming does not move such a home.
+        # True if a client has set home. Otherwise, arming sets home to the position of the vehicle.
         self.home_is_set_by_client = False
         self.mode_after_landing: Px4Mode = modes.HOLD
         self.vtol_state: int = 0
@@ -259,7 +259,7 @@ class Px4Vehicle(Px4Host):
         if not self.home_is_set_by_client:
             self.home = self.motion.place
         self.failsafes.on_armed()
-        # These modes were entered while disarmed, and start now.
+        # MISSION and TAKEOFF may have been entered while disarmed. They start when the vehicle is armed.
         if self.mode == modes.MISSION:
             self.mission.enter()
         elif self.mode == modes.TAKEOFF:
@@ -285,7 +285,8 @@ class Px4Vehicle(Px4Host):
         self.is_in_failsafe = False
         self.intended_mode = mode
         self.failsafes.override()
-        # A request for the current mode restarts the mission or, in another mode, holds the current position.
+        # If the vehicle is already in the requested mode, the request restarts a mission, and in other modes it holds
+        # the current position.
         if mode == self.mode == modes.MISSION:
             self.mission.enter()
         elif mode == self.mode:

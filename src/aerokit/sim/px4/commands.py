@@ -103,7 +103,7 @@ def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
 _FORCE_MAGIC = 21196.0
 _REBOOT_DELAY_S = 0.2
 _ALIASES: dict[Px4Mode, Px4Mode] = {(modes.AUTO, 0): modes.MISSION, modes.ORBIT: modes.POSITION}
-# `_NAN_AS_INT` is the upper half of a NaN of type double.
+# PX4 refuses a COMMAND_INT whose x and y have the value `_NAN_AS_INT`, the upper 32 bits of a double NaN.
 _INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
 
 
@@ -140,7 +140,7 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
 def refusal_by_place(command: ReceivedCommand, *, checks_frame: bool) -> int | None:
     """Return the MAV_RESULT with which an invalid position or frame is refused; None for a valid command."""
     if command.is_long:
-        # COMMAND_LONG has floats, so an INT32_MAX arrives rounded to a multiple of 128.
+        # INT32_MAX marks an invalid coordinate. In the floats of COMMAND_LONG, it arrives rounded to a multiple of 128.
         is_int32_max = all(_INT32_MAX - 128 < value <= _INT32_MAX + 256 for value in (command.x, command.y))
         return MavResult.DENIED if is_int32_max else None
     if command.x == command.y == _NAN_AS_INT:
@@ -231,7 +231,7 @@ class _Flight:
         if not -1 <= command.param1 < px4.mission.count:
             return MavResult.DENIED
         if command.param1 >= 0 and whole(command.param1) != px4.mission.current:
-            px4.mission.set_current(whole(command.param1))  # even if the mode is then refused (navigator_main.cpp)
+            px4.mission.set_current(whole(command.param1))  # even if PX4 refuses the mode below (navigator_main.cpp)
         result = self._change(modes.MISSION)
         if result == MavResult.ACCEPTED and not px4.arming.arm("mission start"):
             return MavResult.TEMPORARILY_REJECTED
@@ -278,7 +278,7 @@ class _Flight:
         radius = command.param1 if math.isfinite(command.param1) else orbit.radius_m
         speed = abs(command.param2) if math.isfinite(command.param2) else orbit.speed_m_s
         if px4.VEHICLE_TYPE == MavType.FIXED_WING:  # A plane has no ORBIT, but circles its target in HOLD.
-            result = self._change(modes.HOLD)  # This sets the target to the current position.
+            result = self._change(modes.HOLD)  # sets the target to the current position; the next line replaces it
             px4.flight.target, px4.flight.radius_m = (north, east, down), radius
             return result
         if not orbit.plan(radius, speed, (north, east), down):

@@ -110,7 +110,7 @@ class PrecisionLanding:
             return
         self._search_began_at = None
         north, east = target[0] - motion.north, target[1] - motion.east
-        # The model needs a tolerance, even if the parameter is 0.
+        # The vehicle never is exactly above the target, so a minimum tolerance replaces a parameter of 0.
         is_above = math.hypot(north, east) <= max(limits["PLD_HACC_RAD"], _MIN_TOLERANCE_M)
         descent = px4.flight.descent_speed_m_s if is_above else 0.0
         motion.seek_velocity(*velocity_to_landing_target(north, east), descent)

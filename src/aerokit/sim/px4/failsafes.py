@@ -225,7 +225,7 @@ class Px4Failsafes:
         state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
         if state == MavBatteryChargeState.OK:
             return Action.NONE
-        is_known_at_arming = state <= self._battery_at_arming  # Arming has accepted this state, so it only warns.
+        is_known_at_arming = state <= self._battery_at_arming  # The pilot armed in this state, so it only warns.
         has_action = action in (_BATTERY_LAND, _BATTERY_RETURN)
         if state == MavBatteryChargeState.LOW or is_known_at_arming or not has_action:
             return Action.WARN
@@ -377,7 +377,7 @@ class Px4Failsafes:
         px4, previous, self.action = self._px4, self.action, action
         px4.is_in_failsafe = action > Action.WARN
         is_escalation = action > max(previous, Action.WARN)
-        if is_escalation and action < Action.TERMINATE:  # A termination sends its own texts.
+        if is_escalation and action < Action.TERMINATE:  # `terminate` sends its own texts.
             self._report(action)
         if action == Action.DISARM:
             px4.arming.disarm("failsafe", force=True)

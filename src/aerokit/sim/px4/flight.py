@@ -47,7 +47,7 @@ class Px4Orbit:
         turn_sign = math.copysign(1.0, self.radius_m)
         tangent = angle + turn_sign * math.pi / 2
         speed = self.speed_m_s
-        # The velocity away from the middle, which leads back to the circle. It is negative outside the circle.
+        # The radial velocity, which leads back to the circle: positive away from the middle, negative towards it.
         outwards = max(-speed, min(speed, _BACK_TO_CIRCLE_PER_S * (abs(self.radius_m) - distance)))
         motion.seek_velocity(
             speed * math.cos(tangent) + outwards * math.cos(angle),
@@ -238,7 +238,8 @@ class Px4Flight:
         height = max(vehicle.parameters["RTL_RETURN_ALT"], current_height)
         if distance < vehicle.parameters["RTL_MIN_DIST"]:
             height = max(vehicle.parameters["RTL_DESCEND_ALT"], current_height)
-        # A smaller down coordinate is higher. The return first climbs at its present place, and never descends.
+        # The return begins with a climb at the present place. `min` prevents a descent, because a smaller down
+        # coordinate is higher.
         self.target = (north, east, min(down, self.destination[2] - height))
         amsl = vehicle.frame.origin.altitude_m - self.target[2]
         text = f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)"
@@ -252,7 +253,8 @@ class Px4Flight:
         self.go()
         if math.dist(self.target, motion.place) > _ARRIVED_M:
             return
-        # The vehicle has arrived at the target of the phase: above its starting point, then above the destination.
+        # In the phase "climb", the vehicle has arrived above its starting point. In the phase "return", it has arrived
+        # above the destination.
         if self._phase == "climb":
             self._phase = "return"
             self.target = (*self.destination[:2], self.target[2])

@@ -80,7 +80,7 @@ TOO_FAR = "Geofence: exceeding maximum distance to Home"
 TOO_HIGH = "Geofence: exceeding maximum altitude above Home"
 OUTSIDE = "Geofence: approaching or outside geofence"
 
-# PX4 marks a text whose content an event also reports by a final tab. It sends these texts without the tab.
+# PX4 appends a tab to a status text if an event has the same content. Texts that begin as follows have no tab.
 _WITHOUT_TAB = (
     "Preflight Fail: ",
     "Geofence: ",
@@ -144,7 +144,7 @@ _FAST_MESSAGES = (
     m.ServoOutputRaw.ID,
 )
 _SIMULATION_RATES_HZ = {m.RcChannels.ID: 20.0, m.OpticalFlowRad.ID: 10.0, m.Statustext.ID: 20.0}
-# Rates of the messages that have the same rate on every link, which cannot be changed.
+# Messages whose rate is the same on every link and cannot be changed. The values are the rates in Hz.
 _ALWAYS_HZ = {m.Heartbeat.ID: 1.0, m.MissionCurrent.ID: 1.0, m.CurrentEventSequence.ID: 0.3}
 
 _OFF, _ON_CHANGE = -1, 0
@@ -167,12 +167,12 @@ class Px4StreamRates:
 
     def start(self, channel: Channel, number: int, first: float) -> None:
         """Start the streams of link ``number`` at time ``first``."""
-        mode = self._modes[min(number, len(self._modes) - 1)]  # Further links have the last mode.
+        mode = self._modes[min(number, len(self._modes) - 1)]  # Links without an own mode have the last mode.
         self._mode_of[channel] = mode
         intervals_us = self._intervals_us[channel] = {}
         for message_id, rate in self._rates_at_start(mode).items():
             intervals_us[message_id] = _interval_us(rate)
-            # GPS_GLOBAL_ORIGIN has a rate, but is sent only once and after a change.
+            # PX4 sends GPS_GLOBAL_ORIGIN only once and after a change, although the table has a rate for it.
             if rate and self._is_built(message_id) and message_id != m.GpsGlobalOrigin.ID:
                 channel.streams.set_interval(message_id, 1.0 / rate, first)
         for message_id, rate in _ALWAYS_HZ.items():

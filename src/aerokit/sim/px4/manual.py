@@ -69,7 +69,7 @@ class Px4Sticks:
         self.yaw = yaw
         self.throttle = throttle
         self._moved_at = self._px4.now
-        if were_fresh:  # The first positions after a silence do not count as a movement.
+        if were_fresh:  # The first positions after a silence are not compared with the old positions.
             present = (roll, pitch, yaw, throttle)
             largest_movement = max(abs(new - old) for new, old in zip(present, previous, strict=True))
             self._px4.on_sticks_moved(largest_movement)
@@ -95,7 +95,7 @@ _EXPO, _DEAD_ZONE = 0.6, 0.1
 _SLOW_SHARE = 0.3
 _LIFTS_OFF_ABOVE = 0.05
 _AT_REST_M_S = 0.3
-# The velocity control of `Motion` has this time constant.
+# Time constant of the velocity control of `Motion`. `_velocity_of_thrust` multiplies an acceleration by it.
 _THRUST_AHEAD_S = 0.3
 
 _HOLDS_HEIGHT = frozenset({ALTITUDE, ALTITUDE_CRUISE, POSITION, POSITION_SLOW})

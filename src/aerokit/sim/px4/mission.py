@@ -56,7 +56,7 @@ def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
 
     MIS_TKO_LAND_REQ is 0 to require nothing, 1 a take-off, 2 (the default of planes) a landing, 3 both, 4 both or none.
     """
-    if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # The table of the multicopter lacks it.
+    if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # A multicopter has no MIS_TKO_LAND_REQ.
         return None
     takes_off = any(item.command in _TAKE_OFFS for item in items)
     lands = any(item.command in _LANDINGS for item in items)
@@ -81,7 +81,7 @@ def _height_above_home(px4: Px4Host, item: MissionItem) -> float:
 
 def _landing_problem(items: Sequence[MissionItem]) -> str | None:
     """Return PX4's text about a wrong order of DO_LAND_START, landing and return, or None."""
-    # Indices of DO_LAND_START and of the item before the landing; -1 if there is no such item.
+    # Indices of DO_LAND_START (`land_start`) and of the item before the landing (`approach`); -1 without such an item.
     land_start = approach = -1
     for index, item in enumerate(items):
         if item.command == Cmd.DO_LAND_START:
@@ -94,7 +94,7 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
             approach = index - 1
         elif item.command == Cmd.NAV_RETURN_TO_LAUNCH and land_start >= 0:
             return "land start item before RTL item not possible."
-    # DO_LAND_START must not be after the item before the landing.
+    # DO_LAND_START must be before the landing, and at the latest the item directly before it.
     return "invalid land start." if land_start > approach else None
 
 
@@ -223,7 +223,7 @@ class Px4Mission:
         """Enter mission mode. A finished mission starts again, unless another item was selected in the meantime."""
         if not self.is_valid:
             return
-        # A finished mission stays at its last item.
+        # A finished mission stays at its last item. If `current` is another item, that item was selected later.
         is_still_finished = self.is_finished and self.current == self.count - 1
         if self.current >= self.count or is_still_finished:
             self.current = 0

@@ -78,7 +78,7 @@ def checksum(items: Sequence[MissionItem], previous: int = 0) -> int:
     for item in items:
         params = (item.param1, item.param2, item.param3, item.param4)
         header = struct.pack("<BHB4f", item.frame, item.command, item.autocontinue, *params)
-        # x and y are integers in MISSION_ITEM_INT, and floats in MISSION_ITEM.
+        # Like PX4, use x and y as received: integers from MISSION_ITEM_INT, and floats from MISSION_ITEM.
         place = struct.pack("<iif" if isinstance(item.x, int) else "<3f", item.x, item.y, item.z)
         # zlib inverts the CRC at the start and at the end. PX4 does not, so the inversion is undone here.
         crc = zlib.crc32(header + place, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
@@ -146,7 +146,7 @@ def _heading(degrees: float) -> float:
     return float32(radians * _DEGREES_PER_RADIAN)
 
 
-# Functions that return a value as it is after it was stored and read again, by storage type.
+# By storage type: functions that return the value that is read after a value was stored.
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
     "-": lambda _: 0.0,
     "f": float32,

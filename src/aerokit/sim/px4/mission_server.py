@@ -163,7 +163,8 @@ class Px4MissionServer(MissionServer):
         if link.uses_int:
             message: AnyItem = item_message_int(downloaded, seq, client, kind, current=is_current)
         else:
-            scale = 1.0 if item.frame == MavFrame.MISSION else 1e-7  # Only positions are in degrees times 1e7.
+            # In MAV_FRAME_MISSION, x and y are not coordinates. In other frames, they are stored as degrees times 1e7.
+            scale = 1.0 if item.frame == MavFrame.MISSION else 1e-7
             place = (item.x * scale, item.y * scale)
             message = item_message_float(downloaded, place, seq, client, kind, int(is_current))
         self._px4.send(message, link.channel)
@@ -299,7 +300,7 @@ class Px4MissionServer(MissionServer):
     def _put(self, upload: ListUpload, message: AnyItem) -> int:
         link, item = self._link(upload.channel), item_from(message)
         is_int = isinstance(message, m.MissionItemInt)
-        item_in_e7 = item  # The item with latitude and longitude in degrees times 1e7.
+        item_in_e7 = item  # has its latitude and longitude in degrees times 1e7, also if received in MISSION_ITEM
         if not is_int and item.frame != MavFrame.MISSION:
             item_in_e7 = item.replace(x=_e7(item.x), y=_e7(item.y))
         stored_item = stored(item_in_e7, link.mission_type, is_int=is_int)
@@ -307,7 +308,7 @@ class Px4MissionServer(MissionServer):
             if stored_item != Result.ERROR:
                 self._warn("IGN MISSION_ITEM: Invalid item")
             return stored_item
-        # The checksum covers the item as it was received. In a MISSION_ITEM, x and y are floats.
+        # The checksum covers the item as received, so x and y of a MISSION_ITEM must be floats.
         received = item if is_int else item.replace(x=float(item.x), y=float(item.y))
         link.opaque_id = checksum([received], link.opaque_id)
         link.items.append(stored_item)

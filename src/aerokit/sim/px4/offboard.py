@@ -114,7 +114,7 @@ class Px4Offboard:
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
         motion = self._vehicle.motion
         if target.type_mask & AttitudeTargetTypemask.ATTITUDE_IGNORE:
-            if self._attitude is None or self._body_rates is None:  # The first rates turn the present attitude.
+            if self._attitude is None or self._body_rates is None:  # Rates start from the present attitude.
                 self._attitude = (motion.roll, motion.pitch, motion.yaw)
             self._body_rates = (target.body_roll_rate, target.body_pitch_rate, target.body_yaw_rate)
         elif all(map(math.isfinite, target.q)):
@@ -128,7 +128,7 @@ class Px4Offboard:
         if self._vehicle.version_number >= _VERSION_1_14:
             return
         motion = self._vehicle.motion
-        # Only the thrust is simulated, so the present attitude is held.
+        # Of the controls, only the thrust is simulated. The vehicle keeps its present attitude.
         self._attitude, self._body_rates = (motion.roll, motion.pitch, motion.yaw), None
         if target.group_mlx == _FLIGHT_CONTROL_GROUP:
             self._thrust = target.controls[_THRUST_CONTROL]
@@ -149,7 +149,8 @@ class Px4Offboard:
 
     def fly(self) -> None:
         motion = self._vehicle.motion
-        # After another mode, the last call may be long ago, so the elapsed time is limited to that of a long tick.
+        # `fly` is called only in OFFBOARD. If the last call was before another mode, the elapsed time is limited to
+        # MAX_TICK_S.
         elapsed, self._flown_at = min(MAX_TICK_S, self._vehicle.now - self._flown_at), self._vehicle.now
         if self._attitude is not None:
             self._fly_attitude(self._attitude, elapsed)

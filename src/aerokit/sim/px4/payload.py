@@ -23,12 +23,13 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import RTL
 from aerokit.sim.vehicle import sender_of
 
-# Values of MNT_MODE_IN that enable the gimbal. It is then controlled by radio and MAVLink, or by MAVLink only.
+# Values of MNT_MODE_IN that enable the gimbal. With 0, radio and MAVLink control the gimbal, with 4 MAVLink only.
 _FITTED_BY = frozenset({0, 4})
 _DEVICE_ID = 1
 _LIMITS = ((-45.0, 45.0), (-45.0, 45.0), (-180.0, 180.0))
 _TAU_S, _STEP_S = 0.3, 0.0187
-# PX4 filters the angle that it integrates from the rate. The gimbal therefore turns more slowly than commanded.
+# PX4 integrates the commanded rate to an angle, and filters this angle. The gimbal therefore turns at this share of the
+# commanded rate.
 _RATE_FACTOR = _STEP_S / (_TAU_S + _STEP_S)
 _RATE_TIMEOUT_S = 2.0
 _POLL_INTERVAL_S = 0.25
@@ -127,7 +128,7 @@ class Px4Gimbal:
         is_going_home = self._px4.mode == RTL
         if is_going_home and not self._was_returning:
             self.rest()
-            self.in_control = (0, 0)  # PX4 takes control and releases it at once, which ends the control of others.
+            self.in_control = (0, 0)  # PX4 takes control and releases it at once, so no component keeps control.
         self._was_returning = is_going_home
 
     def _on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:

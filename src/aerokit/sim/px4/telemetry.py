@@ -26,7 +26,7 @@ from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.telemetry_details import IDENTITY_BUILDERS, SENSOR_BUILDERS
 
-# Masks of sensor bits in SYS_STATUS: the present, the enabled, the healthy, and those healthy during the boot.
+# Sensor bits of SYS_STATUS: present, enabled, healthy, and (`_BOOTING`) healthy during the boot.
 _PRESENT, _ENABLED = 0x0300402F, 0x0301402F
 _HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
 _GPS_BIT, _RC_BIT = int(MavSysStatusSensor.GPS), int(MavSysStatusSensor.RC_RECEIVER)
@@ -73,7 +73,8 @@ def _state(px4: Px4Vehicle) -> MavState:
         return MavState.ACTIVE
     if px4.calibration.is_running:
         return MavState.CALIBRATING
-    return MavState.STANDBY if px4.arming.is_possible else MavState.UNINIT  # A failed arming check is UNINIT, too.
+    # PX4 reports UNINIT while a check prevents arming.
+    return MavState.STANDBY if px4.arming.is_possible else MavState.UNINIT
 
 
 def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
@@ -277,7 +278,7 @@ def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
     motion = px4.motion
     yaw = motion.yaw
     if not px4.is_armed:
-        # PX4 makes sure in this way that there is no thrust (MulticopterPositionControl.cpp).
+        # The downward acceleration ensures that there is no thrust (MulticopterPositionControl.cpp).
         unknown, acceleration = (math.nan, math.nan, math.nan), (0.0, 0.0, 100.0)
         mask = _IGNORE_POSITION_AND_VELOCITY
         return m.PositionTargetLocalNed(

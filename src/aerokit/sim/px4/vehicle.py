@@ -71,8 +71,8 @@ class SimulatedPx4(Px4Vehicle):
 
 _FLARE_M = 3.0
 _GLIDE_SPEED_FACTOR = 1.3
-# The target of a descent is as far below the plane as it sinks in this time, so that `FixedWing.climb_to` returns the
-# wanted sink rate.
+# In a descent, the target altitude is below the plane by this time multiplied by the wanted sink rate. For such a
+# target, `FixedWing.climb_to` returns the wanted sink rate.
 _SINK_TARGET_S = 2.5
 _FLARE_SINK_M_S = 0.5
 _HEIGHT_REACHED_M = 10.0
@@ -138,7 +138,7 @@ class Px4PlaneFlight(Px4Flight):
         throttle = (sticks.throttle + 1.0) / 2  # from 0 to 1
         speed = min_speed + throttle * (max_speed - min_speed)
         self._motion.bank_and_climb(speed, math.radians(parameters["FW_R_LIM"]) * sticks.roll, climb)
-        self.stay_here()  # Without sticks, the plane circles the place where they were lost.
+        self.stay_here()  # After a loss of the sticks, the plane circles the place of the last call.
 
     def go(self) -> None:
         self.circle()
