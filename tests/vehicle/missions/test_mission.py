@@ -62,8 +62,9 @@ async def reaches(flight: AnyFlight, item: int) -> None:
 # ------------------------------------------------------------------------------------ completion
 
 
-async def test_mission_of_earlier_program_is_flown_to_landing() -> None:
-    """The upload sends nothing, because PX4 has the plan already. The end of the mission must be known nevertheless."""
+@pytest.mark.parametrize("uploads_again", [True, False])
+async def test_mission_of_earlier_program_is_flown_to_landing(uploads_again: bool) -> None:
+    """The upload sends nothing, because PX4 has the plan already. Without an upload, its items are unknown."""
     px4 = SimulatedPx4(boot_time_s=1.0)
     async with open_px4(px4) as earlier:
         await earlier.vehicle.wait_ready()
@@ -72,12 +73,27 @@ async def test_mission_of_earlier_program_is_flown_to_landing() -> None:
     async with open_px4(px4) as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.mission.progress.wait_until(lambda _: True)
-        await flight.vehicle.mission.upload(mission, only_changes=True)
+        if uploads_again:
+            await flight.vehicle.mission.upload(mission, only_changes=True)
         assert flight.wire.all(m.MissionItemInt) == []
         await flight.vehicle.arm()
         await flight.vehicle.mission.start()
         await flight.vehicle.mission.wait_finished(timeout=600)
         assert px4.is_landed
+
+
+async def test_unknown_mission_that_ends_in_air_is_finished_there() -> None:
+    px4 = SimulatedPx4(boot_time_s=1.0)
+    async with open_px4(px4) as earlier:
+        await earlier.vehicle.wait_ready()
+        await earlier.vehicle.mission.upload(short_mission(earlier))
+    async with open_px4(px4) as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+        await flight.vehicle.mission.start()
+        await flight.vehicle.mission.wait_finished(timeout=600)
+        assert not px4.is_landed
+        assert flight.vehicle.mode_name == "LOITER"
 
 
 @pytest.mark.sampled(3)

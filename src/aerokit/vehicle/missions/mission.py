@@ -47,7 +47,8 @@ class MissionEndDetector:
     A mission has ended when the vehicle reports the mission as complete, or has landed and disarmed at its last item.
     If the mission ends with a landing, or with a return that includes a landing, the vehicle must also be on the
     ground, because PX4 reports completion when the return starts, and returns in another mode. A return without a
-    landing ends at home. If a vehicle reports no mission state, the mission has ended when the last item is reached.
+    landing ends at home. If a vehicle reports no mission state, the mission has ended when the last item is reached. If
+    the items are unknown, the mode after the completion shows whether the vehicle lands.
     """
 
     def __init__(
@@ -59,6 +60,8 @@ class MissionEndDetector:
         self._order = vehicle_context.arbiter.newest  # the newest order when the wait began
         last_command = items[-1].command if items else None
         is_return = last_command == MavCmd.NAV_RETURN_TO_LAUNCH
+        self._are_items_known = bool(items)
+        self._completed_at: float | None = None  # when a mission whose items are unknown was first seen complete
         self._ends_by_landing = last_command in LANDING_COMMANDS
         self._ends_in_air = is_return and not session.autopilot.lands_after_return
         self._return_began_at: float | None = None
@@ -79,6 +82,8 @@ class MissionEndDetector:
 
     def _is_end_reported(self) -> bool:
         """Return True if the vehicle reports the end of the mission. A vehicle that has fallen may report it too."""
+        if self._tracker.is_complete and not self._are_items_known:
+            return self._is_unknown_end_reached()
         if self._tracker.is_complete:
             # ArduPilot reports completion at home, PX4 already when it begins to return.
             has_returned = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
@@ -94,6 +99,26 @@ class MissionEndDetector:
         last = self._tracker.last_item
         # Without a mission state, the last item that was reached shows the end.
         return not reports_state and last is not None and self._tracker.reached == last
+
+    def _is_unknown_end_reached(self) -> bool:
+        """Return True if a complete mission, whose items are unknown, has ended.
+
+        PX4 reports completion when a return or a landing begins. HEARTBEAT may report the mode of it a little later.
+        """
+        if self._lands_after_unknown_mission:
+            return self._is_on_ground
+        now = self._session.connection.now()
+        if self._completed_at is None:
+            self._completed_at = now
+        return self._is_on_ground or now - self._completed_at >= END_GRACE_S
+
+    @property
+    def _lands_after_unknown_mission(self) -> bool:
+        """True if a mission, whose items are unknown, is complete, and the vehicle returns or lands."""
+        session = self._session
+        if self._are_items_known or not self._tracker.is_complete or not session.autopilot.lands_after_return:
+            return False
+        return session.telemetry.mode.latest in self._landing_modes
 
     def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
         """Return the reason why the vehicle will not fly the mission to its end; None if it may still do so.
@@ -111,7 +136,8 @@ class MissionEndDetector:
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
         is_mode_settling = now < self._vehicle_context.arbiter.mode_settles_at
-        may_have_this_mode = is_paused or is_in_mode or self._is_landing or is_mode_settling
+        is_landing = self._is_landing or self._lands_after_unknown_mission
+        may_have_this_mode = is_paused or is_in_mode or is_landing or is_mode_settling
         if may_have_this_mode and not session.telemetry.is_confirmed_disarmed:
             self._left_at = None
             return None
