@@ -208,8 +208,8 @@ export function typeProblem({ name, type }, value) {
   const [, sign, bits] = /^(U?)INT(8|16|32|64)$/.exec(type) ?? [];
   if (!bits) return type === "REAL32" && Math.abs(value) > MAX_REAL32 ? `${name} = ${value} is too large (it is a REAL32).` : "";
   const size = 2 ** (bits - (sign ? 0 : 1)), minimum = sign ? 0 : -size;
-  if (!Number.isInteger(value)) return `${name} = ${value} must be a whole number (it is an ${type}).`;
-  return value < minimum || value >= size ? `${name} = ${value} must be in ${minimum}..${size - 1} (it is an ${type}).` : "";
+  if (!Number.isInteger(value)) return `${name} = ${value} must be a whole number (its type is ${type}).`;
+  return value < minimum || value >= size ? `${name} = ${value} must be in ${minimum}..${size - 1} (its type is ${type}).` : "";
 }
 
 // Why the metadata does not allow a value, like ParameterMetadata.problem in metadata.py; "" if it does.
