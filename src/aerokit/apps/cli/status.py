@@ -231,8 +231,9 @@ async def run_status(options: argparse.Namespace) -> int:
 
 
 async def _readiness_of(vehicle: Vehicle) -> Readiness:
-    # The messages about the estimator depend on the firmware.
-    estimator_messages = [("estimator", message) for message in vehicle.telemetry.required_messages("estimator")]
+    # `why_not_armable` requests the estimator's messages, which depend on the firmware, from disarmed vehicles only.
+    needed = vehicle.telemetry.required_messages("estimator") if vehicle.is_armed else ()
+    estimator_messages = [("estimator", message) for message in needed]
     for state, message in [*_REQUESTED, *estimator_messages]:
         cell = getattr(vehicle, state)
         if not cell.is_known:

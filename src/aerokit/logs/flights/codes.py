@@ -8,6 +8,8 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
+from aerokit.autopilots.gcs_failsafe import GCS_FAILSAFE_ACTIONS
+
 MODE_REASONS: Mapping[int | None, tuple[str, str | None, bool | None]] = {
     1: ("radio control", None, False),
     2: ("ground station", None, False),
@@ -159,7 +161,6 @@ _ROVER_BATTERY = ("none", "RTL", "HOLD", "SMART_RTL", "SMART_RTL or HOLD", _STOP
 _PLANE_BATTERY = ("none", "RTL", "LAND", _STOPS, "QLAND", "parachute", "LOITER, then QLAND", "AUTOLAND or RTL")
 _SUB_BATTERY = ("none", "", "disarms", "SURFACE")
 _BATTERY = ("BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT")
-_PX4_LINK = ("none", "Hold", "Return", "Land", "", _STOPS, "disarms")
 # Maps firmwares and parameters of failsafes to the meanings of the values, from 0. Sources: AP_BattMonitor_Params.cpp,
 # AC_Fence.cpp and Parameters.cpp of ArduPilot 4.7, commander and navigator parameters of PX4 1.17.
 _ACTIONS: dict[str, dict[str, tuple[str, ...]]] = {
@@ -205,14 +206,16 @@ _ACTIONS: dict[str, dict[str, tuple[str, ...]]] = {
     "PX4": {
         "COM_LOW_BAT_ACT": ("warning", "", "Land", "Return if critical, Land in an emergency"),
         "GF_ACTION": ("none", "warning", "Hold", "Return", _STOPS, "Land"),
-        "NAV_DLL_ACT": _PX4_LINK,
-        "NAV_RCL_ACT": _PX4_LINK,
+        "NAV_RCL_ACT": ("none", "Hold", "Return", "Land", "", _STOPS, "disarms"),
     },
 }
 
 
 def failsafe_action(vehicle: str, parameter: str, value: float) -> str:
     """Return the meaning of a failsafe parameter's value; empty if unknown. ``vehicle`` begins with the firmware."""
-    actions = next((actions for firmware, actions in _ACTIONS.items() if firmware in vehicle), {})
-    meanings = actions.get(parameter, ())
+    firmware = next((firmware for firmware in _ACTIONS if firmware in vehicle), "")
+    of_lost_station = GCS_FAILSAFE_ACTIONS.get(firmware, {}).get(parameter)
+    if of_lost_station is not None:
+        return of_lost_station.get(value, "")
+    meanings = _ACTIONS.get(firmware, {}).get(parameter, ())
     return meanings[int(value)] if value in range(len(meanings)) else ""

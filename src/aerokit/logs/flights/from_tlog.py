@@ -36,11 +36,6 @@ _NULL_ISLAND_E7 = 100_000
 _HEARTBEAT_ID = b"\0\0\0"
 # Bits of a set-point's type mask. If they are set, the position, velocity or attitude is ignored.
 _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
-_CHARGE_STATE_NAMES = {
-    MavBatteryChargeState.LOW: "low",
-    MavBatteryChargeState.CRITICAL: "critical",
-    MavBatteryChargeState.EMERGENCY: "emergency",
-}
 _ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
 
@@ -388,8 +383,9 @@ class _Reader:
         if message.id == 0 and cells_mv:
             self._has_battery_status = True
         state = message.charge_state
-        if state in _CHARGE_STATE_NAMES and state > self._charge_states.get(message.id, 0):
-            text = f"charge state {_CHARGE_STATE_NAMES[MavBatteryChargeState(state)]} (BATTERY_STATUS)"
+        is_low = MavBatteryChargeState.LOW <= state <= MavBatteryChargeState.EMERGENCY
+        if is_low and state > self._charge_states.get(message.id, 0):
+            text = f"charge state {MavBatteryChargeState(state).name.lower()} (BATTERY_STATUS)"
             self._flight.failsafe_evidence.append(FailsafeEvidence(time_s, "battery", text))
         self._charge_states[message.id] = state
         current_a = current(message.current_battery, self._autopilot)

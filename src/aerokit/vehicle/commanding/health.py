@@ -13,8 +13,6 @@ from aerokit.events import LinkRestored, LinkState
 from aerokit.mavlink.enums import MavBatteryChargeState, MavCmd, MavSysStatusSensor
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from aerokit.autopilots import Mode
     from aerokit.vehicle.session.session import VehicleSession
 
@@ -30,16 +28,6 @@ CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
 """The reason for a refusal to arm if no other reason is known."""
 REPORTS_ABOUT_ARMING = ("heartbeats (", "sensors (")
 """How reasons begin that are about reports without which it is unknown whether the vehicle arms."""
-LOW_CHARGE_STATES: Mapping[int, str] = {
-    state: state.name.lower()
-    for state in (
-        MavBatteryChargeState.CRITICAL,
-        MavBatteryChargeState.EMERGENCY,
-        MavBatteryChargeState.FAILED,
-        MavBatteryChargeState.UNHEALTHY,
-    )
-}
-"""Charge states of a battery with which a vehicle refuses to arm, by MAV_BATTERY_CHARGE_STATE."""
 RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
 
@@ -142,8 +130,9 @@ class Health:
         """Return the probable reasons why checks fail, if the vehicle names none. PX4 names a low battery only once."""
         low_batteries = []
         for battery in self._telemetry.batteries.latest or ():
-            state = LOW_CHARGE_STATES.get(battery.charge_state)
-            if state is not None:
+            # With these charge states (critical, emergency, failed, unhealthy), vehicles refuse to arm.
+            if MavBatteryChargeState.CRITICAL <= battery.charge_state <= MavBatteryChargeState.UNHEALTHY:
+                state = MavBatteryChargeState(battery.charge_state).name.lower()
                 charge = "" if battery.remaining_percent is None else f" ({battery.remaining_percent} %)"
                 low_batteries.append(f"battery {battery.id + 1} reports the charge state {state}{charge}")
         return low_batteries or [CHECKS_FAIL]

@@ -91,7 +91,7 @@ class MissionEndDetector:
         # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.
         if self._ends_in_air and self._is_landing:
             return self._is_on_ground or self._is_home
-        self._return_began_at = None  # The vehicle is not returning.
+        self._return_began_at = self._completed_at = None  # The vehicle flies the mission, perhaps once more.
         if self._session.telemetry.is_confirmed_disarmed and self._is_landing:
             return True
         progress = self._tracker.progress.latest
