@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from cli_harness import run_on
 from exhaustive import exhaustive
 from served_copter import served, served_copter
 
@@ -20,6 +21,7 @@ import aerokit.sync
 from aerokit.apps.cli import main
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.sim import SimulatedCopter
+from aerokit.testing import run_virtual
 
 posix_only = pytest.mark.skipif(os.name == "nt", reason="sends POSIX signals")
 
@@ -215,7 +217,13 @@ def test_demo_mode_change_by_pilot_is_not_overruled(mode: str, tmp_path: Path) -
         assert f"the mode changed to {mode}" in printed
         assert f"the vehicle itself or another party changed the mode to {mode}" in printed
         assert process.returncode == 1
-        assert pilot.is_armed
+
+
+def test_demo_records_flight_after_failsafe_to_its_end(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_virtual(run_on(None, "demo", "--speedup", "1", "--fault", "rc_lost@30", "--record", "x.tlog")) == 1
+    out = capsys.readouterr().out
+    assert "still armed: the recording goes on until the vehicle disarms" in out
+    assert "end of the recording: in RTL, disarmed, 0.0 m above home" in out
 
 
 @pytest.mark.exhaustive

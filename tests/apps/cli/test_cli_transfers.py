@@ -17,8 +17,8 @@ from aerokit.apps.cli import main
 from aerokit.apps.cli.mission import upload_parts
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.enums import MavAutopilot
-from aerokit.missions import Mission, Plan, return_to_launch, take_off, waypoint, write_plan_file
+from aerokit.mavlink.enums import MavAutopilot, MavType
+from aerokit.missions import Mission, Plan, land, return_to_launch, take_off, waypoint, write_plan_file
 from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter
 from aerokit.testing import run_virtual
@@ -204,6 +204,18 @@ def test_mission_check_warns_of_unknown_command_and_missing_take_off(capsys: pyt
     assert "warning: mission item 0: command 9999 is not a MAV_CMD" in out
     assert "warning: the mission does not begin with a take-off" in out
     assert out.endswith("m.waypoints has no errors, but 2 warnings\n")
+
+
+@pytest.mark.parametrize(("vehicle_type", "warns"), [(MavType.QUADROTOR, True), (MavType.SUBMARINE, False)])
+def test_mission_check_warns_of_altitudes_below_home(
+    vehicle_type: MavType, warns: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    items = take_off(-5), waypoint(47.3, 8.5, altitude_relative_m=-20), land(47.3, 8.5, altitude_relative_m=-1)
+    write_plan_file("m.plan", Plan(Mission(items), vehicle_type=vehicle_type))
+    assert main(["mission", "check", "m.plan"]) == 0
+    warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning")]
+    expected = ["mission item 0: NAV_TAKEOFF at -5 m above home", "mission item 1: NAV_WAYPOINT at -20 m above home"]
+    assert warnings == [f"warning: {text}" for text in expected if warns]
 
 
 @pytest.mark.parametrize("text", ["", "[1]", '{"a":', "hello"])

@@ -27,6 +27,7 @@ from aerokit.missions.actions import jump
 from aerokit.missions.navigation import return_to_launch, waypoint
 from aerokit.sim import SimulatedPx4
 from aerokit.sim.ardupilot.mission_run import MissionRun
+from aerokit.sim.px4 import modes as px4_modes
 
 pytestmark = pytest.mark.anyio
 
@@ -94,6 +95,24 @@ async def test_unknown_mission_that_ends_in_air_is_finished_there() -> None:
         await flight.vehicle.mission.wait_finished(timeout=600)
         assert not px4.is_landed
         assert flight.vehicle.mode_name == "LOITER"
+
+
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+async def test_landing_elsewhere_during_final_return_fails_mission(opened: Any) -> None:
+    async with armed(opened, return_to_launch()) as flight:
+
+        async def land_during_return() -> None:
+            await reaches(flight, 3)
+            if isinstance(flight, Flight):
+                assert flight.copter.set_mode(CopterMode.LAND)
+            else:
+                assert flight.px4.change_mode(px4_modes.LAND)
+
+        await flight.vehicle.mission.start()
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(land_during_return)
+            with pytest.raises(OperationRejected, match=r"the mode changed to LAND, at item 3 of"):
+                await flight.vehicle.mission.wait_finished(timeout=600)
 
 
 @pytest.mark.sampled(3)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.apps.cli.arguments import add_baud, add_faults, add_vehicle_kind, address, number, system_id, writable_file
 from aerokit.apps.cli.completion import addresses, offer
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_signing_key, connect_to, signing_of
-from aerokit.apps.cli.flight_recording import record_parameters
+from aerokit.apps.cli.flight_recording import record_parameters, record_to_end
 from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, add_json, emit, new_recording
 from aerokit.apps.cli.sim import faults_begin, simulated_vehicle
 from aerokit.apps.cli.supervised_flight import FlightReport, SupervisedFlight
@@ -91,7 +91,10 @@ async def _connect_and_fly(options: argparse.Namespace, interrupts: InterruptSta
         )
         report = FlightReport(vehicle, options, 1.0 if is_real else options.speedup)
         async with report.running():
-            code = await _SquareFlight(vehicle, report, interrupts).fly_square(options.altitude, options.side)
+            flight = _SquareFlight(vehicle, report, interrupts)
+            code = await flight.fly_square(options.altitude, options.side)
+            if flight.armed_by_us:
+                await record_to_end(vehicle, interrupts, report.print_line, report.speedup)
         report.print_summary(options.record)
     return code
 

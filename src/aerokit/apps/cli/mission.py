@@ -15,7 +15,7 @@ from aerokit.apps.cli.output import DONE, add_force, check_not_existing, emit, s
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.apps.plan_text import parse_plan_text
 from aerokit.errors import InvalidArgument, OperationRejected
-from aerokit.mavlink.enums import MavAutopilot, MavCmd
+from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavFrame, MavType
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
 if TYPE_CHECKING:
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 PARTS = ("mission", "fence", "rally")
 _TAKE_OFFS = (MavCmd.NAV_TAKEOFF, MavCmd.NAV_TAKEOFF_LOCAL, MavCmd.NAV_VTOL_TAKEOFF)
+_LANDINGS = (MavCmd.NAV_LAND, MavCmd.NAV_VTOL_LAND)
+_FRAMES_RELATIVE_TO_HOME = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def read_plan(path: str) -> Plan:
@@ -59,9 +61,24 @@ def plan_warnings(plan: Plan) -> list[str]:
         if item.command not in standard_commands
     ]
     mission = plan.mission.items
+    warnings += _altitude_warnings(plan)
     may_be_arducopter = plan.vehicle_type in COPTERS and plan.firmware_type != MavAutopilot.PX4
     if mission and may_be_arducopter and not begins_with_take_off(mission):
         warnings.append("the mission does not begin with a take-off: an ArduCopter on the ground refuses to start it")
+    return warnings
+
+
+def _altitude_warnings(plan: Plan) -> list[str]:
+    """Return warnings about altitudes below home, which are usual only for submarines and for landings."""
+    if plan.vehicle_type == MavType.SUBMARINE:
+        return []
+    warnings = []
+    for index, item in enumerate(plan.mission.items):
+        is_take_off = item.command in _TAKE_OFFS
+        may_be_below = item.command in _LANDINGS or not (is_take_off or item.position is not None)
+        is_below = item.z < 0.0 or (is_take_off and item.z == 0.0)
+        if item.frame in _FRAMES_RELATIVE_TO_HOME and is_below and not may_be_below:
+            warnings.append(f"mission item {index}: {item.name} at {item.z:g} m above home")
     return warnings
 
 

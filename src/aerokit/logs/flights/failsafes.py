@@ -118,7 +118,8 @@ _PX4_PREFIXES = ("BAT_", "COM_", "FD_", "GF_", "NAV_")
 # Maps kinds of failsafes to the parameters that define when the failsafe triggers, and its action.
 _LIMIT_PARAMETERS: dict[str, tuple[str, ...]] = {
     "battery": (
-        *("BATT_LOW_VOLT", "BATT_CRT_VOLT", "BATT_LOW_MAH", "BATT_CRT_MAH", "BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"),
+        *("BATT_LOW_VOLT", "BATT_CRT_VOLT", "BATT_LOW_TIMER", "BATT_LOW_MAH", "BATT_CRT_MAH"),
+        *("BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"),
         *("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR", "COM_LOW_BAT_ACT"),
     ),
     "fence": (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import anyio
 
@@ -32,7 +32,12 @@ if TYPE_CHECKING:
 __all__ = ["MissionControl"]
 
 MAX_ITEM = 0xFFFF - 1
-LANDING_COMMANDS = (MavCmd.NAV_RETURN_TO_LAUNCH, MavCmd.NAV_LAND, MavCmd.NAV_VTOL_LAND)
+# The last items of missions that end with a landing, and what the mode is for in which the vehicle may then land.
+LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
+    MavCmd.NAV_RETURN_TO_LAUNCH: "return",
+    MavCmd.NAV_LAND: "land",
+    MavCmd.NAV_VTOL_LAND: "land",
+}
 
 # Seconds to wait for a report of the end, because MISSION_CURRENT is sent at 1 Hz or faster, and may be lost.
 END_GRACE_S = 2.0
@@ -49,6 +54,9 @@ class MissionEndDetector:
     ground, because PX4 reports completion when the return starts, and returns in another mode. A return without a
     landing ends at home. If a vehicle reports no mission state, the mission has ended when the last item is reached. If
     the items are unknown, the mode after the completion shows whether the vehicle lands.
+
+    After a failsafe in the last item, a vehicle may land elsewhere, in another mode than that of the item: then the
+    mission has failed.
     """
 
     def __init__(
@@ -62,11 +70,12 @@ class MissionEndDetector:
         is_return = last_command == MavCmd.NAV_RETURN_TO_LAUNCH
         self._are_items_known = bool(items)
         self._completed_at: float | None = None  # when a mission whose items are unknown was first seen complete
-        self._ends_by_landing = last_command in LANDING_COMMANDS
+        self._is_last_item_landing = last_command in LANDING_PURPOSES
         self._ends_in_air = is_return and not session.autopilot.lands_after_return
         self._return_began_at: float | None = None
+        purposes = [LANDING_PURPOSES[last_command]] if last_command in LANDING_PURPOSES else LANDING_PURPOSES.values()
         self._landing_modes = tuple(
-            session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol) for purpose in ("return", "land")
+            session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol) for purpose in purposes
         )
         self._grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
@@ -82,9 +91,9 @@ class MissionEndDetector:
 
     def _is_end_reported(self) -> bool:
         """Return True if the vehicle reports the end of the mission. A vehicle that has fallen may report it too."""
-        if self._tracker.is_complete and not self._are_items_known:
-            return self._is_unknown_end_reached()
         if self._tracker.is_complete:
+            if not self._are_items_known and not self._ends_by_landing:
+                return self._is_on_ground or self._has_stayed_complete()
             # ArduPilot reports completion at home, PX4 already when it begins to return.
             has_returned = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
             return not self._ends_by_landing or self._is_on_ground or has_returned
@@ -100,25 +109,23 @@ class MissionEndDetector:
         # Without a mission state, the last item that was reached shows the end.
         return not reports_state and last is not None and self._tracker.reached == last
 
-    def _is_unknown_end_reached(self) -> bool:
-        """Return True if a complete mission, whose items are unknown, has ended.
+    def _has_stayed_complete(self) -> bool:
+        """Return True if the mission has been complete for ``END_GRACE_S``.
 
         PX4 reports completion when a return or a landing begins. HEARTBEAT may report the mode of it a little later.
         """
-        if self._lands_after_unknown_mission:
-            return self._is_on_ground
         now = self._session.connection.now()
         if self._completed_at is None:
             self._completed_at = now
-        return self._is_on_ground or now - self._completed_at >= END_GRACE_S
+        return now - self._completed_at >= END_GRACE_S
 
     @property
-    def _lands_after_unknown_mission(self) -> bool:
-        """True if a mission, whose items are unknown, is complete, and the vehicle returns or lands."""
-        session = self._session
-        if self._are_items_known or not self._tracker.is_complete or not session.autopilot.lands_after_return:
-            return False
-        return session.telemetry.mode.latest in self._landing_modes
+    def _ends_by_landing(self) -> bool:
+        """True if the last item is a landing, or a return. If the items are unknown, the mode shows it at the end."""
+        if self._are_items_known:
+            return self._is_last_item_landing
+        is_complete, lands = self._tracker.is_complete, self._session.autopilot.lands_after_return
+        return is_complete and lands and self._is_in_landing_mode
 
     def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
         """Return the reason why the vehicle will not fly the mission to its end; None if it may still do so.
@@ -136,8 +143,7 @@ class MissionEndDetector:
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
         is_mode_settling = now < self._vehicle_context.arbiter.mode_settles_at
-        is_landing = self._is_landing or self._lands_after_unknown_mission
-        may_have_this_mode = is_paused or is_in_mode or is_landing or is_mode_settling
+        may_have_this_mode = is_paused or is_in_mode or self._is_landing or is_mode_settling
         if may_have_this_mode and not session.telemetry.is_confirmed_disarmed:
             self._left_at = None
             return None
@@ -161,9 +167,13 @@ class MissionEndDetector:
     @property
     def _is_landing(self) -> bool:
         """True if the vehicle has changed from the mission mode to the mode of its last item (land or return)."""
-        mode = self._session.telemetry.mode.latest
         current, last = self._tracker.current.latest, self._tracker.last_item
-        return self._ends_by_landing and current is not None and current == last and mode in self._landing_modes
+        is_at_end = (current is not None and current == last) or not self._are_items_known
+        return is_at_end and self._ends_by_landing and self._is_in_landing_mode
+
+    @property
+    def _is_in_landing_mode(self) -> bool:
+        return self._session.telemetry.mode.latest in self._landing_modes
 
     @property
     def _is_home(self) -> bool:
