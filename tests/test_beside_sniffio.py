@@ -73,7 +73,6 @@ loop.close()
 
 
 @pytest.mark.exhaustive
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "program",
     [BLOCKING, CLASSIC, CALLED_FROM_ANOTHER_LIBRARY, HELD_FROM_A_TIMER],

@@ -53,6 +53,7 @@ def test_every_object_is_listed_once(pages: dict[str, str]) -> None:
     assert sorted(listed) == sorted(set(listed))
 
 
+@pytest.mark.exhaustive
 @for_each(
     "page, names",
     [

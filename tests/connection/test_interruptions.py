@@ -312,6 +312,7 @@ class Interrupted:
             self.vehicle.connection.close()
 
 
+@pytest.mark.exhaustive
 def test_cancelled_at_any_iteration_leaves_nothing_behind() -> None:
     for turns in range(0, 150, 3):
         run_and_do(Interrupted().run, turns, lambda task: task.cancel())

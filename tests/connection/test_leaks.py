@@ -137,6 +137,7 @@ def test_cancelled_by_scope_at_any_iteration(use: Use) -> None:
         assert task.result() in ((True, False), (False, True)), turns
 
 
+@pytest.mark.exhaustive
 @each_use
 def test_link_lost_at_any_iteration(use: Use) -> None:
     for turns in some_of(turns_of(use), 30):
@@ -145,7 +146,7 @@ def test_link_lost_at_any_iteration(use: Use) -> None:
         assert type(task.exception()) in (type(None), LinkLost, SetpointStreamStopped), turns
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.exhaustive
 @each_use
 def test_connection_closed_at_any_iteration(use: Use) -> None:
     for turns in some_of(turns_of(use), 30):
@@ -195,6 +196,7 @@ def test_block_exception_keeps_no_reference_cycle() -> None:
         gc.enable()
 
 
+@pytest.mark.exhaustive
 def test_hundred_connections_leave_no_more_than_one() -> None:
     async def program() -> None:
         async with (

@@ -244,7 +244,7 @@ def loaded(name: str) -> tuple[ModuleType, Dialect]:
     return module, Dialect.from_pymavlink(module)
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", DIALECTS)
 def test_pymavlink_dialect_equals_xml_dialect(name: str) -> None:
     module, dialect = loaded(name)

@@ -7,7 +7,6 @@ import sys
 from importlib.machinery import SourceFileLoader
 
 import pytest
-from exhaustive import exhaustive
 
 import aerokit.errors
 
@@ -57,8 +56,8 @@ def run(pytester: pytest.Pytester, source: str, *arguments: str) -> pytest.RunRe
     )
 
 
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("kind", ["copter", exhaustive("px4")])
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("kind", ["copter", "px4"])
 def test_flights_need_no_async_plugin(pytester: pytest.Pytester, kind: str) -> None:
     run(pytester, ASYNC.format(kind=kind), "-p", "no:anyio").assert_outcomes(passed=2)
 
@@ -120,7 +119,7 @@ async def test_that_fails(flight):
 """
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("mode", ["auto", "strict"])
 def test_pytest_asyncio_tests_run_on_virtual_time(pytester: pytest.Pytester, mode: str) -> None:
     pytest.importorskip("pytest_asyncio")

@@ -118,6 +118,7 @@ def packets_through(seed: int) -> tuple[int, int]:
     return run_virtual(main())
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("seed", [1])
 def test_dropped_packets_are_determined_by_the_seed(seed: int) -> None:
     first = packets_through(seed)

@@ -213,12 +213,16 @@ def test_demo_mode_change_by_pilot_is_not_overruled(mode: str, tmp_path: Path) -
         aerokit.sync.connect(address, source_system=254) as pilot,
     ):
         pilot.set_mode(mode)
-        printed = read_rest(process)
+        printed = read_until(process, "the recording goes on until the vehicle disarms")
         assert f"the mode changed to {mode}" in printed
         assert f"the vehicle itself or another party changed the mode to {mode}" in printed
+        process.send_signal(signal.SIGINT)
+        assert f"in {mode}, still armed" in read_rest(process)
         assert process.returncode == 1
+        assert pilot.is_armed
 
 
+@pytest.mark.exhaustive
 def test_demo_records_flight_after_failsafe_to_its_end(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_virtual(run_on(None, "demo", "--speedup", "1", "--fault", "rc_lost@30", "--record", "x.tlog")) == 1
     out = capsys.readouterr().out

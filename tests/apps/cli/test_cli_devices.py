@@ -103,6 +103,7 @@ def test_camera_invalid_arguments_exit_with_code_2(run: Run, wrong: list[str]) -
     assert caught.value.code == 2
 
 
+@pytest.mark.exhaustive
 def test_gimbal_point_changes_attitude(run: Run, gimbal: SimulatedGimbal) -> None:
     assert run("gimbal", "point", "-45", "20")[0] == 0
     code, out, _ = run("gimbal", "info")

@@ -278,6 +278,7 @@ def test_fly_explains_wait_after_failsafe_mode(capsys: pytest.CaptureFixture[str
     assert changed < waiting < failed
 
 
+@pytest.mark.exhaustive
 def test_px4_without_position_ends_fly_with_failsafe(capsys: pytest.CaptureFixture[str]) -> None:
     options = ("--vehicle", "px4", "--fault", "gps_lost@25", "--record", "x.tlog")
     assert run_virtual(run_on(None, "fly", SURVEY, "--sim", *options)) == 5
@@ -318,6 +319,7 @@ def report_of(path: Path) -> str:
     return "\n".join(summary(flight, statistics_of(flight)))
 
 
+@pytest.mark.exhaustive
 def test_summaries_of_fly_and_report_agree(capsys: pytest.CaptureFixture[str]) -> None:
     """PX4's position is noisy on the ground, which is no flown distance."""
     assert run_virtual(run_on(None, "fly", SURVEY, "--sim", "--vehicle", "px4", "--record", "x.tlog")) == 0

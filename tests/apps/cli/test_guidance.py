@@ -178,6 +178,7 @@ def test_fly_rehearsal_reports_duration_of_real_flight(capsys: pytest.CaptureFix
     assert "simulated in" not in lines["1"]
 
 
+@pytest.mark.exhaustive
 def test_fly_prints_four_words_for_each_item(capsys: pytest.CaptureFixture[str]) -> None:
     """The list counts like the progress, and the vehicle's texts with other numbers are left out."""
     copter = SimulatedCopter(boot_time_s=0.0, home=HOME)
@@ -198,6 +199,7 @@ def test_next_command_replaces_report_of_earlier_flight(capsys: pytest.CaptureFi
     assert capsys.readouterr().out.endswith("\nnext: aerokit report --force x.tlog\n")
 
 
+@pytest.mark.exhaustive
 def test_fly_records_and_names_next_command(capsys: pytest.CaptureFixture[str]) -> None:
     copter = SimulatedCopter(boot_time_s=0.0, home=HOME)
     Path("my flight.tlog").write_text("earlier")

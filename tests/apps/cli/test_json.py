@@ -116,6 +116,7 @@ def test_json_records_match_documentation(group: str, capsys: pytest.CaptureFixt
     assert_all_printed(group, printed)
 
 
+@pytest.mark.exhaustive
 def test_json_of_fly_matches_documentation(capsys: pytest.CaptureFixture[str]) -> None:
     Path("m.waypoints").write_text(MISSION)
     assert main(["fly", "m.waypoints", "--sim", "--speedup", "50", "--json"]) == 0

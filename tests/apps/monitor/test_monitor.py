@@ -111,6 +111,7 @@ async def test_monitor_commands_named_vehicle_after_confirmation() -> None:
         assert "land: command sent" in it.screen()
 
 
+@pytest.mark.exhaustive
 async def test_command_goes_to_vehicle_in_question_despite_selection() -> None:
     async with stage() as it:
         await it.press("h")
@@ -139,6 +140,7 @@ async def test_refusal_and_old_values_are_shown() -> None:
         assert " old)" not in screen
 
 
+@pytest.mark.exhaustive
 async def test_reason_against_arming_is_requested_from_vehicle() -> None:
     """By itself, ArduPilot sends the reasons every 30 s."""
     async with stage(1) as it:

@@ -50,7 +50,7 @@ def item_int(number: int, target: int, command: int = 16) -> Message:
     return m.MissionItemInt(target, 1, number, 6, command, 0, 1, 0.0, 0.0, 0.0, 0.0, 470_000_000, 80_000_000, 10.0)
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("suffix", "write"), [(".bin", log_files.write_bin), (".ulg", log_files.write_ulog)], ids=["bin", "ulg"]
 )

@@ -112,7 +112,6 @@ def flight_of(places: Sequence[Place], tmp_path: Path, changes: int = 0) -> Flig
 
 
 @pytest.mark.exhaustive
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize("changes", [0, 200])
 def test_square_flown_619_times_stays_square(changes: int, tmp_path: Path) -> None:
     chart, note = track_parts(flight_of(square(LAPS), tmp_path, changes))

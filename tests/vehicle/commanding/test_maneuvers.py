@@ -205,7 +205,6 @@ async def test_orbit_px4_flying_another_circle_is_held() -> None:
 
 
 @pytest.mark.exhaustive
-@pytest.mark.sampled(2)
 @BOTH
 async def test_figure_eight_reaches_both_lobes_and_its_center(kind: Callable[..., Kind]) -> None:
     async with hovering(kind(boot_time_s=0.0)) as (vehicle, _):
@@ -242,7 +241,6 @@ async def test_loiter_returns_after_its_time_at_the_place(kind: Callable[..., Ki
 
 
 @pytest.mark.exhaustive
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", [SimulatedPlane, SimulatedPx4Plane])
 async def test_loiter_of_plane_circles_with_its_radius(kind: Callable[..., SimulatedVehicle]) -> None:
     async with simulated_link(kind(boot_time_s=0.0)) as link, aerokit.connect(link) as vehicle:

@@ -216,6 +216,7 @@ async def test_wait_finished_reports_vehicle_that_does_not_move(opened: Any) -> 
         assert now() - started < 75
 
 
+@pytest.mark.exhaustive
 async def test_wait_finished_continues_through_hold_of_minutes() -> None:
     async with armed(open_flight) as flight:
         mission = flight.vehicle.mission
