@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
+from functools import partial
 from itertools import count, pairwise
 
 import anyio
@@ -19,6 +20,7 @@ from flight_harness import (
     open_px4,
     suspend_computer,
 )
+from plan_flights import long_mission
 
 from aerokit import Position, StickInput, TargetMeasurement, VelocitySetpoint
 from aerokit import messages as m
@@ -413,3 +415,26 @@ async def test_item_is_not_set_after_transfer_and_silence() -> None:
         with pytest.raises(HeartbeatTimeout, match="the rest of the order was not sent"):
             await setting
         assert not flight.wire.all(m.MissionSetCurrent)
+
+
+async def test_upload_and_parameter_write_continue_after_computer_slept() -> None:
+    """An upload that ended in the middle would leave a mixture of two missions on ArduPilot."""
+    async with open_flight(latency_s=0.1) as flight:
+        vehicle, faults = flight.vehicle, flight.copter.faults
+        await vehicle.wait_ready()
+        await vehicle.parameters.download()
+        mission = long_mission(40)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(partial(vehicle.mission.upload, mission, method="items"))
+            await anyio.sleep(0.5)
+            faults.silent = True
+            tasks.start_soon(vehicle.parameters.set, "RTL_ALT", 2500.0)
+            await anyio.sleep(0.1)
+            suspend_computer(vehicle, 600.0)
+            flight.wire.clear()
+            await anyio.sleep(0.5)
+            faults.silent = False
+        assert flight.wire.all(m.MissionItemInt)
+        assert flight.wire.all(m.ParamSet)
+        assert flight.copter.parameters["RTL_ALT"] == 2500.0
+        assert mission.matches(await vehicle.mission.download())
