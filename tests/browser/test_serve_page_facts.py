@@ -113,6 +113,24 @@ def test_page_reports_automatic_disarming(browser: Any) -> None:
         picture(page, "disarmed-by-vehicle")
 
 
+def test_page_announces_failsafe_until_it_ends(browser: Any) -> None:
+    with page_of(browser) as (copter, page):
+        order(page, "arm")
+        wait_done(page, "arm")
+        order(page, "take_off", {"altitude_m": "5"})
+        wait_done(page, "take off to 5 m")
+        page.locator("#readiness.good", has_text="Flying").wait_for()
+        copter.faults.rc_lost = True
+        page.locator("#readiness.warn li", has_text="Radio Failsafe").wait_for()
+        assert page.locator("#readiness strong").inner_text() == "Failsafe: RTL"
+        assert page.locator(".toast.failed").all_inner_texts() == ["Vehicle 1: Failsafe: RTL. Radio Failsafe"]
+        assert page.locator(".vehicle .dot.warn").count() == 1
+        picture(page, "failsafe")
+        copter.faults.rc_lost = False
+        page.locator("#readiness.good", has_text="Flying").wait_for()
+        assert page.locator(".toast.failed").count() == 1
+
+
 def test_page_reports_crash_and_lets_disarm(browser: Any) -> None:
     with page_of(browser) as (copter, page):
         order(page, "arm")

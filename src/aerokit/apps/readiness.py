@@ -6,9 +6,11 @@ import contextlib
 import math
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
+from aerokit.autopilots.failsafe_texts import failsafe_kind
 from aerokit.errors import AerokitError
 from aerokit.events import LinkState
 from aerokit.vehicle.commanding.health import REPORTS_ABOUT_ARMING
+from aerokit.vehicle.commanding.order import FAILSAFE_STATES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,6 +18,23 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
 
 _OWN_FLIGHT_PURPOSES: tuple[Literal["setpoint", "mission", "return"], ...] = ("setpoint", "mission", "return")
+
+
+# The texts of one failsafe arrive within this many seconds. PX4 holds for COM_FAIL_ACT_T before some actions.
+_FAILSAFE_REPORT_DURATION_S = 10.0
+
+
+def active_failsafe(vehicle: Vehicle) -> list[str] | None:
+    """Return the vehicle's newest texts about its active failsafe, the oldest of them first; None if none is active.
+
+    ArduPilot and PX4 report a failsafe as MAV_STATE_CRITICAL, which is meaningless while they are disarmed
+    (vehicle_system_status in GCS_MAVLink_Copter.cpp, HEARTBEAT.hpp).
+    """
+    if not vehicle.armed.latest or vehicle.system_status.latest not in FAILSAFE_STATES:
+        return None
+    texts = [text for text in vehicle.telemetry.texts_since(-math.inf) if failsafe_kind(text.text)]
+    since = max((text.at for text in texts), default=0.0) - _FAILSAFE_REPORT_DURATION_S
+    return list(dict.fromkeys(text.text for text in texts if text.at >= since)) or ["no cause is known"]
 
 
 class Readiness(NamedTuple):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit._internal.formatting import to_jsonable
-from aerokit.apps.readiness import ArmingCheckRequests, not_armable, run_arming_checks, unarmable_mode
+from aerokit.apps.readiness import ArmingCheckRequests, active_failsafe, not_armable, run_arming_checks, unarmable_mode
 from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.flight_watch import FlightWatch
 from aerokit.apps.serve.requests import HttpProblem
@@ -220,6 +220,7 @@ class ServedVehicles:
             "disarming": watch.disarming,
             "unread": _unread(vehicle, watch.disarm_parameter),
             "failsafe": ground_station_failsafe(vehicle),
+            "active_failsafe": active_failsafe(vehicle),
             "mission_item": mission.current.latest,
             "mission_items": mission.count.latest,
             "is_flying_mission": _is_flying_mission(vehicle),

@@ -1,6 +1,6 @@
 // Readiness and silence in words: what a vehicle lacks, which orders cannot work now and why, and lost vehicles.
 
-import { age, clock, element, number, show } from "./dom.js";
+import { age, clock, element, number, show, UNKNOWN } from "./dom.js";
 import { ageOf } from "./state.js";
 
 // Orders that the server also tries on a silent vehicle.
@@ -92,6 +92,8 @@ export function disarmText({ disarming: known }) {
   return `Disarmed ${after}, not by an order of this server${parameter && delay !== 0 ? ` (${parameter}${delay === null ? "" : ` = ${delay} s`})` : ""}`;
 }
 
+export const failsafeTitle = (vehicle) => `Failsafe: ${valueOf(vehicle, "mode")?.name ?? UNKNOWN}`;
+
 const RECENT_MS = 60_000;
 
 // Why a vehicle that was armed a short time ago is disarmed; "" if the page has not seen it armed, or longer ago.
@@ -142,6 +144,7 @@ function readiness(vehicle, page, heartbeatAge) {
     const title = valueOf(vehicle, "armed") === false ? "Crashed" : "Crashed: propellers may turn";
     return ["bad", title, [crashText(vehicle), ...missing]];
   }
+  if (vehicle.active_failsafe) return ["warn", failsafeTitle(vehicle), [...vehicle.active_failsafe, ...missing]];
   if (valueOf(vehicle, "armed")) {
     const title = landed === "ON_GROUND" ? "Armed: propellers may turn" : FLYING.has(landed) ? "Flying" : "Armed";
     return [missing.length || landed === "ON_GROUND" ? "warn" : "good", title, missing];
