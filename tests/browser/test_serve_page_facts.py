@@ -113,6 +113,27 @@ def test_page_reports_automatic_disarming(browser: Any) -> None:
         picture(page, "disarmed-by-vehicle")
 
 
+def test_dialogs_name_disarm_delay_and_return_altitude(browser: Any) -> None:
+    with page_of(browser, parameters={"DISARM_DELAY": 25.0, "RTL_ALT": 2250.0}) as (_, page):
+        page.click("button[data-order='arm']")
+        page.locator("dialog .facts", has_text="it disarms itself after 25 s (DISARM_DELAY)").wait_for()
+        page.click("dialog .yes")
+        wait_done(page, "arm")
+        order(page, "take_off", {"altitude_m": "5"})
+        wait_done(page, "take off to 5 m")
+        page.click("button[data-order='return_to_launch']")
+        page.locator("dialog .facts", has_text="It first climbs to 22.5 m above home, unless it is higher.").wait_for()
+        cancel(page)
+        facts = page.evaluate(
+            """async () => {
+                const { orderFacts } = await import("/static/facts.js");
+                const usual = { disarm_parameter: "COM_DISARM_PRFLT", disarm_delay_s: null, missing_for_flight: [] };
+                return [usual, { ...usual, disarm_delay_s: -1 }].map((each) => orderFacts("arm", each, []));
+            }"""
+        )
+        assert facts == [["If it does not take off, it usually disarms itself after 10 s (COM_DISARM_PRFLT)."], []]
+
+
 def test_page_announces_failsafe_until_it_ends(browser: Any) -> None:
     with page_of(browser) as (copter, page):
         order(page, "arm")

@@ -33,7 +33,7 @@ from aerokit.missions import (
     take_off,
 )
 from aerokit.parameters import load_metadata
-from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedPx4, SimulatedRover, simulated_link
+from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedPx4, SimulatedRover, SimulatedVehicle, simulated_link
 
 pytestmark = pytest.mark.anyio
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -456,3 +456,18 @@ async def test_failing_checks_are_requested_once_per_change() -> None:
             assert "Gyros inconsistent" in reasons
             assert "Compass not healthy" not in reasons
             assert len(flight.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 2
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "altitude_m"),
+    [
+        (SimulatedCopter(boot_time_s=0.0, parameters={"RTL_ALT": 2250.0}), 22.5),
+        (SimulatedPlane(boot_time_s=0.0, parameters={"RTL_ALTITUDE": 90.0}), 90.0),
+        (SimulatedPx4(boot_time_s=0.0, parameters={"RTL_RETURN_ALT": 40.0}), 40.0),
+        (SimulatedRover(boot_time_s=0.0), None),
+    ],
+)
+async def test_state_has_return_altitude_of_vehicle(vehicle: SimulatedVehicle, altitude_m: float | None) -> None:
+    async with simulated_link(vehicle) as link, aerokit.connect(link) as connected, make_app(connected) as app:
+        await anyio.sleep(5)
+        assert json.loads(app._served.snapshot())["vehicles"][0]["return_altitude_m"] == altitude_m

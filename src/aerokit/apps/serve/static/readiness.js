@@ -6,7 +6,7 @@ import { ageOf } from "./state.js";
 // Orders that the server also tries on a silent vehicle.
 const SAFE_ORDERS = new Set(["disarm", "hold", "land", "return_to_launch", "mission/pause"]);
 // MAV_TYPE: ground rover, boat, submarine.
-const SURFACE_TYPES = new Set([10, 11, 12]);
+export const SURFACE_TYPES = new Set([10, 11, 12]);
 const FLYING = new Set(["IN_AIR", "TAKEOFF", "LANDING"]);
 const MAX_REASONS = 4;
 // What the page calls the library's actions.
@@ -144,10 +144,11 @@ function readiness(vehicle, page, heartbeatAge) {
     const title = valueOf(vehicle, "armed") === false ? "Crashed" : "Crashed: propellers may turn";
     return ["bad", title, [crashText(vehicle), ...missing]];
   }
-  if (vehicle.active_failsafe) return ["warn", failsafeTitle(vehicle), [...vehicle.active_failsafe, ...missing]];
   if (valueOf(vehicle, "armed")) {
-    const title = landed === "ON_GROUND" ? "Armed: propellers may turn" : FLYING.has(landed) ? "Flying" : "Armed";
-    return [missing.length || landed === "ON_GROUND" ? "warn" : "good", title, missing];
+    const isOnGround = landed === "ON_GROUND", texts = vehicle.active_failsafe;
+    const title = isOnGround ? "Armed: propellers may turn" : FLYING.has(landed) ? "Flying" : "Armed";
+    if (texts) return ["warn", failsafeTitle(vehicle), [...(isOnGround ? [title] : []), ...texts, ...missing]];
+    return [missing.length || isOnGround ? "warn" : "good", title, missing];
   }
   const notes = [disarmed, modeChange(vehicle)].filter(Boolean), against = vehicle.not_armable;
   if (against.length) {
