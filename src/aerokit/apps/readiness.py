@@ -53,13 +53,22 @@ class Readiness(NamedTuple):
         return "cannot arm" if self.is_known else "not known whether it arms"
 
 
-def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None) -> Readiness:
+def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes_mode: bool = False) -> Readiness:
     """Return the requirements for a flight that a vehicle does not meet, grouped by whether they prevent arming.
 
     Args:
         vehicle: the vehicle, whose known state is used. Nothing is sent to it.
         reasons: result of ``vehicle.why_not_armable()``; None: health flags of SYS_STATUS, mode and estimator decide.
+        changes_mode: True if a mode that does not allow arming is no reason, because `Vehicle.arm` will change it.
     """
+    found = _grouped(vehicle, reasons)
+    refused = [text for text in _refused_mode(vehicle) if text not in found.against_arming]
+    if reasons is not None or changes_mode:
+        return found
+    return found._replace(against_arming=(*refused, *found.against_arming))
+
+
+def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
     missing, sensors = vehicle.missing_for_flight(), vehicle.sensors.latest
     checks_pass = sensors is not None and sensors.prearm_checks_pass is True
     against = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)
@@ -101,8 +110,7 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
     if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False:
         return []
     if unarmable is not None and unarmable["arms_in"] is None:  # `arm` cannot change to a mode that allows arming
-        unless = f" unless {unarmable['unless']} allows it" if unarmable["unless"] else ""
-        return [f"{autopilot.firmware} cannot arm in {unarmable['mode']}{unless}", *_needed_to_arm(vehicle, missing)]
+        return [*_refused_mode(vehicle), *_needed_to_arm(vehicle, missing)]
     sensors, estimator = vehicle.sensors.latest, vehicle.estimator.latest
     if sensors is not None and sensors.prearm_checks_pass is False:
         return _needed_to_arm(vehicle, missing)
@@ -129,6 +137,15 @@ def unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
         return None
     arming_mode, option = autopilot.mode_to_arm_in(), autopilot.armable_by_option.get(mode.name)
     return {"mode": mode.name, "arms_in": None if arming_mode is None else arming_mode.name, "unless": option}
+
+
+def _refused_mode(vehicle: Vehicle) -> list[str]:
+    """Return a list with one text if a disarmed vehicle is in a mode that does not allow arming, else an empty list."""
+    unarmable = None if vehicle.armed.latest else unarmable_mode(vehicle)
+    if unarmable is None:
+        return []
+    unless = f" unless {unarmable['unless']} allows it" if unarmable["unless"] else ""
+    return [f"{vehicle.autopilot.firmware} cannot arm in {unarmable['mode']}{unless}"]
 
 
 def own_flight_modes(vehicle: Vehicle) -> str:

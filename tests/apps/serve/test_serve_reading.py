@@ -346,7 +346,8 @@ async def test_state_separates_not_armable_from_not_ready_to_fly() -> None:
         await anyio.sleep(1)
         text = "ArduCopter needs a position to arm in GUIDED, to which arming would change the mode"
         assert state()["not_armable"][0] == text  # type: ignore[index]
-        assert readiness(stage.flight.vehicle).against_arming == tuple(state()["not_armable"])  # type: ignore[arg-type]
+        found = readiness(stage.flight.vehicle, changes_mode=True)
+        assert found.against_arming == tuple(state()["not_armable"])  # type: ignore[arg-type]
         assert (await stage.submit("arm")).status_code == 409
 
 
