@@ -21,8 +21,10 @@ from aerokit.apps.serve import make_app
 from aerokit.apps.serve.app import STATIC
 from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS
+from aerokit.autopilots import px4_custom_mode
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.messages import AvailableModes
 from aerokit.missions import (
     Fence,
     FenceCircle,
@@ -472,3 +474,16 @@ async def test_state_has_return_altitude_of_vehicle(vehicle: SimulatedVehicle, a
     async with simulated_link(vehicle) as link, aerokit.connect(link) as connected, make_app(connected) as app:
         await anyio.sleep(5)
         assert json.loads(app._served.snapshot())["vehicles"][0]["return_altitude_m"] == altitude_m
+
+
+async def test_modes_omit_what_px4_does_not_offer() -> None:
+    async with (
+        simulated_link(SimulatedPx4(boot_time_s=0.0)) as link,
+        aerokit.connect(link) as vehicle,
+        make_app(vehicle, token=TOKEN) as app,
+        httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url=f"http://{HOST}") as client,
+    ):
+        vehicle.telemetry.receive(AvailableModes(2, 1, 0, px4_custom_mode(4, 11), 0, "Arrive"))
+        modes = (await client.get("/api/vehicles/1", headers=BEARER)).json()["modes"]
+    assert {"LOITER", "OFFBOARD", "Arrive"} < set(modes)
+    assert not {"RATTITUDE", "EXTERNAL1", "EXTERNAL8"} & set(modes)

@@ -1,9 +1,9 @@
 // Orders: buttons, and the confirmation dialog that names vehicle and order. Every order needs it, and is sent once.
 
-import { age, byId, element, show } from "./dom.js";
+import { age, byId, element, shortest, show } from "./dom.js";
 import { needsForce, orderFacts, valueProblem } from "./facts.js";
 import { distanceText } from "./map.js";
-import { aboutParameter, parameterProblem, typeProblem } from "./panels.js";
+import { aboutParameter, parameterProblem, short, typeProblem } from "./panels.js";
 import { capitalized, dialogObstacle, inWords, obstacle } from "./readiness.js";
 import { ask, hasToken, newKey, Refusal, useToken } from "./server.js";
 import { ageOf } from "./state.js";
@@ -123,7 +123,7 @@ export class Orders {
     this.confirm({
       impossible: ({ value }) => (value === undefined ? "" : typeProblem(parameter, value)),
       problem: ({ value }) => (value === undefined ? "" : parameterProblem(parameter, value)),
-      vehicle: id, title: `Set ${parameter.name}`, text: `set ${parameter.name}, currently ${parameter.value} ${parameter.unit ?? ""}`.trim(), about: aboutParameter(parameter),
+      vehicle: id, title: `Set ${parameter.name}`, text: `set ${parameter.name}, currently ${short(parameter.value)} ${parameter.unit ?? ""}`.trim(), about: aboutParameter(parameter),
       fields: [["value", "New value", parameter.value, "any"]], order: "parameter", parameter: parameter.name,
     });
   }
@@ -135,7 +135,7 @@ export class Orders {
     const dialog = byId("dialog"), key = newKey();
     const inputs = wanted.fields.map(([name, label, value, step]) => {
       const input = element("input", { type: "number", step, name, required: value !== "" });
-      input.value = typeof value === "number" ? String(+value.toFixed(7)) : value;
+      input.value = typeof value === "number" ? shortest(value) : value;
       return [name, input, element("label", {}, label, input)];
     });
     const will = element("span", {}), facts = element("div", { class: "facts" });
