@@ -290,6 +290,8 @@ class Autopilot:
 
     None: the bit counts in every mode.
     """
+    has_status_text_id_0 = False
+    """True if a long status text may have the id 0, which by the standard means that the text is not chunked."""
     camera_by_trigger_only = False
     """True if the autopilot's own camera supports only DO_DIGICAM_CONTROL and DO_TRIGGER_CONTROL."""
     video_addresses_camera = False
