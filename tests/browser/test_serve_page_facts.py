@@ -249,7 +249,7 @@ def test_upload_dialog_previews_plan_on_map(browser: Any) -> None:
         plan = Plan(Mission([take_off(altitude_relative_m=15), *items]), Fence([FencePolygon(area)]))
         before = page.evaluate(MAP_TEXTS)
         page.evaluate(DROP, ["field.plan", format_plan(plan)])
-        page.locator("dialog[open]", has_text="The map shows the plan.").wait_for()
+        page.locator("dialog[open]", has_text="Its first place is 200 m north of the vehicle.").wait_for()
         shown = page.evaluate(MAP_TEXTS)
         assert {"1", "2"} <= set(shown)
         assert not {"1", "2"} & set(before)
@@ -257,6 +257,12 @@ def test_upload_dialog_previews_plan_on_map(browser: Any) -> None:
         cancel(page)
         page.locator("dialog[open]").wait_for(state="detached")
         assert not {"1", "2"} & set(page.evaluate(MAP_TEXTS))
+        far = here.offset(east_m=25_000)
+        plan = Plan(Mission([waypoint(far.latitude_deg, far.longitude_deg, altitude_relative_m=15)]))
+        page.evaluate(DROP, ["elsewhere.plan", format_plan(plan)])
+        text = re.compile(r"Its first place is 24\.9 km east of the vehicle: is this the plan for this vehicle\?")
+        page.locator("dialog .facts", has_text=text).wait_for()
+        picture(page, "far-plan")
 
 
 def test_orders_tell_when_mission_finished(browser: Any) -> None:
