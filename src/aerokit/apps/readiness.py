@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
 
 _OWN_FLIGHT_PURPOSES: tuple[Literal["setpoint", "mission", "return"], ...] = ("setpoint", "mission", "return")
-
-
 # The texts of one failsafe arrive within this many seconds. PX4 holds for COM_FAIL_ACT_T before some actions.
 _FAILSAFE_REPORT_DURATION_S = 10.0
 
@@ -34,7 +32,9 @@ def active_failsafe(vehicle: Vehicle) -> list[str] | None:
         return None
     texts = [text for text in vehicle.telemetry.texts_since(-math.inf) if failsafe_kind(text.text)]
     since = max((text.at for text in texts), default=0.0) - _FAILSAFE_REPORT_DURATION_S
-    return list(dict.fromkeys(text.text for text in texts if text.at >= since)) or ["no cause is known"]
+    return list(dict.fromkeys(text.text for text in texts if text.at >= since)) or [
+        "no text about its cause was received"
+    ]
 
 
 class Readiness(NamedTuple):
@@ -62,10 +62,9 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes
         changes_mode: True if a mode that does not allow arming is no reason, because `Vehicle.arm` will change it.
     """
     found = _grouped(vehicle, reasons)
-    refused = [text for text in _refused_mode(vehicle) if text not in found.against_arming]
-    if reasons is not None or changes_mode:
+    if reasons is not None or changes_mode:  # `why_not_armable` has the mode among its reasons
         return found
-    return found._replace(against_arming=(*refused, *found.against_arming))
+    return found._replace(against_arming=tuple(dict.fromkeys([*_refused_mode(vehicle), *found.against_arming])))
 
 
 def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
