@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import anyio
 import pytest
-from flight_harness import open_flight, open_px4
+from flight_harness import in_the_air, open_flight, open_px4
 
+from aerokit.apps.cli.status import _vehicle_lines
 from aerokit.apps.monitor.lines import VehicleText
-from aerokit.apps.readiness import not_armable, readiness, run_arming_checks
-from aerokit.sim import SimulatedPx4
+from aerokit.apps.readiness import active_failsafe, not_armable, readiness, run_arming_checks
+from aerokit.mavlink.enums import MavState
+from aerokit.sim import SimulatedCopter, SimulatedPx4
 
 pytestmark = pytest.mark.anyio
 
@@ -56,3 +58,62 @@ async def test_position_is_no_reason_against_arming_with_failing_check() -> None
         found = readiness(flight.vehicle)
         assert found.against_arming == ("Compass not healthy", "GPS is not healthy (SYS_STATUS)")
         assert found.against_flight[0] == "no GPS receiver has a 3D fix (GPS_RAW_INT)"
+
+
+async def test_disarmed_copter_in_rtl_is_not_ready_anywhere() -> None:
+    async with open_flight() as flight:
+        vehicle = flight.vehicle
+        await vehicle.wait_ready()
+        assert VehicleText(vehicle).all_missing() == "Nothing is missing."
+        await vehicle.set_mode("RTL")
+        text = "ArduCopter cannot arm in RTL"
+        assert readiness(vehicle).against_arming == (text,)
+        assert VehicleText(vehicle).row(is_selected=True, more=True).plain.endswith(f"cannot arm: {text} ")
+        assert readiness(vehicle, await vehicle.why_not_armable()).against_arming[0].startswith(text)
+        assert readiness(vehicle, changes_mode=True).against_arming == ()
+
+
+async def test_radio_failsafe_is_named_until_it_ends() -> None:
+    async with in_the_air() as flight:
+        vehicle, system_status = flight.vehicle, flight.vehicle.system_status
+        assert active_failsafe(vehicle) is None
+        flight.copter.faults.rc_lost = True
+        await system_status.wait_until(lambda state: state == MavState.CRITICAL)
+        assert active_failsafe(vehicle) == ["Radio Failsafe"]
+        assert ("failsafe", "failsafe: Radio Failsafe") in [
+            (label, text.plain) for label, text in VehicleText(vehicle).rows()
+        ]
+        assert VehicleText(vehicle).row(is_selected=True, more=True).plain.endswith("failsafe: Radio Failsafe ")
+        assert "  failsafe Radio Failsafe" in _vehicle_lines(vehicle, readiness(vehicle))
+        flight.copter.faults.rc_lost = False
+        await system_status.wait_until(lambda state: state == MavState.ACTIVE)
+        assert active_failsafe(vehicle) is None
+        assert dict(VehicleText(vehicle).rows())["missing"].plain == "nothing"
+
+
+async def test_battery_and_estimator_failsafes_show_newest_texts() -> None:
+    limits = {"BATT_LOW_MAH": 500.0, "BATT_FS_LOW_ACT": 2.0}
+    copter = SimulatedCopter(boot_time_s=0.0, battery_percent=16.0, parameters=limits)
+    async with in_the_air(copter=copter) as flight:
+        await flight.vehicle.system_status.wait_until(lambda state: state == MavState.CRITICAL)
+        battery, failsafe = active_failsafe(flight.vehicle) or ()
+        assert battery.startswith("Battery 1 is low ")
+        assert failsafe == "Battery Failsafe"
+        await anyio.sleep(15)
+        copter.faults.gps_lost = True
+        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "LAND")
+        await anyio.sleep(2)
+        assert active_failsafe(flight.vehicle) == ["EKF variance", "EKF Failsafe: changed to LAND Mode"]
+
+
+async def test_px4_battery_failsafe_is_named_only_while_armed() -> None:
+    px4 = SimulatedPx4(boot_time_s=1.0, parameters={"COM_LOW_BAT_ACT": 3.0})
+    async with open_px4(px4) as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+        await flight.vehicle.take_off(10)
+        px4.battery.percent = 5.0
+        await flight.vehicle.system_status.wait_until(lambda state: state == MavState.CRITICAL)
+        assert (active_failsafe(flight.vehicle) or ())[0] == "Emergency battery level"
+        await flight.vehicle.armed.wait_until(lambda is_armed: not is_armed)
+        assert active_failsafe(flight.vehicle) is None

@@ -25,6 +25,8 @@ def test_parameter_dialog_refuses_values_of_other_types(browser: Any, copters: C
         value, yes, problem, force = (
             page.locator(f"dialog {each}") for each in ("input[name=value]", ".yes", ".problem", ".force")
         )
+        details = page.locator("dialog .detail").all_inner_texts()
+        assert details[0] == "Whole numbers -2147483648 … 2147483647 (INT32)."
         texts = {
             "2000.5": "RTL_ALT = 2000.5 must be a whole number (its type is INT32).",
             "1e30": "RTL_ALT = 1e+30 must be in -2147483648..2147483647 (its type is INT32).",
@@ -44,6 +46,25 @@ def test_parameter_dialog_refuses_values_of_other_types(browser: Any, copters: C
         refused = [["INT8", -129], ["UINT16", -1], ["UINT16", 65536], ["INT16", 0.5], ["REAL32", -1e39]]
         assert page.evaluate(types, allowed + refused) == [False] * 5 + [True] * 5
     assert second.parameters["RTL_ALT"] == before
+
+
+def test_page_shortens_floats_and_words_fix(browser: Any, copters: Copters) -> None:
+    (first, _), address = copters
+    first.parameters["ATC_RAT_RLL_P"] = 0.15000000596046448
+    with serving(address) as server, opened(browser, server["page"]) as page:
+        page.locator("#panel tr", has_text="fix type rtk fixed").wait_for()
+        fractions = """async () => {
+            const { shortest, spelled } = await import("/static/dom.js");
+            const numbers = [0.15000000596046448, 1234567890, -2.5e-8, 16777.216796875];
+            return [...numbers.map(shortest), spelled("TYPE_3D_FIX")];
+        }"""
+        assert page.evaluate(fractions) == ["0.15", "1234567890", "-2.5e-8", "16777.217", "3D"]
+        page.get_by_role("tab", name="Parameters").click()
+        page.fill("input[type=search]", "atc_rat_rll_p")
+        page.locator("tr.clickable:visible", has_text="ATC_RAT_RLL_P").first.click()
+        assert "set ATC_RAT_RLL_P, currently 0.15." in page.locator("dialog").inner_text()
+        assert page.input_value("dialog input[name=value]") == "0.15"
+        assert page.locator("dialog .detail").all_inner_texts()[0] == "Numbers with fractions (REAL32)."
 
 
 def test_page_light_and_dot_of_vehicle_agree(browser: Any, copters: Copters) -> None:

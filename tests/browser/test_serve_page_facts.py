@@ -113,6 +113,45 @@ def test_page_reports_automatic_disarming(browser: Any) -> None:
         picture(page, "disarmed-by-vehicle")
 
 
+def test_dialogs_name_disarm_delay_and_return_altitude(browser: Any) -> None:
+    with page_of(browser, parameters={"DISARM_DELAY": 25.0, "RTL_ALT": 2250.0}) as (_, page):
+        page.click("button[data-order='arm']")
+        page.locator("dialog .facts", has_text="it disarms itself after 25 s (DISARM_DELAY)").wait_for()
+        page.click("dialog .yes")
+        wait_done(page, "arm")
+        order(page, "take_off", {"altitude_m": "5"})
+        wait_done(page, "take off to 5 m")
+        page.click("button[data-order='return_to_launch']")
+        page.locator("dialog .facts", has_text="It first climbs to 22.5 m above home, unless it is higher.").wait_for()
+        cancel(page)
+        facts = page.evaluate(
+            """async () => {
+                const { orderFacts } = await import("/static/facts.js");
+                const usual = { disarm_parameter: "COM_DISARM_PRFLT", disarm_delay_s: null, missing_for_flight: [] };
+                return [usual, { ...usual, disarm_delay_s: -1 }].map((each) => orderFacts("arm", each, []));
+            }"""
+        )
+        assert facts == [["If it does not take off, it usually disarms itself after 10 s (COM_DISARM_PRFLT)."], []]
+
+
+def test_page_announces_failsafe_until_it_ends(browser: Any) -> None:
+    with page_of(browser) as (copter, page):
+        order(page, "arm")
+        wait_done(page, "arm")
+        order(page, "take_off", {"altitude_m": "5"})
+        wait_done(page, "take off to 5 m")
+        page.locator("#readiness.good", has_text="Flying").wait_for()
+        copter.faults.rc_lost = True
+        page.locator("#readiness.warn li", has_text="Radio Failsafe").wait_for()
+        assert page.locator("#readiness strong").inner_text() == "Failsafe: RTL"
+        assert page.locator(".toast.failed").all_inner_texts() == ["Vehicle 1: Failsafe: RTL. Radio Failsafe"]
+        assert page.locator(".vehicle .dot.warn").count() == 1
+        picture(page, "failsafe")
+        copter.faults.rc_lost = False
+        page.locator("#readiness.good", has_text="Flying").wait_for()
+        assert page.locator(".toast.failed").count() == 1
+
+
 def test_page_reports_crash_and_lets_disarm(browser: Any) -> None:
     with page_of(browser) as (copter, page):
         order(page, "arm")
@@ -210,7 +249,7 @@ def test_upload_dialog_previews_plan_on_map(browser: Any) -> None:
         plan = Plan(Mission([take_off(altitude_relative_m=15), *items]), Fence([FencePolygon(area)]))
         before = page.evaluate(MAP_TEXTS)
         page.evaluate(DROP, ["field.plan", format_plan(plan)])
-        page.locator("dialog[open]", has_text="The map shows the plan.").wait_for()
+        page.locator("dialog[open]", has_text="Its first place is 200 m north of the vehicle.").wait_for()
         shown = page.evaluate(MAP_TEXTS)
         assert {"1", "2"} <= set(shown)
         assert not {"1", "2"} & set(before)
@@ -218,6 +257,12 @@ def test_upload_dialog_previews_plan_on_map(browser: Any) -> None:
         cancel(page)
         page.locator("dialog[open]").wait_for(state="detached")
         assert not {"1", "2"} & set(page.evaluate(MAP_TEXTS))
+        far = here.offset(east_m=25_000)
+        plan = Plan(Mission([waypoint(far.latitude_deg, far.longitude_deg, altitude_relative_m=15)]))
+        page.evaluate(DROP, ["elsewhere.plan", format_plan(plan)])
+        text = re.compile(r"Its first place is 24\.9 km east of the vehicle: is this the plan for this vehicle\?")
+        page.locator("dialog .facts", has_text=text).wait_for()
+        picture(page, "far-plan")
 
 
 def test_orders_tell_when_mission_finished(browser: Any) -> None:

@@ -6,9 +6,11 @@ import contextlib
 import math
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
+from aerokit.autopilots.failsafe_texts import failsafe_kind
 from aerokit.errors import AerokitError
 from aerokit.events import LinkState
 from aerokit.vehicle.commanding.health import REPORTS_ABOUT_ARMING
+from aerokit.vehicle.commanding.order import FAILSAFE_STATES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,6 +18,23 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
 
 _OWN_FLIGHT_PURPOSES: tuple[Literal["setpoint", "mission", "return"], ...] = ("setpoint", "mission", "return")
+# The texts of one failsafe arrive within this many seconds. PX4 holds for COM_FAIL_ACT_T before some actions.
+_FAILSAFE_REPORT_DURATION_S = 10.0
+
+
+def active_failsafe(vehicle: Vehicle) -> list[str] | None:
+    """Return the vehicle's newest texts about its active failsafe, the oldest of them first; None if none is active.
+
+    ArduPilot and PX4 report a failsafe as MAV_STATE_CRITICAL, which is meaningless while they are disarmed
+    (vehicle_system_status in GCS_MAVLink_Copter.cpp, HEARTBEAT.hpp).
+    """
+    if not vehicle.armed.latest or vehicle.system_status.latest not in FAILSAFE_STATES:
+        return None
+    texts = [text for text in vehicle.telemetry.texts_since(-math.inf) if failsafe_kind(text.text)]
+    since = max((text.at for text in texts), default=0.0) - _FAILSAFE_REPORT_DURATION_S
+    return list(dict.fromkeys(text.text for text in texts if text.at >= since)) or [
+        "no text about its cause was received"
+    ]
 
 
 class Readiness(NamedTuple):
@@ -34,13 +53,21 @@ class Readiness(NamedTuple):
         return "cannot arm" if self.is_known else "not known whether it arms"
 
 
-def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None) -> Readiness:
+def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes_mode: bool = False) -> Readiness:
     """Return the requirements for a flight that a vehicle does not meet, grouped by whether they prevent arming.
 
     Args:
         vehicle: the vehicle, whose known state is used. Nothing is sent to it.
         reasons: result of ``vehicle.why_not_armable()``; None: health flags of SYS_STATUS, mode and estimator decide.
+        changes_mode: True if a mode that does not allow arming is no reason, because `Vehicle.arm` will change it.
     """
+    found = _grouped(vehicle, reasons)
+    if reasons is not None or changes_mode:  # `why_not_armable` has the mode among its reasons
+        return found
+    return found._replace(against_arming=tuple(dict.fromkeys([*_refused_mode(vehicle), *found.against_arming])))
+
+
+def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
     missing, sensors = vehicle.missing_for_flight(), vehicle.sensors.latest
     checks_pass = sensors is not None and sensors.prearm_checks_pass is True
     against = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)
@@ -82,8 +109,7 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
     if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False:
         return []
     if unarmable is not None and unarmable["arms_in"] is None:  # `arm` cannot change to a mode that allows arming
-        unless = f" unless {unarmable['unless']} allows it" if unarmable["unless"] else ""
-        return [f"{autopilot.firmware} cannot arm in {unarmable['mode']}{unless}", *_needed_to_arm(vehicle, missing)]
+        return [*_refused_mode(vehicle), *_needed_to_arm(vehicle, missing)]
     sensors, estimator = vehicle.sensors.latest, vehicle.estimator.latest
     if sensors is not None and sensors.prearm_checks_pass is False:
         return _needed_to_arm(vehicle, missing)
@@ -110,6 +136,15 @@ def unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
         return None
     arming_mode, option = autopilot.mode_to_arm_in(), autopilot.armable_by_option.get(mode.name)
     return {"mode": mode.name, "arms_in": None if arming_mode is None else arming_mode.name, "unless": option}
+
+
+def _refused_mode(vehicle: Vehicle) -> list[str]:
+    """Return a list with one text if a disarmed vehicle is in a mode that does not allow arming, else an empty list."""
+    unarmable = None if vehicle.armed.latest else unarmable_mode(vehicle)
+    if unarmable is None:
+        return []
+    unless = f" unless {unarmable['unless']} allows it" if unarmable["unless"] else ""
+    return [f"{vehicle.autopilot.firmware} cannot arm in {unarmable['mode']}{unless}"]
 
 
 def own_flight_modes(vehicle: Vehicle) -> str:

@@ -275,6 +275,8 @@ class Autopilot:
     """True if the autopilot refuses a mission on the ground unless its first navigation command is a take-off."""
     mode_when_landed: ClassVar[str | None] = None
     """Mode to which the vehicle changes by itself after landing; None if it stays in the landing mode."""
+    unselectable_modes: frozenset[str] = frozenset()
+    """Modes that the autopilot may report, but does not let a ground station select."""
     unarmable_modes: frozenset[str] = frozenset()
     """Modes in which the autopilot refuses to arm, or disarms at once."""
     armable_by_option: Mapping[str, str] = {}
@@ -288,6 +290,8 @@ class Autopilot:
 
     None: the bit counts in every mode.
     """
+    has_status_text_id_0 = False
+    """True if a long status text may have the id 0, which by the standard means that the text is not chunked."""
     camera_by_trigger_only = False
     """True if the autopilot's own camera supports only DO_DIGICAM_CONTROL and DO_TRIGGER_CONTROL."""
     video_addresses_camera = False

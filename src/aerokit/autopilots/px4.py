@@ -126,9 +126,14 @@ class Px4(Autopilot):
     modes_with_rc: frozenset[str] | None = frozenset(
         ("MANUAL", "ALTCTL", "POSCTL", "POSITION_SLOW", "ALTITUDE_CRUISE", "ACRO", "STABILIZED", "RATTITUDE", "SIMPLE")
     )
+    has_status_text_id_0 = True  # The first text after the start of a link (STATUSTEXT.hpp).
     calibration_protocol = "texts"
     camera_by_trigger_only = True
     arming_mode: ClassVar[str | None] = "LOITER"
+    # Commander.cpp of 1.17. External modes are selectable by the names that the vehicle reports.
+    unselectable_modes: frozenset[str] = frozenset(
+        ("ORBIT", "RATTITUDE", "READY", "RTGS", "SIMPLE", "TERMINATION", "VTOL_TAKEOFF")
+    ).union(f"EXTERNAL{number}" for number in range(1, 9))
     # OFFBOARD needs a stream of set-points.
     unarmable_modes: frozenset[str] = frozenset(("LAND", "OFFBOARD", "PRECLAND", "RTL", "TERMINATION"))
     purposes: ClassVar[Mapping[str, str]] = {

@@ -21,8 +21,10 @@ from aerokit.apps.serve import make_app
 from aerokit.apps.serve.app import STATIC
 from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS
+from aerokit.autopilots import px4_custom_mode
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.messages import AvailableModes
 from aerokit.missions import (
     Fence,
     FenceCircle,
@@ -33,7 +35,7 @@ from aerokit.missions import (
     take_off,
 )
 from aerokit.parameters import load_metadata
-from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedPx4, SimulatedRover, simulated_link
+from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedPx4, SimulatedRover, SimulatedVehicle, simulated_link
 
 pytestmark = pytest.mark.anyio
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -346,7 +348,8 @@ async def test_state_separates_not_armable_from_not_ready_to_fly() -> None:
         await anyio.sleep(1)
         text = "ArduCopter needs a position to arm in GUIDED, to which arming would change the mode"
         assert state()["not_armable"][0] == text  # type: ignore[index]
-        assert readiness(stage.flight.vehicle).against_arming == tuple(state()["not_armable"])  # type: ignore[arg-type]
+        found = readiness(stage.flight.vehicle, changes_mode=True)
+        assert found.against_arming == tuple(state()["not_armable"])  # type: ignore[arg-type]
         assert (await stage.submit("arm")).status_code == 409
 
 
@@ -456,3 +459,31 @@ async def test_failing_checks_are_requested_once_per_change() -> None:
             assert "Gyros inconsistent" in reasons
             assert "Compass not healthy" not in reasons
             assert len(flight.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 2
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "altitude_m"),
+    [
+        (SimulatedCopter(boot_time_s=0.0, parameters={"RTL_ALT": 2250.0}), 22.5),
+        (SimulatedPlane(boot_time_s=0.0, parameters={"RTL_ALTITUDE": 90.0}), 90.0),
+        (SimulatedPx4(boot_time_s=0.0, parameters={"RTL_RETURN_ALT": 40.0}), 40.0),
+        (SimulatedRover(boot_time_s=0.0), None),
+    ],
+)
+async def test_state_has_return_altitude_of_vehicle(vehicle: SimulatedVehicle, altitude_m: float | None) -> None:
+    async with simulated_link(vehicle) as link, aerokit.connect(link) as connected, make_app(connected) as app:
+        await anyio.sleep(5)
+        assert json.loads(app._served.snapshot())["vehicles"][0]["return_altitude_m"] == altitude_m
+
+
+async def test_modes_omit_what_px4_does_not_offer() -> None:
+    async with (
+        simulated_link(SimulatedPx4(boot_time_s=0.0)) as link,
+        aerokit.connect(link) as vehicle,
+        make_app(vehicle, token=TOKEN) as app,
+        httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url=f"http://{HOST}") as client,
+    ):
+        vehicle.telemetry.receive(AvailableModes(2, 1, 0, px4_custom_mode(4, 11), 0, "Arrive"))
+        modes = (await client.get("/api/vehicles/1", headers=BEARER)).json()["modes"]
+    assert {"LOITER", "OFFBOARD", "Arrive"} < set(modes)
+    assert not {"RATTITUDE", "EXTERNAL1", "EXTERNAL8"} & set(modes)

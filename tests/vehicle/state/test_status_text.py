@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import anyio
 import pytest
-from flight_harness import now, open_flight
+from flight_harness import now, open_flight, open_px4
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -43,6 +43,14 @@ def test_status_text_chunks_are_joined() -> None:
     texts = StatusTextAssembler()
     texts_read = [text for chunk in chunks(LONG) for text in texts.receive(chunk, 1.0)]
     assert texts_read == [StatusText(4, LONG, 1.0)]
+
+
+@pytest.mark.anyio
+async def test_first_text_of_px4_is_joined() -> None:
+    async with open_px4() as flight:
+        for chunk in chunks(LONG, number=0):
+            flight.vehicle.telemetry.receive(chunk)
+        assert flight.vehicle.status_text.value.text == LONG
 
 
 def test_status_text_full_chunks_end_with_empty_chunk() -> None:

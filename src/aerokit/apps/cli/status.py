@@ -10,7 +10,7 @@ import anyio
 from aerokit.apps.cli.arguments import number
 from aerokit.apps.cli.connecting import add_link, add_seconds, await_vehicle, opened
 from aerokit.apps.cli.output import DONE, FAILED, emit
-from aerokit.apps.readiness import Readiness, readiness, readiness_lines
+from aerokit.apps.readiness import Readiness, active_failsafe, readiness, readiness_lines
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout
 from aerokit.events import SILENT_AFTER_S
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavType
@@ -52,6 +52,7 @@ def _vehicle_record(vehicle: Vehicle, found: Readiness) -> dict[str, Any]:
         "version": None if version is None else str(version),
         "mode": vehicle.mode_name,
         "armed": vehicle.armed.latest,
+        "failsafe": active_failsafe(vehicle),
         "missing": [*found.against_arming, *found.against_flight],
         "against_arming": list(found.against_arming),
         **_frame_of(vehicle.connection.heartbeats.get((vehicle.system_id, vehicle.component_id))),
@@ -75,6 +76,7 @@ def _vehicle_lines(vehicle: Vehicle, found: Readiness) -> list[str]:
         f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or _UNKNOWN}",
         f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or _UNKNOWN}",
         f"  link     {_link(vehicle, frame)}",
+        *_aligned("failsafe", active_failsafe(vehicle) or ()),
         *_readiness(vehicle, found),
     ]
 

@@ -374,7 +374,7 @@ class FlightReport:
                 seconds = self.speedup * vehicle.heartbeat_age
                 self.print_line(f"  silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}")
                 continue
-            found = Readiness((), ()) if vehicle.is_armed else readiness(vehicle)
+            found = Readiness((), ()) if vehicle.is_armed else readiness(vehicle, changes_mode=True)
             if found.against_arming:
                 yet = " yet" if found.is_known else ""
                 self.print_line(f"  {found.prefix}{yet}: {'; '.join([*found.against_arming, *found.against_flight])}")

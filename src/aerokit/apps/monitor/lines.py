@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from rich.text import Text
 
 from aerokit._internal.formatting import printable
-from aerokit.apps.readiness import readiness
+from aerokit.apps.readiness import active_failsafe, readiness
 from aerokit.events import SILENT_AFTER_S, LinkState
 from aerokit.mavlink.enums import MissionState
 
@@ -55,6 +55,7 @@ class VehicleText:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
+        self._failsafe = active_failsafe(vehicle)
         self._link_state = vehicle.link_state.latest
         is_silent = self._link_state not in (LinkState.CONNECTED, None)
         self._silent_s = vehicle.heartbeat_age if is_silent else 0.0
@@ -79,7 +80,8 @@ class VehicleText:
             columns, lines = size
             width = columns - max(len(label) for label, _ in rows) - _LABEL_PADDING
             unused_lines = lines - len(rows)
-            rows[1] = ("missing", self._missing(1 + unused_lines, width))  # replaces the row with one reason only
+            label = "missing" if self._failsafe is None else "failsafe"
+            rows[1] = (label, self._missing(1 + unused_lines, width))  # replaces the row with one reason only
         return rows
 
     def _main_rows(self) -> list[tuple[str, Text]]:
@@ -129,7 +131,7 @@ class VehicleText:
                 (40, cell(vehicle.gps, lambda receivers: _gps(receivers[0]))),
             ]
         if not self._silent_s and more:
-            columns.append((0, self._missing() if vehicle.missing_for_flight() else self._ready()))
+            columns.append((0, self._missing() if self._reasons() else self._ready()))
         for width, column in columns:
             column.pad_right(width - len(column))
             text.append_text(column)
@@ -177,10 +179,14 @@ class VehicleText:
         return f"{silence}\n{reasons}" if silence else reasons
 
     def _reasons(self) -> list[str]:
-        """Return the reasons that prevent a flight: those against arming, then the others. Each group has a prefix."""
+        """Return the reasons that prevent a flight: those against arming, then the others. Each group has a prefix.
+
+        An active failsafe comes first.
+        """
         found = readiness(self._vehicle)
         if self._vehicle.armed.latest:
-            return [*found.against_arming, *found.against_flight]
+            failsafe = [f"failsafe: {text}" for text in self._failsafe or ()]
+            return [*failsafe, *found.against_arming, *found.against_flight]
         flight_prefix = "also missing for flight" if found.against_arming else "arms, cannot fly by itself"
         groups = ((found.prefix, found.against_arming), (flight_prefix, found.against_flight))
         return [

@@ -349,7 +349,8 @@ class HttpApi:
         vehicle = self._vehicle_of(request)
         built_in = vehicle.autopilot.modes.names
         modes = [*built_in, *(name for name in vehicle.telemetry.mode_names.values() if name not in built_in)]
-        return json_response({**overview(vehicle), "modes": modes})
+        unselectable = vehicle.autopilot.unselectable_modes
+        return json_response({**overview(vehicle), "modes": [name for name in modes if name not in unselectable]})
 
     async def _texts(self, request: Request) -> Response:
         return json_response({"texts": self._served.texts(self._vehicle_of(request).system_id)})

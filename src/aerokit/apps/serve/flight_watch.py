@@ -106,9 +106,7 @@ class FlightWatch:
         if self._disarming is None:
             return None
         at, armed_for_s = self._disarming
-        parameter = self.disarm_parameter
-        known = None if parameter is None else self._vehicle.parameters.known(parameter)
-        delay_s = None if known is None else float(known.value)
+        parameter, delay_s = self.disarm_parameter, self.disarm_delay_s
         return {
             "age_s": round(self._now() - at, 1),
             "armed_for_s": round(armed_for_s, 1),
@@ -121,6 +119,12 @@ class FlightWatch:
     def disarm_parameter(self) -> str | None:
         """Name of the parameter with the delay of the automatic disarming; None if the firmware has none."""
         return DISARM_PARAMETERS.get(self._vehicle.autopilot.firmware)
+
+    @property
+    def disarm_delay_s(self) -> float | None:
+        """Delay of the automatic disarming; 0 or less if it is off, None if it has not been read."""
+        known = None if self.disarm_parameter is None else self._vehicle.parameters.known(self.disarm_parameter)
+        return None if known is None else float(known.value)
 
     def on_order(self, order: str) -> None:
         """Record an order of this server. Disarming shortly after the order ``disarm`` is caused by the order."""

@@ -6,19 +6,20 @@ import asyncio
 import json
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import anyio
 
 from aerokit._internal.formatting import to_jsonable
-from aerokit.apps.readiness import ArmingCheckRequests, not_armable, run_arming_checks, unarmable_mode
+from aerokit.apps.readiness import ArmingCheckRequests, active_failsafe, not_armable, run_arming_checks, unarmable_mode
 from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.flight_watch import FlightWatch
 from aerokit.apps.serve.requests import HttpProblem
 from aerokit.connection.connection import Connection
 from aerokit.connection.tasks import BackgroundTasks
-from aerokit.errors import InvalidArgument
+from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.events import Event, LinkReport, LinkState, StatusTextReceived
 from aerokit.vehicle.commanding.ground import VELOCITY_MAX_AGE_S
 from aerokit.vehicle.connect import vehicles_on
@@ -46,8 +47,8 @@ TRACK_GAP_S = 3.0
 class ServedVehicles:
     """Follows the vehicles of a source, and keeps their recent events, texts and tracks.
 
-    Requests nothing but the reasons for not arming. These are requested when a disarmed vehicle begins to report
-    failing checks, and again when the failing sensors change.
+    Requests nothing but the return altitude, once, and the reasons for not arming. These are requested when a disarmed
+    vehicle begins to report failing checks, and again when the failing sensors change.
 
     ``source`` is a connection (its vehicles are added as they appear), one vehicle, or a mapping from system id to
     vehicle, which may grow.
@@ -149,6 +150,7 @@ class ServedVehicles:
     def _watch(self, vehicle: Vehicle) -> FlightWatch:
         if vehicle not in self._watches:
             self._watches[vehicle] = FlightWatch(vehicle)
+            self._background.start(partial(_read_return_altitude, vehicle), "aerokit serve altitude")
         return self._watches[vehicle]
 
     def _on_message(self, message: Mapping[str, Any]) -> None:
@@ -218,8 +220,12 @@ class ServedVehicles:
             # known crash.
             "crash": self.crash(vehicle) if is_connected else watch.crash,
             "disarming": watch.disarming,
-            "unread": _unread(vehicle, watch.disarm_parameter),
+            "disarm_parameter": watch.disarm_parameter,
+            "disarm_delay_s": watch.disarm_delay_s,
+            "unread": [watch.disarm_parameter] if watch.disarm_parameter and watch.disarm_delay_s is None else [],
+            "return_altitude_m": _return_altitude_m(vehicle),
             "failsafe": ground_station_failsafe(vehicle),
+            "active_failsafe": active_failsafe(vehicle),
             "mission_item": mission.current.latest,
             "mission_items": mission.count.latest,
             "is_flying_mission": _is_flying_mission(vehicle),
@@ -227,9 +233,17 @@ class ServedVehicles:
         }
 
 
-def _unread(vehicle: Vehicle, parameter: str | None) -> list[str]:
-    """Return the parameters that ``disarming`` needs and that have not been read."""
-    return [] if parameter is None or vehicle.parameters.known(parameter) is not None else [parameter]
+async def _read_return_altitude(vehicle: Vehicle) -> None:
+    with suppress(AerokitError):  # The altitude then stays unknown.
+        await vehicle.return_altitude()
+
+
+def _return_altitude_m(vehicle: Vehicle) -> float | None:
+    """Return the known result of `Vehicle.return_altitude`; None if it was not read."""
+    for name, scale in vehicle.autopilot.return_altitude_parameters(is_vtol=vehicle.is_vtol):
+        if (known := vehicle.parameters.known(name)) is not None:
+            return round(known.value / scale, 3)
+    return None
 
 
 def _is_flying_mission(vehicle: Vehicle) -> bool:

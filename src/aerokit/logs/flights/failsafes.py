@@ -7,6 +7,7 @@ import re
 from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
+from aerokit.autopilots.failsafe_texts import failsafe_kind
 from aerokit.logs.flights.codes import failsafe_action
 from aerokit.logs.flights.flight import FailsafeEvidence, TangentPlane, battery_name
 from aerokit.mavlink.enums import GpsFixType
@@ -80,36 +81,6 @@ KINDS = {
 }
 """Maps the kind of a failsafe to its title in reports."""
 
-_NO_EVIDENCE_PATTERN = re.compile(
-    r"clear|resolved|\boff$|prearm|pre-arm|preflight|^arm\b|(?<!dis)arming|re-?gained|recovered|restored"
-    r"|compensation off|connection .*established|fence enabled|fence disabled",
-    re.I,
-)
-_TEXT_PATTERNS: tuple[tuple[re.Pattern[str], str], ...] = tuple(
-    (re.compile(pattern, re.I), kind)
-    for pattern, kind in (
-        (r"battery.*(failsafe|is low|critical|unhealthy|emergency)", "battery"),
-        (r"low battery|(critical|emergency|dangerous).*batter", "battery"),
-        (r"fence.*(breach|violat)|breach.*fence|outside.*fence", "fence"),
-        (r"(radio|rc|throttle|manual control).*(failsafe|lost)|no rc\b|(short|long) failsafe", "radio"),
-        (r"gcs.*(failsafe|lost)|data ?link lost", "ground station"),
-        (r"(connection|link) to ground.*lost|ground (control )?station.*lost", "ground station"),
-        (r"ekf.*(failsafe|variance)|dead ?reckon|position estimate|navigation failure|estimator.*fail", "estimator"),
-        (r"gps.*(glitch|lost|failsafe|spoof|jam)|gnss.*(stopped|spoof|not reliable|lost)", "gps"),
-        (r"compass.*(error|fail|variance|inconsistent)", "compass"),
-        (r"vibration", "vibration"),
-        (r"crash|loss of control|attitude fail", "crash"),
-        (r"thrust loss", "thrust"),
-        (r"(motor|esc).*fail", "motor"),
-        (r"terrain data missing|failsafe.*terrain", "terrain"),
-        (r"avoid.*perform", "avoidance"),
-        (r"offboard.*lost|no offboard", "offboard"),
-        (r"parachute.*released|terminat", "termination"),
-        (r"maximum flight time", "time"),
-        (r"wind.*(limit|too)", "wind"),
-        (r"fail-?safe", "general"),
-    )
-)  # fmt: skip
 _ACTION_PATTERN = re.compile(
     r"failsafe activated|changed to|switch|fail-?safe.*[-:] *(rtl|land|hold|brake|disarm)", re.I
 )
@@ -141,11 +112,10 @@ def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
     """Return the evidence of failsafes that the vehicle's texts contain."""
     evidence = []
     for text in texts:
-        if _NO_EVIDENCE_PATTERN.search(text.text) is None:
-            kind = next((kind for pattern, kind in _TEXT_PATTERNS if pattern.search(text.text)), None)
-            if kind is not None:
-                is_action = bool(_ACTION_PATTERN.search(text.text))
-                evidence.append(FailsafeEvidence(text.time_s, kind, f"text: {text.text}", is_action))
+        kind = failsafe_kind(text.text)
+        if kind is not None:
+            is_action = bool(_ACTION_PATTERN.search(text.text))
+            evidence.append(FailsafeEvidence(text.time_s, kind, f"text: {text.text}", is_action))
     return evidence
 
 

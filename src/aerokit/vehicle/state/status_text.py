@@ -39,11 +39,14 @@ class StatusTextAssembler:
         self._incomplete: dict[tuple[_Sender, int], _IncompleteText] = {}
         self._recent: deque[StatusText] = deque(maxlen=MAX_RECENT_TEXTS)
 
-    def receive(self, message: Statustext, now: float) -> list[StatusText]:
-        """Process one message. Return the texts that it completes, and truncated texts whose next chunk is overdue."""
+    def receive(self, message: Statustext, now: float, *, joins_id_0: bool = False) -> list[StatusText]:
+        """Process one message. Return the texts that it completes, and truncated texts whose next chunk is overdue.
+
+        By the standard, a text with the id 0 is not chunked. With ``joins_id_0``, it is treated like other texts.
+        """
         truncated_texts = self.expire(now)
         chunk = _bytes_of(message)
-        if message.id == 0:
+        if message.id == 0 and not joins_id_0:
             texts = [StatusText(message.severity, _text(chunk), now)]
         else:
             texts = list(self._add_chunk(message, chunk, now))

@@ -298,7 +298,8 @@ class Telemetry(States):
     def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
         # A text gets the time of its processing, not of its arrival. Otherwise a text that explains a refusal could be
         # older than the refused command.
-        self._publish_texts(self._texts.receive(message, self._clock()), source)
+        may_join = self.autopilot.has_status_text_id_0
+        self._publish_texts(self._texts.receive(message, self._clock(), joins_id_0=may_join), source)
 
     def _publish_texts(self, texts: Iterable[StatusText], source: Source) -> None:
         for text in texts:

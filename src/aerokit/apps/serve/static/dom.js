@@ -22,6 +22,13 @@ export function number(value, digits = 1, unit = "") {
   return unit ? `${text} ${unit}` : text;
 }
 
+// The shortest text of a number that is the same 32-bit float, as in which vehicles store and send fractions.
+export function shortest(value) {
+  if (Number.isInteger(value)) return String(value);
+  const texts = [1, 2, 3, 4, 5, 6, 7, 8, 9].map((digits) => String(+value.toPrecision(digits)));
+  return texts.find((text) => Math.fround(+text) === Math.fround(value)) ?? String(value);
+}
+
 // Suffix of a name, unit, digits, and label; longer suffixes first.
 const UNITS = [
   ["_rate_deg_s", "°/s", 1, " rate"], ["_m_s2", "m/s²", 2], ["_m_s", "m/s", 2], ["_per_s", "/s"], ["_deg", "°", 1], ["_percent", "%"], ["_mah", "mAh"],
@@ -50,7 +57,7 @@ export function staleness(seconds) {
 }
 
 // A name of an enumeration in lower case: "ON_GROUND" becomes "on ground".
-export const spelled = (name) => ({ MC: "multicopter", FW: "fixed wing" })[name] ?? name.toLowerCase().replaceAll("_", " ");
+export const spelled = (name) => ({ MC: "multicopter", FW: "fixed wing", TYPE_2D_FIX: "2D", TYPE_3D_FIX: "3D" })[name] ?? name.toLowerCase().replaceAll("_", " ");
 
 export function clock(unixSeconds) {
   return new Date(unixSeconds * 1000).toLocaleTimeString([], { hour12: false });

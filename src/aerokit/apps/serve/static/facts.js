@@ -2,7 +2,7 @@
 
 import { clock, number, spelled, UNKNOWN } from "./dom.js";
 import { orderTitle } from "./panels.js";
-import { crashText, flightGap, modeChange, withoutSource } from "./readiness.js";
+import { crashText, flightGap, modeChange, SURFACE_TYPES, withoutSource } from "./readiness.js";
 
 // Orders that replace a running one of this set.
 const MOTION = new Set(["take_off", "go_to", "hold", "land", "return_to_launch", "mode", "mission/start", "mission/pause", "mission/resume"]);
@@ -35,7 +35,16 @@ export function orderFacts(order, vehicle, running) {
   if (!MOTION.has(order)) return [];
   const replaced = running.filter((each) => MOTION.has(each.order)).map(orderTitle);
   if (!replaced.length && vehicle.is_flying_mission && !order.startsWith("mission/")) replaced.push(`its mission${itemText(vehicle)}`);
-  return replaced.length ? [`Replaces: ${replaced.join(", ")}`] : [];
+  const facts = replaced.length ? [`Replaces: ${replaced.join(", ")}`] : [];
+  return order === "return_to_launch" ? [...facts, ...returnFacts(vehicle)] : facts;
+}
+
+// At which altitude the vehicle returns. ArduCopter and PX4 climb less if home is near (RTL_CONE_SLOPE, RTL_CONE_ANG).
+function returnFacts({ return_altitude_m: height, firmware, vehicle_type: type }) {
+  if (SURFACE_TYPES.has(type)) return [];
+  if (height !== null && height <= 0) return ["It returns at its present altitude."];
+  const altitude = height === null ? "its return altitude" : `${+height.toFixed(1)} m above home`;
+  return [firmware === "ArduPlane" ? `It returns at ${altitude}.` : `It first climbs to ${altitude}, unless it is higher. Near home it may climb less.`];
 }
 
 const itemText = ({ mission_item: item, mission_items: count }) =>
@@ -45,10 +54,12 @@ const itemText = ({ mission_item: item, mission_items: count }) =>
 export const needsForce = (vehicle) => Boolean(vehicle.crash) && vehicle.states.landed_state?.value !== "ON_GROUND";
 
 function armFacts(vehicle) {
-  const { missing_for_flight: missing, crash } = vehicle, change = modeChange(vehicle);
+  const { missing_for_flight: missing, crash, disarm_parameter: parameter, disarm_delay_s: delay } = vehicle, change = modeChange(vehicle);
+  const disarms = parameter && (delay === null ? "usually disarms itself after 10 s" : delay > 0 && `disarms itself after ${delay} s`);
   return [
     crash ? `${crashText(vehicle)}.` : "",
     change && `${change}.`,
+    disarms && `If it does not take off, it ${disarms} (${parameter}).`,
     missing.length ? `${flightGap(vehicle)}: ${missing.map(withoutSource).join("; ")}.` : "",
   ].filter(Boolean);
 }

@@ -6,7 +6,7 @@ import { colourOf, MapView } from "./map.js";
 import { Orders } from "./orders.js";
 import { targetAltitude } from "./facts.js";
 import { currentItem, MissionPanel, OrderPanel, ParameterPanel, shownState, TextPanel } from "./panels.js";
-import { disarmText, inWords, isConnected, light, showCrashes, showReadiness, showSilences } from "./readiness.js";
+import { disarmText, failsafeTitle, inWords, isConnected, light, showCrashes, showReadiness, showSilences } from "./readiness.js";
 import { ask, hasToken, openStream, useToken } from "./server.js";
 import { ageOf, BigValues, bitNames, StateTable } from "./state.js";
 
@@ -280,6 +280,8 @@ function onMessage(message) {
     for (const each of message.vehicles) {
       const before = page.vehicles.get(each.system_id), text = disarmText(each);
       if (text && before && !disarmText(before)) toast(`Vehicle ${each.system_id}: ${text}`, "note");
+      const causes = each.active_failsafe;
+      if (causes && before && !before.active_failsafe) toast(`Vehicle ${each.system_id}: ${failsafeTitle(each)}. ${causes.join("; ")}`, "failed");
     }
     page.vehicles = new Map(message.vehicles.map((each) => [each.system_id, each]));
     message.vehicles.forEach(loadFailsafe);

@@ -11,11 +11,15 @@ const BUTTONS_WIDTH = 52, BUTTONS_HEIGHT = 170; // pixels of the buttons at the 
 
 const DIRECTIONS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
 
+// Metres north and east from one position to another.
+export function offset(from, to) {
+  const away = ((to.longitude_deg - from.longitude_deg + 540) % 360) - 180;
+  return [(to.latitude_deg - from.latitude_deg) * METRES_PER_DEGREE, away * METRES_PER_DEGREE * Math.cos(from.latitude_deg * Math.PI / 180)];
+}
+
 // "13 m north-east of": from one position to another.
 export function distanceText(from, to) {
-  const north = (to.latitude_deg - from.latitude_deg) * METRES_PER_DEGREE;
-  const away = ((to.longitude_deg - from.longitude_deg + 540) % 360) - 180;
-  const east = away * METRES_PER_DEGREE * Math.cos(from.latitude_deg * Math.PI / 180), metres = Math.hypot(north, east);
+  const [north, east] = offset(from, to), metres = Math.hypot(north, east);
   if (metres < 1) return "less than 1 m from";
   const direction = DIRECTIONS[(Math.round(Math.atan2(east, north) * 4 / Math.PI) + 8) % 8];
   return `${metres < 1000 ? `${metres.toFixed(0)} m` : `${(metres / 1000).toFixed(1)} km`} ${direction} of`;

@@ -1,9 +1,9 @@
 // Orders: buttons, and the confirmation dialog that names vehicle and order. Every order needs it, and is sent once.
 
-import { age, byId, element, show } from "./dom.js";
+import { age, byId, element, shortest, show } from "./dom.js";
 import { needsForce, orderFacts, valueProblem } from "./facts.js";
-import { distanceText } from "./map.js";
-import { aboutParameter, parameterProblem, typeProblem } from "./panels.js";
+import { distanceText, offset } from "./map.js";
+import { aboutParameter, parameterProblem, short, typeProblem } from "./panels.js";
 import { capitalized, dialogObstacle, inWords, obstacle } from "./readiness.js";
 import { ask, hasToken, newKey, Refusal, useToken } from "./server.js";
 import { ageOf } from "./state.js";
@@ -21,6 +21,16 @@ export const BUTTONS = [
   ["mission/pause", "Pause", "pause its mission and hold", [], ""],
   ["mission/resume", "Resume", "resume its mission", [], ""],
 ];
+
+const FAR_M = 10_000;
+
+// How far away the first place of a mission is, as [text, warning]; the other one is "".
+function distanceOfPlan(items, vehicle) {
+  const there = items.find((each) => each.position)?.position, here = vehicle.states.position?.value;
+  if (!there || !here) return ["", ""];
+  const text = `Its first place is ${distanceText(here, there)} the vehicle`;
+  return Math.hypot(...offset(here, there)) > FAR_M ? ["", `${text}: is this the plan for this vehicle?`] : [`${text}.`, ""];
+}
 
 export class Orders {
   // page: {vehicle(), seenAt(), pick(), toast(text, kind), record(order), changed(), running(id), preview(plan)}
@@ -76,6 +86,7 @@ export class Orders {
       const checked = await ask("POST", "api/plan", { plan, name });
       const { mission_items: count, fence_areas: areas, rally_points: rally } = checked;
       const parts = [[count, "mission items"], [areas, "fence areas"], [rally, "rally points"]];
+      const [distance, warning] = distanceOfPlan(checked.items, vehicle);
       const replaced = parts.filter(([each]) => each).map(([each, what]) => `${each} ${each === 1 ? what.slice(0, -1) : what}`);
       this.confirm({
         order: "mission/upload", title: "Upload", fields: [], fixed: { name, plan }, preview: checked, place: "beside",
@@ -83,8 +94,10 @@ export class Orders {
         about: [
           vehicle.states.armed?.value ? "The vehicle is armed." : "",
           "The map shows the plan.",
+          distance,
           areas && rally ? "" : "What the file does not contain (fence, rally points) stays as it is.",
         ].filter(Boolean),
+        facts: warning ? [warning] : [],
       });
     } catch (error) {
       this.page.toast(error instanceof Refusal ? inWords(error.problem) : `${file.name} was not checked: the server did not answer.`, "failed");
@@ -123,7 +136,7 @@ export class Orders {
     this.confirm({
       impossible: ({ value }) => (value === undefined ? "" : typeProblem(parameter, value)),
       problem: ({ value }) => (value === undefined ? "" : parameterProblem(parameter, value)),
-      vehicle: id, title: `Set ${parameter.name}`, text: `set ${parameter.name}, currently ${parameter.value} ${parameter.unit ?? ""}`.trim(), about: aboutParameter(parameter),
+      vehicle: id, title: `Set ${parameter.name}`, text: `set ${parameter.name}, currently ${short(parameter.value)} ${parameter.unit ?? ""}`.trim(), about: aboutParameter(parameter),
       fields: [["value", "New value", parameter.value, "any"]], order: "parameter", parameter: parameter.name,
     });
   }
@@ -135,7 +148,7 @@ export class Orders {
     const dialog = byId("dialog"), key = newKey();
     const inputs = wanted.fields.map(([name, label, value, step]) => {
       const input = element("input", { type: "number", step, name, required: value !== "" });
-      input.value = typeof value === "number" ? String(+value.toFixed(7)) : value;
+      input.value = typeof value === "number" ? shortest(value) : value;
       return [name, input, element("label", {}, label, input)];
     });
     const will = element("span", {}), facts = element("div", { class: "facts" });
@@ -151,7 +164,7 @@ export class Orders {
       const why = dialogObstacle(wanted.order, page.vehicles.get(id), page);
       show(blocked, why);
       blocked.hidden = !why;
-      const lines = orderFacts(wanted.order, page.vehicles.get(id), this.page.running(id));
+      const lines = (wanted.facts ?? []).concat(orderFacts(wanted.order, page.vehicles.get(id), this.page.running(id)));
       if (facts.dataset.drawn !== lines.join("\n")) facts.replaceChildren(...lines.map((line) => element("p", {}, line)));
       facts.dataset.drawn = lines.join("\n");
       enable();

@@ -1,6 +1,6 @@
 // The panels: mission, parameters, texts and events, orders.
 
-import { clock, element, number, SEVERITIES, show, spelled, unbroken, UNKNOWN, unitOf } from "./dom.js";
+import { clock, element, number, SEVERITIES, shortest, show, spelled, unbroken, UNKNOWN, unitOf } from "./dom.js";
 import { inWords } from "./readiness.js";
 import { ask } from "./server.js";
 
@@ -186,7 +186,7 @@ function edits(word, name) {
   return row[name.length];
 }
 
-const short = (value) => (value === null || value === undefined ? UNKNOWN : String(+value.toPrecision(7)));
+export const short = (value) => (value === null || value === undefined ? UNKNOWN : shortest(value));
 const withUnit = (each, value) => `${short(value)}${each.unit ? ` ${each.unit}` : ""}`;
 const meaning = (each) => (each.meaning && each.meaning !== withUnit(each, each.value) ? each.meaning : "");
 const isKnown = (value) => value !== null && value !== undefined;
@@ -203,13 +203,21 @@ function range(each) {
 
 const MAX_REAL32 = 3.4028234663852886e38;
 
+// The smallest and the largest number of an integer type; undefined for other types.
+function integerLimits(type) {
+  const [, sign, bits] = /^(U?)INT(8|16|32|64)$/.exec(type) ?? [];
+  if (!bits) return undefined;
+  const size = 2 ** (bits - (sign ? 0 : 1));
+  return [sign ? 0 : -size, size - 1];
+}
+
 // Why the type of a parameter cannot hold a value, like checked_value in parameter.py; "" if it can.
 export function typeProblem({ name, type }, value) {
-  const [, sign, bits] = /^(U?)INT(8|16|32|64)$/.exec(type) ?? [];
-  if (!bits) return type === "REAL32" && Math.abs(value) > MAX_REAL32 ? `${name} = ${value} is too large (it is a REAL32).` : "";
-  const size = 2 ** (bits - (sign ? 0 : 1)), minimum = sign ? 0 : -size;
+  const limits = integerLimits(type);
+  if (!limits) return type === "REAL32" && Math.abs(value) > MAX_REAL32 ? `${name} = ${value} is too large (it is a REAL32).` : "";
+  const [minimum, maximum] = limits;
   if (!Number.isInteger(value)) return `${name} = ${value} must be a whole number (its type is ${type}).`;
-  return value < minimum || value >= size ? `${name} = ${value} must be in ${minimum}..${size - 1} (its type is ${type}).` : "";
+  return value < minimum || value > maximum ? `${name} = ${value} must be in ${minimum}..${maximum} (its type is ${type}).` : "";
 }
 
 // Why the metadata does not allow a value, like ParameterMetadata.problem in metadata.py; "" if it does.
@@ -222,11 +230,16 @@ export function parameterProblem(each, value) {
   return `${each.name} = ${short(value)} is not in ${bound(each.minimum)}..${bound(each.maximum)} ${each.unit ?? ""}`.trimEnd();
 }
 
+function typeText(type) {
+  const limits = integerLimits(type);
+  return limits ? `Whole numbers ${limits.join(" … ")} (${type}).` : `Numbers with fractions (${type}).`;
+}
+
 // What is known about a parameter, one line each, for the dialog that sets it.
 export function aboutParameter(each) {
   return [
     each.description || each.short_description,
-    range(each) ? `Range: ${range(each)} ${each.unit ?? ""}` : "",
+    range(each) ? `Range: ${range(each)} ${each.unit ?? ""}` : typeText(each.type),
     isKnown(each.default) ? `Default: ${withUnit(each, each.default)}` : "",
     each.reboot_required ? "Takes effect after a reboot." : "",
   ].filter(Boolean);
@@ -368,7 +381,7 @@ const ORDER_TEXTS = {
   take_off: ({ altitude_m }) => ` to ${+altitude_m.toFixed(2)} m`,
   mode: ({ mode }) => ` ${mode}`,
   "mission/upload": ({ name, mission_items }) => ` ${name} (${mission_items} items)`,
-  set_parameter: ({ name, value }) => ` ${name} to ${+value.toPrecision(7)}`,
+  set_parameter: ({ name, value }) => ` ${name} to ${shortest(value)}`,
 };
 
 // Done when the vehicle reports its hold mode. PX4 then still moves.

@@ -1,12 +1,12 @@
 // Readiness and silence in words: what a vehicle lacks, which orders cannot work now and why, and lost vehicles.
 
-import { age, clock, element, number, show } from "./dom.js";
+import { age, clock, element, number, show, UNKNOWN } from "./dom.js";
 import { ageOf } from "./state.js";
 
 // Orders that the server also tries on a silent vehicle.
 const SAFE_ORDERS = new Set(["disarm", "hold", "land", "return_to_launch", "mission/pause"]);
 // MAV_TYPE: ground rover, boat, submarine.
-const SURFACE_TYPES = new Set([10, 11, 12]);
+export const SURFACE_TYPES = new Set([10, 11, 12]);
 const FLYING = new Set(["IN_AIR", "TAKEOFF", "LANDING"]);
 const MAX_REASONS = 4;
 // What the page calls the library's actions.
@@ -92,6 +92,8 @@ export function disarmText({ disarming: known }) {
   return `Disarmed ${after}, not by an order of this server${parameter && delay !== 0 ? ` (${parameter}${delay === null ? "" : ` = ${delay} s`})` : ""}`;
 }
 
+export const failsafeTitle = (vehicle) => `Failsafe: ${valueOf(vehicle, "mode")?.name ?? UNKNOWN}`;
+
 const RECENT_MS = 60_000;
 
 // Why a vehicle that was armed a short time ago is disarmed; "" if the page has not seen it armed, or longer ago.
@@ -143,14 +145,18 @@ function readiness(vehicle, page, heartbeatAge) {
     return ["bad", title, [crashText(vehicle), ...missing]];
   }
   if (valueOf(vehicle, "armed")) {
-    const title = landed === "ON_GROUND" ? "Armed: propellers may turn" : FLYING.has(landed) ? "Flying" : "Armed";
-    return [missing.length || landed === "ON_GROUND" ? "warn" : "good", title, missing];
+    const isOnGround = landed === "ON_GROUND", texts = vehicle.active_failsafe;
+    const title = isOnGround ? "Armed: propellers may turn" : FLYING.has(landed) ? "Flying" : "Armed";
+    if (texts) return ["warn", failsafeTitle(vehicle), [...(isOnGround ? [title] : []), ...texts, ...missing]];
+    return [missing.length || isOnGround ? "warn" : "good", title, missing];
   }
   const notes = [disarmed, modeChange(vehicle)].filter(Boolean), against = vehicle.not_armable;
   if (against.length) {
     const forFlight = missing.filter((reason) => !against.includes(reason));
     return ["warn", "Cannot arm", [...against, ...(disarmed ? [disarmed] : [])], forFlight];
   }
+  const mode = vehicle.unarmable_mode;
+  if (mode?.arms_in) return ["warn", `${mode.unless ? "May refuse to" : "Cannot"} arm in ${mode.mode}`, [...notes, ...missing]];
   return missing.length ? ["warn", flightGap(vehicle), [...missing, ...notes]] : ["good", "Ready to arm", notes];
 }
 
