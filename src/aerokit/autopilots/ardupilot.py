@@ -262,6 +262,7 @@ class ArduCopter(ArduPilot):
     speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED, SpeedType.CLIMB_SPEED))
     condition_yaw = True
     lands_after_return = True
+    auto_disarm_parameter: ClassVar[str | None] = "DISARM_DELAY"
     # There is no DO_ORBIT, and CIRCLE follows the throttle stick (mode_circle.cpp).
     circles_by: Literal["orbit", "reposition", "setpoints"] | None = "setpoints"
     arming_mode: ClassVar[str | None] = "GUIDED"

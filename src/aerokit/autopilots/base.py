@@ -275,6 +275,8 @@ class Autopilot:
     """True if the autopilot refuses a mission on the ground unless its first navigation command is a take-off."""
     mode_when_landed: ClassVar[str | None] = None
     """Mode to which the vehicle changes by itself after landing; None if it stays in the landing mode."""
+    auto_disarm_parameter: ClassVar[str | None] = None
+    """Parameter with the seconds after which an armed vehicle that does not take off disarms; None if it does not."""
     unselectable_modes: frozenset[str] = frozenset()
     """Modes that the autopilot may report, but does not let a ground station select."""
     unarmable_modes: frozenset[str] = frozenset()

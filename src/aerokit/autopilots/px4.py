@@ -126,6 +126,7 @@ class Px4(Autopilot):
     modes_with_rc: frozenset[str] | None = frozenset(
         ("MANUAL", "ALTCTL", "POSCTL", "POSITION_SLOW", "ALTITUDE_CRUISE", "ACRO", "STABILIZED", "RATTITUDE", "SIMPLE")
     )
+    auto_disarm_parameter: ClassVar[str | None] = "COM_DISARM_PRFLT"
     has_status_text_id_0 = True  # The first text after the start of a link (STATUSTEXT.hpp).
     calibration_protocol = "texts"
     camera_by_trigger_only = True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from aerokit.mavlink.enums import MavLandedState, MavType
@@ -17,8 +16,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
 
 SURFACE_TYPES = (MavType.GROUND_ROVER, MavType.SURFACE_BOAT, MavType.SUBMARINE)
-DISARM_PARAMETERS: Mapping[str, str] = {"ArduCopter": "DISARM_DELAY", "PX4": "COM_DISARM_PRFLT"}
-"""Maps firmwares to the parameter that contains after how many seconds a vehicle that does not take off is disarmed."""
 DISARM_DELAY_TOLERANCE_S = 1.5
 DISARM_ORDER_MAX_AGE_S = 5.0
 
@@ -118,7 +115,7 @@ class FlightWatch:
     @property
     def disarm_parameter(self) -> str | None:
         """Name of the parameter with the delay of the automatic disarming; None if the firmware has none."""
-        return DISARM_PARAMETERS.get(self._vehicle.autopilot.firmware)
+        return self._vehicle.autopilot.auto_disarm_parameter
 
     @property
     def disarm_delay_s(self) -> float | None:

@@ -100,9 +100,9 @@ const RECENT_MS = 60_000;
 function recentDisarm(vehicle) {
   const since = performance.now() - (vehicle?.disarmedAt ?? -Infinity);
   if (valueOf(vehicle ?? { states: {} }, "armed") || since > RECENT_MS) return "";
-  const parameter = vehicle.firmware === "ArduCopter" ? "DISARM_DELAY" : vehicle.firmware.startsWith("PX4") ? "COM_DISARM_PRFLT" : "";
+  const parameter = vehicle.disarm_parameter;
   const delay = parameter && ` ${vehicle.firmware} disarms itself on the ground after ${parameter}, 10 s by default.`;
-  return ` It disarmed ${age(Math.max(1, since / 1000))} ago.${delay}`;
+  return ` It disarmed ${age(Math.max(1, since / 1000))} ago.${delay ?? ""}`;
 }
 
 // The reason why the order of an open dialog cannot work now, as sentences; "" if it may work.
