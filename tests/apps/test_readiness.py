@@ -96,7 +96,7 @@ async def test_battery_and_estimator_failsafes_show_newest_texts() -> None:
     copter = SimulatedCopter(boot_time_s=0.0, battery_percent=16.0, parameters=limits)
     async with in_the_air(copter=copter) as flight:
         await flight.vehicle.system_status.wait_until(lambda state: state == MavState.CRITICAL)
-        battery, failsafe = active_failsafe(flight.vehicle) or ()
+        battery, failsafe = active_failsafe(flight.vehicle) or []
         assert battery.startswith("Battery 1 is low ")
         assert failsafe == "Battery Failsafe"
         await anyio.sleep(15)
@@ -114,6 +114,6 @@ async def test_px4_battery_failsafe_is_named_only_while_armed() -> None:
         await flight.vehicle.take_off(10)
         px4.battery.percent = 5.0
         await flight.vehicle.system_status.wait_until(lambda state: state == MavState.CRITICAL)
-        assert (active_failsafe(flight.vehicle) or ())[0] == "Emergency battery level"
+        assert (active_failsafe(flight.vehicle) or [""])[0] == "Emergency battery level"
         await flight.vehicle.armed.wait_until(lambda is_armed: not is_armed)
         assert active_failsafe(flight.vehicle) is None
