@@ -100,24 +100,26 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             self._end_stream()
 
     def _on_value(self, setting: Setting, index: int, count: int, now: float) -> None:
-        """Store a value: of the stream, or the answer to a request. Request indices that the stream has left out."""
-        if self._is_streaming and index >= self._next:
-            for missing in range(self._next, index):
+        """Store a value of the stream, or an answer to a request. Request indices that the stream has left out."""
+        if self._is_streaming and index >= self._next_index:
+            for missing in range(self._next_index, index):
                 self._window.request(missing)
-            if self._next:  # The time before the first value is not a pause of the stream.
+            if self._next_index:  # The time before the first value is not a pause of the stream.
                 self._pause_s = max(self._pause_s, now - self._last_at)
-            self._next, self._last_at = index + 1, now
+            self._next_index = index + 1
+            self._last_at = now
             quiet_s = max(self.round_trip.timeout_s(), PAUSES * self._pause_s, MIN_START_TIMEOUT_S)
             self._quiet_at = now + min(quiet_s, MAX_QUIET_S)
             self._window.discard(index)
         else:
             self._window.on_answer(index, now)
         self._store(index, setting, count, now)
-        if self._next >= count:
+        if self._next_index >= count:
             self._end_stream()
 
     def _end_stream(self) -> None:
-        self._is_streaming, self._quiet_at = False, None
+        self._is_streaming = False
+        self._quiet_at = None
         for index in self._missing():
             self._window.request(index)
 
@@ -131,7 +133,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             if not stale:
                 settings = (self._received[index][0] for index in range(self._count))
                 self._finish({setting.name: setting for setting in settings})
-        elif not len(self._window):  # Nothing is requested, but values are missing: the count has increased.
+        elif len(self._window) == 0:  # Nothing is requested, but values are missing: the count has increased.
             self._end_stream()
 
 

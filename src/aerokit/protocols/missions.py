@@ -124,8 +124,8 @@ class MissionExchange(Transfer[ResultT]):
         self.deadline: float | None = now + (self._timeout_s(self._attempt) if seconds is None else seconds)
 
     def _timeout_s(self, attempt: int) -> float:
-        # After a few attempts, the time-out stays the same for a while. Longer waits would help only on a congested
-        # link, which the small messages of a mission do not cause.
+        # After a few attempts, the time-out stays the same for a while. Longer waits only help on a congested link, and
+        # the small messages of a mission do not congest a link.
         backoff_attempt = min(attempt, max(GROWING_ATTEMPTS, attempt - CONSTANT_ATTEMPTS))
         return self.round_trip.timeout_s(backoff_attempt)
 
@@ -190,8 +190,8 @@ class SetCurrentItem(Transfer[None]):
     ``reported`` is the item last reported by the vehicle. If the vehicle moves from ``reported`` past the requested
     item, this also counts as confirmation.
 
-    With an ``order_status``, a retry waits for a HEARTBEAT since the last transmission, and retries stop when the order
-    has ended.
+    With an ``order_status``, a retry waits for a HEARTBEAT that is newer than the last transmission. Retries stop when
+    the order has ended.
     """
 
     expects: tuple[type[Message], ...] = (MissionCurrent,)
@@ -275,6 +275,7 @@ def mission_checksum(items: Iterable[MissionItem]) -> int:
     ``mission_id``, ``fence_id`` and ``rally_points_id`` in MISSION_CURRENT
     (https://mavlink.io/en/messages/common.html#MISSION_CURRENT).
     """
+    # zlib.crc32 inverts its start value and its result, so both are inverted once more.
     checksum = _INVERT
     for item in items:
         numbers = (item.param1, item.param2, item.param3, item.param4, int(item.x), int(item.y), item.z)

@@ -61,7 +61,7 @@ def rtcm_messages(data: bytes) -> list[bytes]:
     """
     messages: list[bytes] = []
     begin = 0
-    while begin < len(data) or not messages:  # The second condition also refuses empty data, in the first iteration.
+    while True:  # The first iteration also refuses empty data.
         size = _frame_size(data, begin) if len(data) - begin > HEADER_SIZE else None
         subject = f"rtcm (byte {begin} of {len(data)})"
         if size is None:
@@ -80,7 +80,8 @@ def rtcm_messages(data: bytes) -> list[bytes]:
             )
         messages.append(frame)
         begin += size
-    return messages
+        if begin == len(data):
+            return messages
 
 
 class RtcmReader:

@@ -132,11 +132,23 @@ def _thermal_range(camera: CameraDevice) -> list[m.CameraThermalRange]:
     if camera.thermal_celsius is None:
         return []
     coldest, hottest = camera.thermal_celsius
-    stream, now_ms = len(camera.streams), camera.host.time_boot_ms
-    return [m.CameraThermalRange(now_ms, stream, 0, hottest, 1.0, 1.0, coldest, 0.0, 0.0)]
+    return [
+        m.CameraThermalRange(
+            time_boot_ms=camera.host.time_boot_ms,
+            stream_id=len(camera.streams),
+            camera_device_id=0,
+            max=hottest,
+            max_point_x=1.0,
+            max_point_y=1.0,
+            min=coldest,
+            min_point_x=0.0,
+            min_point_y=0.0,
+        )
+    ]
 
 
 def _field_of_view(camera: CameraDevice) -> int:
     """Return the horizontal field of view in degrees; 0 if unknown."""
-    width, focal = camera.sensor_mm[0], camera.focal_length_mm
-    return 0 if math.isnan(width / focal) else round(math.degrees(2 * math.atan(width / 2 / focal)))
+    sensor_width_mm, _ = camera.sensor_mm
+    tangent = sensor_width_mm / 2 / camera.focal_length_mm
+    return 0 if math.isnan(tangent) else round(math.degrees(2 * math.atan(tangent)))

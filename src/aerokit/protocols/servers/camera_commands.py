@@ -26,7 +26,7 @@ def camera_commands(camera: CameraDevice) -> dict[int, AsyncHandler]:
     return {
         MavCmd.IMAGE_START_CAPTURE: pictures.start,
         MavCmd.IMAGE_STOP_CAPTURE: pictures.stop,
-        MavCmd.DO_DIGICAM_CONTROL: pictures.control,
+        MavCmd.DO_DIGICAM_CONTROL: pictures.digicam_control,
         MavCmd.STORAGE_FORMAT: pictures.format,
         MavCmd.VIDEO_START_CAPTURE: videos.start,
         MavCmd.VIDEO_STOP_CAPTURE: videos.stop,
@@ -100,7 +100,7 @@ class _Pictures:
         self._camera.captures.stop()
         return MavResult.ACCEPTED
 
-    async def control(self, command: ReceivedCommand) -> int:
+    async def digicam_control(self, command: ReceivedCommand) -> int:
         """Execute DO_DIGICAM_CONTROL, a command of the older camera protocol. Param 5 is 1 to take an image."""
         if command.x == 1:
             self._camera.captures.take()

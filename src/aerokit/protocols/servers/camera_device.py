@@ -101,7 +101,18 @@ class CameraDevice:
 
     def failed_shot(self) -> Shot:
         """Return the content of CAMERA_IMAGE_CAPTURED for an image that could not be taken."""
-        return partial(CameraImageCaptured, self.host.time_boot_ms, 0, 0, 0, 0, 0, 0, UNKNOWN_ATTITUDE, file_url="")
+        return partial(
+            CameraImageCaptured,
+            time_boot_ms=self.host.time_boot_ms,
+            time_utc=0,
+            camera_id=0,
+            lat=0,
+            lon=0,
+            alt=0,
+            relative_alt=0,
+            q=UNKNOWN_ATTITUDE,
+            file_url="",
+        )
 
     def has_space(self) -> bool:
         """Return True if another image fits."""
@@ -175,7 +186,9 @@ class Captures:
 
     def switch_off(self) -> None:
         """End the series and the video at once, as a power failure does. The image log is kept."""
-        self._remaining, self._is_exposing, self._is_late, self._recording_since = 0, False, False, math.nan
+        self._remaining = 0
+        self._is_exposing = self._is_late = False
+        self._recording_since = math.nan
         self._series += 1
 
     @property

@@ -92,18 +92,40 @@ class CommandDispatcher:
         host.on(CommandInt, self._on_int)
 
     def _on_long(self, message: CommandLong, channel: Channel) -> None:
-        params = (message.param1, message.param2, message.param3, message.param4)
-        position = (message.param5, message.param6, message.param7)
-        sender, confirmation = sender_of(message), message.confirmation
-        self.execute(ReceivedCommand(message.command, *params, *position, None, channel, sender, confirmation))
+        command = ReceivedCommand(
+            command=message.command,
+            param1=message.param1,
+            param2=message.param2,
+            param3=message.param3,
+            param4=message.param4,
+            x=message.param5,
+            y=message.param6,
+            z=message.param7,
+            frame=None,
+            channel=channel,
+            sender=sender_of(message),
+            confirmation=message.confirmation,
+        )
+        self.execute(command)
 
     def _on_int(self, message: CommandInt, channel: Channel) -> None:
-        params = (message.param1, message.param2, message.param3, message.param4)
-        position = (message.x, message.y, message.z)
-        self.execute(ReceivedCommand(message.command, *params, *position, message.frame, channel, sender_of(message)))
+        command = ReceivedCommand(
+            command=message.command,
+            param1=message.param1,
+            param2=message.param2,
+            param3=message.param3,
+            param4=message.param4,
+            x=message.x,
+            y=message.y,
+            z=message.z,
+            frame=message.frame,
+            channel=channel,
+            sender=sender_of(message),
+        )
+        self.execute(command)
 
     def execute(self, command: ReceivedCommand) -> None:
-        """Answer a command with the refusal, if there is one; otherwise dispatch the command."""
+        """Refuse a command, or dispatch it to its handler."""
         refusal = self._refusal(command)
         if refusal is not None:
             self.answer(command, refusal)

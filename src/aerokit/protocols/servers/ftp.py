@@ -198,7 +198,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _path(self, request: FtpPacket) -> str:
         return checked_path(request.data[: request.size])
 
-    def _opened(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
+    def _session_of(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
         """Return the session that a request names; raises Refused if it is not open."""
         session = peer.sessions.get(request.session)
         if session is None:
@@ -212,7 +212,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge(request.data[: request.size])
 
     def _terminate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        session = self._opened(peer, request)
+        session = self._session_of(peer, request)
         del peer.sessions[request.session]
         session.burst = None
         session.file.close()
@@ -281,19 +281,19 @@ class SessionFtpServer(Generic[FilesT]):
         self._host.call_at(peer.used_at + self.session_timeout_s, close_if_due)
 
     def _read(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        session = self._opened(peer, request)
+        session = self._session_of(peer, request)
         if request.offset >= session.size:
             return request.refuse(MavFtpErr.EOF)
         return request.acknowledge(session.file.read(request.offset, request.size))
 
     def _write(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        session = self._opened(peer, request)
+        session = self._session_of(peer, request)
         session.file.write(request.offset, request.data[: request.size])
         return request.acknowledge(request.size.to_bytes(4, "little"))
 
     def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
         """Start a burst, or move a running one to another offset. Return None, because the blocks are the answer."""
-        session = self._opened(peer, request)
+        session = self._session_of(peer, request)
         is_running = session.burst is not None
         first_sequence = (request.sequence + 1) & 0xFFFF
         session.burst, session.burst_sent = request.replace(sequence=first_sequence), 0

@@ -18,6 +18,9 @@ from aerokit.protocols.servers.host import Channel, ServerHost
 Builder = Callable[["ReceivedCommand | None"], "Iterable[Message]"]
 
 
+_NOT_STREAMED = -1  # interval in MESSAGE_INTERVAL
+
+
 class MessageStreams:
     """Sends the messages of ``builders``, by message id, on request or periodically.
 
@@ -62,7 +65,7 @@ class MessageStreams:
         return True
 
     def _send_stream(self, key: tuple[Channel, int], stream: _Stream) -> None:
-        if self._streams.get(key) is not stream:  # This stream was stopped, or replaced by another one.
+        if self._streams.get(key) is not stream:  # This stream was stopped, or replaced by a new one.
             return
         channel, message_id = key
         try:
@@ -101,9 +104,9 @@ class MessageStreams:
         message_id = whole(command.param1)
         if message_id not in self.builders:
             return MavResult.DENIED
-        stream_to_all = self._streams.get((None, message_id), _Stream(0.0))
-        interval_s = self._streams.get((command.channel, message_id), stream_to_all).interval_s
-        interval_us = round(interval_s * 1e6) or -1  # -1: the message is not streamed
+        stream_to_all = self._streams.get((None, message_id))
+        stream = self._streams.get((command.channel, message_id), stream_to_all)
+        interval_us = _NOT_STREAMED if stream is None else round(stream.interval_s * 1e6)
         self._host.send(MessageInterval(message_id, interval_us), command.channel)
         return MavResult.ACCEPTED
 

@@ -141,7 +141,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             raise Refused(MavFtpErr.INVALIDDATASIZE)
         return path_in(request.data)
 
-    def _opened(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
+    def _session_of(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
         session = peer.sessions.get(request.session)
         if session is None:
             raise Refused(MavFtpErr.FILENOTFOUND)
@@ -174,11 +174,11 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return answer
 
     def _read(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        data = self._opened(peer, request).file.read(request.offset, request.size)
+        data = self._session_of(peer, request).file.read(request.offset, request.size)
         return request.acknowledge(data) if data else request.refuse(MavFtpErr.EOF)
 
     def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> None:
-        session = self._opened(peer, request)
+        session = self._session_of(peer, request)
         self._is_bursting = True
         self._send_next(peer, session, request, 0)
 
