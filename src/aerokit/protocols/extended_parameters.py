@@ -7,13 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.errors import ParameterRejected, ParameterTimeout
 from aerokit.mavlink.enums import ParamAck
-from aerokit.mavlink.messages import (
-    ParamExtAck,
-    ParamExtRequestList,
-    ParamExtRequestRead,
-    ParamExtSet,
-    ParamExtValue,
-)
+from aerokit.mavlink.messages import ParamExtAck, ParamExtRequestList, ParamExtRequestRead, ParamExtSet, ParamExtValue
 from aerokit.parameters.parameter import MAX_PARAMETERS, Setting, setting_bytes, setting_value, settings_equal
 from aerokit.protocols.exchange import StaleAnswerFilter, Transfer
 from aerokit.protocols.named_values import (
@@ -150,20 +144,9 @@ class SettingReads(NamedReads[Setting]):
     unknown_text = "the component has no setting"
 
     def __init__(
-        self,
-        target_system: int,
-        target_component: int,
-        names: Iterable[str],
-        **options: Unpack[TransferOptions],
+        self, target_system: int, target_component: int, names: Iterable[str], **options: Unpack[TransferOptions]
     ) -> None:
-        super().__init__(
-            target_system,
-            target_component,
-            names,
-            window=READ_WINDOW,
-            duplicate_last=False,
-            **options,
-        )
+        super().__init__(target_system, target_component, names, window=READ_WINDOW, duplicate_last=False, **options)
 
     def _read_request(self, name: str, index: int) -> Message:
         return ParamExtRequestRead(self.target_system, self.target_component, name, index)

@@ -134,13 +134,7 @@ class FtpMessage(Snapshot):
     def encode(self) -> bytes:
         """Return the payload of the FILE_TRANSFER_PROTOCOL message: 251 bytes."""
         head = HEADER.pack(
-            self.sequence,
-            self.session,
-            self.opcode,
-            self.size,
-            self.request_opcode,
-            self.burst_complete,
-            self.offset,
+            self.sequence, self.session, self.opcode, self.size, self.request_opcode, self.burst_complete, self.offset
         )
         return (head + self.data).ljust(PAYLOAD_SIZE, b"\0")
 

@@ -375,13 +375,7 @@ class FtpUpload(FtpExchange[None]):
     """Upload of ``data`` to an open file: blocks are sent in a window and repeated until acknowledged."""
 
     def __init__(
-        self,
-        client: FtpClient,
-        path: str,
-        data: bytes,
-        *,
-        session: int,
-        **options: Unpack[TransferOptions],
+        self, client: FtpClient, path: str, data: bytes, *, session: int, **options: Unpack[TransferOptions]
     ) -> None:
         super().__init__(client, path, **options)
         self._data = data

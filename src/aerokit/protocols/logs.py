@@ -228,12 +228,7 @@ class LogStop(Transfer[None]):
     expects: tuple[type[Message], ...] = (LogData, LogEntry)
 
     def __init__(
-        self,
-        target_system: int,
-        target_component: int,
-        *,
-        is_sent: bool = False,
-        **options: Unpack[TransferOptions],
+        self, target_system: int, target_component: int, *, is_sent: bool = False, **options: Unpack[TransferOptions]
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._is_sent = is_sent

@@ -18,12 +18,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.missions.wire import from_wire
 from aerokit.protocols.exchange import format_ranges
-from aerokit.protocols.missions import (
-    BUSY_RETRY_INTERVAL_S,
-    BUSY_TIMEOUT_S,
-    TRANSFER_EXPIRY_S,
-    MissionExchange,
-)
+from aerokit.protocols.missions import BUSY_RETRY_INTERVAL_S, BUSY_TIMEOUT_S, TRANSFER_EXPIRY_S, MissionExchange
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -17,12 +17,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.missions.wire import to_wire, to_wire_float
 from aerokit.protocols.exchange import format_ranges
-from aerokit.protocols.missions import (
-    BUSY_RETRY_INTERVAL_S,
-    BUSY_TIMEOUT_S,
-    TRANSFER_EXPIRY_S,
-    MissionExchange,
-)
+from aerokit.protocols.missions import BUSY_RETRY_INTERVAL_S, BUSY_TIMEOUT_S, TRANSFER_EXPIRY_S, MissionExchange
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message

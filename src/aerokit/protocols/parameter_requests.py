@@ -17,14 +17,7 @@ from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.encoding import parameter_of, set_message
 from aerokit.parameters.parameter import same_value
 from aerokit.protocols.exchange import StaleAnswerFilter
-from aerokit.protocols.named_values import (
-    BY_NAME,
-    PROBE,
-    PROBE_INDEX,
-    NamedReads,
-    NamedRequests,
-    UnexpectedAnswers,
-)
+from aerokit.protocols.named_values import BY_NAME, PROBE, PROBE_INDEX, NamedReads, NamedRequests, UnexpectedAnswers
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

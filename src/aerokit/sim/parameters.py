@@ -48,8 +48,9 @@ class SimParameter:
     def as_parameter(self, index: int | None = None) -> Parameter:
         """Convert to a `Parameter`, the client's class. Values of integer types become int."""
         type_ = ParameterType(self.type)
-        value, default = (int(x) if type_.is_integer else x for x in (self.value, self.default))
-        return Parameter(self.name, value, type_, default, index)
+        if type_.is_integer:
+            return Parameter(self.name, int(self.value), type_, int(self.default), index)
+        return Parameter(self.name, self.value, type_, self.default, index)
 
 
 class SimParameters:
@@ -60,7 +61,8 @@ class SimParameters:
 
     def __init__(self, rows: Iterable[SimParameter]) -> None:
         self._rows: dict[str, SimParameter | str] = {row.name: row for row in rows}
-        self._switches = {row.name: row.switch for row in self._all() if row.switch is not None}
+        # Maps the name of a parameter to the name of the parameter that enables it.
+        self._switches = {row.name: row.switch for row in self._all_rows() if row.switch is not None}
         self._names: tuple[str, ...] | None = None
         self._indices: dict[str, int] = {}
 
@@ -149,16 +151,17 @@ class SimParameters:
         self._switches.pop(name, None)
         self._names = None
 
-    def _all(self) -> Iterator[SimParameter]:
+    def _all_rows(self) -> Iterator[SimParameter]:
         return (self.row(name) for name in list(self._rows))
 
 
 def stored(value: float, type_: int) -> float:
     """Return the value that a parameter of this MAV_PARAM_TYPE stores."""
-    range_ = _RANGES.get(MavParamType(type_))
-    if range_ is None:
+    integer_range = _RANGES.get(MavParamType(type_))
+    if integer_range is None:
         return float(struct.unpack("<f", struct.pack("<f", value))[0]) if math.isfinite(value) else value
-    return float(max(range_[0], min(range_[1], int(value))))
+    low, high = integer_range
+    return float(max(low, min(high, int(value))))
 
 
 def _row(fields: list[str]) -> SimParameter:
@@ -274,7 +277,8 @@ class _Reader(FileHandle):
     def read(self, offset: int, size: int) -> bytes:
         if size == 0:
             return b""
-        self._block = self._block or size
+        if self._block == 0:
+            self._block = size
         if self._block != size:
             raise FileFault(EINVAL)
         return self.content[offset : offset + size]

@@ -55,21 +55,13 @@ def _number(command: ReceivedCommand | None) -> int:
 
 def _information(camera: CameraDevice) -> m.CameraInformation:
     return m.CameraInformation(
-        time_boot_ms=camera.host.time_boot_ms,
-        vendor_name=camera.vendor.encode()[:32].ljust(32, b"\0"),
-        model_name=camera.model.encode()[:32].ljust(32, b"\0"),
-        firmware_version=camera.firmware_version,
-        focal_length=camera.focal_length_mm,
-        sensor_size_h=camera.sensor_mm[0],
-        sensor_size_v=camera.sensor_mm[1],
-        resolution_h=camera.resolution[0],
-        resolution_v=camera.resolution[1],
-        lens_id=0,
-        flags=camera.capabilities,
+        time_boot_ms=camera.host.time_boot_ms, vendor_name=camera.vendor.encode()[:32].ljust(32, b"\0"),
+        model_name=camera.model.encode()[:32].ljust(32, b"\0"), firmware_version=camera.firmware_version,
+        focal_length=camera.focal_length_mm, sensor_size_h=camera.sensor_mm[0], sensor_size_v=camera.sensor_mm[1],
+        resolution_h=camera.resolution[0], resolution_v=camera.resolution[1], lens_id=0, flags=camera.capabilities,
         cam_definition_version=camera.definition_version if camera.definition_uri else 0,
-        cam_definition_uri=camera.definition_uri,
-        gimbal_device_id=camera.gimbal_device_id,
-    )
+        cam_definition_uri=camera.definition_uri, gimbal_device_id=camera.gimbal_device_id,
+    )  # fmt: skip
 
 
 def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[Message]:

@@ -302,14 +302,10 @@ class Captures:
             image_status = _CAPTURING if self._is_exposing else _IDLE
         recording_s = camera.host.now - self._recording_since if self.is_recording else 0.0
         return CameraCaptureStatus(
-            time_boot_ms=camera.host.time_boot_ms,
-            image_status=image_status,
-            video_status=int(self.is_recording),
-            image_interval=self.interval_s if is_series else 0.0,
-            recording_time_ms=round(recording_s * 1000),
-            available_capacity=camera.free_mib,
-            image_count=self.image_count,
-        )
+            time_boot_ms=camera.host.time_boot_ms, image_status=image_status, video_status=int(self.is_recording),
+            image_interval=self.interval_s if is_series else 0.0, recording_time_ms=round(recording_s * 1000),
+            available_capacity=camera.free_mib, image_count=self.image_count,
+        )  # fmt: skip
 
 
 _UNKNOWN = math.nan

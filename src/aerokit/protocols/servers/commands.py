@@ -93,35 +93,18 @@ class CommandDispatcher:
 
     def _on_long(self, message: CommandLong, channel: Channel) -> None:
         command = ReceivedCommand(
-            command=message.command,
-            param1=message.param1,
-            param2=message.param2,
-            param3=message.param3,
-            param4=message.param4,
-            x=message.param5,
-            y=message.param6,
-            z=message.param7,
-            frame=None,
-            channel=channel,
-            sender=sender_of(message),
-            confirmation=message.confirmation,
-        )
+            command=message.command, param1=message.param1, param2=message.param2, param3=message.param3,
+            param4=message.param4, x=message.param5, y=message.param6, z=message.param7, frame=None, channel=channel,
+            sender=sender_of(message), confirmation=message.confirmation,
+        )  # fmt: skip
         self.execute(command)
 
     def _on_int(self, message: CommandInt, channel: Channel) -> None:
         command = ReceivedCommand(
-            command=message.command,
-            param1=message.param1,
-            param2=message.param2,
-            param3=message.param3,
-            param4=message.param4,
-            x=message.x,
-            y=message.y,
-            z=message.z,
-            frame=message.frame,
-            channel=channel,
+            command=message.command, param1=message.param1, param2=message.param2, param3=message.param3,
+            param4=message.param4, x=message.x, y=message.y, z=message.z, frame=message.frame, channel=channel,
             sender=sender_of(message),
-        )
+        )  # fmt: skip
         self.execute(command)
 
     def execute(self, command: ReceivedCommand) -> None:

@@ -36,15 +36,10 @@ class FtpPacket(FtpMessage):
     def acknowledge(self, data: bytes = b"", *, offset: int = 0, session: int | None = None) -> FtpPacket:
         """Return the ACK of this request."""
         return FtpPacket(
-            sequence=(self.sequence + 1) & 0xFFFF,
-            opcode=MavFtpOpcode.ACK,
-            session=self.session if session is None else session,
-            size=len(data),
-            request_opcode=self.opcode,
-            offset=offset & 0xFFFFFFFF,
-            data=data,
-            client=self.client,
-        )
+            sequence=(self.sequence + 1) & 0xFFFF, opcode=MavFtpOpcode.ACK,
+            session=self.session if session is None else session, size=len(data), request_opcode=self.opcode,
+            offset=offset & 0xFFFFFFFF, data=data, client=self.client,
+        )  # fmt: skip
 
     def refuse(self, code: int, errno: int | None = None) -> FtpPacket:
         """Return the NAK of this request."""

@@ -138,40 +138,21 @@ def _attitude_status(gimbal: GimbalMount) -> m.GimbalDeviceAttitudeStatus:
     is_from_north = gimbal.is_yaw_locked
     angles = gimbal.angles_from_north() if is_from_north else gimbal.angles()
     return m.GimbalDeviceAttitudeStatus(
-        target_system=0,
-        target_component=0,
-        time_boot_ms=gimbal.host.time_boot_ms,
-        flags=_flags(gimbal) | GimbalDeviceFlags.ACCEPTS_YAW_IN_EARTH_FRAME,
-        q=quaternion_from_euler(*angles),
-        angular_velocity_x=math.nan,
-        angular_velocity_y=math.nan,
-        angular_velocity_z=math.nan,
-        failure_flags=0,
-        delta_yaw=gimbal.heading(),
-        delta_yaw_velocity=math.nan,
-        gimbal_device_id=0,
-    )
+        target_system=0, target_component=0, time_boot_ms=gimbal.host.time_boot_ms,
+        flags=_flags(gimbal) | GimbalDeviceFlags.ACCEPTS_YAW_IN_EARTH_FRAME, q=quaternion_from_euler(*angles),
+        angular_velocity_x=math.nan, angular_velocity_y=math.nan, angular_velocity_z=math.nan, failure_flags=0,
+        delta_yaw=gimbal.heading(), delta_yaw_velocity=math.nan, gimbal_device_id=0,
+    )  # fmt: skip
 
 
 def _device_information(gimbal: GimbalMount) -> m.GimbalDeviceInformation:
     (roll_min, roll_max), (pitch_min, pitch_max), (yaw_min, yaw_max) = gimbal.limits
     return m.GimbalDeviceInformation(
-        time_boot_ms=gimbal.host.time_boot_ms,
-        vendor_name=gimbal.vendor,
-        model_name=gimbal.model,
-        custom_name="",
-        firmware_version=_FIRMWARE,
-        hardware_version=_FIRMWARE,
-        uid=gimbal.device_id,
-        cap_flags=gimbal.capabilities,
-        custom_cap_flags=0,
-        roll_min=roll_min,
-        roll_max=roll_max,
-        pitch_min=pitch_min,
-        pitch_max=pitch_max,
-        yaw_min=yaw_min,
-        yaw_max=yaw_max,
-    )
+        time_boot_ms=gimbal.host.time_boot_ms, vendor_name=gimbal.vendor, model_name=gimbal.model, custom_name="",
+        firmware_version=_FIRMWARE, hardware_version=_FIRMWARE, uid=gimbal.device_id, cap_flags=gimbal.capabilities,
+        custom_cap_flags=0, roll_min=roll_min, roll_max=roll_max, pitch_min=pitch_min, pitch_max=pitch_max,
+        yaw_min=yaw_min, yaw_max=yaw_max,
+    )  # fmt: skip
 
 
 def _manager_information(gimbal: GimbalMount) -> m.GimbalManagerInformation:

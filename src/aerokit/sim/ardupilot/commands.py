@@ -38,7 +38,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     common, requests = _CommonCommands(vehicle), vehicle.requests
     # The table lists commands that the simulation does not execute, and the MAV_RESULT that answers each of them.
     handlers: dict[int, CommandHandler] = {
-        Cmd[command]: common.fixed(Result[result], _FIXED_TEXTS.get((Cmd[command], vehicle.KIND), ()))
+        Cmd[command]: common.constant_answer(Result[result], _FIXED_TEXTS.get((Cmd[command], vehicle.KIND), ()))
         for command, result in rows_of(vehicle.KIND, "fixed_results.csv")
     }
     if vehicle.KIND != "sub":
@@ -60,7 +60,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         Cmd.DO_FENCE_ENABLE: lambda command: vehicle.fence.command(command),
         Cmd.IMAGE_START_CAPTURE: lambda command: vehicle.camera.start_capture(command),
         Cmd.IMAGE_STOP_CAPTURE: lambda command: vehicle.camera.stop_capture(command),
-        Cmd.DO_DIGICAM_CONTROL: lambda command: vehicle.camera.control(command),
+        Cmd.DO_DIGICAM_CONTROL: lambda command: vehicle.camera.digicam_control(command),
         Cmd.DO_SET_CAM_TRIGG_DIST: lambda command: vehicle.camera.set_trigger_distance(command),
         Cmd.SET_CAMERA_ZOOM: lambda command: vehicle.camera.zoom(command),
         Cmd.SET_CAMERA_FOCUS: lambda command: vehicle.camera.focus(command),
@@ -112,7 +112,7 @@ class _CommonCommands:
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
 
-    def fixed(self, result: int, texts: tuple[tuple[int, str], ...]) -> CommandHandler:
+    def constant_answer(self, result: int, texts: tuple[tuple[int, str], ...]) -> CommandHandler:
         """Return a handler that always sends these texts and answers ``result``."""
 
         def handle(_: ReceivedCommand) -> int:
@@ -136,7 +136,8 @@ class _CommonCommands:
         return Result.ACCEPTED if is_done else Result.FAILED
 
     def set_mission_current(self, command: ReceivedCommand) -> int:
-        vehicle, resets_mission = self._vehicle, command.param2 == 1.0
+        vehicle = self._vehicle
+        resets_mission = command.param2 == 1.0
         if not 0 <= command.param1 < vehicle.missions.commands.count:
             return Result.DENIED
         if resets_mission:
@@ -170,7 +171,7 @@ class _CommonCommands:
         if point is None:
             return Result.DENIED
         # Check the target first, so that the mode stays unchanged if the vehicle may not fly to the target.
-        if not vehicle.may_go_to(point) or not vehicle.set_mode(guided.number):
+        if not vehicle.accept_reposition(point) or not vehicle.set_mode(guided.number):
             return Result.FAILED
         guided.go_to(point)
         return Result.ACCEPTED
@@ -316,7 +317,7 @@ class GimbalCommands:
         self.commands: dict[int, CommandHandler] = {
             Cmd.DO_MOUNT_CONFIGURE: self._configure_mount,
             Cmd.DO_MOUNT_CONTROL: self._control_mount,
-            Cmd.DO_GIMBAL_MANAGER_PITCHYAW: self._manage,
+            Cmd.DO_GIMBAL_MANAGER_PITCHYAW: self._point_or_turn,
             Cmd.DO_GIMBAL_MANAGER_CONFIGURE: self._configure_manager,
         }
         vehicle.on(m.GimbalManagerSetAttitude, self._on_attitude)
@@ -335,7 +336,8 @@ class GimbalCommands:
         return Result.ACCEPTED
 
     def _control_mount(self, command: ReceivedCommand) -> int:
-        gimbal, mode = self._gimbal(), whole(command.z)
+        gimbal = self._gimbal()
+        mode = whole(command.z)
         if gimbal is None:
             return Result.FAILED
         if mode in _PLAIN_MOUNT_MODES:
@@ -358,7 +360,7 @@ class GimbalCommands:
             return Result.ACCEPTED
         return Result.FAILED
 
-    def _manage(self, command: ReceivedCommand) -> int:
+    def _point_or_turn(self, command: ReceivedCommand) -> int:
         gimbal = self._gimbal(command.z)
         if gimbal is None:
             return Result.FAILED
@@ -386,7 +388,8 @@ class GimbalCommands:
         values = (message.pitch, message.yaw, message.pitch_rate, message.yaw_rate)
         has_angles_and_rates = not any(map(math.isnan, values))
         if gimbal is not None and not has_angles_and_rates:
-            angles, rates = (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate)
+            angles = (0.0, message.pitch, message.yaw)
+            rates = (0.0, message.pitch_rate, message.yaw_rate)
             gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
 
 

@@ -126,12 +126,7 @@ _GUIDED_MODES = frozenset((
 ))  # fmt: skip
 
 _refusing = partial(
-    variant,
-    CopterHold,
-    is_available=False,
-    needs_position=False,
-    can_arm=False,
-    entry_severity=MavSeverity.WARNING,
+    variant, CopterHold, is_available=False, needs_position=False, can_arm=False, entry_severity=MavSeverity.WARNING
 )
 
 # Modes in the order of AVAILABLE_MODES. SPORT and AUTOROTATE do not exist, as in the firmware for quadrotors.
@@ -224,7 +219,8 @@ class SimulatedCopter(CopterHost):
     def base_mode(self) -> int:
         if not self.has_left_boot:  # During the boot, GUIDED_ENABLED is set in every mode.
             return _BASE | _GUIDED
-        flags, mode_name = _BASE, self.mode.name
+        flags = _BASE
+        mode_name = self.mode.name
         # GUIDED_ENABLED is set in modes that use a position, in RTL only while armed.
         if mode_name in _GUIDED_MODES and (self.motors.is_armed or mode_name != "RTL"):
             flags |= _GUIDED
@@ -257,14 +253,15 @@ class SimulatedCopter(CopterHost):
         is_accepted = self.mode.take_off(command.z, must_navigate=must_navigate)
         return MavResult.ACCEPTED if is_accepted else MavResult.FAILED
 
-    def may_go_to(self, place: Ned) -> bool:
+    def accept_reposition(self, place: Ned) -> bool:
         if not self.fence.contains(place):
             return False
         self.yaw.apply_default()  # A new target position ends a commanded heading.
         return True
 
     def _change_speed(self, command: ReceivedCommand) -> int:
-        mode, speed = self.mode, command.param2
+        mode = self.mode
+        speed = command.param2
         if not speed > 0:  # also refuses NaN
             return MavResult.DENIED
         if not mode.can_change_speed:

@@ -82,7 +82,8 @@ class ArduPilotDevices:
         if not self._is_set("WINCH_TYPE") or action > WinchActions.RATE_CONTROL:
             return Result.FAILED
         was_moving = self.line_rate_m_s != 0.0
-        self._goal_m, self.line_rate_m_s = None, 0.0  # This line is the whole action RELAXED.
+        self._goal_m = None
+        self.line_rate_m_s = 0.0  # The action RELAXED only stops the winch.
         if action == WinchActions.RATE_CONTROL:
             self.line_rate_m_s = max(-_WINCH_RATE_M_S, min(_WINCH_RATE_M_S, rate_m_s))
         elif action == WinchActions.RELATIVE_LENGTH_CONTROL:

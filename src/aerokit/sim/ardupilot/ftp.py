@@ -199,7 +199,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             self._reply(peer, end)
             self._end_burst()
             return
-        is_short, is_last = len(data) < block_size, block_number == _BURST_BLOCKS - 1
+        is_short = len(data) < block_size
+        is_last = block_number == _BURST_BLOCKS - 1
         block = request.acknowledge(data, offset=offset)
         block = block.replace(sequence=sequence, burst_complete=is_short or is_last)
         self._reply(peer, block)
@@ -242,7 +243,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
 
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         old_name, _, remainder = request.data.partition(b"\0")
-        new_name = remainder.partition(b"\0")[0]
+        new_name, _, _ = remainder.partition(b"\0")
         length = len(old_name) + len(new_name)
         if request.size == 0 or request.size not in (length + 1, length + 2):  # with or without the final NUL
             raise Refused(MavFtpErr.INVALIDDATASIZE)

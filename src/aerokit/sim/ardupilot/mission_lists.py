@@ -70,11 +70,7 @@ class CommandList(ItemList):
     name = "Mission"
 
     def __init__(
-        self,
-        capacity: int,
-        home: Callable[[], MissionItem],
-        is_running: Callable[[], bool],
-        kind: Kind = "copter",
+        self, capacity: int, home: Callable[[], MissionItem], is_running: Callable[[], bool], kind: Kind = "copter"
     ) -> None:
         super().__init__(capacity)
         self._kind: Kind = kind

@@ -109,8 +109,9 @@ class ArduPilotMissionServer(MissionServer):
 
     def capacity(self, mission_type: int) -> int:
         """Return the capacity of a list. The capacity of the mission is 0 until the vehicle is initialised."""
-        is_late = mission_type == MavMissionType.MISSION and not self._vehicle.is_initialised
-        return 0 if is_late else self._lists[mission_type].capacity
+        if mission_type == MavMissionType.MISSION and not self._vehicle.is_initialised:
+            return 0
+        return self._lists[mission_type].capacity
 
     def count(self, mission_type: int) -> int:
         return self._lists[mission_type].count
@@ -197,7 +198,8 @@ class ArduPilotMissionServer(MissionServer):
         super()._time_out(upload)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
-        item, kind = _without_floats(message), message.mission_type
+        item = _with_integer_position(message)
+        kind = message.mission_type
         if isinstance(item, int):  # The position is refused with this MAV_MISSION_RESULT.
             self._answer_item(message, item, channel)
         elif kind == MavMissionType.MISSION and message.current in (_GUIDED_TARGET, _ALTITUDE_CHANGE):
@@ -214,7 +216,7 @@ class ArduPilotMissionServer(MissionServer):
         self._acknowledge(sender_of(message), message.mission_type, result, channel)
 
     def _put(self, upload: ListUpload, message: AnyItem) -> int:
-        item = _without_floats(message)
+        item = _with_integer_position(message)
         assert not isinstance(item, int)
         return self._lists[upload.mission_type].put(message.seq, item, upload.end - 1)
 
@@ -268,7 +270,7 @@ class ArduPilotMissionServer(MissionServer):
         return Result.ACCEPTED
 
 
-def _without_floats(message: AnyItem) -> MissionItem | int:
+def _with_integer_position(message: AnyItem) -> MissionItem | int:
     """Return the item with x and y as integers, or the MAV_MISSION_RESULT of an invalid position.
 
     Like the firmware, convert the degrees of a MISSION_ITEM in single precision.

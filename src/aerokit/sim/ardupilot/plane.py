@@ -43,10 +43,7 @@ class PlaneArming(ArduPilotArming[PlaneHost]):
         # The long failsafe follows the short failsafe, so FS_LONG_TIMEOUT must not be shorter than FS_SHORT_TIMEOUT.
         is_long_shorter = parameters["FS_LONG_TIMEOUT"] < parameters["FS_SHORT_TIMEOUT"]
         checks = (
-            (
-                is_long_shorter and parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED,
-                "FS_LONG_TIMEOUT < FS_SHORT_TIMEOUT",
-            ),
+            (is_long_shorter and parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED, "FS_LONG_TIMEOUT < FS_SHORT_TIMEOUT"),
             (max_roll < _MIN_ANGLE_DEG, f"ROLL_LIMIT_DEG too small ({max_roll:.1f})"),
             (max_pitch < _MIN_ANGLE_DEG, f"PTCH_LIM_MAX_DEG too small ({max_pitch:.1f})"),
             (min_pitch > -_MIN_ANGLE_DEG, f"PTCH_LIM_MIN_DEG too large ({min_pitch:.1f})"),

@@ -41,6 +41,7 @@ class ArduPilotRadio:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self._sticks: list[int] = list(_AT_REST)
+        # Maps a channel index to the pulse width (0: released), and to the time at which it was received.
         self._overrides: dict[int, tuple[int, float]] = {}
 
     def __len__(self) -> int:
@@ -48,7 +49,7 @@ class ArduPilotRadio:
 
     def __getitem__(self, index: int) -> int:
         if index in self._overrides:
-            value, since = self._overrides[index]  # The value 0 means that the channel is released.
+            value, since = self._overrides[index]
             if value and self._vehicle.now - since < self._override_time():
                 return value
         if index == RC_THROTTLE and self._failure == _LOW_THROTTLE:  # SIM_RC_FAIL simulates a receiver without signal.
@@ -101,7 +102,8 @@ class ArduPilotRadio:
     def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
         """Apply overrides of the ground station MAV_GCS_SYSID. The value 0 releases only the channels 1 to 8."""
         vehicle = self._vehicle
-        if sender_of(override)[0] != vehicle.parameters["MAV_GCS_SYSID"]:
+        sender_system, _component = sender_of(override)
+        if sender_system != vehicle.parameters["MAV_GCS_SYSID"]:
             return
         vehicle.failsafes.ground_station_seen_at = vehicle.now
         for index in range(_OVERRIDABLE):
@@ -110,7 +112,7 @@ class ArduPilotRadio:
             if value == _UNCHANGED or (value == 0 and is_upper):  # For channels above 8, 0 means unchanged, too.
                 continue
             if value == _RELEASE_UPPER and is_upper:
-                value = 0  # `_overrides` stores 0 for a released channel.
+                value = 0
             self._overrides[index] = (value, vehicle.now)
 
 
@@ -131,7 +133,8 @@ class ArduPilotJoystick:
 
     def _on_message(self, axes: m.ManualControl, _: Channel) -> None:
         vehicle = self._vehicle
-        if sender_of(axes)[0] != vehicle.parameters["MAV_GCS_SYSID"] or axes.target != vehicle.system_id:
+        sender_system, _component = sender_of(axes)
+        if sender_system != vehicle.parameters["MAV_GCS_SYSID"] or axes.target != vehicle.system_id:
             return
         vehicle.rc.override(self.sticks(axes))
         vehicle.failsafes.ground_station_seen_at = vehicle.now
@@ -151,7 +154,8 @@ class ArduPilotJoystick:
         """Scale the value of an axis to RCn_MIN … RCn_MAX. Return 0 if the message has no value for the axis."""
         if value == _NO_VALUE:
             return 0
-        low, high = self.setting(f"RC{channel + 1}_MIN", 1100.0), self.setting(f"RC{channel + 1}_MAX", 1900.0)
+        low = self.setting(f"RC{channel + 1}_MIN", 1100.0)
+        high = self.setting(f"RC{channel + 1}_MAX", 1900.0)
         if reverse:
             value = -value
         share = (value - lowest) / (1000 - lowest)

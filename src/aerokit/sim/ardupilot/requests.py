@@ -63,8 +63,8 @@ class ArduPilotMessageRequests:
         self._groups: dict[int, tuple[int, ...]] = dict.fromkeys(_RATE_PARAMETERS, ())
         for stream, message_id, _ in rows_of(vehicle.KIND, "stream_groups.csv"):
             self._groups[Stream[stream]] += (int(message_id),)
-        # By rate parameter: the value after the next reboot, and the value that REQUEST_DATA_STREAM has set until then.
-        self._saved: dict[str, tuple[float, int]] = {}
+        # Maps a rate parameter to its value after the next reboot, and to the value that REQUEST_DATA_STREAM has set.
+        self._changed_rates: dict[str, tuple[float, int]] = {}
         if stream_groups:
             vehicle.on(m.RequestDataStream, self._on_group)
 
@@ -96,7 +96,9 @@ class ArduPilotMessageRequests:
 
     def _send_interval(self, message_id: int, channel: Channel) -> int:
         is_supported = message_id in self._supported
-        interval_us = round(channel.streams.interval(message_id) * 1e6) or -1
+        interval_us = round(channel.streams.interval(message_id) * 1e6)
+        if interval_us == 0:
+            interval_us = -1  # The message is not streamed.
         if message_id < _MESSAGE_INTERVAL_IDS:
             self._vehicle.send(m.MessageInterval(message_id, interval_us if is_supported else 0), channel)
         return MavResult.ACCEPTED if is_supported else MavResult.FAILED
@@ -133,8 +135,9 @@ class ArduPilotMessageRequests:
         """
         vehicle = self._vehicle
         modes = vehicle.available_modes()
-        requested_modes = modes[max(0, index - 1) : max(0, index)] if index else modes  # empty if there is no such mode
-        for message in requested_modes:
+        if index != 0:
+            modes = [mode for mode in modes if mode.mode_index == index]
+        for message in modes:
             vehicle.call_later(0.0, partial(vehicle.send, message, channel))
         channel.streams.set_interval(m.AvailableModesMonitor.ID, _MODES_MONITOR_INTERVAL_S, vehicle.now)
 
@@ -143,7 +146,8 @@ class ArduPilotMessageRequests:
             return
         rate = request.req_message_rate if request.start_stop else 0
         requested = request.req_stream_id
-        for stream in self._groups if requested == Stream.ALL else (requested,):
+        streams = list(self._groups) if requested == Stream.ALL else [requested]
+        for stream in streams:
             if stream in self._groups:
                 self._stream_group(stream, rate, channel, self._vehicle.now)
                 self._store_rate(f"{self._prefix(channel)}{_RATE_PARAMETERS[stream]}", rate)
@@ -163,22 +167,22 @@ class ArduPilotMessageRequests:
     def restart(self) -> None:
         """Restore the stream rates that REQUEST_DATA_STREAM has changed, because of a reboot."""
         parameters = self._vehicle.parameters
-        for name, (saved, changed) in self._saved.items():
-            if parameters[name] == changed:  # False if PARAM_SET has set another value, which is kept.
-                parameters[name] = saved
-        self._saved.clear()
+        for name, (value_after_reboot, requested) in self._changed_rates.items():
+            if parameters[name] == requested:  # False if PARAM_SET has set another value, which is kept.
+                parameters[name] = value_after_reboot
+        self._changed_rates.clear()
 
     def _store_rate(self, name: str, rate: int) -> None:
         vehicle, parameters = self._vehicle, self._vehicle.parameters
         if name not in parameters or parameters[name] == rate:
             return
         # A reboot restores the value from before the first change, so a second change keeps the stored value.
-        value_after_reboot, _ = self._saved.get(name, (parameters[name], rate))
+        value_after_reboot, _ = self._changed_rates.get(name, (parameters[name], rate))
         parameters[name] = rate
         if vehicle.KIND == "plane":  # Only ArduPlane saves stream rates beyond a reboot (persist_streamrates).
             vehicle.announce_parameter(name)
         else:
-            self._saved[name] = (value_after_reboot, rate)
+            self._changed_rates[name] = (value_after_reboot, rate)
 
     def _stream_group(self, stream: int, rate: float, channel: Channel, first: float) -> None:
         group_interval = max(1.0 / rate, _MIN_INTERVAL_S) if rate > 0 else 0.0

@@ -7,15 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
-from aerokit.mavlink.enums import (
-    FenceMitigate,
-    MavCmd,
-    MavModeFlag,
-    MavResult,
-    MavSeverity,
-    MavType,
-    RoverMode,
-)
+from aerokit.mavlink.enums import FenceMitigate, MavCmd, MavModeFlag, MavResult, MavSeverity, MavType, RoverMode
 from aerokit.mavlink.messages import SetAttitudeTarget
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes, ArmingCheck
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence

@@ -155,7 +155,8 @@ def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
         return MavResult.TEMPORARILY_REJECTED
     mode = _ALIASES.get(mode, mode)
     if mode not in modes.SELECTABLE:
-        level = "auto" if mode[0] == modes.AUTO else "main"
+        main_mode, _ = mode
+        level = "auto" if main_mode == modes.AUTO else "main"
         px4.send_text(MavSeverity.CRITICAL, f"Unsupported {level} mode")
         # PX4 1.16 accepts an unknown mode, but does not enter the mode.
         return MavResult.ACCEPTED if px4.version.startswith("1.16") else MavResult.TEMPORARILY_REJECTED
@@ -205,7 +206,8 @@ class _Flight:
 
     def take_off(self, command: ReceivedCommand) -> int:
         """Take off to the altitude in param 7 (AMSL), or to MIS_TAKEOFF_ALT above home if param 7 is NaN."""
-        px4, result = self._px4, self._change(modes.TAKEOFF)
+        px4 = self._px4
+        result = self._change(modes.TAKEOFF)
         if result == MavResult.ACCEPTED and math.isfinite(command.z):
             down = px4.frame.origin.altitude_m - command.z
             if px4.is_armed and down > px4.motion.down and not px4.is_landed:
@@ -279,7 +281,8 @@ class _Flight:
         speed = abs(command.param2) if math.isfinite(command.param2) else orbit.speed_m_s
         if px4.VEHICLE_TYPE == MavType.FIXED_WING:  # A plane has no ORBIT, but circles its target in HOLD.
             result = self._change(modes.HOLD)  # sets the target to the current position; the next line replaces it
-            px4.flight.target, px4.flight.radius_m = (north, east, down), radius
+            px4.flight.target = (north, east, down)
+            px4.flight.radius_m = radius
             return result
         if not orbit.plan(radius, speed, (north, east), down):
             px4.send_text(MavSeverity.CRITICAL, "Orbit radius limit exceeded")
@@ -297,13 +300,13 @@ class _Flight:
             self._tuning_since = px4.now
         steps = (px4.now - self._tuning_since) / _TUNING_STEP_S  # NaN while disarmed
         progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), len(_TUNING_PROGRESS) - 1)]
-        answer = m.CommandAck(command.command, MavResult.IN_PROGRESS, progress, 0, *command.sender)
-        px4.send(answer, command.channel)
+        px4.commands.answer(command, MavResult.IN_PROGRESS, progress)
         return None
 
     def transition(self, command: ReceivedCommand) -> int | None:
         """Change to the VTOL state in param 1, after a transition. A vehicle that is no VTOL does not answer."""
-        px4, requested_state = self._px4, whole(command.param1)
+        px4 = self._px4
+        requested_state = whole(command.param1)
         if not px4.vtol_state:
             return None
         if requested_state not in (MavVtolState.MC, MavVtolState.FW) or px4.mode in _NO_TRANSITION:
@@ -319,7 +322,8 @@ class _Flight:
         result = self._change(modes.HOLD)
         if result == MavResult.ACCEPTED and math.isfinite(command.param1):
             flight = self._px4.flight
-            flight.target = (*flight.target[:2], self._px4.frame.origin.altitude_m - command.param1)
+            north, east, _ = flight.target
+            flight.target = (north, east, self._px4.frame.origin.altitude_m - command.param1)
         return result
 
     def terminate(self, command: ReceivedCommand) -> int:
@@ -406,10 +410,13 @@ class _Requests:
             return self._send_interval(_number(command.param2), command)
         if message_id != m.AvailableModes.ID:
             return self.send_now(message_id, command)
-        if not 0 <= (index := _number(command.param2)) <= len(messages := available_modes(self._px4)):
+        index = _number(command.param2)
+        messages = available_modes(self._px4)
+        if not 0 <= index <= len(messages):
             return MavResult.DENIED
-        for message in messages[index - 1 : index] if index else messages:  # The index 0 selects all modes.
-            self._px4.send(message, command.channel)
+        for message in messages:
+            if index in (0, message.mode_index):  # The index 0 selects all modes.
+                self._px4.send(message, command.channel)
         return MavResult.ACCEPTED
 
     def set_interval(self, command: ReceivedCommand) -> int:

@@ -31,11 +31,7 @@ from aerokit.sim.px4.mission_items import as_downloaded, checksum, stored
 from aerokit.sim.vehicle import sender_of
 
 _NO_PARTNER = (0, 0)
-_CAPACITIES: dict[int, int] = {
-    MavMissionType.MISSION: 10_000,
-    MavMissionType.FENCE: 64,
-    MavMissionType.RALLY: 32,
-}
+_CAPACITIES: dict[int, int] = {MavMissionType.MISSION: 10_000, MavMissionType.FENCE: 64, MavMissionType.RALLY: 32}
 
 
 class TransferState(Enum):
@@ -69,8 +65,13 @@ class Px4MissionServer(MissionServer):
         self.requests_int: bool = not px4.version.startswith("1.16")
 
     def _link(self, channel: Channel) -> _Link:
-        unused = _Link(_NO_PARTNER, channel, 0, 0, 0, 0.0, 0.0, self.requests_int)
-        return self._links.setdefault(channel, unused)
+        """Return the state of a link; idle if the link has had no transfer yet."""
+        if channel not in self._links:
+            self._links[channel] = _Link(
+                _NO_PARTNER, channel, mission_type=0, next=0, end=0, received_at=0.0, requested_at=0.0,
+                uses_int=self.requests_int,
+            )  # fmt: skip
+        return self._links[channel]
 
     def reset(self) -> None:
         super().reset()
@@ -265,7 +266,8 @@ class Px4MissionServer(MissionServer):
         if self._uploads:  # PX4 has one upload at a time, on all links.
             self._answer(link, Result.ERROR, sender_of(count))
             return
-        link.client, link.mission_type = sender_of(count), count.mission_type
+        link.client = sender_of(count)
+        link.mission_type = count.mission_type
         self._px4.mission.forget_reached()
         if count.count > self.capacity(link.mission_type):
             self._answer(link, Result.NO_SPACE)
@@ -273,7 +275,9 @@ class Px4MissionServer(MissionServer):
             self._store(link.mission_type, [], opaque_id=0, current=0)
             self._answer(link, Result.ACCEPTED)
         else:
-            link.items, link.opaque_id, link.current = [], 0, -1
+            link.items = []
+            link.opaque_id = 0
+            link.current = -1
             link = self._begin_transfer(TransferState.GETTING, count, link.channel, count.count)
             self._uploads[self._key(link.mission_type)] = link
             self._request_item(link)
@@ -298,7 +302,8 @@ class Px4MissionServer(MissionServer):
             self._answer(link, Result.ERROR)
 
     def _put(self, upload: ListUpload, message: AnyItem) -> int:
-        link, item = self._link(upload.channel), item_from(message)
+        link = self._link(upload.channel)
+        item = item_from(message)
         is_int = isinstance(message, m.MissionItemInt)
         item_in_e7 = item  # has its latitude and longitude in degrees times 1e7, also if received in MISSION_ITEM
         if not is_int and item.frame != MavFrame.MISSION:
