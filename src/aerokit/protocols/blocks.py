@@ -24,10 +24,11 @@ MIN_ROUND_TRIP_FRACTION = 0.5
 # Requests back off after this many consecutive timeouts. Fewer mean nothing, because radios lose single frames.
 TIMEOUTS_BEFORE_BACKOFF = 3
 
-# Answers count as fast, or as delayed by a queue, if they take up to, or more than, (factor, margin in seconds) of the
-# fastest answer. Between the two, the window keeps its size.
-FAST, QUEUED = (1.25, 0.01), (2.0, 0.05)
-# A fast answer widens the window by this number of requests, a delayed answer narrows it.
+# An answer is fast if it takes at most FAST_FACTOR times the fastest answer plus FAST_MARGIN_S.
+FAST_FACTOR, FAST_MARGIN_S = 1.25, 0.01
+# An answer has waited in a queue if it takes longer than QUEUED_FACTOR times the fastest answer plus QUEUED_MARGIN_S.
+QUEUED_FACTOR, QUEUED_MARGIN_S = 2.0, 0.05
+# A fast answer widens the window by WIDENING requests, a queued answer narrows it by NARROWING.
 WIDENING, NARROWING = 0.5, 0.25
 # Weight of each request in the average loss, and the average loss above which the window is halved.
 LOSS_WEIGHT, MAX_LOSS = 1 / 16, 0.75
@@ -66,11 +67,9 @@ class AdaptiveWindow:
             return
         if self._fastest_s is None or seconds < self._fastest_s:
             self._fastest_s = seconds
-        fast_factor, fast_margin_s = FAST
-        queued_factor, queued_margin_s = QUEUED
-        if seconds <= fast_factor * self._fastest_s + fast_margin_s:
+        if seconds <= FAST_FACTOR * self._fastest_s + FAST_MARGIN_S:
             self._size = min(self._max_size, self._size + WIDENING)
-        elif seconds > queued_factor * self._fastest_s + queued_margin_s:
+        elif seconds > QUEUED_FACTOR * self._fastest_s + QUEUED_MARGIN_S:
             self._size = max(self._min_size, self._size - NARROWING)
 
     def on_loss(self) -> None:

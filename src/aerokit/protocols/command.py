@@ -31,11 +31,11 @@ __all__ = [
 MAX_ATTEMPTS = 4
 """Maximum number of transmissions of a command that may be repeated."""
 
-# Conditions of the table: index and value of a parameter.
+# Conditions in UNREPEATABLE_COMMANDS: index and value of a parameter.
 _PARAM1_IS_0, _PARAM1_IS_1, _PARAM1_IS_2, _PARAM4_IS_1 = (0, 0.0), (0, 1.0), (0, 2.0), (3, 1.0)
 
-# Commands of which a repetition has a further effect. Maps MAV_CMD to (effect, condition). With None, every repetition
-# has the effect; otherwise only if the condition is true. docs/reliability.md has the same table.
+# Commands whose repetition has a further effect. Maps MAV_CMD to (effect, condition). If the condition is None, every
+# repetition has the effect. docs/reliability.md has the same table.
 UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _PARAM1_IS_1),
     MavCmd.CONDITION_YAW: ("turns by the same angle again", _PARAM4_IS_1),

@@ -102,7 +102,7 @@ GAIN, DEVIATION_GAIN = 1 / 8, 1 / 4
 # A time-out is the smoothed round trip plus this many deviations, as in TCP.
 DEVIATIONS = 4.0
 
-# Minimum jitter of answers, which is due to the vehicle's main loop and the resolution of the clock.
+# Minimum jitter of answers, caused by the vehicle's main loop and the resolution of the clock.
 JITTER_S = 0.03
 
 BACKOFF = 1.5  # From the third attempt on, each attempt waits longer than the previous one by this factor.
@@ -130,13 +130,14 @@ class RoundTrip:
         """Record the time from a request that was sent once to its answer."""
         self.fastest_s = seconds if self.fastest_s is None else min(self.fastest_s, seconds)
         if self.smoothed_s is None:
-            self.smoothed_s, self._deviation_s = seconds, seconds / 2
+            self.smoothed_s = seconds
+            self._deviation_s = seconds / 2
             return
         self._deviation_s += DEVIATION_GAIN * (abs(seconds - self.smoothed_s) - self._deviation_s)
         self.smoothed_s += GAIN * (seconds - self.smoothed_s)
 
     def timeout_s(self, attempt: int = 1) -> float:
-        """Seconds to wait for an answer after transmission number ``attempt`` (from 1), before the next retry.
+        """Return the seconds to wait for an answer to transmission number ``attempt`` (from 1) before the next retry.
 
         The second attempt waits as long as the first, because radios lose single frames. Later attempts back off,
         because the link may be congested or down.
@@ -179,7 +180,7 @@ class MessageStream:
     def due_at(self) -> float:
         """Deadline for the next message.
 
-        If it passes, the stream counts as ended; before the first message, it counts as not started.
+        If it passes, the stream has ended or, before the first message, has not started.
         """
         # The first failures do not lengthen the wait, because radios lose single requests.
         silence_s = self._round_trip.timeout_s(max(1, self.failures - 1))
@@ -233,13 +234,14 @@ _MAX_RANGES = 10
 
 def format_ranges(numbers: Iterable[int]) -> str:
     """Format numbers as ranges: ``3, 7–12``. After ten ranges, the text only says how many more there are."""
-    ranges: list[tuple[int, int]] = []  # (first, last)
+    ranges: list[range] = []
     for number in sorted(numbers):
-        if ranges and number == ranges[-1][1] + 1:
-            ranges[-1] = (ranges[-1][0], number)
+        if ranges and number == ranges[-1].stop:
+            ranges[-1] = range(ranges[-1].start, number + 1)
         else:
-            ranges.append((number, number))
-    text = ", ".join(str(first) if first == last else f"{first}–{last}" for first, last in ranges[:_MAX_RANGES])
+            ranges.append(range(number, number + 1))
+    shown = ranges[:_MAX_RANGES]
+    text = ", ".join(f"{run.start}" if len(run) == 1 else f"{run.start}–{run.stop - 1}" for run in shown)
     omitted = len(ranges) - _MAX_RANGES
     return f"{text} and {omitted} more ranges" if omitted > 0 else text
 

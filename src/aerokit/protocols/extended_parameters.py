@@ -197,7 +197,9 @@ class SettingWrite(Transfer[Setting]):
         **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(target_system, target_component, **options)
-        self._name, self._value, self._type, self._before = name, value, type, before
+        self._name = name
+        self._value, self._type = value, type
+        self._before = before
         self._unexpected: UnexpectedAnswers[Setting] = UnexpectedAnswers(_is_same)
         self._stale_answers = StaleAnswerFilter(self.round_trip)
         self._is_writing = False
@@ -280,7 +282,8 @@ class SettingWrite(Transfer[Setting]):
         self._wait(now, is_writing=False)
 
     def _wait(self, now: float, *, is_writing: bool) -> None:
-        self._is_writing, self._sent_at = is_writing, now
+        self._is_writing = is_writing
+        self._sent_at = now
         self.deadline: float | None = min(now + self.round_trip.timeout_s(self._attempts), self._idle_deadline)
 
     def _measure(self, now: float) -> None:

@@ -185,7 +185,7 @@ class FtpDownload(FtpExchange[int]):
         self._add(reply.offset, reply.data, now)
 
     def _record_block(self, burst: _Burst, number: int, now: float) -> None:
-        """Record the arrival of block ``number`` of a burst, as progress, and to measure round trip and interval."""
+        """Record that block ``number`` of a burst has arrived. It may count as progress, and measure the link."""
         # Blocks that a repeated burst sends again also count as progress, because they show that the server works. The
         # number of repeated bursts is limited, so that the download cannot go on forever.
         if number > self._highest_blocks.get(burst.sequence, -1) and self._repeated_bursts <= MAX_REPEATED_BURSTS:
@@ -314,8 +314,8 @@ class FtpDownload(FtpExchange[int]):
         """Request a burst of everything after the last block received."""
         offset = self._reassembly.tail
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
-        # The replies to a burst have increasing sequence numbers. These are reserved, because a later request with such
-        # a number would look like a repetition of this one, and the server would only repeat its last reply.
+        # The sequence numbers of the replies are reserved. A later request with one of them would look like a
+        # repetition of this request, and the server would only repeat its last reply.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
         self._bursts.append(_Burst(sequence, offset, now))
         self._is_bursting = True
@@ -325,7 +325,7 @@ class FtpDownload(FtpExchange[int]):
 
     @property
     def _burst_due_at(self) -> float:
-        """Deadline for the next block. If it passes, the burst counts as ended; before any block, as not started."""
+        """Deadline for the next block. If it passes, the burst has ended or, before any block, has not started."""
         silence_s = self.round_trip.timeout_s(1 + self._failed_bursts)
         if self._interval.smoothed_s is None:
             # Repeating the burst of a long file is expensive, so such a burst gets more time to start.
@@ -364,9 +364,10 @@ class FtpDownload(FtpExchange[int]):
     def _timed_out(self) -> FileTimeout:
         missing = self._reassembly.missing(self._size)
         received = self._reassembly.done
+        first_offset, _ = missing[0] if missing else (0, 0)
         return FileTimeout(
             f"read {self._path}: no data received for {self._idle_timeout_s:g} s; {received} bytes received,"
-            f" {len(missing)} ranges missing, the first from byte {missing[0][0] if missing else 0}",
+            f" {len(missing)} ranges missing, the first from byte {first_offset}",
             missing=missing,
         )
 

@@ -38,7 +38,7 @@ __all__ = [
 ResultT = TypeVar("ResultT")
 
 # A vehicle is busy for at most this many seconds with a transfer that another station has abandoned. ArduPilot drops
-# such a transfer after 8 s, PX4 after 5 s.
+# it after 8 s, PX4 after 5 s.
 BUSY_TIMEOUT_S = 9.0
 
 BUSY_RETRY_INTERVAL_S = 1.0

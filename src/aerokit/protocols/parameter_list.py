@@ -24,9 +24,8 @@ __all__ = ["ParameterList", "merge_update"]
 def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Parameter:
     """Merge a PARAM_VALUE that is not part of a list into a known parameter.
 
-    If values are not sent bytewise, such a message has less information than a list or a file. In its answer to
-    PARAM_SET, ArduPilot reports an integer as a float if the value is the default. An INT32 beyond 2**24 loses its last
-    bits.
+    If values are not sent bytewise, the message has less information than a list or a file. In its answer to PARAM_SET,
+    ArduPilot reports an integer as a float if the value is the default. An INT32 beyond 2**24 loses its last bits.
     """
     value, type_ = reported.value, reported.type
     if not bytewise and known.type.is_integer:
@@ -49,7 +48,7 @@ NEAR_END = 20
 # The list's stream counts as started once it has sent this many values. The list is then not requested again.
 MIN_STREAMED = 2
 
-# Factor of the longest pause for each further value, because a single long pause may have been an exception.
+# With each value of the stream, the longest pause shrinks by this factor, because it may have been an exception.
 PAUSE_DECAY = 0.98
 
 # An index counts as nonexistent after this many PARAM_ERROR messages.

@@ -63,8 +63,8 @@ class RequestWindow(Generic[KeyT]):
         self._in_flight: dict[KeyT, _Request] = {}
         # All unanswered requests that were sent at least once, including overdue ones that wait to be sent again.
         self._requests: dict[KeyT, _Request] = {}
-        # For requests that were answered after a repetition: seconds from the first transmission to the answer. It is
-        # ambiguous which transmission was answered, until a second answer arrives.
+        # Maps a key that was answered after a repetition to the seconds from its first transmission to the answer.
+        # Until a second answer arrives, it is unknown which transmission was answered.
         self._ambiguous: dict[KeyT, float] = {}
         self._sent_count = 0
 

@@ -16,7 +16,7 @@ from aerokit.protocols.servers import commands
 from aerokit.protocols.servers.commands import CommandHandler as CommandHandler
 from aerokit.protocols.servers.commands import CommandProgress as CommandProgress
 from aerokit.protocols.servers.commands import ReceivedCommand as ReceivedCommand
-from aerokit.protocols.servers.commands import whole as whole
+from aerokit.protocols.servers.commands import to_int as to_int
 from aerokit.sim.faults import CommandFault
 from aerokit.sim.motion import Ned
 from aerokit.sim.vehicle import MessageHost

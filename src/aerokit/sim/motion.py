@@ -111,7 +111,7 @@ def _clamp(value: float, limit: float) -> float:
 
 
 def velocity_to_landing_target(north: float, east: float) -> tuple[float, float]:
-    """Return the horizontal velocity (m/s) towards the target of a precision landing, which is this far away (m)."""
+    """Return the horizontal velocity (m/s) towards a landing target that is ``north`` and ``east`` metres away."""
     gain_per_s = min(_APPROACH_PER_S, _MAX_APPROACH_M_S / max(math.hypot(north, east), 1e-6))
     return (north * gain_per_s, east * gain_per_s)
 
@@ -294,7 +294,7 @@ class Motion:
         self._wanted_yaw, self._wanted_yaw_rate = None, 0.0
 
     def _update_gusts(self, dt: float) -> None:
-        # A random walk that returns to zero, whose standard deviation is `gusts_m_s`.
+        # The gusts are a random walk that returns to zero. Its standard deviation is `gusts_m_s`.
         decay = 1.0 - dt / 2.0
         kick = self.wind.gusts_m_s * math.sqrt(dt)
         self._gust_north = self._gust_north * decay + self._rng.gauss(0.0, kick)

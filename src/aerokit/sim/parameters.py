@@ -90,7 +90,7 @@ class SimParameters:
     def __setitem__(self, name: str, value: float) -> None:
         """Set a value. Raises KeyError for an unknown name."""
         row = self.row(name)
-        row.value = stored(value, row.type)
+        row.value = stored_value(value, row.type)
         if name in self._switches.values():
             self._names = None  # `names` is made again, because the switch may show or hide parameters.
 
@@ -143,7 +143,7 @@ class SimParameters:
 
     def add(self, name: str, value: float, type: int = MavParamType.REAL32) -> None:  # noqa: A002
         """Append a parameter, like a firmware on which a feature is enabled at run time."""
-        self._rows[name] = SimParameter(name, type, stored(value, type), stored(value, type))
+        self._rows[name] = SimParameter(name, type, stored_value(value, type), stored_value(value, type))
         self._names = None
 
     def remove(self, name: str) -> None:
@@ -155,7 +155,7 @@ class SimParameters:
         return (self.row(name) for name in list(self._rows))
 
 
-def stored(value: float, type_: int) -> float:
+def stored_value(value: float, type_: int) -> float:
     """Return the value that a parameter of this MAV_PARAM_TYPE stores."""
     integer_range = _RANGES.get(MavParamType(type_))
     if integer_range is None:
@@ -170,7 +170,7 @@ def _row(fields: list[str]) -> SimParameter:
     switch_or_mark = fields[4] if len(fields) > 4 else None
     is_volatile = switch_or_mark == _VOLATILE
     switch = None if is_volatile else switch_or_mark
-    return SimParameter(name, type_, stored(value, type_), stored(default, type_), is_volatile, switch)
+    return SimParameter(name, type_, stored_value(value, type_), stored_value(default, type_), is_volatile, switch)
 
 
 def _switch_of(line: str) -> str | None:

@@ -381,7 +381,8 @@ class UnderwaterMotion(Motion):
             north, east, commanded_down = self._commanded_acceleration()
             down = floating_down if self._is_floating else commanded_down
         else:
-            north, east = -_DRAG_PER_S * self.velocity_north, -_DRAG_PER_S * self.velocity_east
+            north = -_DRAG_PER_S * self.velocity_north
+            east = -_DRAG_PER_S * self.velocity_east
             down = floating_down
         self._integrate(north, east, down, dt)
         self._turn(dt, powered=powered)

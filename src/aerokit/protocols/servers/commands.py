@@ -48,7 +48,7 @@ class ReceivedCommand:
     def place(self) -> tuple[int, int]:
         """Return latitude and longitude in degrees times 1e7."""
         scale = 1e7 if self.is_long else 1
-        return (whole(self.x * scale), whole(self.y * scale))
+        return (to_int(self.x * scale), to_int(self.y * scale))
 
     @property
     def altitude_frame(self) -> int:
@@ -196,8 +196,8 @@ class RunningCommands:
         self._host = host
         self._server = server
         self._running: dict[int, RunningCommand] = {}
-        # Maps MAV_CMD and sender to the sender's last such command that has ended, its result, and the time of its end.
-        # The command that ended last is the last entry.
+        # Maps (MAV_CMD, sender) to the last command that has ended, its result, and the time of its end. The command
+        # that ended last is the last entry.
         self._ended: dict[tuple[int, tuple[int, int]], tuple[ReceivedCommand, Outcome, float]] = {}
         host.on(CommandCancel, self._on_cancel)
 
@@ -270,6 +270,6 @@ def _is_repeated(command: ReceivedCommand, first: ReceivedCommand) -> bool:
     return all(param == earlier or (math.isnan(param) and math.isnan(earlier)) for param, earlier in pairs)
 
 
-def whole(value: float) -> int:
+def to_int(value: float) -> int:
     """Return a parameter as an integer; 0 for NaN (unset) and for values beyond 32 bits."""
     return int(value) if not math.isnan(value) and abs(value) < 2**31 else 0

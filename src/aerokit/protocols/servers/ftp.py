@@ -141,7 +141,7 @@ class SessionFtpServer(Generic[FilesT]):
             return request.session
         return next(number for number in range(self.max_sessions) if number not in peer.sessions)
 
-    def _fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
+    def _answer_fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
         """Return the answer to a request that failed."""
         return request.refuse_errno(fault.errno)
 
@@ -174,13 +174,14 @@ class SessionFtpServer(Generic[FilesT]):
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
         """Execute a request. A handler that returns None answers later."""
         handler = _HANDLERS.get(request.opcode)
-        peer.request, peer.reply = request, None  # The reply to the previous request must not be sent again.
+        peer.request = request
+        peer.reply = None  # The reply to the previous request must not be sent again.
         try:
             answer = self._unknown(request) if handler is None else handler(self, peer, request)
         except Refused as refused:
             answer = request.refuse(refused.code)
         except FileFault as fault:
-            answer = self._fault(peer, request, fault)
+            answer = self._answer_fault(peer, request, fault)
         if answer is not None:
             self._reply(peer, self._adapted(peer, request, answer))
 
@@ -320,7 +321,8 @@ class SessionFtpServer(Generic[FilesT]):
         try:
             data = b"" if burst.offset >= session.size else session.file.read(burst.offset, DATA_SIZE)
         except FileFault as fault:
-            data, peer.errno = b"", fault.errno
+            data = b""
+            peer.errno = fault.errno
             refusal = refusal.replace(data=bytes([MavFtpErr.FAILERRNO, peer.errno]), size=2)
         if not data:
             session.burst = None
@@ -362,7 +364,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         old_path, _, new_path = request.data[: request.size].partition(b"\0")
         if len(old_path) + 2 >= request.size:  # The data ends after the old path, so there is no new path.
-            return self._fault(peer, request, FileFault(EINVAL))
+            return self._answer_fault(peer, request, FileFault(EINVAL))
         self.files.rename(checked_path(old_path), checked_path(new_path))
         return request.acknowledge()
 
@@ -371,11 +373,13 @@ class SessionFtpServer(Generic[FilesT]):
         path = self._path(request)
         is_repeated = peer.checksum is not None and request.repeats(peer.checksum)
         if not is_repeated:  # The running computation also answers a repeated request.
-            file, peer.checksum = self.files.open(path), request
-            self._continue_crc32(peer, request, file, 0, 0)
+            file = self.files.open(path)
+            peer.checksum = request
+            self._continue_crc32(peer, request, file, offset=0, checksum=0)
         return None
 
     def _continue_crc32(self, peer: FtpPeer, request: FtpPacket, file: FileHandle, offset: int, checksum: int) -> None:
+        """Add the next slice of the file to the checksum, and schedule the slice after it, or answer at the end."""
         has_more = True
         try:
             for _ in range(self.crc_blocks_at_once):
@@ -383,17 +387,20 @@ class SessionFtpServer(Generic[FilesT]):
                 if not data:
                     has_more = False
                     break
-                checksum, offset = crc32(data, checksum), offset + len(data)
+                checksum = crc32(data, checksum)
+                offset += len(data)
             answer = request.acknowledge(checksum.to_bytes(4, "little"))
         except FileFault as fault:
-            has_more, answer = False, self._fault(peer, request, fault)
+            has_more = False
+            answer = self._answer_fault(peer, request, fault)
         if peer.checksum is request and has_more:
             self._host.call_later(_CRC_PAUSE_S, lambda: self._continue_crc32(peer, request, file, offset, checksum))
             return
         with suppress(FileFault):
             file.close()
         if peer.checksum is request:  # A newer request may have replaced this one, which then gets no answer.
-            peer.checksum, peer.used_at = None, self._host.now
+            peer.checksum = None
+            peer.used_at = self._host.now
             self._reply(peer, self._adapted(peer, request, answer))
 
 

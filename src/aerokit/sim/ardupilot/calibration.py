@@ -14,7 +14,7 @@ from aerokit.mavlink.enums import (
     PreflightCalibrationAccelerometer,
 )
 from aerokit.sim.ardupilot.host import ArduPilotHost
-from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, to_int
 
 _SAMPLE_S, _REPEAT_INTERVAL_S = 1.3, 1.0
 _LAST = AccelcalVehiclePos.BACK
@@ -52,7 +52,7 @@ class AccelerometerCalibration:
         if not self.is_waiting or command.param1 != self._requested:
             return MavResult.FAILED
         self._requested = None
-        run_number, position = self._run_number, whole(command.param1)
+        run_number, position = self._run_number, to_int(command.param1)
         self._vehicle.call_later(_SAMPLE_S, lambda: self._on_sample(run_number, position))
         return MavResult.ACCEPTED
 
@@ -139,7 +139,7 @@ class CompassCalibration:
             return MavResult.FAILED
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
-        requested = whole(command.param1) & _ALL_COMPASSES  # Bits of compasses that are not fitted are ignored.
+        requested = to_int(command.param1) & _ALL_COMPASSES  # Bits of compasses that are not fitted are ignored.
         self._compass_mask = _ALL_COMPASSES if requested == 0 else requested
         self._started_at = self._vehicle.now
         self._saves_at_once = command.param3 != 0.0
@@ -154,7 +154,7 @@ class CompassCalibration:
     def _cancel(self, command: ReceivedCommand) -> int:
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
-        cancelled = whole(command.param1)
+        cancelled = to_int(command.param1)
         self._compass_mask &= ~(_ALL_COMPASSES if cancelled == 0 else cancelled)
         return MavResult.ACCEPTED
 

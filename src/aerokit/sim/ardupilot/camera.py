@@ -8,7 +8,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult, SetFocusType
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import ArduPilotHost
-from aerokit.sim.commands import ReceivedCommand, whole
+from aerokit.sim.commands import ReceivedCommand, to_int
 
 _PERIOD_S, _SHUTTER_S = 0.02, 0.1
 _IDLE, _INTERVAL_SET = 0, 2
@@ -121,7 +121,7 @@ class ArduPilotCamera:
     def _start(self, interval_s: float, count: float) -> bool:
         if count == 1.0 or (interval_s == 0.0 and count == 0.0):
             return self.take()
-        return self.take_series(interval_s if math.isfinite(interval_s) else 0.0, whole(count) or _UNLIMITED)
+        return self.take_series(interval_s if math.isfinite(interval_s) else 0.0, to_int(count) or _UNLIMITED)
 
     def start_capture(self, command: ReceivedCommand) -> int:
         """Handle MAV_CMD_IMAGE_START_CAPTURE. Param 1 is the number of the camera, or 0 for all cameras."""
@@ -157,7 +157,7 @@ class ArduPilotCamera:
 
     def focus(self, command: ReceivedCommand) -> int:
         """Handle MAV_CMD_SET_CAMERA_FOCUS. Focus by rate or in percent is accepted. Autofocus is UNSUPPORTED."""
-        kind = whole(command.param1)
+        kind = to_int(command.param1)
         # The firmware denies these types even without a camera (AP_Camera.cpp).
         is_unsupported = kind in (SetFocusType.STEP, SetFocusType.METERS)
         if is_unsupported or kind not in list(SetFocusType):

@@ -29,7 +29,7 @@ from aerokit.sim.ardupilot.fence import ArduPilotFence
 from aerokit.sim.ardupilot.host import ArduPilotMode, ConditionTimer, variant
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 from aerokit.sim.motion import Ned
 
 _MAX_S = 600.0
@@ -78,7 +78,7 @@ class MotorTest:
         if not is_valid:
             return 0.0
         seconds_per_motor = max(0.0, min(command.param4, _MAX_S))
-        motor_count = max(1, whole(command.x))
+        motor_count = max(1, to_int(command.x))
         return seconds_per_motor * (motor_count + (motor_count - 1) * _PAUSE_SHARE)
 
     def _stop(self, number: int) -> None:

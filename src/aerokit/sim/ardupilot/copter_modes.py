@@ -35,7 +35,7 @@ class AutoYaw:
     def apply_default(self, *, returning: bool = False) -> None:
         """Apply WP_YAW_BEHAVIOR: hold (0), look ahead (1), look ahead except when returning home (2).
 
-        Every new guided target calls this, which ends a commanded heading or region of interest.
+        Called at every new guided target, which ends a commanded heading or region of interest.
         """
         behaviour = int(self._copter.parameters["WP_YAW_BEHAVIOR"])
         if behaviour == _YAW_AHEAD or (behaviour == _YAW_AHEAD_EXCEPT_RTL and not returning):
@@ -73,7 +73,7 @@ class AutoYaw:
         self._control = self._turn
 
     def set_region_of_interest(self, point: Ned | None) -> None:
-        """Turn towards a place until the next target. None ends this. A fitted gimbal turns instead of the copter."""
+        """Face a place until the next target, or face none again. A fitted gimbal turns instead of the copter."""
         gimbal = self._copter.gimbal
         gimbal.look_at(point)
         if point is None:

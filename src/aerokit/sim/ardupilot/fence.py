@@ -10,7 +10,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import FenceBreach, FenceMitigate, FenceType, MavCmd, MavMissionType, MavResult, MavSeverity
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import ArduPilotMode, HostT
-from aerokit.sim.commands import ReceivedCommand, whole
+from aerokit.sim.commands import ReceivedCommand, to_int
 from aerokit.sim.motion import LocalFrame, Ned
 
 _IN, _OUT = MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION
@@ -147,7 +147,7 @@ class ArduPilotFence(Generic[HostT]):
         self.breach_time_ms: int = 0  # Start of the latest breach, in milliseconds since boot.
         self.caused_mode: bool = False  # True while the present mode is the result of FENCE_ACTION.
         self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE when they were read last.
-        # By kind of fence: a breached fence is breached again if the vehicle is this many metres beyond the limit.
+        # Maps a kind of fence to the metres beyond its limit at which a further breach counts as new.
         self._new_breach_m: dict[int, float] = {}
         # True if the last command about the lower limit enabled the limit, False if it disabled it; None without a
         # command.
@@ -204,7 +204,7 @@ class ArduPilotFence(Generic[HostT]):
 
     def command(self, command: ReceivedCommand) -> int:
         """Execute DO_FENCE_ENABLE. Param 1 is 0 to disable, 1 to enable, and 2 to disable only the lower limit."""
-        kinds = whole(command.param2) or _ALL  # The value 0 selects all kinds.
+        kinds = to_int(command.param2) or _ALL  # The value 0 selects all kinds.
         if command.param1 == 1.0:
             if not self.present & kinds:
                 return MavResult.FAILED
@@ -334,6 +334,10 @@ class ArduPilotFence(Generic[HostT]):
 
     def act(self, new_breaches: int) -> None:
         """React to a new breach of these kinds while armed."""
+
+    def enter_first(self, modes: Sequence[int]) -> None:
+        """Change to the first of these modes that the vehicle accepts, because of a breach."""
+        self.caused_mode = any(self.vehicle.set_mode(mode) for mode in modes)  # stops at the first accepted mode
 
     def on_cleared(self) -> None:
         """Called when the last breach has ended."""

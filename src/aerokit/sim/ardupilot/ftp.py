@@ -72,7 +72,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             self._host.call_later(_WORKER_PERIOD_S, self._work)
 
     def _work(self) -> None:
-        """Process the queued requests. A burst interrupts this. The end of the burst calls this method again."""
+        """Process the queued requests until one starts a burst. The end of the burst calls this method again."""
         while self._queue and not self._is_bursting:
             request, channel = self._queue.popleft()
             peer = self._peer(request, channel)
@@ -124,7 +124,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             self._is_banner_due = False
             self._send_banner()
 
-    def _fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
+    def _answer_fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
         is_opening = request.opcode in (Op.OPENFILERO, Op.OPENFILEWO, Op.CREATEFILE)
         # If a folder is opened as a file, the firmware reports a missing file.
         errno = ENOENT if is_opening and fault.errno == EISDIR else fault.errno
@@ -191,7 +191,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         try:
             data = session.file.read(offset, block_size)
         except FileFault as fault:
-            data, refusal = b"", request.refuse_errno(fault.errno)
+            data = b""
+            refusal = request.refuse_errno(fault.errno)
         if not data:
             # The firmware sends the refusal with the offset and the flag burst_complete of the previous block.
             previous = peer.reply if block_number and peer.reply is not None else refusal

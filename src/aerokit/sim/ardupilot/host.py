@@ -115,7 +115,7 @@ class ConditionTimer:
     def seconds(self, condition: bool, now: float) -> float:
         """Return the seconds since the condition became true, or 0 while the condition is false.
 
-        A condition becomes true at the first call with ``condition`` True, which returns 0.
+        The first call with ``condition`` True returns 0.
         """
         if not condition:
             self._since = None

@@ -87,7 +87,7 @@ class MissionMode(ArduPilotMode):
         """Called after the mission has started or resumed in this mode."""
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
-        """Return True as soon as the command is complete. This is polled at every tick."""
+        """Return True as soon as the command is complete. Called at every tick."""
         raise NotImplementedError
 
     def end_mission(self) -> None:

@@ -26,7 +26,7 @@ from aerokit.protocols.servers.missions import (
     item_message_int,
 )
 from aerokit.sim.ardupilot.host import ArduPilotHost
-from aerokit.sim.ardupilot.mission_items import has_location, stored, whole
+from aerokit.sim.ardupilot.mission_items import as_stored, has_location, to_int
 from aerokit.sim.ardupilot.mission_lists import CommandList, FenceList, ItemList, RallyList
 from aerokit.sim.channel import Channel
 from aerokit.sim.missions import float32
@@ -72,7 +72,7 @@ class ArduPilotMissionServer(MissionServer):
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
         """Store a list of items, as the upload of a file does, and return the MAV_MISSION_RESULT.
 
-        Only a mission can be changed from the index ``start`` on and without deleting its other items (``clear``).
+        Only a mission can be replaced from the index ``start`` on, or keep its other items (``clear`` is False).
         """
         if mission_type == MavMissionType.MISSION:
             if clear:
@@ -215,7 +215,7 @@ class ArduPilotMissionServer(MissionServer):
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
         self._acknowledge(sender_of(message), message.mission_type, result, channel)
 
-    def _put(self, upload: ListUpload, message: AnyItem) -> int:
+    def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
         item = _with_integer_position(message)
         assert not isinstance(item, int)
         return self._lists[upload.mission_type].put(message.seq, item, upload.end - 1)
@@ -256,7 +256,7 @@ class ArduPilotMissionServer(MissionServer):
 
     def _guide(self, item: MissionItem, current: int) -> int:
         """Handle an item that is a target for GUIDED, because of the special value of its field ``current``."""
-        stored_item = stored(item, self._vehicle.KIND)
+        stored_item = as_stored(item, self._vehicle.KIND)
         if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             return stored_item
         if current == _ALTITUDE_CHANGE:  # The altitude change has no effect in the simulation.
@@ -279,7 +279,7 @@ def _with_integer_position(message: AnyItem) -> MissionItem | int:
     if isinstance(message, m.MissionItemInt):
         return item
     if not has_location(item.command):
-        return item.replace(x=whole(item.x), y=whole(item.y))
+        return item.replace(x=to_int(item.x), y=to_int(item.y))
     if not abs(item.x) <= 90.0:
         return Result.INVALID_PARAM5_X
     if not abs(item.y) <= 180.0:

@@ -272,7 +272,7 @@ class SmartPath:
         self._only_armed = only_armed
         self._points: list[Ned] = []
         self._cleaned_count = 0  # Number of points after the last simplification.
-        # Times at which the position was good, a point was recorded and a warning was sent for the last time.
+        # Times of the last good position, the last recorded point and the last warning.
         self._good_at = self._saved_at = self._warned_at = -math.inf
         self._is_started = False
         self.is_active: bool = False  # True while SMART_RTL is possible.

@@ -26,7 +26,7 @@ from aerokit.sim.ardupilot.plane_auto import PlaneAuto, PlaneGuided, PlaneSetpoi
 from aerokit.sim.ardupilot.plane_failsafes import PlaneFailsafes, PlaneFence
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneModeBase, PlaneNavigatingMode
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 
 _SHORT_DISABLED = 3
 _MIN_ANGLE_DEG, _MIN_AIRSPEED_M_S = 3.0, 5
@@ -187,7 +187,7 @@ class SimulatedPlane(PlaneHost):
         point = self.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:
             return MavResult.DENIED
-        if self.mode is not self.guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
+        if self.mode is not self.guided and not to_int(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
             return MavResult.FAILED
         if not self.set_mode(PlaneMode.GUIDED):
             return MavResult.FAILED

@@ -19,7 +19,7 @@ from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneLanding, PlaneNavigatingMode
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 
 _FLY, _LOITER, _CLIMB, _LAND = range(4)
@@ -275,7 +275,7 @@ class PlaneGuided(PlaneNavigatingMode):
             self._climb_limit = climb_m_s
 
     def change_course(self, course: float | None) -> None:
-        """Fly on a course in radians from north. None ends this, so that the plane circles again."""
+        """Fly on a course in radians from north. With None, the plane circles again."""
         self._course = course
 
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
@@ -382,7 +382,7 @@ def guided_commands(plane: PlaneHost) -> dict[int, CommandHandler]:
 
 
 def _change_speed(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    if whole(command.param1) != SpeedType.AIRSPEED:
+    if to_int(command.param1) != SpeedType.AIRSPEED:
         return MavResult.DENIED
     if not plane.is_valid_airspeed(command.param2):
         return MavResult.FAILED
@@ -415,7 +415,7 @@ def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand)
 
 def _change_target_altitude(plane: PlaneHost, command: ReceivedCommand) -> int:
     """Change the altitude to param 1 metres (MAV_FRAME param 2). Only GUIDED uses the altitude; all modes accept it."""
-    point = plane.world_point(0, 0, command.param1, whole(command.param2))  # Only the altitude is used.
+    point = plane.world_point(0, 0, command.param1, to_int(command.param2))  # Only the altitude is used.
     if point is None:
         return MavResult.DENIED
     guided = plane.mode_of(PlaneGuided)

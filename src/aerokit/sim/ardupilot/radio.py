@@ -20,7 +20,7 @@ from aerokit.sim.ardupilot.host import (
 )
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import ReceivedCommand, whole
+from aerokit.sim.commands import ReceivedCommand, to_int
 from aerokit.sim.vehicle import sender_of
 
 _AT_REST = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
@@ -228,19 +228,19 @@ class AuxiliaryOutputs:
 
     def set_servo(self, command: ReceivedCommand) -> int:
         """Set a servo output for DO_SET_SERVO, or for the first pulse of DO_REPEAT_SERVO."""
-        output = whole(command.param1)
+        output = to_int(command.param1)
         if not 1 <= output <= _SERVOS:
             return MavResult.FAILED
         if not self.is_free(output):
             self._vehicle.info(f"ServoRelayEvent: Channel {output} is already in use")
             return MavResult.FAILED
-        self.servos[output] = whole(command.param2)
+        self.servos[output] = to_int(command.param2)
         return MavResult.ACCEPTED
 
     def set_relay(self, command: ReceivedCommand) -> int:
         if not 0 <= command.param1 < self.relay_count:
             return MavResult.FAILED
-        bit = 1 << whole(command.param1)
+        bit = 1 << to_int(command.param1)
         self.relays = self.relays | bit if command.param2 else self.relays & ~bit
         return MavResult.ACCEPTED
 
@@ -251,11 +251,11 @@ class AuxiliaryOutputs:
 
     def switch(self, command: ReceivedCommand) -> int:
         """Record the switch position of DO_AUX_FUNCTION. The function itself is not simulated."""
-        function = whole(command.param1)
+        function = to_int(command.param1)
         if command.param2 not in _AUX_POSITIONS:
             return MavResult.DENIED
         if not 0 <= function < _FUNCTIONS or function in _REFUSED_FUNCTIONS[self._vehicle.KIND]:
             self._vehicle.info(f"Invalid channel option ({function})")
             return MavResult.FAILED
-        self.functions[function] = whole(command.param2)
+        self.functions[function] = to_int(command.param2)
         return MavResult.ACCEPTED

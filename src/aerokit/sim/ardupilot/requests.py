@@ -10,7 +10,7 @@ from aerokit.mavlink.enums import MavResult
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import ReceivedCommand, whole
+from aerokit.sim.commands import ReceivedCommand, to_int
 
 # Suffixes of the parameters with the stream rates. The prefix is that of the port: MAV1_EXTRA1 on the first port.
 _RATE_PARAMETERS: dict[int, str] = {
@@ -73,7 +73,7 @@ class ArduPilotMessageRequests:
 
         0 selects the default, which is one second for HEARTBEAT and off for other messages.
         """
-        message_id, interval_us = whole(command.param1), whole(command.param2)
+        message_id, interval_us = to_int(command.param1), to_int(command.param2)
         if command.param3 != 0.0:
             return MavResult.DENIED
         if message_id not in self._supported:
@@ -92,7 +92,7 @@ class ArduPilotMessageRequests:
 
     def get_interval(self, command: ReceivedCommand) -> int:
         """Send MESSAGE_INTERVAL, before the acknowledgement."""
-        return self._send_interval(whole(command.param1), command.channel)
+        return self._send_interval(to_int(command.param1), command.channel)
 
     def _send_interval(self, message_id: int, channel: Channel) -> int:
         is_supported = message_id in self._supported
@@ -105,13 +105,13 @@ class ArduPilotMessageRequests:
 
     def request_message(self, command: ReceivedCommand) -> int:
         """Send a message once, after the acknowledgement."""
-        message_id = whole(command.param1)
+        message_id = to_int(command.param1)
         if message_id == m.MessageInterval.ID:
-            return self._send_interval(whole(command.param2), command.channel)
+            return self._send_interval(to_int(command.param2), command.channel)
         if message_id not in self._supported:
             return MavResult.FAILED
         if message_id == m.AvailableModes.ID:
-            self._send_modes(whole(command.param2), command.channel)
+            self._send_modes(to_int(command.param2), command.channel)
         else:
             self.send_soon(message_id, command.channel)
         return MavResult.ACCEPTED

@@ -193,7 +193,7 @@ class ArduPilotVehicle(ArduPilotHost):
         """Register the handlers of set-point messages."""
 
     def look_at(self, place: Ned | None) -> None:
-        """Point the gimbal, if there is one, at a place. None ends this."""
+        """Point the gimbal, if there is one, at a place. None returns it to its default mode."""
         self.gimbal.look_at(place)
 
     def accept_reposition(self, place: Ned) -> bool:

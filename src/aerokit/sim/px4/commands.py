@@ -18,7 +18,7 @@ from aerokit.mavlink.enums import (
     MavVtolState,
 )
 from aerokit.mavlink.enums import MavCmd as Cmd
-from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, to_int
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.modes import Px4Mode
@@ -73,7 +73,7 @@ def _inject_failure(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
     """Acknowledge a failure of the motors or the battery, as SIH does, but without an effect."""
     if not px4.parameters.get("SYS_FAILURE_EN", 0):
         return MavResult.DENIED
-    unit, failure_type = whole(command.param1), whole(command.param2)
+    unit, failure_type = to_int(command.param1), to_int(command.param2)
     if unit not in _FAILURES:
         return None
     return MavResult.ACCEPTED if failure_type in _FAILURES[FailureUnit(unit)] else MavResult.UNSUPPORTED
@@ -88,7 +88,7 @@ def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
     """Accept a test of a motor, a servo or (numbers from 1000 on) an output function, without a visible effect."""
     if px4.is_armed:
         return MavResult.DENIED
-    function = whole(command.x)
+    function = to_int(command.x)
     is_known = function in _MOTORS or function in _SERVOS or function >= _FIRST_OUTPUT_FUNCTION
     return MavResult.ACCEPTED if is_known else None
 
@@ -97,7 +97,7 @@ def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
     """Accept known storage actions, without a visible effect. Unknown actions are not answered."""
     if px4.is_armed:
         return MavResult.TEMPORARILY_REJECTED
-    return MavResult.ACCEPTED if whole(command.param1) in _STORAGE_ACTIONS else None
+    return MavResult.ACCEPTED if to_int(command.param1) in _STORAGE_ACTIONS else None
 
 
 _FORCE_MAGIC = 21196.0
@@ -190,10 +190,10 @@ class _Flight:
     def set_mode(self, command: ReceivedCommand) -> int:
         """Set a mode and acknowledge twice. PX4's link module always accepts. Then the commander sends the result."""
         self._px4.commands.answer(command, MavResult.ACCEPTED)
-        return set_mode(self._px4, whole(command.param1), (whole(command.param2), whole(command.param3)))
+        return set_mode(self._px4, to_int(command.param1), (to_int(command.param2), to_int(command.param3)))
 
     def set_standard_mode(self, command: ReceivedCommand) -> int:
-        mode = modes.STANDARD_MODES.get(whole(command.param1))
+        mode = modes.STANDARD_MODES.get(to_int(command.param1))
         if mode is None:
             return MavResult.FAILED
         return MavResult.ACCEPTED if self._px4.change_mode(mode) else MavResult.TEMPORARILY_REJECTED
@@ -232,8 +232,8 @@ class _Flight:
             return MavResult.DENIED
         if not -1 <= command.param1 < px4.mission.count:
             return MavResult.DENIED
-        if command.param1 >= 0 and whole(command.param1) != px4.mission.current:
-            px4.mission.set_current(whole(command.param1))  # even if PX4 refuses the mode below (navigator_main.cpp)
+        if command.param1 >= 0 and to_int(command.param1) != px4.mission.current:
+            px4.mission.set_current(to_int(command.param1))  # even if PX4 refuses the mode below (navigator_main.cpp)
         result = self._change(modes.MISSION)
         if result == MavResult.ACCEPTED and not px4.arming.arm("mission start"):
             return MavResult.TEMPORARILY_REJECTED
@@ -244,7 +244,7 @@ class _Flight:
 
         A latitude or longitude that is NaN or INT32_MAX keeps the place, and an altitude that is NaN keeps the height.
         """
-        if whole(command.param2) != MavDoRepositionFlags.CHANGE_MODE:  # PX4 requires this flag, and no other flag.
+        if to_int(command.param2) != MavDoRepositionFlags.CHANGE_MODE:  # PX4 requires this flag, and no other flag.
             return MavResult.UNSUPPORTED
         result = self._change(modes.HOLD)
         if result != MavResult.ACCEPTED:
@@ -306,7 +306,7 @@ class _Flight:
     def transition(self, command: ReceivedCommand) -> int | None:
         """Change to the VTOL state in param 1, after a transition. A vehicle that is no VTOL does not answer."""
         px4 = self._px4
-        requested_state = whole(command.param1)
+        requested_state = to_int(command.param1)
         if not px4.vtol_state:
             return None
         if requested_state not in (MavVtolState.MC, MavVtolState.FW) or px4.mode in _NO_TRANSITION:

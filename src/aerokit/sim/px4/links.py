@@ -179,7 +179,7 @@ class Px4StreamRates:
 
     def start(self, channel: Channel, number: int, first: float) -> None:
         """Start the streams of link ``number`` at time ``first``."""
-        mode = self._modes[min(number, len(self._modes) - 1)]  # Links without an own mode have the last mode.
+        mode = self._modes[min(number, len(self._modes) - 1)]  # Further links have the last mode.
         self._mode_of[channel] = mode
         intervals_us = self._intervals_us[channel] = {}
         for message_id, rate in self._rates_at_start(mode).items():

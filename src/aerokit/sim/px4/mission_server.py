@@ -27,7 +27,7 @@ from aerokit.protocols.servers.missions import (
 )
 from aerokit.sim.channel import Channel
 from aerokit.sim.px4.host import Px4Host
-from aerokit.sim.px4.mission_items import as_downloaded, checksum, stored
+from aerokit.sim.px4.mission_items import as_downloaded, as_stored, checksum
 from aerokit.sim.vehicle import sender_of
 
 _NO_PARTNER = (0, 0)
@@ -92,7 +92,7 @@ class Px4MissionServer(MissionServer):
             return Result.ERROR
         stored_items: list[MissionItem] = []
         for item in items:
-            stored_item = stored(item, mission_type)
+            stored_item = as_stored(item, mission_type)
             if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
                 return stored_item
             stored_items.append(stored_item)
@@ -301,14 +301,14 @@ class Px4MissionServer(MissionServer):
             self._warn(f"IGN MISSION_ITEM: {reason}")
             self._answer(link, Result.ERROR)
 
-    def _put(self, upload: ListUpload, message: AnyItem) -> int:
+    def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
         link = self._link(upload.channel)
         item = item_from(message)
         is_int = isinstance(message, m.MissionItemInt)
         item_in_e7 = item  # has its latitude and longitude in degrees times 1e7, also if received in MISSION_ITEM
         if not is_int and item.frame != MavFrame.MISSION:
             item_in_e7 = item.replace(x=_e7(item.x), y=_e7(item.y))
-        stored_item = stored(item_in_e7, link.mission_type, is_int=is_int)
+        stored_item = as_stored(item_in_e7, link.mission_type, is_int=is_int)
         if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             if stored_item != Result.ERROR:
                 self._warn("IGN MISSION_ITEM: Invalid item")

@@ -27,6 +27,7 @@ _NAN3: Ned = (math.nan, math.nan, math.nan)
 # The simulated ground is level, so altitudes above terrain are treated as altitudes above home.
 _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFrame.GLOBAL_TERRAIN_ALT_INT)
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
+_UPWARDS = 0.1  # A set-point lifts the vehicle off if it is more than this upwards, in m, m/s or m/s².
 _VERSION_1_14 = 1 << 24 | 14 << 16  # One byte each for the major and the minor version.
 _FLIGHT_CONTROL_GROUP, _THRUST_CONTROL = 0, 3
 
@@ -67,8 +68,11 @@ class Px4Offboard:
     def wants_up(self) -> bool:
         if self._attitude is not None:
             return self._thrust > 0.5
-        down = self._position[2] - self._vehicle.motion.down
-        return down < -0.1 or self._velocity[2] < -0.1 or self._acceleration[2] < -0.1
+        _, _, position_down = self._position
+        _, _, velocity_down = self._velocity
+        _, _, acceleration_down = self._acceleration
+        components = (position_down - self._vehicle.motion.down, velocity_down, acceleration_down)
+        return any(down < -_UPWARDS for down in components)  # False for components that are NaN
 
     def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
         frame = target.coordinate_frame

@@ -16,7 +16,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GimbalDeviceFlags, GimbalManagerCapFlags, MavCmd, MavMountMode, MavResult
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 from aerokit.sim.components.component import pose_of
 from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
 from aerokit.sim.px4.host import Px4Host
@@ -141,9 +141,9 @@ class Px4Gimbal:
         if not self.is_fitted or sender_of(message) != self.in_control:
             return
         has_angles = not any(map(math.isnan, message.q))
-        angles = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
+        roll, pitch, yaw = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
         rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
-        self.apply(message.flags, (angles[0], angles[1], angles[2]), rates)
+        self.apply(message.flags, (roll, pitch, yaw), rates)
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
         if not self.is_fitted:
@@ -193,7 +193,7 @@ def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
     In PX4, unlike in the standard, -2 gives control to the autopilot instead of the sender. -3 releases control.
     """
     # The firmware applies special values to the system id (param 1) and to the component id (param 2) separately.
-    requested = (whole(command.param1), whole(command.param2))
+    requested = (to_int(command.param1), to_int(command.param2))
     system, component = map(_id_in_control, requested, gimbal.in_control, gimbal.own_ids, command.sender)
     gimbal.in_control = (system, component)
     return MavResult.ACCEPTED
@@ -212,13 +212,13 @@ def _pitch_and_yaw(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
         return MavResult.DENIED
     angles = (0.0, math.radians(command.param1), math.radians(command.param2))
     rates = (math.nan, math.radians(command.param3), math.radians(command.param4))
-    gimbal.apply(whole(command.x), angles, rates)
+    gimbal.apply(to_int(command.x), angles, rates)
     return MavResult.ACCEPTED
 
 
 def _control_mount(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
     """Handle DO_MOUNT_CONTROL. Unknown modes are accepted, but have no effect."""
-    mode = whole(command.z)
+    mode = to_int(command.z)
     if mode in (MavMountMode.RETRACT, MavMountMode.NEUTRAL):
         gimbal.rest()
     elif mode == MavMountMode.MAVLINK_TARGETING:
@@ -299,7 +299,7 @@ class Px4CameraTrigger:
         if not self.is_fitted:
             return None
         was_running = self.is_running
-        enable, reset, pause = whole(command.param1), whole(command.param2), whole(command.param3)
+        enable, reset, pause = to_int(command.param1), to_int(command.param2), to_int(command.param3)
         if pause in (0, 1):
             self._is_paused = pause == 1
         if reset == 1:
