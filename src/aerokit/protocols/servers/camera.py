@@ -83,16 +83,13 @@ def _streams(camera: CameraDevice, number: int) -> list[m.VideoStreamInformation
     """Return VIDEO_STREAM_INFORMATION for one stream, or for all streams if ``number`` is 0."""
     return [
         m.VideoStreamInformation(
-            **_stream_fields(camera, stream),
-            count=len(camera.streams),
-            type=VideoStreamType.RTSP if uri.startswith("rtsp") else VideoStreamType.RTPUDP,
-            name=f"Stream {stream}",
-            uri=uri,
-            encoding=VideoStreamEncoding.H264,
+            **_stream_fields(camera, stream), count=len(camera.streams),
+            type=VideoStreamType.RTSP if uri.startswith("rtsp") else VideoStreamType.RTPUDP, name=f"Stream {stream}",
+            uri=uri, encoding=VideoStreamEncoding.H264,
         )
         for stream, uri in enumerate(camera.streams, start=1)
         if number in (0, stream)
-    ]
+    ]  # fmt: skip
 
 
 def _stream_status(camera: CameraDevice, number: int) -> list[m.VideoStreamStatus]:
@@ -129,17 +126,10 @@ def _thermal_range(camera: CameraDevice) -> list[m.CameraThermalRange]:
     coldest, hottest = camera.thermal_celsius
     return [
         m.CameraThermalRange(
-            time_boot_ms=camera.host.time_boot_ms,
-            stream_id=len(camera.streams),
-            camera_device_id=0,
-            max=hottest,
-            max_point_x=1.0,
-            max_point_y=1.0,
-            min=coldest,
-            min_point_x=0.0,
-            min_point_y=0.0,
+            time_boot_ms=camera.host.time_boot_ms, stream_id=len(camera.streams), camera_device_id=0, max=hottest,
+            max_point_x=1.0, max_point_y=1.0, min=coldest, min_point_x=0.0, min_point_y=0.0,
         )
-    ]
+    ]  # fmt: skip
 
 
 def _field_of_view(camera: CameraDevice) -> int:

@@ -339,15 +339,11 @@ class ArduPilotVehicle(ArduPilotHost):
     def available_modes(self) -> list[m.AvailableModes]:
         return [
             m.AvailableModes(
-                number_modes=len(self._modes),
-                mode_index=index,
-                standard_mode=0,
-                custom_mode=mode.number,
-                properties=0,
+                number_modes=len(self._modes), mode_index=index, standard_mode=0, custom_mode=mode.number, properties=0,
                 mode_name=mode.name,
             )
             for index, mode in enumerate(self._modes.values(), start=1)
-        ]
+        ]  # fmt: skip
 
     def build(self, message_id: int) -> Message | None:
         """Build the message with this id. Return None if the firmware does not send the message at present."""

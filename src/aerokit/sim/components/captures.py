@@ -54,20 +54,14 @@ class MemoryCard:
         is_inserted = self.is_inserted
         return [
             StorageInformation(
-                time_boot_ms=camera.time_boot_ms,
-                storage_id=_STORAGE_ID,
-                storage_count=1,
+                time_boot_ms=camera.time_boot_ms, storage_id=_STORAGE_ID, storage_count=1,
                 status=StorageStatus.READY if is_inserted else StorageStatus.EMPTY,
                 total_capacity=self.capacity_mib if is_inserted else 0.0,
-                used_capacity=self.used_mib if is_inserted else 0.0,
-                available_capacity=self.free_mib,
-                read_speed=_READ_MIB_S,
-                write_speed=_WRITE_MIB_S,
-                type=StorageType.MICROSD,
-                name="SD",
+                used_capacity=self.used_mib if is_inserted else 0.0, available_capacity=self.free_mib,
+                read_speed=_READ_MIB_S, write_speed=_WRITE_MIB_S, type=StorageType.MICROSD, name="SD",
                 storage_usage=StorageUsageFlag.SET | StorageUsageFlag.PHOTO | StorageUsageFlag.VIDEO,
             )
-        ]
+        ]  # fmt: skip
 
 
 FOCAL_LENGTH_MM = 4.5
@@ -171,18 +165,8 @@ def tracked_place(component: SimulatedComponent, flags: int, angles: Angles | No
     place = LocalFrame(pose.place).to_global(distance * math.cos(yaw), distance * math.sin(yaw), pose.height_m)
     return [
         m.CameraTrackingGeoStatus(
-            tracking_status=flags,
-            lat=place.latitude_e7,
-            lon=place.longitude_e7,
-            alt=place.altitude_m,
-            h_acc=_ACCURACY_M,
-            v_acc=_ACCURACY_M,
-            vel_n=0.0,
-            vel_e=0.0,
-            vel_d=0.0,
-            vel_acc=_UNKNOWN,
-            dist=math.hypot(distance, pose.height_m),
-            hdg=_UNKNOWN,
-            hdg_acc=_UNKNOWN,
+            tracking_status=flags, lat=place.latitude_e7, lon=place.longitude_e7, alt=place.altitude_m,
+            h_acc=_ACCURACY_M, v_acc=_ACCURACY_M, vel_n=0.0, vel_e=0.0, vel_d=0.0, vel_acc=_UNKNOWN,
+            dist=math.hypot(distance, pose.height_m), hdg=_UNKNOWN, hdg_acc=_UNKNOWN,
         )
-    ]
+    ]  # fmt: skip

@@ -56,15 +56,10 @@ class Px4Events:
         px4 = self._px4
         px4.send(
             Event(
-                destination_component=0,
-                destination_system=0,
-                id=event_id,
-                event_time_boot_ms=px4.time_boot_ms,
-                sequence=self._next_sequence,
-                log_levels=_INFO_LEVELS,
-                arguments=arguments,
+                destination_component=0, destination_system=0, id=event_id, event_time_boot_ms=px4.time_boot_ms,
+                sequence=self._next_sequence, log_levels=_INFO_LEVELS, arguments=arguments,
             )
-        )
+        )  # fmt: skip
         self._next_sequence = (self._next_sequence + 1) & 0xFFFF
 
 

@@ -312,14 +312,11 @@ def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
         main_mode, first_sub_mode = modes.EXTERNAL_1
         messages.append(
             m.AvailableModes(
-                number_modes=count,
-                mode_index=len(_AVAILABLE_MODES) + 1 + number,
-                standard_mode=0,
+                number_modes=count, mode_index=len(_AVAILABLE_MODES) + 1 + number, standard_mode=0,
                 custom_mode=modes.custom_mode((main_mode, first_sub_mode + number)),
-                properties=MavModeProperty.NOT_USER_SELECTABLE,
-                mode_name="(Mode not available)",
+                properties=MavModeProperty.NOT_USER_SELECTABLE, mode_name="(Mode not available)",
             )
-        )
+        )  # fmt: skip
     return messages
 
 
