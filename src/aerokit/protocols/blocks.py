@@ -300,8 +300,8 @@ class Reassembly:
         ranges: list[tuple[int, int]] = []
         for offset in self.gaps:
             length = self.block_size if self.end is None else min(self.block_size, self.end - offset)
-            start, size_so_far = ranges[-1] if ranges else (0, 0)
-            if ranges and start + size_so_far == offset:
+            if ranges and sum(ranges[-1]) == offset:  # The block follows the last range.
+                start, size_so_far = ranges[-1]
                 ranges[-1] = (start, size_so_far + length)
             else:
                 ranges.append((offset, length))

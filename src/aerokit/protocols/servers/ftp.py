@@ -297,7 +297,8 @@ class SessionFtpServer(Generic[FilesT]):
         session = self._session_of(peer, request)
         is_running = session.burst is not None
         first_sequence = (request.sequence + 1) & 0xFFFF
-        session.burst, session.burst_sent = request.replace(sequence=first_sequence), 0
+        session.burst = request.replace(sequence=first_sequence)
+        session.burst_sent = 0
         if not is_running:
             self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
         return None
@@ -337,12 +338,12 @@ class SessionFtpServer(Generic[FilesT]):
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         """Answer with the folder's entries from number ``offset`` on: as many as fit into one message."""
-        entries = self._entries(self._path(request))
+        lines = [*self.list_prefix, *map(_line, self._entries(self._path(request)))]
         listing = b""
-        for text in [*self.list_prefix, *map(_line, entries)][request.offset :]:
-            if len(listing) + len(text) + len(self.line_end) > DATA_SIZE:
+        for line in lines[request.offset :]:
+            if len(listing) + len(line) + len(self.line_end) > DATA_SIZE:
                 break
-            listing += text + self.line_end
+            listing += line + self.line_end
         if not listing:
             return request.refuse(MavFtpErr.EOF)
         return request.acknowledge(listing)

@@ -233,7 +233,8 @@ class Calibrations:
         if vehicle.motors.is_armed:
             vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow calibration")
             return MavResult.FAILED
-        is_gyro_requested, is_barometer_requested = command.param1 == 1.0, command.param3 == 1.0
+        is_gyro_requested = command.param1 == 1.0
+        is_barometer_requested = command.param3 == 1.0
         if is_gyro_requested:
             vehicle.info("Initialising ArduPilot")
             return CommandProgress(percents=(), interval_s=_GYROS_S)  # Without percentages, only the result is sent.

@@ -55,14 +55,14 @@ _FIXED_ANGLE_MODES = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
 
 @dataclass(frozen=True)
 class MountTarget:
-    """Target angles in degrees at the time ``since``. From then on, ``rates`` (degrees per second) change them."""
+    """Target angles in degrees at the time ``set_at``. From then on, ``rates`` (degrees per second) change them."""
 
     roll: float = 0.0
     pitch: float = 0.0
     yaw: float = 0.0
     is_from_north: bool = False
     rates: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    since: float = 0.0
+    set_at: float = 0.0
 
 
 class ArduPilotGimbal:
@@ -122,7 +122,7 @@ class ArduPilotGimbal:
         """Return the target as its rates have moved it until now. Angles relative to the vehicle are limited."""
         if not any(target.rates):
             return target
-        seconds = self._vehicle.now - target.since
+        seconds = self._vehicle.now - target.set_at
         roll_rate, pitch_rate, yaw_rate = target.rates
         roll = self._limited("ROLL", target.roll + roll_rate * seconds)
         pitch = self._limited("PITCH", target.pitch + pitch_rate * seconds)
@@ -223,6 +223,7 @@ class ArduPilotGimbal:
     def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
         """Apply GIMBAL_MANAGER_FLAGS with angles or rates, which are NaN if not given. Return the MAV_RESULT."""
         from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
+        (_, pitch, yaw), (_, pitch_rate, yaw_rate) = angles, rates
         if flags & GimbalManagerFlags.RETRACT:
             self.set_mode(MavMountMode.RETRACT)
         elif flags & GimbalManagerFlags.NEUTRAL:
@@ -231,7 +232,7 @@ class ArduPilotGimbal:
             self.point(*angles, from_north=from_north)
         elif not any(map(math.isnan, rates)):
             self.turn(*rates, from_north=from_north)
-        elif all(map(math.isnan, (*angles[1:], *rates[1:]))):  # Neither pitch nor yaw is given: the yaw lock changes.
+        elif all(map(math.isnan, (pitch, yaw, pitch_rate, yaw_rate))):  # Only the yaw lock changes.
             self.is_yaw_locked = from_north
         else:
             return MavResult.FAILED

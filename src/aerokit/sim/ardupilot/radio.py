@@ -49,8 +49,8 @@ class ArduPilotRadio:
 
     def __getitem__(self, index: int) -> int:
         if index in self._overrides:
-            value, since = self._overrides[index]
-            if value and self._vehicle.now - since < self._override_time():
+            value, received_at = self._overrides[index]
+            if value and self._vehicle.now - received_at < self._override_time():
                 return value
         if index == RC_THROTTLE and self._failure == _LOW_THROTTLE:  # SIM_RC_FAIL simulates a receiver without signal.
             return _LOW_THROTTLE_PWM
@@ -76,7 +76,7 @@ class ArduPilotRadio:
         if not (vehicle.faults.rc_lost or self._failure == _NO_PULSES):
             return True
         expired_before = vehicle.now - self._override_time()
-        return any(value and since > expired_before for value, since in self._overrides.values())
+        return any(value and received_at > expired_before for value, received_at in self._overrides.values())
 
     def override(self, pulses: Mapping[int, int]) -> None:
         """Override channels for RC_OVERRIDE_TIME. ``pulses`` maps a channel index to µs; 0 releases the channel."""

@@ -91,7 +91,8 @@ def _acceleration(vehicle: ArduPilotVehicle) -> Three:
     """Return the acceleration that the accelerometers measure, in milli-g."""
     motion = vehicle.motion
     acceleration_down = 0.0 if vehicle.is_landed else motion.acceleration_down
-    x, y = 1000 * math.sin(motion.pitch), -1000 * math.sin(motion.roll)
+    x = 1000 * math.sin(motion.pitch)
+    y = -1000 * math.sin(motion.roll)
     return (_int16(x), _int16(y), _int16((-GRAVITY_M_S2 + acceleration_down) / GRAVITY_M_S2 * 1000))
 
 
@@ -150,6 +151,7 @@ _POSITION_ONLY = (
 _UNDEFINED_BITS = 0xF000
 # Spacing of the terrain grid in metres, and the offset in degrees from the vehicle to the corner of its terrain block.
 _GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
+_GRIDS_PER_BLOCK = 56  # The mask of TERRAIN_REQUEST has one bit for each grid of a block.
 _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which the vehicle stands.
 
 
@@ -217,19 +219,11 @@ def _home_position(vehicle: ArduPilotVehicle) -> m.HomePosition | None:
         return None
     place = vehicle.navigation.frame.to_global(*home)
     x, y, z = vehicle.navigation.local(home)
+    quaternion = (math.nan,) * 4  # as ArduPilot sends it
     return m.HomePosition(
-        latitude=place.latitude_e7,
-        longitude=place.longitude_e7,
-        altitude=round(place.altitude_m * 1000),
-        x=x,
-        y=y,
-        z=z,
-        q=(math.nan,) * 4,  # as ArduPilot sends it
-        approach_x=0.0,
-        approach_y=0.0,
-        approach_z=0.0,
-        time_usec=vehicle.time_boot_us,
-    )
+        latitude=place.latitude_e7, longitude=place.longitude_e7, altitude=round(place.altitude_m * 1000),
+        x=x, y=y, z=z, q=quaternion, approach_x=0.0, approach_y=0.0, approach_z=0.0, time_usec=vehicle.time_boot_us,
+    )  # fmt: skip
 
 
 def _global_origin(vehicle: ArduPilotVehicle) -> m.GpsGlobalOrigin | None:
@@ -293,11 +287,11 @@ def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
     place = vehicle.navigation.position
     if place is None:
         return m.TerrainReport(
-            lat=0, lon=0, spacing=_GRID_M, terrain_height=0.0, current_height=0.0, pending=56, loaded=0
+            lat=0, lon=0, spacing=_GRID_M, terrain_height=0.0, current_height=0.0, pending=_GRIDS_PER_BLOCK, loaded=0
         )
     return m.TerrainReport(
         lat=place.latitude_e7, lon=place.longitude_e7, spacing=0, terrain_height=0.0, current_height=place.altitude_m,
-        pending=0 if vehicle.KIND == "sub" else 504, loaded=0,
+        pending=0 if vehicle.KIND == "sub" else 9 * _GRIDS_PER_BLOCK, loaded=0,
     )  # fmt: skip
 
 
@@ -307,7 +301,8 @@ def _terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
     if place is None:
         return None
     south, west = (round(1e7 * degrees) for degrees in _GRID_CORNER)
-    return m.TerrainRequest(place.latitude_e7 - south, place.longitude_e7 - west, _GRID_M, (1 << 56) - 1)
+    all_grids = (1 << _GRIDS_PER_BLOCK) - 1
+    return m.TerrainRequest(place.latitude_e7 - south, place.longitude_e7 - west, _GRID_M, all_grids)
 
 
 def _rangefinder(vehicle: ArduPilotVehicle) -> m.Rangefinder | None:
@@ -341,9 +336,9 @@ MOTION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.Ahrs2.ID: _ahrs2,
     m.Simstate.ID: _simstate,
     m.VfrHud.ID: _vfr_hud,
-    m.RawImu.ID: lambda v: m.RawImu(v.time_boot_us, *_imu(v), 0, 3500),
-    m.ScaledImu.ID: lambda v: m.ScaledImu(v.time_boot_ms, *_imu(v), 3500),
-    m.ScaledImu2.ID: lambda v: m.ScaledImu2(v.time_boot_ms, *_imu(v), 3500),
+    m.RawImu.ID: lambda v: m.RawImu(v.time_boot_us, *_imu(v), id=0, temperature=3500),
+    m.ScaledImu.ID: lambda v: m.ScaledImu(v.time_boot_ms, *_imu(v), temperature=3500),
+    m.ScaledImu2.ID: lambda v: m.ScaledImu2(v.time_boot_ms, *_imu(v), temperature=3500),
     m.ScaledImu3.ID: lambda v: m.ScaledImu3(v.time_boot_ms, 0, 0, 0, 0, 0, 0, *_magnetic_field(v)),
     m.HighresImu.ID: _highres_imu,
     m.ScaledPressure.ID: lambda v: m.ScaledPressure(v.time_boot_ms, _pressure_hpa(v), 0.0, 2800, 0),

@@ -124,8 +124,8 @@ class PrecisionLanding:
         if self._search_began_at is None:
             self._search_began_at = px4.now
             self._search_count += 1
-        is_over = px4.now - self._search_began_at > limits["PLD_SRCH_TOUT"]
-        if is_over or self._search_count > limits["PLD_MAX_SRCH"]:
+        has_timed_out = px4.now - self._search_began_at > limits["PLD_SRCH_TOUT"]
+        if has_timed_out or self._search_count > limits["PLD_MAX_SRCH"]:
             px4.flight.descend()
             return
         _, _, home_down = px4.home

@@ -159,7 +159,8 @@ class Px4MissionServer(MissionServer):
         item = self.item(link.mission_type, seq)
         assert item is not None
         link.requested_at = self._px4.now
-        client, kind, is_current = link.client, link.mission_type, self._px4.mission.current == seq
+        client, kind = link.client, link.mission_type
+        is_current = self._px4.mission.current == seq
         downloaded = as_downloaded(item, as_int=link.uses_int)
         if link.uses_int:
             message: AnyItem = item_message_int(downloaded, seq, client, kind, current=is_current)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pkgutil
 from collections.abc import Callable, Sequence
-from typing import NoReturn
 
 from aerokit.errors import RemoteProtocolError
 from aerokit.mavlink.enums import MavSeverity
@@ -88,23 +87,24 @@ class _Writer(FileHandle):
         new_bytes = data[max(0, self._written - offset) :]  # A repeated write contains bytes that were received before.
         has_gap = offset > self._written
         if self._is_rejected or has_gap:
-            self._raise_rejected()
+            raise self._rejection()
         self._pending += new_bytes
         self._written += len(new_bytes)
         self._parse()
         if self._announced is not None:
             _, size = self._announced
             if self._written > size:
-                self._raise_rejected()
+                raise self._rejection()
 
     def close(self) -> None:
         is_complete = not self._pending and self._announced == (self._count, self._written)
         if self._is_rejected or not is_complete:
             raise FileFault(EINVAL)
 
-    def _raise_rejected(self) -> NoReturn:
+    def _rejection(self) -> FileFault:
+        """Return the error of an invalid upload. All later requests fail, too."""
         self._is_rejected = True
-        raise FileFault(EINVAL)
+        return FileFault(EINVAL)
 
     def _parse(self) -> None:
         """Apply the entries of which all bytes were received."""
@@ -113,7 +113,7 @@ class _Writer(FileHandle):
                 return
             magic, count, size = read_header(self._pending)
             if magic != MAGIC or size < HEADER.size:
-                self._raise_rejected()
+                raise self._rejection()
             self._announced = (count, size)
             self._pending = self._pending[HEADER.size :]
         while self._parse_row():
@@ -125,11 +125,11 @@ class _Writer(FileHandle):
         try:
             entry = read_entry(pending, 0, self._previous_name) if pending else None
         except RemoteProtocolError:
-            self._raise_rejected()
+            raise self._rejection() from None
         if entry is None:
             return False
         if entry.default is not None:
-            self._raise_rejected()
+            raise self._rejection()
         name = entry.name.decode("ascii", "replace")
         if name in self._parameters:
             self._apply(name, entry.value)

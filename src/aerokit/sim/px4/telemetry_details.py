@@ -51,7 +51,7 @@ def _flight_information(px4: Px4Vehicle) -> m.FlightInformation:
     armed_for = px4.now - px4.arming.armed_at
     armed_at_us = int((px4.unix_time - armed_for) * 1e6) if px4.is_armed else 0
     take_off_us = 0 if px4.is_landed else armed_at_us
-    return m.FlightInformation(px4.time_boot_ms, armed_at_us, take_off_us, 0)
+    return m.FlightInformation(px4.time_boot_ms, armed_at_us, take_off_us, flight_uuid=0)
 
 
 def _component_metadata(px4: Px4Vehicle) -> m.ComponentMetadata:
@@ -105,23 +105,13 @@ def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
         return None
     home = px4.frame.to_global(*px4.home)
     seconds = max(0, int(px4.unix_time) - _REMOTE_ID_EPOCH)
+    unknown_m = -1000.0
     return m.OpenDroneIdSystem(
-        target_system=0,
-        target_component=0,
-        id_or_mac=_BROADCAST_ID,
-        operator_location_type=0,
-        classification_type=0,
-        operator_latitude=home.latitude_e7,
-        operator_longitude=home.longitude_e7,
-        area_count=1,
-        area_radius=0,
-        area_ceiling=-1000.0,  # unknown, as is the floor
-        area_floor=-1000.0,
-        category_eu=0,
-        class_eu=0,
-        operator_altitude_geo=home.altitude_m,
-        timestamp=seconds,
-    )
+        target_system=0, target_component=0, id_or_mac=_BROADCAST_ID, operator_location_type=0, classification_type=0,
+        operator_latitude=home.latitude_e7, operator_longitude=home.longitude_e7, area_count=1, area_radius=0,
+        area_ceiling=unknown_m, area_floor=unknown_m, category_eu=0, class_eu=0,
+        operator_altitude_geo=home.altitude_m, timestamp=seconds,
+    )  # fmt: skip
 
 
 IDENTITY_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
@@ -156,8 +146,8 @@ def _pressure_hpa(px4: Px4Vehicle) -> float:
 
 
 def _scaled_pressure(px4: Px4Vehicle) -> m.ScaledPressure:
-    temperature = _SEA_LEVEL_C - _LAPSE_C_PER_M * _height(px4)
-    return m.ScaledPressure(px4.time_boot_ms, _pressure_hpa(px4), 0.0, round(temperature * 100), 0)
+    temperature = round(100 * (_SEA_LEVEL_C - _LAPSE_C_PER_M * _height(px4)))
+    return m.ScaledPressure(px4.time_boot_ms, _pressure_hpa(px4), press_diff=0.0, temperature=temperature)
 
 
 def _distance_sensor(px4: Px4Vehicle) -> m.DistanceSensor:
@@ -174,7 +164,8 @@ def _measured_acceleration(px4: Px4Vehicle) -> tuple[float, float, float]:
     """Return the acceleration that the accelerometers measure, in m/s² forward, right and down."""
     motion = px4.motion
     # At rest, accelerometers measure the force of the ground: 1 g upwards.
-    north, east, down = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down - GRAVITY_M_S2)
+    north, east = motion.acceleration_north, motion.acceleration_east
+    down = motion.acceleration_down - GRAVITY_M_S2
     cos_yaw, sin_yaw = math.cos(motion.yaw), math.sin(motion.yaw)
     forward = north * cos_yaw + east * sin_yaw
     right = east * cos_yaw - north * sin_yaw
