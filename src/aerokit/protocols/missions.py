@@ -78,7 +78,7 @@ RESULTS: dict[int, str] = {
 
 
 class MissionExchange(Transfer[ResultT]):
-    """A transfer with one component. Ignores messages to other systems and of other mission types.
+    """A transfer with one component. It ignores messages to other systems and of other mission types.
 
     Errors contain the program's indices, which are the indices in the messages minus ``offset``.
     """

@@ -235,8 +235,8 @@ class SimulatedAutopilot(SimulatedVehicle):
 
 
 _RESTING_CELL_VOLTS = ((0.0, 3.0), (5.0, 3.3), (20.0, 3.6), (50.0, 3.75), (75.0, 3.95), (100.0, 4.2))
-# Sections of the resting voltage between two of these points, from full to empty: percent and volts at the lower end,
-# and the slope in volts per percent.
+# The lines between two of these points, from full to empty. Each is given by percent and volts at its lower end, and by
+# its slope in volts per percent.
 _RESTING_CELL_SLOPES = tuple(
     (low, volts, (high_volts - volts) / (high - low))
     for (low, volts), (high, high_volts) in pairwise(_RESTING_CELL_VOLTS)

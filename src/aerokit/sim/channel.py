@@ -266,7 +266,7 @@ class Channel:
         return datagrams(self.take_pieces())
 
     def reset(self) -> None:
-        """Reset stream rates, partial frames and sequence numbers because of a reboot. The outbox stays."""
+        """Reset stream rates, partial frames and sequence numbers because of a reboot. The outbox is kept."""
         self.streams = Streams()
         self.reader = MessageReader(self._wanted)
         self._encoders.clear()

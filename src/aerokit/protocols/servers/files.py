@@ -152,7 +152,7 @@ class _File:
 
     @property
     def size(self) -> int:
-        """Size in bytes. If the size was given, the content is not created only to determine the size."""
+        """Size in bytes. A size that was given is returned without creating the content."""
         if self._make_content is not None and self._size is not None:
             return self._size
         return len(self.content)

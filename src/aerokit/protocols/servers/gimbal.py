@@ -134,7 +134,7 @@ def _flags(gimbal: GimbalMount) -> int:
 
 
 def _attitude_status(gimbal: GimbalMount) -> m.GimbalDeviceAttitudeStatus:
-    """Return the attitude of the gimbal, to all (0). Its yaw is from north if it is locked, else from the nose."""
+    """Return the attitude as a broadcast. The yaw is relative to north if it is locked, otherwise to the nose."""
     is_from_north = gimbal.is_yaw_locked
     angles = gimbal.angles_from_north() if is_from_north else gimbal.angles()
     return m.GimbalDeviceAttitudeStatus(

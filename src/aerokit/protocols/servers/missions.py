@@ -178,7 +178,7 @@ class MissionServer:
         return items[seq] if 0 <= seq < len(items) else _R.INVALID_SEQUENCE
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
-        """Return the item as MISSION_ITEM_INT or MISSION_ITEM, like the request."""
+        """Return the item as MISSION_ITEM_INT or MISSION_ITEM, whichever was requested."""
         seq, kind = request.seq, request.mission_type
         system, component = sender_of(request)
         current = seq == self.current and kind == MavMissionType.MISSION
