@@ -332,4 +332,5 @@ class StaleAnswerFilter:
             self._round_trip.add_sample(elapsed_s)
         early_requests = self._early.setdefault(name, set())
         early_requests.add(sent_at)
-        return len(early_requests) <= MAX_EARLY_ANSWERS
+        has_become_faster = len(early_requests) > MAX_EARLY_ANSWERS
+        return not has_become_faster

@@ -118,6 +118,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             self._window.request(index)
 
     def _conclude(self) -> None:
+        """Finish, if all values are known and none is stale. Stale values are requested again."""
         if self._is_streaming or self._count is None:
             return
         if len(self._received) >= self._count and not self._missing():

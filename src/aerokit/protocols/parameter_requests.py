@@ -236,6 +236,7 @@ class ParameterWrites(ParameterRequests):
         return [write]
 
     def _on_value(self, message: ParamValue, now: float) -> None:
+        """Accept the reported value as the result, or request it again, because it may be old or unintended."""
         name = message.param_id
         if not self._window.attempts(name):
             return  # This answers another station, because our write of this name was not sent yet.

@@ -334,6 +334,7 @@ class Motion:
         )
 
     def _integrate(self, north: float, east: float, down: float, dt: float) -> None:
+        """Accelerate for ``dt`` seconds. On the ground, the vehicle stops."""
         self.acceleration_north = north
         self.acceleration_east = east
         self.acceleration_down = down
@@ -353,6 +354,7 @@ class Motion:
             self.velocity_down = 0.0
 
     def _lean(self, north: float, east: float, dt: float, *, powered: bool) -> None:
+        """Lean in the direction of the acceleration. Without power, or on the ground, become level."""
         roll = pitch = 0.0
         if powered and not self.is_on_ground:
             # The copter also leans against its drag.

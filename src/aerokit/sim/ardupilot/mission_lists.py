@@ -195,8 +195,8 @@ def _stored_rally_point(item: MissionItem) -> MissionItem | int:
     frame = altitude_frame(item.frame)
     if frame is None or item.frame == MavFrame.MISSION:
         return MavMissionResult.UNSUPPORTED_FRAME
-    place, height = (int(item.x), int(item.y)), float32(int(item.z))
-    return MissionItem(item.command, frame, 0.0, 0.0, 0.0, 0.0, *place, height, autocontinue=False)
+    height = float32(int(item.z))
+    return MissionItem(item.command, frame, x=int(item.x), y=int(item.y), z=height, autocontinue=False)
 
 
 _POLYGONS = (Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)

@@ -109,6 +109,7 @@ class PlaneLanding:
         wing.fly_to(*start, airspeed=self._plane.cruise_m_s)
 
     def _approach(self) -> None:
+        """Descend along the line from the start of the approach to the landing point, and flare above the ground."""
         plane, wing = self._plane, self._plane.wing
         north, east, down = self.point
         start_north, start_east, start_down = self._approach_start

@@ -254,7 +254,7 @@ def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
     # Number of received telemetry packets. The field has 16 bits.
     counts = per_motor(int(vehicle.uptime * _ESC_PACKETS_PER_S) & 0xFFFF)
     temperatures = bytes(per_motor(_ESC_TEMPERATURE_C))
-    return m.EscTelemetry1To4(temperatures, voltages, currents, (0,) * 4, rpms, counts)
+    return m.EscTelemetry1To4(temperatures, voltages, currents, totalcurrent=(0,) * 4, rpm=rpms, count=counts)
 
 
 def _autopilot_version(vehicle: ArduPilotVehicle) -> m.AutopilotVersion:

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
     from aerokit.sim.vehicle import SimulatedVehicle
 
-# Sizes of the data fields of SERIAL_CONTROL and of LOGGING_DATA, in bytes.
-_PIECE, _DATA = 70, 249
+# Sizes of the fields `data` of SERIAL_CONTROL and LOGGING_DATA.
+_SERIAL_BYTES, _LOGGING_BYTES = 70, 249
 _STEP_S, _MAX_TRIES = 0.05, 50
 _DEFINITION_BLOCKS = 2
 _HEADER = b"ULog\x01\x12\x35\x01" + bytes(8)
@@ -41,12 +41,12 @@ class Px4Shell:
         line = self._line
         self._line = b""
         output = line + self._output(line.decode(errors="replace").strip()) + b"pxh> "
-        for start in range(0, len(output), _PIECE):
-            piece = output[start : start + _PIECE]
+        for start in range(0, len(output), _SERIAL_BYTES):
+            piece = output[start : start + _SERIAL_BYTES]
             target_system, target_component = sender_of(message)
             reply = m.SerialControl(
                 device=SerialControlDev.DEV_SHELL, flags=SerialControlFlag.REPLY, timeout=0, baudrate=0,
-                count=len(piece), data=piece.ljust(_PIECE, b"\0"), target_system=target_system,
+                count=len(piece), data=piece.ljust(_SERIAL_BYTES, b"\0"), target_system=target_system,
                 target_component=target_component,
             )  # fmt: skip
             self._px4.send(reply, channel)
@@ -96,18 +96,20 @@ class Px4LogStream:
         return self._acknowledged < _DEFINITION_BLOCKS
 
     def _run(self) -> None:
+        """Send the next block, or repeat a definition block that was not acknowledged."""
         if self._station is None:
             return
         self._tries += 1
         if self._tries > _MAX_TRIES and self._sends_definitions:
             self._station = None
             return
+        # Each block contains two text messages, and the first block begins with the header of the file.
         message_class = m.LoggingDataAcked if self._sends_definitions else m.LoggingData
         header = _HEADER if self._acknowledged == 0 else b""
         data = header + b"".join(_ulog_message(number) for number in range(2))
         sequence = self._sequence & 0xFFFF
         first_message_offset = len(header)
-        padded = data.ljust(_DATA, b"\0")
+        padded = data.ljust(_LOGGING_BYTES, b"\0")
         block = message_class(*self._station, sequence, len(data), first_message_offset, padded)
         self._px4.send(block, self._channel)
         if not self._sends_definitions:  # A definition block keeps its number until it is acknowledged.

@@ -106,29 +106,29 @@ class PrecisionLanding:
         self._search_count = 0
 
     def update(self) -> None:
-        px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
+        px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
         target = px4.external.target
-        if target is None or self._search_count > limits["PLD_MAX_SRCH"]:
+        if target is None or self._search_count > parameters["PLD_MAX_SRCH"]:
             self._search()
             return
         self._search_began_at = None
         target_north, target_east = target
         north, east = target_north - motion.north, target_east - motion.east
         # The vehicle never is exactly above the target, so a minimum tolerance replaces a parameter of 0.
-        is_above = math.hypot(north, east) <= max(limits["PLD_HACC_RAD"], _MIN_TOLERANCE_M)
+        is_above = math.hypot(north, east) <= max(parameters["PLD_HACC_RAD"], _MIN_TOLERANCE_M)
         descent = px4.flight.descent_speed_m_s if is_above else 0.0
         motion.seek_velocity(*velocity_to_landing_target(north, east), descent)
 
     def _search(self) -> None:
-        px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
+        px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
         if self._search_began_at is None:
             self._search_began_at = px4.now
             self._search_count += 1
-        has_timed_out = px4.now - self._search_began_at > limits["PLD_SRCH_TOUT"]
-        if has_timed_out or self._search_count > limits["PLD_MAX_SRCH"]:
+        has_timed_out = px4.now - self._search_began_at > parameters["PLD_SRCH_TOUT"]
+        if has_timed_out or self._search_count > parameters["PLD_MAX_SRCH"]:
             px4.flight.descend()
             return
         _, _, home_down = px4.home
-        search_down = home_down - limits["PLD_SRCH_ALT"]
+        search_down = home_down - parameters["PLD_SRCH_ALT"]
         # Search from above: hold the place, and climb to the search altitude.
         motion.seek_position(motion.north, motion.east, search_down, speed=1.0, climb=2.0, descent=1.0)

@@ -75,29 +75,17 @@ def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
         return None
     motion = px4.motion
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
-    # The course in hundredths of a degree, rounded to whole degrees. Rounding may give 360, which is 0.
-    course = round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0) % 360 * 100
+    course_deg = math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0
+    direction = 100 * (round(course_deg) % 360)  # Hundredths of a degree. Rounding may give 360 degrees, which is 0.
+    unknown_time = 65535.0
     return m.OpenDroneIdLocation(
-        target_system=0,
-        target_component=0,
-        id_or_mac=_BROADCAST_ID,
-        status=MavOdidStatus.GROUND if px4.is_landed else MavOdidStatus.AIRBORNE,
-        direction=course,
-        speed_horizontal=round(motion.ground_speed_m_s * 100),
-        speed_vertical=round(-motion.velocity_down * 100),
-        latitude=place.latitude_e7,
-        longitude=place.longitude_e7,
-        altitude_barometric=place.altitude_m,
-        altitude_geodetic=place.altitude_m,
-        height_reference=0,
-        height=px4.altitude_m,
-        horizontal_accuracy=12,
-        vertical_accuracy=5,
-        barometer_accuracy=0,
-        speed_accuracy=3,
-        timestamp=65535.0,  # unknown
-        timestamp_accuracy=0,
-    )
+        target_system=0, target_component=0, id_or_mac=_BROADCAST_ID,
+        status=MavOdidStatus.GROUND if px4.is_landed else MavOdidStatus.AIRBORNE, direction=direction,
+        speed_horizontal=round(motion.ground_speed_m_s * 100), speed_vertical=round(-motion.velocity_down * 100),
+        latitude=place.latitude_e7, longitude=place.longitude_e7, altitude_barometric=place.altitude_m,
+        altitude_geodetic=place.altitude_m, height_reference=0, height=px4.altitude_m, horizontal_accuracy=12,
+        vertical_accuracy=5, barometer_accuracy=0, speed_accuracy=3, timestamp=unknown_time, timestamp_accuracy=0,
+    )  # fmt: skip
 
 
 def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
