@@ -296,6 +296,7 @@ class PlaneGuided(PlaneNavigatingMode):
             self._throttle = _TimedValue(max(0.0, min(1.0, message.thrust)), now)
 
     def update(self, dt: float) -> None:
+        """Follow the latest attitude or course that was commanded. Without one, circle the target."""
         wing, now = self.vehicle.wing, self.vehicle.now
         has_bank, has_pitch, has_throttle = (
             now - target.received_at < _ATTITUDE_TIMEOUT_S for target in (self._bank, self._pitch, self._throttle)
