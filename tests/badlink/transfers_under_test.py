@@ -18,7 +18,7 @@ from aerokit.missions.compare import ItemStorage
 from aerokit.position import Position
 from aerokit.sim import SimulatedCopter
 from aerokit.sim.logs import SimulatedLog
-from aerokit.sim.parameters import stored
+from aerokit.sim.parameters import stored_value
 from aerokit.vehicle.files.logs import LogMethod
 
 REAL32 = 9
@@ -112,7 +112,7 @@ def check_parameters(table: Any, copter: SimulatedCopter, sizes: Sizes) -> None:
 def changes(copter: SimulatedCopter, sizes: Sizes) -> dict[str, float]:
     """Values other than the vehicle's, for parameters that take any."""
     names = [name for name in copter.parameters if copter.parameters.type(name) == REAL32]
-    return {name: stored(copter.parameters[name] + 0.5, REAL32) for name in names[: sizes.writes]}
+    return {name: stored_value(copter.parameters[name] + 0.5, REAL32) for name in names[: sizes.writes]}
 
 
 async def set_many(program: Program, sizes: Sizes) -> Any:

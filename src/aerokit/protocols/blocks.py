@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
 
-# Answers arrive in the order of the requests. A request therefore counts as lost once the answer to a request that was
-# sent this many places later has arrived.
+# Answers arrive in the order of the requests. A request counts as lost if the answered request was sent this many
+# transmissions after it.
 OVERTAKEN = 3
 
 # ArduPilot queues at most five requests, processes one every 2 ms, and drops further requests.
@@ -24,6 +24,15 @@ MIN_ROUND_TRIP_FRACTION = 0.5
 # Requests back off after this many consecutive timeouts. Fewer mean nothing, because radios lose single frames.
 TIMEOUTS_BEFORE_BACKOFF = 3
 
+# An answer is fast if it takes at most FAST_FACTOR times the fastest answer plus FAST_MARGIN_S.
+FAST_FACTOR, FAST_MARGIN_S = 1.25, 0.01
+# An answer has waited in a queue if it takes longer than QUEUED_FACTOR times the fastest answer plus QUEUED_MARGIN_S.
+QUEUED_FACTOR, QUEUED_MARGIN_S = 2.0, 0.05
+# A fast answer widens the window by WIDENING requests, a queued answer narrows it by NARROWING.
+WIDENING, NARROWING = 0.5, 0.25
+# Weight of each request in the average loss, and the average loss above which the window is halved.
+LOSS_WEIGHT, MAX_LOSS = 1 / 16, 0.75
+
 
 class AdaptiveWindow:
     """Limits the number of requests in flight to what the link carries without delaying the answers.
@@ -37,7 +46,7 @@ class AdaptiveWindow:
         self._size = float(start)
         self._min_size, self._max_size = min_size, max_size
         self._fastest_s: float | None = None
-        self._loss = 0.0  # fraction of lost requests, averaged over about the last 16 requests
+        self._loss = 0.0  # average fraction of lost requests
 
     @property
     def size(self) -> int:
@@ -53,30 +62,31 @@ class AdaptiveWindow:
 
         ``seconds`` is the time since its request; None if the answer may be to one of several transmissions.
         """
-        self._loss -= self._loss / 16  # an average, to which an answer adds 0 and a lost request 1
+        self._loss -= LOSS_WEIGHT * self._loss  # The average moves towards 0 with an answer, towards 1 with a loss.
         if seconds is None:
             return
         if self._fastest_s is None or seconds < self._fastest_s:
             self._fastest_s = seconds
-        # An answer that takes much longer than the fastest one has waited in a queue.
-        if seconds <= 1.25 * self._fastest_s + 0.01:
-            self._size = min(self._max_size, self._size + 0.5)
-        elif seconds > 2.0 * self._fastest_s + 0.05:
-            self._size = max(self._min_size, self._size - 0.25)
+        if seconds <= FAST_FACTOR * self._fastest_s + FAST_MARGIN_S:
+            self._size = min(self._max_size, self._size + WIDENING)
+        elif seconds > QUEUED_FACTOR * self._fastest_s + QUEUED_MARGIN_S:
+            self._size = max(self._min_size, self._size - NARROWING)
 
     def on_loss(self) -> None:
         """Record a request without an answer."""
-        self._loss += (1.0 - self._loss) / 16
-        if self._loss > 0.75:
+        self._loss += LOSS_WEIGHT * (1.0 - self._loss)
+        if self._loss > MAX_LOSS:
             self._size = max(self._min_size, self._size / 2)
-            self._loss = 0.5  # The average starts again below the limit, so only further losses halve the size again.
+            self._loss = 0.5  # Below the limit, so that only further losses halve the size again.
 
 
 class _Block:
-    __slots__ = ("attempts", "number", "previous_sent_at", "sent_at")
+    """Transmissions of the request for one block; ``last_number`` is the number of the latest one."""
+
+    __slots__ = ("attempts", "last_number", "previous_sent_at", "sent_at")
 
     def __init__(self) -> None:
-        self.attempts = self.number = 0
+        self.attempts = self.last_number = 0
         self.previous_sent_at = self.sent_at = 0.0
 
 
@@ -89,7 +99,9 @@ class BlockRequests:
 
     def __init__(self, round_trip: RoundTrip, *, burst_size: int = BURST_SIZE, spacing_s: float = SPACING_S) -> None:
         self.window: AdaptiveWindow = AdaptiveWindow()
-        self._round_trip, self._burst_size, self._spacing_s = round_trip, burst_size, spacing_s
+        self._round_trip = round_trip
+        self._burst_size = burst_size
+        self._spacing_s = spacing_s
         self._waiting: dict[int, None] = {}
         self._in_flight: dict[int, _Block] = {}  # in the order in which they were sent
         self._blocks: dict[int, _Block] = {}
@@ -147,7 +159,7 @@ class BlockRequests:
         self._round_trip.add_sample(now - sent_at)
         self.window.on_answer(now - sent_at)
         if block.attempts == 1:
-            self._requeue_overtaken(block.number)
+            self._requeue_overtaken(block.last_number)
 
     def _sent_at_of_answer(self, block: _Block, now: float) -> float | None:
         """Return the time of the transmission that was answered; None if it may be one of several."""
@@ -158,7 +170,10 @@ class BlockRequests:
         return block.previous_sent_at if is_too_early else None
 
     def take_due(self, now: float, *, limit: int | None = None) -> list[int]:
-        """Return the offsets to request now, retries first, and count them as sent. The window is at most ``limit``."""
+        """Return the offsets to request now, retries first, and count them as sent.
+
+        ``limit`` reduces the number of requests in flight.
+        """
         overdue = [offset for offset, block in self._in_flight.items() if self._due_at(block) <= now]
         self._requeue(overdue)
         if overdue:
@@ -186,13 +201,16 @@ class BlockRequests:
         self._sent_count += 1
         block = self._blocks.setdefault(offset, _Block())
         block.attempts += 1
-        block.number, block.previous_sent_at, block.sent_at = self._sent_count, block.sent_at, now
+        block.last_number = self._sent_count
+        block.previous_sent_at = block.sent_at
+        block.sent_at = now
         self._in_flight[offset] = block
 
     def _requeue_overtaken(self, number: int) -> None:
+        """Repeat the requests that were sent long before transmission ``number``, which was answered first."""
         overtaken = []
         for offset, block in self._in_flight.items():
-            if block.number > number - OVERTAKEN:
+            if block.last_number > number - OVERTAKEN:
                 break
             overtaken.append(offset)
         self._requeue(overtaken)
@@ -282,8 +300,8 @@ class Reassembly:
         ranges: list[tuple[int, int]] = []
         for offset in self.gaps:
             length = self.block_size if self.end is None else min(self.block_size, self.end - offset)
-            start, size_so_far = ranges[-1] if ranges else (0, 0)
-            if ranges and start + size_so_far == offset:
+            if ranges and sum(ranges[-1]) == offset:  # The block follows the last range.
+                start, size_so_far = ranges[-1]
                 ranges[-1] = (start, size_so_far + length)
             else:
                 ranges.append((offset, length))

@@ -31,14 +31,14 @@ __all__ = [
 MAX_ATTEMPTS = 4
 """Maximum number of transmissions of a command that may be repeated."""
 
-_ARM, _RELATIVE, _STEP = (0, 1.0), (3, 1.0), (0, 0.0)
+# Conditions in UNREPEATABLE_COMMANDS: index and value of a parameter.
+_PARAM1_IS_0, _PARAM1_IS_1, _PARAM1_IS_2, _PARAM4_IS_1 = (0, 0.0), (0, 1.0), (0, 2.0), (3, 1.0)
 
-# Commands of which a repetition has a further effect. Maps MAV_CMD to (effect, condition). The condition is a parameter
-# (index, value) with which a repetition has the effect; None means that every repetition has it. docs/reliability.md
-# has the same table.
+# Commands whose repetition has a further effect. Maps MAV_CMD to (effect, condition). If the condition is None, every
+# repetition has the effect. docs/reliability.md has the same table.
 UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
-    MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _ARM),
-    MavCmd.CONDITION_YAW: ("turns by the same angle again", _RELATIVE),
+    MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _PARAM1_IS_1),
+    MavCmd.CONDITION_YAW: ("turns by the same angle again", _PARAM4_IS_1),
     MavCmd.DO_REPEAT_RELAY: ("cycles the relay again", None),
     MavCmd.DO_REPEAT_SERVO: ("cycles the servo again", None),
     MavCmd.DO_DIGICAM_CONTROL: ("takes another picture, zooms another step", None),
@@ -54,15 +54,15 @@ UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.DO_FLIGHTTERMINATION: ("stops the motors of a flight that began meanwhile", None),
     MavCmd.START_RX_PAIR: ("starts pairing again", None),
     MavCmd.STORAGE_FORMAT: ("erases what was stored meanwhile", None),
-    MavCmd.SET_CAMERA_ZOOM: ("zooms another step", _STEP),
-    MavCmd.SET_CAMERA_FOCUS: ("focuses another step", _STEP),
+    MavCmd.SET_CAMERA_ZOOM: ("zooms another step", _PARAM1_IS_0),
+    MavCmd.SET_CAMERA_FOCUS: ("focuses another step", _PARAM1_IS_0),
     MavCmd.IMAGE_START_CAPTURE: ("takes another picture, or starts another series", None),
     MavCmd.VIDEO_START_CAPTURE: ("starts another file", None),
     MavCmd.LOGGING_START: ("starts another log", None),
     MavCmd.DO_START_MAG_CAL: ("calibrates again", None),
     MavCmd.FIXED_MAG_CAL_YAW: ("calibrates again", None),
     MavCmd.DO_GRIPPER: ("moves a gripper that another station has moved meanwhile", None),
-    MavCmd.DO_PARACHUTE: ("releases a parachute that was disabled meanwhile", (0, 2.0)),
+    MavCmd.DO_PARACHUTE: ("releases a parachute that was disabled meanwhile", _PARAM1_IS_2),
     MavCmd.INJECT_FAILURE: ("injects a failure again that was ended meanwhile", None),
     MavCmd.DO_WINCH: ("pays out the same length again", None),
     MavCmd.FLASH_BOOTLOADER: ("writes the bootloader again", None),
@@ -77,7 +77,7 @@ def max_attempts(command: int, params: Sequence[float]) -> int:
     _, condition = UNREPEATABLE_COMMANDS[command]
     if condition is None:
         return 1
-    index, value = condition  # A repetition has a further effect only if this parameter has this value.
+    index, value = condition
     return 1 if params[index] == value else MAX_ATTEMPTS
 
 
@@ -185,7 +185,7 @@ class CommandExchange(Exchange[CommandAck]):
         acks_per_sending: number of acknowledgements that the vehicle sends for each transmission; the first one counts.
         min_timeout_s: lower limit of ``attempt_timeout``, for slow links.
         order_status: the state of the order; None for a request.
-        is_sent: True if the command was already sent, just before :meth:`start`.
+        is_sent: True if the caller itself makes the first transmission. The exchange then only repeats the command.
 
     Raises from ``result()``:
         CommandRejected: the result is neither ACCEPTED nor IN_PROGRESS. The caller adds status texts of the vehicle.
@@ -292,16 +292,16 @@ class CommandExchange(Exchange[CommandAck]):
             self._fail(CommandTimeout(self._timeout_text(now)))
 
     def _expire_order(self, order_status: OrderStatus, now: float) -> None:
-        give_up_at = self._started_at + self._attempts * self._attempt_timeout
+        """Repeat an order if a new HEARTBEAT allows it; fail if the order has ended or its time is over."""
         if order_status.end:
             self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {order_status.end}"))
             return
-        # If the last HEARTBEAT is not older than this, the link to the vehicle works, so the order may be repeated.
-        min_heartbeat_at = self._sent_at + MIN_RESEND_FRACTION * self._attempt_timeout
-        min_heartbeat_at = max(min_heartbeat_at, now - MAX_HEARTBEAT_AGE_S)
+        # A HEARTBEAT after this time shows that the link to the vehicle works, so the order may be repeated.
+        min_heartbeat_at = max(self._sent_at + MIN_RESEND_FRACTION * self._attempt_timeout, now - MAX_HEARTBEAT_AGE_S)
         if self._sent_count < self._attempts and order_status.heartbeat_at >= min_heartbeat_at:
             self._send(now)
             return
+        give_up_at = self._started_at + self._attempts * self._attempt_timeout
         if now >= give_up_at:
             self._fail(CommandTimeout(self._timeout_text(now) + self._why_not_repeated()))
         else:
@@ -320,7 +320,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._sent_count += 1
         self._sent_at = now
         wait_s = self._attempt_timeout
-        # For an order, the deadline is earlier, to check for a HEARTBEAT and whether the order has ended.
+        # The deadline of an order is earlier, because the order then checks for a HEARTBEAT and for its own end.
         if self._order_status is not None:
             wait_s = min(MIN_RESEND_FRACTION * wait_s, ATTEMPT_TIMEOUT_S)
         self.deadline = now + wait_s
@@ -336,7 +336,8 @@ class CommandExchange(Exchange[CommandAck]):
     def _is_ours(self, ack: CommandAck) -> bool:
         # In MAVLink 1, and from old firmware, an acknowledgement has no target fields, which then count as 0 (all).
         own_system, own_component = self._own_ids
-        frame, component = ack.received_frame, self._message.target_component
+        component = self._message.target_component
+        frame = ack.received_frame
         return (
             ack.command == self._message.command
             and (frame is None or component in (BROADCAST, frame.component_id))
@@ -351,11 +352,11 @@ class CommandExchange(Exchange[CommandAck]):
             self._on_progress(ack.progress if 0 < ack.progress <= 100 else None)
 
     def _timeout_text(self, now: float) -> str:
-        name, seconds = command_name(self._message.command), now - self._started_at
+        name = command_name(self._message.command)
         if self._in_progress:
             return f"{name} was in progress, then no COMMAND_ACK for {self._progress_timeout:g} s"
         times = "once" if self._sent_count == 1 else f"{self._sent_count} times"
-        return f"no COMMAND_ACK for {name}, sent {times} within {seconds:.1f} s"
+        return f"no COMMAND_ACK for {name}, sent {times} within {now - self._started_at:.1f} s"
 
 
 def _params_of(message: CommandLong | CommandInt) -> tuple[float, ...]:

@@ -72,8 +72,9 @@ class Exchange(ABC, Generic[ResultT]):
 
     def take_outbox(self) -> list[Message]:
         """Return the messages to send now, and clear the outbox."""
-        outbox, self._outbox = self._outbox, []
-        return outbox
+        messages = self._outbox
+        self._outbox = []
+        return messages
 
     def result(self) -> ResultT:
         """Return the result, or raise the error with which the exchange ended. Call it only when ``done`` is True."""
@@ -85,7 +86,9 @@ class Exchange(ABC, Generic[ResultT]):
 
     def _finish(self, result: ResultT) -> None:
         if not self.done:
-            self._result, self.done, self.deadline = result, True, None
+            self._result = result
+            self.done = True
+            self.deadline = None
 
     def _fail(self, error: Exception) -> None:
         if not self.done:
@@ -96,9 +99,10 @@ class Exchange(ABC, Generic[ResultT]):
 
 # The smoothing factors of TCP for the round trip and its deviation (RFC 6298).
 GAIN, DEVIATION_GAIN = 1 / 8, 1 / 4
+# A time-out is the smoothed round trip plus this many deviations, as in TCP.
 DEVIATIONS = 4.0
 
-# Minimum jitter of answers, which is due to the vehicle's main loop and the resolution of the clock.
+# Minimum jitter of answers, caused by the vehicle's main loop and the resolution of the clock.
 JITTER_S = 0.03
 
 BACKOFF = 1.5  # From the third attempt on, each attempt waits longer than the previous one by this factor.
@@ -126,29 +130,30 @@ class RoundTrip:
         """Record the time from a request that was sent once to its answer."""
         self.fastest_s = seconds if self.fastest_s is None else min(self.fastest_s, seconds)
         if self.smoothed_s is None:
-            self.smoothed_s, self._deviation_s = seconds, seconds / 2
+            self.smoothed_s = seconds
+            self._deviation_s = seconds / 2
             return
         self._deviation_s += DEVIATION_GAIN * (abs(seconds - self.smoothed_s) - self._deviation_s)
         self.smoothed_s += GAIN * (seconds - self.smoothed_s)
 
     def timeout_s(self, attempt: int = 1) -> float:
-        """Seconds to wait for an answer after transmission number ``attempt`` (from 1), before the next retry.
+        """Return the seconds to wait for an answer to transmission number ``attempt`` (from 1) before the next retry.
 
         The second attempt waits as long as the first, because radios lose single frames. Later attempts back off,
         because the link may be congested or down.
         """
         if self.smoothed_s is None:
-            first_s = min(1.0, self._max_s)
+            first_timeout_s = min(1.0, self._max_s)
         else:
-            first_s = self.smoothed_s + max(DEVIATIONS * self._deviation_s, JITTER_S)
+            first_timeout_s = self.smoothed_s + max(DEVIATIONS * self._deviation_s, JITTER_S)
         backoffs = min(max(0, attempt - 2), MAX_BACKOFFS)
-        backed_off_s = max(first_s, self._min_s) * BACKOFF**backoffs
+        backed_off_s = max(first_timeout_s, self._min_s) * BACKOFF**backoffs
         # The maximum must not be shorter than a slow link needs for a normal answer.
-        return min(backed_off_s, max(self._max_s, first_s))
+        return min(backed_off_s, max(self._max_s, first_timeout_s))
 
 
-# If no message arrives in the time of this many messages, the vehicle has stopped sending, because radios hardly ever
-# lose so many in a row.
+# If nothing arrives in the time in which the vehicle sends this many messages, it has stopped sending. Radios hardly
+# ever lose so many in a row.
 SILENT_MESSAGES = 10
 
 
@@ -161,8 +166,8 @@ class MessageStream:
     def __init__(self, round_trip: RoundTrip) -> None:
         self._round_trip = round_trip
         self._interval = RoundTrip(min_s=0.001)
-        self._received_at: float | None = None  # time of the last message after the request; None if there was none
-        self._last_at = 0.0  # time of the request or of the last message after it
+        self._has_started = False  # True once a message has followed the request
+        self._last_at = 0.0  # time of the request, or of the last message after it
         self.failures: int = 0
         """Number of consecutive requests that no message followed. The owner of this object counts them."""
 
@@ -175,24 +180,28 @@ class MessageStream:
     def due_at(self) -> float:
         """Deadline for the next message.
 
-        If it passes, the stream counts as ended; before the first message, it counts as not started.
+        If it passes, the stream has ended or, before the first message, has not started.
         """
+        # The first failures do not lengthen the wait, because radios lose single requests.
         silence_s = self._round_trip.timeout_s(max(1, self.failures - 1))
-        if self._received_at is not None and self._interval.smoothed_s is not None:
+        if self._has_started and self._interval.smoothed_s is not None:
             silence_s += max(SILENT_MESSAGES * self._interval.smoothed_s, self._interval.timeout_s())
         return self._last_at + silence_s
 
     def on_request(self, now: float) -> None:
         """Record that the request for the stream is sent now."""
-        self._last_at, self._received_at = now, None
+        self._last_at = now
+        self._has_started = False
 
     def on_message(self, now: float, messages: int) -> None:
-        """Record a message of the stream. It comes ``messages`` places after the previous one, so 1 means no loss."""
-        if self._received_at is not None and messages > 0:
-            self._interval.add_sample((now - self._received_at) / messages)
-        elif self._received_at is None and self.failures == 0:  # The first message answers the only request.
-            self._round_trip.add_sample(now - self._last_at)
-        self._last_at = self._received_at = now
+        """Record a message. ``messages`` counts it and the lost messages right before it, so 1 means no loss."""
+        elapsed_s = now - self._last_at
+        if self._has_started and messages > 0:
+            self._interval.add_sample(elapsed_s / messages)
+        elif not self._has_started and self.failures == 0:  # The first message answers the only request.
+            self._round_trip.add_sample(elapsed_s)
+        self._last_at = now
+        self._has_started = True
         self.failures = 0
 
 
@@ -225,13 +234,14 @@ _MAX_RANGES = 10
 
 def format_ranges(numbers: Iterable[int]) -> str:
     """Format numbers as ranges: ``3, 7–12``. After ten ranges, the text only says how many more there are."""
-    ranges: list[tuple[int, int]] = []  # (first, last)
+    ranges: list[range] = []
     for number in sorted(numbers):
-        if ranges and number == ranges[-1][1] + 1:
-            ranges[-1] = (ranges[-1][0], number)
+        if ranges and number == ranges[-1].stop:
+            ranges[-1] = range(ranges[-1].start, number + 1)
         else:
-            ranges.append((number, number))
-    text = ", ".join(str(first) if first == last else f"{first}–{last}" for first, last in ranges[:_MAX_RANGES])
+            ranges.append(range(number, number + 1))
+    shown = ranges[:_MAX_RANGES]
+    text = ", ".join(f"{run.start}" if len(run) == 1 else f"{run.start}–{run.stop - 1}" for run in shown)
     omitted = len(ranges) - _MAX_RANGES
     return f"{text} and {omitted} more ranges" if omitted > 0 else text
 
@@ -322,4 +332,5 @@ class StaleAnswerFilter:
             self._round_trip.add_sample(elapsed_s)
         early_requests = self._early.setdefault(name, set())
         early_requests.add(sent_at)
-        return len(early_requests) <= MAX_EARLY_ANSWERS
+        has_become_faster = len(early_requests) > MAX_EARLY_ANSWERS
+        return not has_become_faster

@@ -7,13 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.errors import ParameterRejected, ParameterTimeout
 from aerokit.mavlink.enums import ParamAck
-from aerokit.mavlink.messages import (
-    ParamExtAck,
-    ParamExtRequestList,
-    ParamExtRequestRead,
-    ParamExtSet,
-    ParamExtValue,
-)
+from aerokit.mavlink.messages import ParamExtAck, ParamExtRequestList, ParamExtRequestRead, ParamExtSet, ParamExtValue
 from aerokit.parameters.parameter import MAX_PARAMETERS, Setting, setting_bytes, setting_value, settings_equal
 from aerokit.protocols.exchange import StaleAnswerFilter, Transfer
 from aerokit.protocols.named_values import (
@@ -40,7 +34,7 @@ SettingAnswer = Setting | ParameterRejected | ParameterTimeout
 """Answer to one request: the setting as the component reports it, or the error."""
 
 UNKNOWN_INDEX = 0xFFFF
-MAX_QUIET_S = 1.1  # The stream of a list has stopped after this silence, even if its pauses were long before.
+MAX_QUIET_S = 1.1  # A list has ended after this many seconds of silence, however long its pauses were before.
 READ_WINDOW = 10
 # Seconds to wait after PARAM_ACK_IN_PROGRESS before the value is requested.
 PROGRESS_TIMEOUT_S = 5.0
@@ -100,28 +94,31 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             self._end_stream()
 
     def _on_value(self, setting: Setting, index: int, count: int, now: float) -> None:
-        """Store a value: of the stream, or the answer to a request. Request indices that the stream has left out."""
-        if self._is_streaming and index >= self._next:
-            for missing in range(self._next, index):
+        """Store a value of the stream, or an answer to a request. Request indices that the stream has left out."""
+        if self._is_streaming and index >= self._next_index:
+            for missing in range(self._next_index, index):
                 self._window.request(missing)
-            if self._next:  # The time before the first value is not a pause of the stream.
+            if self._next_index:  # The time before the first value is not a pause of the stream.
                 self._pause_s = max(self._pause_s, now - self._last_at)
-            self._next, self._last_at = index + 1, now
+            self._next_index = index + 1
+            self._last_at = now
             quiet_s = max(self.round_trip.timeout_s(), PAUSES * self._pause_s, MIN_START_TIMEOUT_S)
             self._quiet_at = now + min(quiet_s, MAX_QUIET_S)
             self._window.discard(index)
         else:
             self._window.on_answer(index, now)
         self._store(index, setting, count, now)
-        if self._next >= count:
+        if self._next_index >= count:
             self._end_stream()
 
     def _end_stream(self) -> None:
-        self._is_streaming, self._quiet_at = False, None
+        self._is_streaming = False
+        self._quiet_at = None
         for index in self._missing():
             self._window.request(index)
 
     def _conclude(self) -> None:
+        """Finish, if all values are known and none is stale. Stale values are requested again."""
         if self._is_streaming or self._count is None:
             return
         if len(self._received) >= self._count and not self._missing():
@@ -131,7 +128,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             if not stale:
                 settings = (self._received[index][0] for index in range(self._count))
                 self._finish({setting.name: setting for setting in settings})
-        elif not len(self._window):  # Nothing is requested, but values are missing: the count has increased.
+        elif len(self._window) == 0:  # Nothing is requested, but values are missing: the count has increased.
             self._end_stream()
 
 
@@ -148,20 +145,9 @@ class SettingReads(NamedReads[Setting]):
     unknown_text = "the component has no setting"
 
     def __init__(
-        self,
-        target_system: int,
-        target_component: int,
-        names: Iterable[str],
-        **options: Unpack[TransferOptions],
+        self, target_system: int, target_component: int, names: Iterable[str], **options: Unpack[TransferOptions]
     ) -> None:
-        super().__init__(
-            target_system,
-            target_component,
-            names,
-            window=READ_WINDOW,
-            duplicate_last=False,
-            **options,
-        )
+        super().__init__(target_system, target_component, names, window=READ_WINDOW, duplicate_last=False, **options)
 
     def _read_request(self, name: str, index: int) -> Message:
         return ParamExtRequestRead(self.target_system, self.target_component, name, index)
@@ -212,7 +198,9 @@ class SettingWrite(Transfer[Setting]):
         **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(target_system, target_component, **options)
-        self._name, self._value, self._type, self._before = name, value, type, before
+        self._name = name
+        self._value, self._type = value, type
+        self._before = before
         self._unexpected: UnexpectedAnswers[Setting] = UnexpectedAnswers(_is_same)
         self._stale_answers = StaleAnswerFilter(self.round_trip)
         self._is_writing = False
@@ -295,7 +283,8 @@ class SettingWrite(Transfer[Setting]):
         self._wait(now, is_writing=False)
 
     def _wait(self, now: float, *, is_writing: bool) -> None:
-        self._is_writing, self._sent_at = is_writing, now
+        self._is_writing = is_writing
+        self._sent_at = now
         self.deadline: float | None = min(now + self.round_trip.timeout_s(self._attempts), self._idle_deadline)
 
     def _measure(self, now: float) -> None:

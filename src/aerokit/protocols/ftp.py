@@ -107,7 +107,7 @@ OPERATIONS: dict[int, str] = {
 class FtpMessage(Snapshot):
     """The payload of one FILE_TRANSFER_PROTOCOL message, a request or a reply.
 
-    ``size`` is the length of ``data``, except in READFILE and BURSTREADFILE, where it is the number of bytes requested.
+    ``size`` is the length of ``data``. In READFILE and BURSTREADFILE requests, it is the number of bytes requested.
     """
 
     sequence: int
@@ -134,13 +134,7 @@ class FtpMessage(Snapshot):
     def encode(self) -> bytes:
         """Return the payload of the FILE_TRANSFER_PROTOCOL message: 251 bytes."""
         head = HEADER.pack(
-            self.sequence,
-            self.session,
-            self.opcode,
-            self.size,
-            self.request_opcode,
-            self.burst_complete,
-            self.offset,
+            self.sequence, self.session, self.opcode, self.size, self.request_opcode, self.burst_complete, self.offset
         )
         return (head + self.data).ljust(PAYLOAD_SIZE, b"\0")
 
@@ -209,8 +203,8 @@ ATTEMPTS_BEFORE_BACKOFF = 3
 
 SESSION_OPCODES = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)
 
-# Errors that mean "no file is open": PX4 answers INVALIDSESSION, ArduPilot FILENOTFOUND. Once PX4 has answered
-# FILEEXISTS, it answers every refused request with FILEEXISTS until an operation fails with an errno.
+# Errors that mean "no file is open". PX4 answers INVALIDSESSION, ArduPilot FILENOTFOUND. After a FILEEXISTS, PX4 also
+# refuses all other requests with FILEEXISTS, until an operation fails with an errno.
 NO_SESSION_ERRORS = (MavFtpErr.INVALIDSESSION, MavFtpErr.FILENOTFOUND, MavFtpErr.FILEEXISTS)
 
 
@@ -298,7 +292,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
 
     Args:
         path: used in error texts.
-        is_sent: True if the request was already sent outside this exchange.
+        is_sent: True if the caller itself makes the first transmission. The exchange then only repeats the request.
     """
 
     attempts: int
@@ -390,28 +384,29 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._wait(now)
 
     def _receive_other(self, reply: FtpMessage, now: float) -> None:
-        # ArduPilot answers TERMINATESESSION only after the current burst. The burst's blocks count as progress.
+        # ArduPilot answers TERMINATESESSION only after the current burst, so the blocks of the burst count as progress.
         if self._request.opcode == MavFtpOpcode.TERMINATESESSION and reply.session == self._request.session:
             self._progress_at = now
             self._wait(now)
 
     def _end(self, reply: FtpMessage) -> None:
-        if reply.is_ack or self._was_done_before(reply):
+        if reply.is_ack or self._is_already_done(reply):
             self._finish(reply)
         else:
             self._fail(self._refused(reply))
 
-    def _was_done_before(self, reply: FtpMessage) -> bool:
-        opcode, code = self._request.opcode, reply.error_code
+    def _is_already_done(self, reply: FtpMessage) -> bool:
+        """Return True if this NAK only means that the operation was executed before."""
+        opcode = self._request.opcode
         if opcode == MavFtpOpcode.TERMINATESESSION:
             return True  # If the session does not exist, it is already closed.
         if self.attempts == 1:
             return False
-        # Perhaps an earlier transmission was executed, and only the answer was lost. The file is then already removed,
+        # An earlier transmission may have been executed although its answer was lost. The file is then already removed,
         # or the directory already created.
         if opcode in (MavFtpOpcode.REMOVEFILE, MavFtpOpcode.REMOVEDIRECTORY):
-            return code == MavFtpErr.FILENOTFOUND
-        return opcode == MavFtpOpcode.CREATEDIRECTORY and code == MavFtpErr.FILEEXISTS
+            return reply.error_code == MavFtpErr.FILENOTFOUND
+        return opcode == MavFtpOpcode.CREATEDIRECTORY and reply.error_code == MavFtpErr.FILEEXISTS
 
     @property
     def _operation(self) -> str:

@@ -16,6 +16,7 @@ Behaviour of servers (ArduPilot 4.7, PX4 1.17) that determines this design:
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.errors import FileTimeout, RemoteProtocolError
@@ -41,7 +42,7 @@ MAX_GAPS = 512
 BURST_BLOCKS = 500
 # After each received block of a burst, the server counts as busy for the time of this many blocks.
 BUSY_BLOCKS = 3
-# Minimum seconds to wait for the first block of a long file. Even a slow radio carries a few blocks in this time.
+# Minimum seconds to wait for the first block of a long file, in which even a slow radio carries a few blocks.
 FIRST_BLOCK_TIMEOUT_S = 0.5
 SHORT_FILE = 20 * DATA_SIZE  # Up to this size in bytes, repeating a burst costs little.
 MAX_REPEATED_BURSTS = 3
@@ -49,8 +50,8 @@ MAX_REPEATED_BURSTS = 3
 MAX_BURSTS = 32
 # Sequence numbers wrap around, so they do not show the distance of two blocks that are farther apart than this.
 MAX_BLOCK_DISTANCE = SEQUENCE_COUNT // 2 * DATA_SIZE
-# If no block arrives in the time of this many blocks, the burst has not started (first number), or has ended (second
-# number), because radios hardly ever lose so many blocks in a row.
+# If no block arrives in the time in which the server sends this many blocks, the burst has not started, or has ended.
+# Radios hardly ever lose so many blocks in a row.
 MAX_LOST_FIRST_BLOCKS, MAX_LOST_BLOCKS = 4, 10
 
 
@@ -114,20 +115,23 @@ class FtpDownload(FtpExchange[int]):
         **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(client, path, **options)
-        self._into, self._session = into, session
+        self._reassembly = into
+        self._session = session
         self._size = None if is_virtual(path) or size == 0 else size
         self._scanned = into.position  # Missing blocks before this offset were already requested.
         self._requests = BlockRequests(self.round_trip)
         self._reads: dict[int, _SentRequest] = {}  # requests by sequence number
-        self._bursts: list[_Burst] = []
+        self._bursts: deque[_Burst] = deque(maxlen=MAX_BURSTS)
         self._is_bursting = False
         self._failed_bursts = 0
         self._repeated_bursts = 0  # number of bursts requested since the last block that was new
-        self._blocks_sent: dict[int, int] = {}  # sequence number of a burst → highest number of its blocks received
+        self._highest_blocks: dict[int, int] = {}  # sequence number of a burst → highest number of its received blocks
         self._supports_bursts = True
-        self._burst_at = 0.0
-        # The last block of a burst that was received: its burst, the time, and its number in the burst.
-        self._last_block: tuple[_Burst | None, float, int] = (None, 0.0, -1)
+        self._burst_at = 0.0  # time of the latest request for a burst, or of the last block after it
+        # Burst and time of the last block that was received, and the highest number of a block of this burst.
+        self._last_burst: _Burst | None = None
+        self._last_block_at = 0.0
+        self._last_block_number = -1
         self._interval = RoundTrip(min_s=0.001)  # smoothed time between two blocks of a burst
 
     def start(self, now: float) -> None:
@@ -172,28 +176,32 @@ class FtpDownload(FtpExchange[int]):
         if not self._is_plausible(reply.offset):
             return
         is_latest = burst is self._bursts[-1]
-        self._measure(burst, burst.blocks_before(reply), now)
-        self._burst_at, self._failed_bursts = now, 0
+        self._record_block(burst, burst.blocks_before(reply), now)
+        self._burst_at = now
+        self._failed_bursts = 0
         self._requests.set_busy(now + BUSY_BLOCKS * (self._interval.smoothed_s or 0.0))
         if is_latest and reply.burst_complete:
             self._stop_bursting()
         self._add(reply.offset, reply.data, now)
 
-    def _measure(self, burst: _Burst, number: int, now: float) -> None:
+    def _record_block(self, burst: _Burst, number: int, now: float) -> None:
+        """Record that block ``number`` of a burst has arrived. It may count as progress, and measure the link."""
         # Blocks that a repeated burst sends again also count as progress, because they show that the server works. The
-        # number of such bursts is limited, so that the download cannot go on forever.
-        if number > self._blocks_sent.get(burst.sequence, -1) and self._repeated_bursts <= MAX_REPEATED_BURSTS:
-            self._blocks_sent[burst.sequence], self._progress_at = number, now
-        last_burst, last_at, last_number = self._last_block
+        # number of repeated bursts is limited, so that the download cannot go on forever.
+        if number > self._highest_blocks.get(burst.sequence, -1) and self._repeated_bursts <= MAX_REPEATED_BURSTS:
+            self._highest_blocks[burst.sequence] = number
+            self._progress_at = now
         # Only the first burst measures the round trip, because a later burst may have to wait for the end of an earlier
         # one.
-        if last_burst is None and number == 0 and len(self._bursts) == 1:
+        if self._last_burst is None and number == 0 and len(self._bursts) == 1:
             self.round_trip.add_sample(now - burst.sent_at)
-        elif last_burst is burst and number > last_number:
-            self._interval.add_sample((now - last_at) / (number - last_number))
-        if last_burst is burst:
-            number = max(number, last_number)
-        self._last_block = (burst, now, number)
+        elif self._last_burst is burst and number > self._last_block_number:
+            self._interval.add_sample((now - self._last_block_at) / (number - self._last_block_number))
+        is_out_of_order = self._last_burst is burst and number < self._last_block_number
+        if not is_out_of_order:
+            self._last_block_number = number
+        self._last_burst = burst
+        self._last_block_at = now
 
     def _stop_bursting(self) -> None:
         self._is_bursting = False
@@ -209,10 +217,14 @@ class FtpDownload(FtpExchange[int]):
             self._stop_bursting()
         if reply.error_code == MavFtpErr.EOF:
             self._end_at(end)
-        # An error of `NO_BURST` after the first block is a failure, because the server does support bursts.
-        elif is_latest and reply.error_code in NO_BURST and self._into.done == self._into.start:
+            return
+        if not is_latest:
+            return
+        # Once the server has sent a block, it does support bursts, and these errors are failures.
+        has_no_block = self._reassembly.done == self._reassembly.start
+        if has_no_block and reply.error_code in NO_BURST:
             self._supports_bursts = False
-        elif is_latest:
+        else:
             self._fail(self._refused(reply))
 
     def _receive_read(self, sent: _SentRequest, reply: FtpMessage, now: float) -> None:
@@ -227,40 +239,41 @@ class FtpDownload(FtpExchange[int]):
             self._fail(self._refused(reply))
 
     def _end_at(self, end: int) -> None:
-        self._into.end_at(end)
+        """Record that the file ends at this offset."""
+        self._reassembly.end_at(end)
         self._requests.discard_from(end)
 
     def _is_plausible(self, offset: int) -> bool:
         # A block far beyond all others would add millions of missing blocks.
-        return not self._is_past_size(offset) and offset - self._into.tail < MAX_BLOCK_DISTANCE
+        return not self._is_past_size(offset) and offset - self._reassembly.tail < MAX_BLOCK_DISTANCE
 
     def _is_past_size(self, offset: int) -> bool:
-        # At the end of the file, PX4 may answer FILEEXISTS instead of EOF, namely if it answered FILEEXISTS before. So
-        # any error after the known size counts as the end.
+        # After a FILEEXISTS, PX4 answers FILEEXISTS instead of EOF. Any error after the known size therefore counts as
+        # the end of the file.
         return self._size is not None and offset >= self._size
 
     def _add(self, offset: int, data: bytes, now: float) -> None:
         if self._size is not None:
             data = data[: self._size - offset]  # The file may have grown since it was opened.
         try:
-            is_new = self._into.add(offset, data)
+            is_new = self._reassembly.add(offset, data)
         except Exception as error:  # Writing failed, e.g. because the disk is full.
             self._fail(error)
             return
         if is_new:
             self._repeated_bursts = 0
             self._requests.discard(offset)
-            self._report_progress(now, self._into.done, self._total)
+            self._report_progress(now, self._reassembly.done, self._total)
 
     # -------------------------------------------------------------------------------- requests
 
     def _proceed(self, now: float) -> None:
         """Finish, or send the requests that are due."""
-        into = self._into
-        if self._size is not None and into.position >= self._size:
-            self._finish(into.position)
+        reassembly = self._reassembly
+        if self._size is not None and reassembly.position >= self._size:
+            self._finish(reassembly.position)
             return
-        if into.is_complete:
+        if reassembly.is_complete:
             self._end()
             return
         self._request_gaps()
@@ -274,22 +287,23 @@ class FtpDownload(FtpExchange[int]):
         self._set_deadline()
 
     def _request_gaps(self) -> None:
-        while self._scanned < self._into.tail:
-            if self._scanned in self._into.gaps:
+        while self._scanned < self._reassembly.tail:
+            if self._scanned in self._reassembly.gaps:
                 self._requests.request(self._scanned)
             self._scanned += DATA_SIZE
 
     @property
     def _needs_burst(self) -> bool:
-        if self._is_bursting or not self._supports_bursts or self._into.end is not None:
+        if self._is_bursting or not self._supports_bursts or self._reassembly.end is not None:
             return False
-        was_sent_completely = self._size is not None and self._into.tail >= self._size
-        return not was_sent_completely and len(self._into.gaps) < MAX_GAPS
+        was_sent_completely = self._size is not None and self._reassembly.tail >= self._size
+        return not was_sent_completely and len(self._reassembly.gaps) < MAX_GAPS
 
     def _request_ahead(self) -> None:
-        if self._into.end is None:
+        """Request the blocks after the tail one by one, because the server does not support bursts."""
+        if self._reassembly.end is None:
             for number in range(self._requests.window.size):
-                self._requests.request(self._into.tail + number * DATA_SIZE)
+                self._requests.request(self._reassembly.tail + number * DATA_SIZE)
 
     def _read(self, offset: int, now: float) -> None:
         sequence = self._client.next_sequence()
@@ -298,26 +312,27 @@ class FtpDownload(FtpExchange[int]):
 
     def _burst(self, now: float) -> None:
         """Request a burst of everything after the last block received."""
-        offset = self._into.tail
+        offset = self._reassembly.tail
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
-        # The replies to a burst have increasing sequence numbers. These are reserved, because a later request with such
-        # a number would look like a repetition of this one, and the server would only repeat its last reply.
+        # The sequence numbers of the replies are reserved. A later request with one of them would look like a
+        # repetition of this request, and the server would only repeat its last reply.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
-        self._bursts = [*self._bursts[1 - MAX_BURSTS :], _Burst(sequence, offset, now)]  # at most MAX_BURSTS
-        self._is_bursting, self._burst_at = True, now
+        self._bursts.append(_Burst(sequence, offset, now))
+        self._is_bursting = True
+        self._burst_at = now
         self._repeated_bursts += 1
         self._send(FtpMessage(sequence, MavFtpOpcode.BURSTREADFILE, self._session, DATA_SIZE, offset=offset))
 
     @property
     def _burst_due_at(self) -> float:
-        """Deadline for the next block. If it passes, the burst counts as ended; before any block, as not started."""
+        """Deadline for the next block. If it passes, the burst has ended or, before any block, has not started."""
         silence_s = self.round_trip.timeout_s(1 + self._failed_bursts)
         if self._interval.smoothed_s is None:
             # Repeating the burst of a long file is expensive, so such a burst gets more time to start.
             if self._size is not None and self._size > SHORT_FILE:
                 silence_s = max(silence_s, FIRST_BLOCK_TIMEOUT_S)
         else:
-            has_started = self._last_block[0] is self._bursts[-1]
+            has_started = self._last_burst is self._bursts[-1]
             max_lost = MAX_LOST_BLOCKS if has_started else MAX_LOST_FIRST_BLOCKS
             silence_s += max(max_lost * self._interval.smoothed_s, self._interval.timeout_s())
         return self._burst_at + silence_s
@@ -335,11 +350,11 @@ class FtpDownload(FtpExchange[int]):
 
     @property
     def _total(self) -> int | None:
-        return self._size if self._into.end is None else self._into.end
+        return self._size if self._reassembly.end is None else self._reassembly.end
 
     def _end(self) -> None:
         """Process the end of the file. Fail if the server has announced a larger size when it opened the file."""
-        end = self._into.position
+        end = self._reassembly.position
         if self._size is None:  # The size of a virtual file is known only now.
             self._finish(end)
         else:
@@ -347,10 +362,12 @@ class FtpDownload(FtpExchange[int]):
             self._fail(RemoteProtocolError(text))
 
     def _timed_out(self) -> FileTimeout:
-        missing = self._into.missing(self._size)
+        missing = self._reassembly.missing(self._size)
+        received = self._reassembly.done
+        first_offset, _ = missing[0] if missing else (0, 0)
         return FileTimeout(
-            f"read {self._path}: no data received for {self._idle_timeout_s:g} s; {self._into.done} bytes received,"
-            f" {len(missing)} ranges missing, the first from byte {missing[0][0] if missing else 0}",
+            f"read {self._path}: no data received for {self._idle_timeout_s:g} s; {received} bytes received,"
+            f" {len(missing)} ranges missing, the first from byte {first_offset}",
             missing=missing,
         )
 
@@ -359,16 +376,11 @@ class FtpUpload(FtpExchange[None]):
     """Upload of ``data`` to an open file: blocks are sent in a window and repeated until acknowledged."""
 
     def __init__(
-        self,
-        client: FtpClient,
-        path: str,
-        data: bytes,
-        *,
-        session: int,
-        **options: Unpack[TransferOptions],
+        self, client: FtpClient, path: str, data: bytes, *, session: int, **options: Unpack[TransferOptions]
     ) -> None:
         super().__init__(client, path, **options)
-        self._data, self._session = data, session
+        self._data = data
+        self._session = session
         self._requests = BlockRequests(self.round_trip)
         self._unwritten = dict.fromkeys(range(0, len(data), DATA_SIZE))
         self._written = 0

@@ -69,14 +69,16 @@ class LogDownload(Transfer[int]):
         **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(target_system, target_component, **options)
-        self._id, self._size, self._into = log_id, size, into
+        self._id = log_id
+        self._size = size
+        self._reassembly = into
         self._requests = BlockRequests(self.round_trip, burst_size=1, spacing_s=SPACING_S)
         self._stream = MessageStream(self.round_trip)
         self._is_streaming = False
         self._range_end = into.position
-        self._latest = self._range_end  # largest offset received in the current range
-        # Numbers of blocks: maximum for a range, requested in the current range, and received of the current range.
-        self._range, self._requested, self._received = FIRST_RANGE, 0, 0
+        self._latest_offset = self._range_end  # largest offset received in the current range
+        self._max_range_blocks = FIRST_RANGE
+        self._requested_blocks = self._received_blocks = 0  # of the current range
         self._early_ends = 0
         self._has_checked_gaps = True
 
@@ -100,11 +102,11 @@ class LogDownload(Transfer[int]):
 
     def expire(self, now: float) -> None:
         if self._is_idle(now):
-            missing = self._into.missing(self._size)
+            missing = self._reassembly.missing(self._size)
             self._fail(
                 FileTimeout(
                     f"log {self._id}: no data received for {self._idle_timeout_s:g} s;"
-                    f" {self._into.done} of {self._size} bytes received",
+                    f" {self._reassembly.done} of {self._size} bytes received",
                     missing=missing,
                 )
             )
@@ -117,19 +119,19 @@ class LogDownload(Transfer[int]):
 
     def _is_plausible(self, offset: int) -> bool:
         # A block far beyond the data received so far would add millions of missing blocks.
-        return offset < self._size and offset - self._into.tail < MAX_RANGE * LOG_BLOCK
+        return offset < self._size and offset - self._reassembly.tail < MAX_RANGE * LOG_BLOCK
 
     def _on_block(self, message: LogData, now: float) -> None:
-        offset, into = message.ofs, self._into
-        if self._is_streaming and offset > self._latest:
-            self._stream.on_message(now, (offset - self._latest) // LOG_BLOCK)
-            self._latest = offset
-            self._received += 1
+        offset = message.ofs
+        if self._is_streaming and offset > self._latest_offset:
+            self._stream.on_message(now, (offset - self._latest_offset) // LOG_BLOCK)
+            self._latest_offset = offset
+            self._received_blocks += 1
             self._is_streaming = offset + LOG_BLOCK < self._range_end
         # If the log has grown since it was listed, PX4 sends a full block at the listed end. The rest is cut off.
         length = min(message.count, self._size - offset)
-        if into.add(offset, bytes(message.data[:length])):
-            self._report_progress(now, into.done, self._size)
+        if self._reassembly.add(offset, bytes(message.data[:length])):
+            self._report_progress(now, self._reassembly.done, self._size)
         self._requests.on_answer(offset, now)
 
     def _end_early(self, end: int) -> None:
@@ -143,16 +145,16 @@ class LogDownload(Transfer[int]):
             self._send_end()
 
     def _proceed(self, now: float) -> None:
-        """Finish if all data is there. Else request the gaps of the last range; without gaps, the next range."""
-        into = self._into
-        if into.position >= self._size:
-            self._finish(into.position)
+        """Finish if all data was received. Otherwise request the gaps of the last range, or the next range."""
+        reassembly = self._reassembly
+        if reassembly.position >= self._size:
+            self._finish(reassembly.position)
             self._send_end()
             return
         if not self._is_streaming:
             self._request_gaps(now)
-        if not self._is_streaming and not into.gaps:
-            self._stream_range(into.tail, self._size, now)
+        if not self._is_streaming and not reassembly.gaps:
+            self._stream_range(reassembly.tail, self._size, now)
         self._set_deadline()
 
     def _request_gaps(self, now: float) -> None:
@@ -163,7 +165,7 @@ class LogDownload(Transfer[int]):
                 self._stream_range(*gap, now)
                 return
             self._has_checked_gaps = True
-            for offset in self._into.gaps:
+            for offset in self._reassembly.gaps:
                 self._requests.request(offset)
         for offset in self._requests.take_due(now):
             self._request(offset, LOG_BLOCK)
@@ -171,7 +173,7 @@ class LogDownload(Transfer[int]):
     def _first_long_gap(self) -> tuple[int, int] | None:
         """Return start and end of the first gap of at least `LONG_GAP` blocks."""
         start = end = -1
-        for offset in self._into.gaps:
+        for offset in self._reassembly.gaps:
             is_new_gap = offset != end
             if is_new_gap:
                 if end - start >= LONG_GAP * LOG_BLOCK:
@@ -183,24 +185,26 @@ class LogDownload(Transfer[int]):
     def _stream_range(self, start: int, end: int, now: float) -> None:
         """Request a range, or its beginning if the range is longer than a request may be."""
         self._adapt_range()
-        self._range_end = min(start + self._range * LOG_BLOCK, end, self._size)
-        self._requested = math.ceil((self._range_end - start) / LOG_BLOCK)
-        self._latest, self._received = start - LOG_BLOCK, 0
-        self._is_streaming, self._has_checked_gaps = True, False
+        self._range_end = min(start + self._max_range_blocks * LOG_BLOCK, end, self._size)
+        self._requested_blocks = math.ceil((self._range_end - start) / LOG_BLOCK)
+        self._latest_offset = start - LOG_BLOCK
+        self._received_blocks = 0
+        self._is_streaming = True
+        self._has_checked_gaps = False
         self._stream.on_request(now)
         self._request(start, self._range_end - start)
 
     def _adapt_range(self) -> None:
         # Radios lose up to a third of the messages. If more than half are lost, a queue overflows, so ranges must be
         # shorter.
-        if self._stream.failures or not self._requested:
+        if self._stream.failures or not self._requested_blocks:
             return
-        if self._received < self._requested / 2:
-            self._range = max(self._range // 2, MIN_RANGE)
-        elif self._requested >= self._range and self._stream.interval_s:
+        if self._received_blocks < self._requested_blocks / 2:
+            self._max_range_blocks = max(self._max_range_blocks // 2, MIN_RANGE)
+        elif self._requested_blocks >= self._max_range_blocks and self._stream.interval_s:
             # Ranges grow until the pause between two ranges is negligible.
             useful_blocks = MIN_RANGE_ROUND_TRIPS * self.round_trip.timeout_s() / self._stream.interval_s
-            self._range = min(2 * self._range, max(int(useful_blocks), FIRST_RANGE), MAX_RANGE)
+            self._max_range_blocks = min(2 * self._max_range_blocks, max(int(useful_blocks), FIRST_RANGE), MAX_RANGE)
 
     def _request(self, offset: int, count: int) -> None:
         self._outbox.append(LogRequestData(self.target_system, self.target_component, self._id, offset, count))
@@ -218,18 +222,13 @@ class LogStop(Transfer[None]):
     """Sends LOG_REQUEST_END until the vehicle stops sending, because LOG_REQUEST_END is not acknowledged.
 
     Args:
-        is_sent: True if the request was already sent outside this exchange.
+        is_sent: True if the caller itself makes the first transmission.
     """
 
     expects: tuple[type[Message], ...] = (LogData, LogEntry)
 
     def __init__(
-        self,
-        target_system: int,
-        target_component: int,
-        *,
-        is_sent: bool = False,
-        **options: Unpack[TransferOptions],
+        self, target_system: int, target_component: int, *, is_sent: bool = False, **options: Unpack[TransferOptions]
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._is_sent = is_sent
@@ -315,9 +314,9 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         if not self._missing:
             self._finish(tuple(self._entries[number] for number in sorted(self._entries)))
             self._outbox.append(LogRequestEnd(self.target_system, self.target_component))
-        # Entries arrive in the order of their ids. After an entry with a larger id, the missing ones will not arrive
-        # without a new request.
-        elif message.id > next(reversed(self._missing)):
+        # Entries arrive in the order of their ids. After an entry with a larger id, the missing ones only arrive after
+        # a new request.
+        elif message.id > next(reversed(self._missing)):  # the largest missing id
             self._request_missing(now)
         self._set_deadline()
 

@@ -18,12 +18,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.missions.wire import from_wire
 from aerokit.protocols.exchange import format_ranges
-from aerokit.protocols.missions import (
-    BUSY_RETRY_INTERVAL_S,
-    BUSY_TIMEOUT_S,
-    TRANSFER_EXPIRY_S,
-    MissionExchange,
-)
+from aerokit.protocols.missions import BUSY_RETRY_INTERVAL_S, BUSY_TIMEOUT_S, TRANSFER_EXPIRY_S, MissionExchange
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,7 +50,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
 
     ``window`` is the number of requests in flight. It must be 1 for PX4, which aborts with ERROR unless a request is
     for the next item or the previous one. ArduPilot answers requests in any order, so only missing items are requested
-    again. ``only`` restricts the download to these items.
+    again. ``only`` restricts the download to these items. ``gives_int`` is False for a vehicle that has no
+    MISSION_ITEM_INT.
     """
 
     expects: tuple[type[Message], ...] = (MissionCount, MissionItemInt, MissionItem, MissionAck)
@@ -75,13 +71,14 @@ class MissionDownload(MissionExchange[DownloadResult]):
         **options: Any,
     ) -> None:
         super().__init__(target_system, target_component, **options)
-        self._window, self._uses_int = window, gives_int
+        self._window = window
+        self._uses_int = gives_int
         self._only = only
         self._indices: Sequence[int] = ()
         self._items: dict[int, Item] = {}
         self._count: int | None = None
         self._opaque_id = 0
-        self._next = 0  # position (in `_indices`) of the item to request next
+        self._next_position = 0  # position in `_indices` of the item to request next
         self._requested_at: dict[int, float] = {}
         self._request_counts: dict[int, int] = {}
         self._busy_until: float | None = None
@@ -113,7 +110,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
         elif now - self._received_at >= TRANSFER_EXPIRY_S:  # The vehicle may have dropped the transfer.
             self._restart_after_error(now)
         else:
-            for seq in [seq for seq in self._requested_at if self._due_at(seq) <= now]:
+            overdue = [seq for seq in self._requested_at if self._due_at(seq) <= now]
+            for seq in overdue:
                 self._request(seq, now)
             self._wait_for_items(now)
 
@@ -139,7 +137,9 @@ class MissionDownload(MissionExchange[DownloadResult]):
         else:  # The plan has changed since the download began.
             self._items.clear()
             self._discard_requests()
-        self._count, self._opaque_id, self._busy_until = message.count, opaque_id, None
+        self._count = message.count
+        self._opaque_id = opaque_id
+        self._busy_until = None
         self._indices = range(self._count) if self._only is None else [seq for seq in self._only if seq < self._count]
         self._report_progress(now, len(self._items), len(self._indices))
         self._proceed(now)
@@ -159,8 +159,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
-            # An ERROR that arrives too soon after the request for the list answers an earlier message, e.g. a repeated
-            # item of an upload. Such an ERROR is ignored.
+            # An ERROR that arrives too soon after the request for the list is ignored, because it answers an earlier
+            # message, e.g. a repeated item of an upload.
             if now - self._list_requested_at >= MIN_ROUND_TRIP_FRACTION * (self.round_trip.smoothed_s or 0.0):
                 self._restart_after_error(now)
         elif result not in (
@@ -194,13 +194,15 @@ class MissionDownload(MissionExchange[DownloadResult]):
 
     def _restart(self, now: float) -> None:
         self._discard_requests()
-        self._count, self._attempt, self._received_at = None, 1, now
+        self._count = None
+        self._attempt = 1
+        self._received_at = now
         self._request_list(now)
 
     def _discard_requests(self) -> None:
         self._requested_at.clear()
         self._request_counts.clear()
-        self._next = 0
+        self._next_position = 0
 
     # -------------------------------------------------------------------------------- requests
 
@@ -208,12 +210,12 @@ class MissionDownload(MissionExchange[DownloadResult]):
         if len(self._items) >= len(self._indices):
             self._end()
             return
-        while self._next < len(self._indices) and len(self._requested_at) < self._window:
-            seq = self._indices[self._next]
+        while self._next_position < len(self._indices) and len(self._requested_at) < self._window:
+            seq = self._indices[self._next_position]
             needs_sequence = self._window == 1  # PX4 requires a request for each item, even if we already have it.
             if needs_sequence or seq not in self._items:
                 self._request(seq, now)
-            self._next += 1
+            self._next_position += 1
         self._wait_for_items(now)
 
     def _request(self, seq: int, now: float) -> None:
@@ -237,9 +239,9 @@ class MissionDownload(MissionExchange[DownloadResult]):
     # ------------------------------------------------------------------------------------ end
 
     def _end(self) -> None:
-        # Until PX4 receives the acknowledgement, it accepts no upload for 5 s. The acknowledgement is therefore sent
-        # twice, because one may be lost.
-        self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * (2 if self._window == 1 else 1)
+        # PX4 (window 1) accepts no upload for 5 s if the acknowledgement is lost, so it is sent twice.
+        transmissions = 2 if self._window == 1 else 1
+        self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * transmissions
         items = tuple(self._items[seq] for seq in self._indices)
         self._finish(DownloadResult(items, self._count or 0, self._opaque_id))
 

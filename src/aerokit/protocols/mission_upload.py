@@ -17,12 +17,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.missions.wire import to_wire, to_wire_float
 from aerokit.protocols.exchange import format_ranges
-from aerokit.protocols.missions import (
-    BUSY_RETRY_INTERVAL_S,
-    BUSY_TIMEOUT_S,
-    TRANSFER_EXPIRY_S,
-    MissionExchange,
-)
+from aerokit.protocols.missions import BUSY_RETRY_INTERVAL_S, BUSY_TIMEOUT_S, TRANSFER_EXPIRY_S, MissionExchange
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -52,7 +47,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     """Uploads a plan: sends MISSION_COUNT, then the items that the vehicle requests.
 
     If ``first`` is given, the upload begins with MISSION_WRITE_PARTIAL_LIST instead, and replaces the items from
-    ``first`` on.
+    ``first`` on. ``takes_int`` is False for a vehicle that does not accept MISSION_ITEM_INT.
 
     With a ``window`` above 1, items are sent before they are requested, so that one round trip carries several items.
     ArduPilot and PX4 accept the next item even if their request for it was lost, and request items that they miss. A
@@ -86,7 +81,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._is_partial = first is not None
         self._first = first or 0
         self._end = self._first + len(items)
-        self._window, self._accepts_int = window, takes_int
+        self._window = window
+        self._accepts_int = takes_int
         self.is_refusal_ambiguous: bool = False
         """True if it is unknown which of several items in flight was refused. To find out, send items one at a time."""
         self.was_started: bool = False
@@ -128,7 +124,8 @@ class MissionUpload(MissionExchange[UploadResult]):
     def receive(self, message: Message, now: float) -> None:
         if not self._is_ours(message):
             return
-        silence_s, self._received_at = now - self._received_at, now
+        silence_s = now - self._received_at
+        self._received_at = now
         if isinstance(message, MissionAck):
             # After a long silence, ERROR means that the vehicle's transfer has expired. The upload then starts again.
             has_expired = self._is_accepted and silence_s >= TRANSFER_EXPIRY_S
@@ -148,8 +145,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         if not self._is_accepted:
             self._announce(now)
         elif self._sent_end < self._end:
-            # With a window of 1, no item is sent before the vehicle requests it.
-            self._send_window(now, ahead=1 if self._window > 1 else 0)
+            may_send_ahead = self._window > 1  # Otherwise, no item is sent before the vehicle requests it.
+            self._send_window(now, ahead=1 if may_send_ahead else 0)
         elif self._attempt % 2 == 0:
             # The last item alone is enough if only the confirmation was lost: the vehicle then confirms again.
             self._send(self._end - 1, now)
@@ -254,9 +251,8 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._wait(now, BUSY_RETRY_INTERVAL_S)
 
     def _restart(self, now: float) -> None:
-        # A transfer has expired on the vehicle. Until the vehicle has accepted this upload, that transfer was an older
-        # one.
-        if not self._is_accepted:
+        """Begin again, because the vehicle's transfer has expired or was cancelled."""
+        if not self._is_accepted:  # It was an older transfer.
             return
         if self._is_partial or self._restarts >= MAX_RESTARTS:
             self._refuse(MavMissionResult.OPERATION_CANCELLED)
@@ -328,9 +324,10 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._sent_end = max(self._sent_end, seq + 1)
 
     def _is_in_flight(self, seq: int, now: float) -> bool:
-        # An item in flight is not repeated. The vehicle would answer the duplicate by another request, and each such
-        # request would make us send a whole window of items again.
-        sent_at, round_trip_s = self._sent_at.get(seq), self.round_trip.smoothed_s
+        # The vehicle would answer a duplicate by another request, and each request for an item that was already
+        # requested makes us send a whole window again. An item in flight is therefore not repeated.
+        sent_at = self._sent_at.get(seq)
+        round_trip_s = self.round_trip.smoothed_s
         if round_trip_s is None:
             round_trip_s = self.round_trip.timeout_s()
         return sent_at is not None and now - sent_at < IN_FLIGHT_ROUND_TRIPS * round_trip_s

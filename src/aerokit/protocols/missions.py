@@ -38,7 +38,7 @@ __all__ = [
 ResultT = TypeVar("ResultT")
 
 # A vehicle is busy for at most this many seconds with a transfer that another station has abandoned. ArduPilot drops
-# such a transfer after 8 s, PX4 after 5 s.
+# it after 8 s, PX4 after 5 s.
 BUSY_TIMEOUT_S = 9.0
 
 BUSY_RETRY_INTERVAL_S = 1.0
@@ -78,7 +78,7 @@ RESULTS: dict[int, str] = {
 
 
 class MissionExchange(Transfer[ResultT]):
-    """A transfer with one component. Ignores messages to other systems and of other mission types.
+    """A transfer with one component. It ignores messages to other systems and of other mission types.
 
     Errors contain the program's indices, which are the indices in the messages minus ``offset``.
     """
@@ -124,8 +124,8 @@ class MissionExchange(Transfer[ResultT]):
         self.deadline: float | None = now + (self._timeout_s(self._attempt) if seconds is None else seconds)
 
     def _timeout_s(self, attempt: int) -> float:
-        # After a few attempts, the time-out stays the same for a while. Longer waits would help only on a congested
-        # link, which the small messages of a mission do not cause.
+        # After a few attempts, the time-out stays the same for a while. Longer waits only help on a congested link, and
+        # the small messages of a mission do not congest a link.
         backoff_attempt = min(attempt, max(GROWING_ATTEMPTS, attempt - CONSTANT_ATTEMPTS))
         return self.round_trip.timeout_s(backoff_attempt)
 
@@ -190,8 +190,8 @@ class SetCurrentItem(Transfer[None]):
     ``reported`` is the item last reported by the vehicle. If the vehicle moves from ``reported`` past the requested
     item, this also counts as confirmation.
 
-    With an ``order_status``, a retry waits for a HEARTBEAT since the last transmission, and retries stop when the order
-    has ended.
+    With an ``order_status``, a retry waits for a HEARTBEAT that is newer than the last transmission. Retries stop when
+    the order has ended.
     """
 
     expects: tuple[type[Message], ...] = (MissionCurrent,)
@@ -275,6 +275,7 @@ def mission_checksum(items: Iterable[MissionItem]) -> int:
     ``mission_id``, ``fence_id`` and ``rally_points_id`` in MISSION_CURRENT
     (https://mavlink.io/en/messages/common.html#MISSION_CURRENT).
     """
+    # zlib.crc32 inverts its start value and its result, so both are inverted once more.
     checksum = _INVERT
     for item in items:
         numbers = (item.param1, item.param2, item.param3, item.param4, int(item.x), int(item.y), item.z)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 ValueT = TypeVar("ValueT")
 ResultT = TypeVar("ResultT")
 
-# The stream of a list has stopped if nothing arrives for its longest pause so far, multiplied by this number.
+# The stream of a list has stopped if nothing arrives for this many times its longest pause so far.
 PAUSES = 4
 # A list gets at least this many seconds to start. An earlier second request would restart the list.
 MIN_START_TIMEOUT_S = 0.3
@@ -35,8 +35,8 @@ BY_NAME = -1
 PROBE, PROBE_INDEX = "", 0
 # A name without an answer counts as unknown once the probability that all its answers were lost is below this value.
 MAX_LOSS_PROBABILITY = 1e-4
-# A write ends with an unexpected value after this many answers with the same value. The second number is for the value
-# from before the write, because the vehicle may have sent such answers before the write arrived.
+# A write ends with an unexpected value after this many answers with the same value. More answers are needed if it is
+# the value from before the write, because the vehicle may have sent them before the write arrived.
 ANSWERS_TO_SETTLE, ANSWERS_TO_SETTLE_UNCHANGED = 2, 8
 
 
@@ -53,11 +53,13 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         # Maps an index to the value, and to the number of parameters that the same message reports.
         self._received: dict[int, tuple[ValueT, int]] = {}
         self._count: int | None = None
-        self._next = 0  # next index that is expected in the stream
+        self._next_index = 0  # next index that is expected in the stream
         self._is_streaming = False
         self._quiet_at: float | None = None  # The stream has stopped if no message of it arrives before this time.
-        self._last_at = self._pause_s = 0.0  # time of the stream's last message, and its longest pause
-        self._attempts = self._refreshes = 0
+        self._last_at = 0.0  # time of the stream's last message
+        self._pause_s = 0.0  # longest pause of the stream
+        self._attempts = 0  # number of requests for the list
+        self._refreshes = 0  # number of times that old values were requested again
 
     def expire(self, now: float) -> None:
         if self.deadline is None or now < self.deadline:
@@ -264,7 +266,7 @@ class NamedReads(NamedRequests[ValueT]):
 
 
 class UnexpectedAnswers(Generic[ValueT]):
-    """The last answers to one write, if they all have the same value, and this is not the requested value."""
+    """Collects the answers to one write that have the same value, which is not the requested one."""
 
     def __init__(self, is_same: Callable[[ValueT, ValueT], bool]) -> None:
         self._is_same = is_same
@@ -283,6 +285,9 @@ class UnexpectedAnswers(Generic[ValueT]):
         self._answers.append(answer)
 
     def are_conclusive(self, *, is_unchanged: bool) -> bool:
-        """Return True if the answers suffice to end the write. ``is_unchanged``: they have the value from before it."""
+        """Return True if the answers suffice to end the write.
+
+        ``is_unchanged`` is True if they have the value from before the write.
+        """
         needed = ANSWERS_TO_SETTLE_UNCHANGED if is_unchanged else ANSWERS_TO_SETTLE
         return len(self._answers) >= needed

@@ -24,13 +24,12 @@ __all__ = ["ParameterList", "merge_update"]
 def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Parameter:
     """Merge a PARAM_VALUE that is not part of a list into a known parameter.
 
-    If values are not sent bytewise, such a message has less information than a list or a file. In its answer to
-    PARAM_SET, ArduPilot reports an integer as a float if the value is the default. An INT32 beyond 2**24 loses its last
-    bits.
+    If values are not sent bytewise, the message has less information than a list or a file. In its answer to PARAM_SET,
+    ArduPilot reports an integer as a float if the value is the default. An INT32 beyond 2**24 loses its last bits.
     """
     value, type_ = reported.value, reported.type
     if not bytewise and known.type.is_integer:
-        is_whole = value == value // 1  # False for NaN and infinity
+        is_whole = float(value).is_integer()
         if type_ is ParameterType.REAL32 and is_whole:
             value, type_ = int(value), known.type
         if same_value(float(known.value), float(value)):
@@ -48,6 +47,9 @@ NEAR_END = 20
 
 # The list's stream counts as started once it has sent this many values. The list is then not requested again.
 MIN_STREAMED = 2
+
+# With each value of the stream, the longest pause shrinks by this factor, because it may have been an exception.
+PAUSE_DECAY = 0.98
 
 # An index counts as nonexistent after this many PARAM_ERROR messages.
 MAX_REFUSALS = 2
@@ -76,9 +78,9 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._bytewise = bytewise
         self._names: dict[str, Parameter] = {}  # name → parameter with the latest value
         self._refusals: dict[int, int] = {}  # index → number of PARAM_ERROR messages
-        self._streamed_count: int | None = None  # number of parameters that the stream's last message reported
-        self._needs_check = False  # True if missing indices must be searched and requested
-        self._streamed = 0  # number of values received from the stream
+        self._count_in_stream: int | None = None  # number of parameters that the stream's last message reported
+        self._must_request_missing = False
+        self._streamed_values = 0  # number of values received from the stream
 
     # ---------------------------------------------------------------------------- as an exchange
 
@@ -105,13 +107,13 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     # ------------------------------------------------------------------------------------ answers
 
     def _on_value(self, message: ParamValue, now: float) -> None:
-        """Process a value: of the stream, the answer to a request, or (index 65535) one outside the list."""
+        """Process a value of the stream, an answer to a request, or a value outside the list (index 65535)."""
         index = message.param_index
         if index == UNKNOWN_INDEX or message.param_id == HASH_NAME:
             self._on_uncounted_value(message, now)
             return
-        is_streamed = self._is_streaming and index >= self._next
-        self._record_count(message.param_count, is_streamed)
+        is_streamed = self._is_streaming and index >= self._next_index
+        self._record_count(message.param_count, is_streamed=is_streamed)
         if is_streamed:
             self._on_streamed_value(index, now)
         else:
@@ -128,7 +130,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     def _on_uncounted_value(self, message: ParamValue, now: float) -> None:
         # The value is not part of the list. Either another client has set the parameter, or the value is PX4's hash of
         # all parameters, after which the list starts.
-        self._record_count(message.param_count, False)
+        self._record_count(message.param_count, is_streamed=False)
         if message.param_id == HASH_NAME:
             self._last_at = now
             self._quiet_at = (now + self._quiet_s()) if self._is_streaming else None
@@ -148,32 +150,32 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
                 self._window.discard(nonexistent)
             self._count = min(self._count, index)
 
-    def _record_count(self, count: int, is_streamed: bool) -> None:
+    def _record_count(self, count: int, *, is_streamed: bool) -> None:
         # All messages of ArduPilot's stream report the count from the start of the stream, although the number of
         # parameters may change meanwhile. A streamed count is therefore only compared with an earlier streamed count.
         if is_streamed:
-            is_unchanged = count == self._streamed_count
-            self._streamed_count = count
+            is_unchanged = count == self._count_in_stream
+            self._count_in_stream = count
         else:
             is_unchanged = count == self._count
         if not is_unchanged:
-            self._count, self._needs_check = count, True
+            self._count = count
+            self._must_request_missing = True
 
     def _on_streamed_value(self, index: int, now: float) -> None:
         """Request missing indices before this one, and measure the pauses of the stream."""
-        for missing in range(self._next, min(index, self._count or 0)):
+        for missing in range(self._next_index, min(index, self._count or 0)):
             self._window.request(missing)
-        if self._streamed:
-            # The longest pause is slowly forgotten, because it may have been an exception.
-            self._pause_s = max(now - self._last_at, 0.98 * self._pause_s)
-        self._next = index + 1
-        self._streamed += 1
+        if self._streamed_values:
+            self._pause_s = max(now - self._last_at, PAUSE_DECAY * self._pause_s)
+        self._next_index = index + 1
+        self._streamed_values += 1
         self._last_at = now
         if index == 0:
             self._window.on_answer(0, now)
         else:
             self._window.discard(index)
-        if self._count is not None and self._next >= self._count:
+        if self._count is not None and self._next_index >= self._count:
             self._end_stream()
 
     # ----------------------------------------------------------------------------------- requests
@@ -186,35 +188,37 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
 
     def _on_quiet(self, now: float) -> None:
         is_longer = self._count is None or self._count > MIN_STREAMED
-        if self._streamed < MIN_STREAMED and is_longer:  # The stream has never begun.
+        if self._streamed_values < MIN_STREAMED and is_longer:  # The stream has never begun.
             self._send_list_request(now)
             return
         self._end_stream()
 
     def _end_stream(self) -> None:
-        self._is_streaming, self._quiet_at, self._needs_check = False, None, True
+        self._is_streaming = False
+        self._quiet_at = None
+        self._must_request_missing = True
 
     def _quiet_s(self) -> float:
-        """Seconds without any message after which the stream has stopped.
+        """Return the seconds without a message after which the stream has stopped.
 
         Answers to requests also count as messages, because they delay the stream.
         """
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
-        if self._streamed < MIN_STREAMED:  # A single value may be the answer to our request by index.
+        if self._streamed_values < MIN_STREAMED:  # A single value may be the answer to our request by index.
             return max(seconds, MIN_START_TIMEOUT_S)
         # Near the end, waiting for a further tick of the vehicle would take longer than requesting the rest.
         return seconds if self._is_near_end else max(seconds, MAX_TICK_S)
 
     @property
     def _is_near_end(self) -> bool:
-        return self._count is not None and self._count - self._next <= NEAR_END
+        return self._count is not None and self._count - self._next_index <= NEAR_END
 
     def _conclude(self) -> None:
         if self._is_streaming:
             return
         self._finish_when_complete()
-        if self._needs_check and not self.done:
-            self._needs_check = False
+        if self._must_request_missing and not self.done:
+            self._must_request_missing = False
             for index in self._missing():
                 self._window.request(index)
 
@@ -230,7 +234,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         names = {parameter.name for parameter in parameters}
         is_consistent = len(names) == count == len(self._names)  # Each name has exactly one index, and vice versa.
         if not is_consistent and self._drop_stale(count):
-            self._needs_check = True
+            self._must_request_missing = True
         else:
             self._finish(ParameterTable(self._in_order(parameters, names)))
 

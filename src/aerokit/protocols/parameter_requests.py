@@ -17,14 +17,7 @@ from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.encoding import parameter_of, set_message
 from aerokit.parameters.parameter import same_value
 from aerokit.protocols.exchange import StaleAnswerFilter
-from aerokit.protocols.named_values import (
-    BY_NAME,
-    PROBE,
-    PROBE_INDEX,
-    NamedReads,
-    NamedRequests,
-    UnexpectedAnswers,
-)
+from aerokit.protocols.named_values import BY_NAME, PROBE, PROBE_INDEX, NamedReads, NamedRequests, UnexpectedAnswers
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -106,7 +99,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
 
     ``alternatives`` maps names to other names of the same parameter. The vehicle has at most one of these names, so an
     answer for one name makes the result of all others a ParameterRejected. ``possibly_stale`` maps names to old values
-    that a delayed message may still have. Such a value is accepted only when it is received a second time.
+    that a delayed message may still have. An old value is accepted only when it is received a second time.
     """
 
     unknown_text = "the vehicle has no parameter"
@@ -137,7 +130,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
         self._probe = self._is_probe_wanted = probe
         self._possibly_stale = dict(possibly_stale)
         self._refused: set[str] = set()
-        self._alternatives = {name: tuple(names_of_same) for name, names_of_same in alternatives.items()}
+        self._alternatives = {name: tuple(other_names) for name, other_names in alternatives.items()}
 
     def _read_request(self, name: str, index: int) -> Message:
         return ParamRequestRead(self.target_system, self.target_component, name, index)
@@ -195,7 +188,7 @@ class ParameterWrites(ParameterRequests):
     is the result: the vehicle rounded or clamped the value, or another station set it. Retries are therefore bounded,
     and a later change by another station is not undone.
 
-    ``recent`` has names that were already written a moment ago. Answers to that earlier write may still arrive, so the
+    ``recent`` has names that an earlier call has just written. Answers to the earlier write may still arrive, so the
     first matching answer is verified by another read.
     """
 
@@ -228,21 +221,22 @@ class ParameterWrites(ParameterRequests):
         self._stale_answers = StaleAnswerFilter(self.round_trip)
 
     def _request(self, name: str) -> list[Message]:
-        requested, unexpected = self._requested[name], self._unexpected.get(name)
         read = ParamRequestRead(self.target_system, self.target_component, name, BY_NAME)
         if name not in self._to_set:
             return [read]
         self._to_set.remove(name)
+        requested = self._requested[name]
         write = set_message(
             self.target_system, self.target_component, name, requested.value, requested.type, self._bytewise
         )
-        if unexpected:
+        if self._unexpected.get(name):
             # The vehicle has answered an earlier write with another value, so it may ignore this write and send no
             # answer. The read makes the vehicle send the value in any case.
             return [write, read]
         return [write]
 
     def _on_value(self, message: ParamValue, now: float) -> None:
+        """Accept the reported value as the result, or request it again, because it may be old or unintended."""
         name = message.param_id
         if not self._window.attempts(name):
             return  # This answers another station, because our write of this name was not sent yet.
@@ -251,7 +245,7 @@ class ParameterWrites(ParameterRequests):
         unexpected = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))
         is_as_requested = same_value(reported.value, requested.value)
         if is_as_requested and name in self._recent:
-            # This may be the late answer to the write from a moment ago, so the value is read once more.
+            # This may be the late answer to the earlier write, so the value is read once more.
             self._recent.remove(name)
             unexpected.add(reported)
             self._window.on_answer(name, now)
@@ -277,8 +271,8 @@ class ParameterWrites(ParameterRequests):
 
     def _with_integer_type(self, reported: Parameter, type_: ParameterType) -> Parameter:
         # If the value is the default, ArduPilot's answer to PARAM_SET reports an integer parameter as a float.
-        is_whole = reported.type is ParameterType.REAL32 and reported.value == reported.value // 1
-        if self._bytewise or not type_.is_integer or not is_whole:
+        is_whole_float = reported.type is ParameterType.REAL32 and float(reported.value).is_integer()
+        if self._bytewise or not type_.is_integer or not is_whole_float:
             return reported
         return Parameter(reported.name, int(reported.value), type_, None, reported.index)
 

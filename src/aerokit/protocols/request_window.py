@@ -25,41 +25,46 @@ FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
 FEW_LEFT_TIMEOUT_S = 0.5
 # Maximum seconds to wait for an answer. A queue that delayed the answers may be empty by then.
 MAX_TIMEOUT_S = 2.0
-# Answers arrive in the order of the requests. A request therefore counts as lost once the answer to a request that was
-# sent this many places later has arrived.
+# Answers arrive in the order of the requests. A request counts as lost if the answered request was sent this many
+# transmissions after it.
 OVERTAKEN = 3
 
 
 class _Request:
-    __slots__ = ("attempts", "due_at", "first_at", "first_number", "number", "sent_at", "was_duplicated")
+    """Times and numbers of the first and the latest transmission. All transmissions of the window are numbered."""
+
+    __slots__ = ("attempts", "due_at", "first_at", "first_number", "last_number", "sent_at", "was_duplicated")
 
     def __init__(self, now: float, number: int) -> None:
         self.first_at = self.sent_at = self.due_at = now
-        self.first_number = self.number = number
+        self.first_number = self.last_number = number
         self.was_duplicated = False
         self.attempts = 0
 
 
 class RequestWindow(Generic[KeyT]):
-    """Requests by key. ``size`` requests are in flight, or more while that does not delay their answers.
+    """Requests by key. ``size`` requests may be in flight, or more while their answers do not become slower.
 
     With ``duplicate_last``, the last few requests are sent twice from their third attempt on. A request is repeated
     when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
     """
 
     def __init__(self, round_trip: RoundTrip, *, size: int = DEFAULT_SIZE, duplicate_last: bool = True) -> None:
-        self._round_trip, self._size, self._limit = round_trip, size, size
+        self._round_trip = round_trip
+        self._initial_size = size
+        self._max_in_flight = size
         self._fastest_s = math.inf
         self._duplicate_last = duplicate_last
-        self._answered_at = self._silent_until = -math.inf
-        self._silences = 0  # number of times since the last answer that the whole link was found silent
+        self._answered_at = -math.inf
+        self._silences = 0  # number of silences of the whole link since the last answer
+        self._next_silence_at = -math.inf  # earliest time at which a further silence is counted
         self._waiting: dict[KeyT, None] = {}
         # Requests whose answer is awaited and not yet overdue, in the order in which they were sent.
         self._in_flight: dict[KeyT, _Request] = {}
         # All unanswered requests that were sent at least once, including overdue ones that wait to be sent again.
         self._requests: dict[KeyT, _Request] = {}
-        # For requests that were answered after a repetition: seconds from the first transmission to the answer. It is
-        # ambiguous which transmission was answered, until a second answer arrives.
+        # Maps a key that was answered after a repetition to the seconds from its first transmission to the answer.
+        # Until a second answer arrives, it is unknown which transmission was answered.
         self._ambiguous: dict[KeyT, float] = {}
         self._sent_count = 0
 
@@ -102,12 +107,13 @@ class RequestWindow(Generic[KeyT]):
     def on_answer(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
         """Record an answer. Return the requests that count as lost.
 
-        These are the requests that were sent at least ``overtaken`` places before the answered request.
+        These are the requests that were sent at least ``overtaken`` transmissions before the answered request.
         """
         request = self._requests.pop(key, None)
         self._waiting.pop(key, None)
         self._in_flight.pop(key, None)
-        self._answered_at, self._silences = now, 0
+        self._answered_at = now
+        self._silences = 0
         if request is None:
             self._on_second_answer(key)
             return []
@@ -117,7 +123,7 @@ class RequestWindow(Generic[KeyT]):
             self._ambiguous[key] = now - request.first_at
         lost = []
         for key_in_flight, request_in_flight in self._in_flight.items():
-            if request_in_flight.number > request.first_number - overtaken:
+            if request_in_flight.last_number > request.first_number - overtaken:
                 break  # All further requests were sent later.
             lost.append(key_in_flight)
         self._requeue(lost)
@@ -132,7 +138,7 @@ class RequestWindow(Generic[KeyT]):
             self._on_silence(now)
         self._requeue(overdue)
         due: list[KeyT] = []
-        while self._waiting and len(self._in_flight) < self._limit:
+        while self._waiting and len(self._in_flight) < self._max_in_flight:
             key = next(iter(self._waiting))
             del self._waiting[key]
             self._send(key, now)
@@ -146,10 +152,10 @@ class RequestWindow(Generic[KeyT]):
 
     def _on_silence(self, now: float) -> None:
         # The link may be down, so fewer requests are sent at a time, and less often.
-        self._limit = self._size
-        if now >= self._silent_until:
+        self._max_in_flight = self._initial_size
+        if now >= self._next_silence_at:
             self._silences += 1
-            self._silent_until = now + self._timeout_s(1)
+            self._next_silence_at = now + self._timeout_s(1)
 
     def _timeout_s(self, attempts: int) -> float:
         round_trip = self._round_trip
@@ -163,9 +169,9 @@ class RequestWindow(Generic[KeyT]):
         self._round_trip.add_sample(seconds)
         self._fastest_s = min(self._fastest_s, seconds)
         if seconds <= QUEUED_FACTOR * self._fastest_s + QUEUED_MARGIN_S:
-            self._limit = min(self._limit + 1, MAX_GROWTH * self._size)
+            self._max_in_flight = min(self._max_in_flight + 1, MAX_GROWTH * self._initial_size)
         else:
-            self._limit = max(self._limit - 1, self._size)
+            self._max_in_flight = max(self._max_in_flight - 1, self._initial_size)
 
     def _send(self, key: KeyT, now: float) -> None:
         """Record a transmission of the request, and the time at which its answer is overdue."""
@@ -174,19 +180,21 @@ class RequestWindow(Generic[KeyT]):
         if request is None:
             request = self._requests[key] = _Request(now, self._sent_count)
         request.attempts += 1
-        request.number, request.sent_at = self._sent_count, now
+        request.last_number = self._sent_count
+        request.sent_at = now
         request.due_at = now + self._timeout_s(request.attempts)
         self._in_flight[key] = request
 
     def _requeue(self, keys: list[KeyT]) -> None:
+        """Queue requests again, before all that wait."""
         if keys:
             for key in keys:
                 del self._in_flight[key]
             self._waiting = {**dict.fromkeys(keys), **self._waiting}
 
     def _on_second_answer(self, key: KeyT) -> None:
-        # A second answer shows that the first one answered the first transmission, which was repeated too early. The
-        # round trip is now known, and makes the time-out longer.
+        # Two answers mean that the first transmission was not lost, but repeated too early. The first answer therefore
+        # belongs to it, and measures a round trip that makes the time-out longer.
         seconds = self._ambiguous.pop(key, None)
         if seconds is not None:
             self._round_trip.add_sample(seconds)

@@ -61,7 +61,7 @@ def rtcm_messages(data: bytes) -> list[bytes]:
     """
     messages: list[bytes] = []
     begin = 0
-    while begin < len(data) or not messages:  # The second condition also refuses empty data, in the first iteration.
+    while True:  # The first iteration also refuses empty data.
         size = _frame_size(data, begin) if len(data) - begin > HEADER_SIZE else None
         subject = f"rtcm (byte {begin} of {len(data)})"
         if size is None:
@@ -80,7 +80,8 @@ def rtcm_messages(data: bytes) -> list[bytes]:
             )
         messages.append(frame)
         begin += size
-    return messages
+        if begin == len(data):
+            return messages
 
 
 class RtcmReader:
@@ -95,13 +96,14 @@ class RtcmReader:
 
     def feed(self, data: bytes) -> Iterator[bytes]:
         """Process bytes, and yield each complete message. At most one incomplete message (1029 bytes) is kept."""
-        buffer, begin = self._buffer + data, 0
+        buffer = self._buffer + data
+        begin = 0
         while True:
-            start = buffer.find(PREAMBLE, begin)
-            if start < 0:
-                start = len(buffer)
-            self.skipped_bytes += start - begin
-            begin = start
+            preamble_at = buffer.find(PREAMBLE, begin)
+            if preamble_at < 0:
+                preamble_at = len(buffer)
+            self.skipped_bytes += preamble_at - begin
+            begin = preamble_at
             if len(buffer) - begin < HEADER_SIZE:
                 break
             size = _frame_size(buffer, begin)

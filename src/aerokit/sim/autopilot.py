@@ -20,6 +20,7 @@ from aerokit.sim.motion import Motion
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
 
 _CORRECTIONS_MAX_AGE_S = 5.0
+_MAX_CORRECTIONS = 1000
 
 
 class VehicleSigning:
@@ -55,10 +56,7 @@ class VehicleSigning:
             return
         first_timestamp = (self.timestamp + self.AHEAD) & LAST_TIMESTAMP
         signing = _Signing(
-            self.key,
-            link_id=link_id,
-            timestamp=first_timestamp,
-            allow_unsigned=self.unsigned_on(link_id),
+            self.key, link_id=link_id, timestamp=first_timestamp, allow_unsigned=self.unsigned_on(link_id)
         )
         signing.streams = self._streams  # The ports share the last time stamps of all senders.
         channel.sign_with(signing)
@@ -68,7 +66,7 @@ class VehicleSigning:
         return True
 
     def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:
-        """Return the function that decides which unsigned frames this port accepts; None accepts no such frame."""
+        """Return the function that decides which unsigned frames this port accepts; None to accept none."""
         raise NotImplementedError
 
     def may_change(self) -> bool:
@@ -105,14 +103,15 @@ class _Signing(Signing):
 class ReceivedCorrections:
     """Assembles the fragments of RTCM messages as ArduPilot does (AP_GPS.cpp, handle_gps_rtcm_fragment).
 
-    ``messages`` contains the assembled messages. ``is_recent`` is True if the latest message is recent.
+    ``messages`` contains the last 1000 assembled messages. ``is_recent`` is True if the latest one is recent.
     """
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
         self.messages: list[bytes] = []
         self._received_at = -math.inf
-        self._sequence, self._fragments = -1, dict[int, bytes]()
+        self._sequence = -1  # of the message that is being assembled
+        self._fragments: dict[int, bytes] = {}  # by fragment id
         vehicle.on(GpsRtcmData, lambda message, _: self._on_fragment(message))
 
     @property
@@ -121,14 +120,16 @@ class ReceivedCorrections:
 
     def _on_fragment(self, message: GpsRtcmData) -> None:
         data = bytes(message.data[: message.len])
-        # The flags contain, from the lowest bit: is_fragmented (1 bit), fragment_id (2 bits), sequence (5 bits).
-        is_fragmented, fragment_id, sequence = message.flags & 1, message.flags >> 1 & 3, message.flags >> 3
+        is_fragmented = message.flags & 1
+        fragment_id = message.flags >> 1 & 3
+        sequence = message.flags >> 3
         if not is_fragmented:
             self._add(data)
             return
         if sequence != self._sequence or fragment_id in self._fragments:  # A new message begins.
             self._fragments.clear()
-        self._sequence, self._fragments[fragment_id] = sequence, data
+        self._sequence = sequence
+        self._fragments[fragment_id] = data
         # A fragment that is shorter than FRAGMENT_SIZE is the last one. If the message fills all MAX_FRAGMENTS
         # fragments, no fragment is short.
         has_short = any(len(fragment) < FRAGMENT_SIZE for fragment in self._fragments.values())
@@ -140,7 +141,7 @@ class ReceivedCorrections:
 
     def _add(self, message: bytes) -> None:
         self.messages.append(message)
-        del self.messages[:-1000]
+        del self.messages[:-_MAX_CORRECTIONS]
         self._received_at = self._vehicle.now
 
 
@@ -234,7 +235,8 @@ class SimulatedAutopilot(SimulatedVehicle):
 
 
 _RESTING_CELL_VOLTS = ((0.0, 3.0), (5.0, 3.3), (20.0, 3.6), (50.0, 3.75), (75.0, 3.95), (100.0, 4.2))
-# Linear sections of the resting voltage, from full to empty: percent and volts at the lower end, volts per percent.
+# The lines between two of these points, from full to empty. Each is given by percent and volts at its lower end, and by
+# its slope in volts per percent.
 _RESTING_CELL_SLOPES = tuple(
     (low, volts, (high_volts - volts) / (high - low))
     for (low, volts), (high, high_volts) in pairwise(_RESTING_CELL_VOLTS)
@@ -248,12 +250,7 @@ class SimulatedBattery:
     consumed_wh: float
 
     def __init__(
-        self,
-        capacity_mah: float = 3300.0,
-        *,
-        cells: int = 3,
-        percent: float = 100.0,
-        resistance_ohm: float = 0.012,
+        self, capacity_mah: float = 3300.0, *, cells: int = 3, percent: float = 100.0, resistance_ohm: float = 0.012
     ) -> None:
         self.capacity_mah = capacity_mah
         self.cells = cells
@@ -290,4 +287,5 @@ class SimulatedBattery:
         for low_percent, low_volts, volts_per_percent in _RESTING_CELL_SLOPES:
             if percent >= low_percent:
                 return low_volts + (min(percent, 100.0) - low_percent) * volts_per_percent
-        return _RESTING_CELL_VOLTS[0][1]
+        _, empty_volts = _RESTING_CELL_VOLTS[0]
+        return empty_volts

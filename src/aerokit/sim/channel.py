@@ -18,7 +18,7 @@ from aerokit.mavlink.signing import Signing
 MessageT = TypeVar("MessageT", bound=Message)
 _MAX_FLOAT32 = 3.4028234663852886e38
 NS_PER_S = 1e9
-"""Due times in seconds are rounded to nanoseconds: events with different intervals are then due at the same instants.
+"""Due times in seconds are rounded to nanoseconds, so that events with different intervals can be due at one instant.
 
 ``round(seconds * NS_PER_S) / NS_PER_S`` takes half the time of ``round(seconds, 9)``.
 """
@@ -106,7 +106,9 @@ class _StreamGroup:
     __slots__ = ("count", "ids", "interval_s", "start")
 
     def __init__(self, interval_s: float, start: float) -> None:
-        self.interval_s, self.start, self.count = interval_s, start, 0
+        self.interval_s = interval_s
+        self.start = start
+        self.count = 0
         self.ids: list[int] = []
 
 
@@ -176,10 +178,12 @@ class Streams:
                 return ids
             ids += group.ids
             group.count += 1
-            following = round((group.start + group.count * group.interval_s) * NS_PER_S) / NS_PER_S
-            if following <= now:  # The next message is late, too, so the streams start again now.
-                following, group.start, group.count = now + group.interval_s, now, 1
-            heapreplace(heap, (following, number, group))
+            next_due = round((group.start + group.count * group.interval_s) * NS_PER_S) / NS_PER_S
+            if next_due <= now:  # The next message is late, too, so the streams start again now.
+                group.start = now
+                group.count = 1
+                next_due = now + group.interval_s
+            heapreplace(heap, (next_due, number, group))
         self.next_due = math.inf
         return ids
 
@@ -253,7 +257,8 @@ class Channel:
 
     def take_pieces(self) -> list[bytes]:
         """Return and clear the outbox, with one element for each call of `write`."""
-        pieces, self._outbox = self._outbox, []
+        pieces = self._outbox
+        self._outbox = []
         return pieces
 
     def take_datagrams(self) -> list[bytes]:
@@ -261,7 +266,7 @@ class Channel:
         return datagrams(self.take_pieces())
 
     def reset(self) -> None:
-        """Reset stream rates, partial frames and sequence numbers because of a reboot. The outbox stays."""
+        """Reset stream rates, partial frames and sequence numbers because of a reboot. The outbox is kept."""
         self.streams = Streams()
         self.reader = MessageReader(self._wanted)
         self._encoders.clear()

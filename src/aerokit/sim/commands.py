@@ -16,7 +16,7 @@ from aerokit.protocols.servers import commands
 from aerokit.protocols.servers.commands import CommandHandler as CommandHandler
 from aerokit.protocols.servers.commands import CommandProgress as CommandProgress
 from aerokit.protocols.servers.commands import ReceivedCommand as ReceivedCommand
-from aerokit.protocols.servers.commands import whole as whole
+from aerokit.protocols.servers.commands import to_int as to_int
 from aerokit.sim.faults import CommandFault
 from aerokit.sim.motion import Ned
 from aerokit.sim.vehicle import MessageHost
@@ -51,7 +51,7 @@ class CommandServer(commands.CommandDispatcher):
             self._answer_with(command, answer, fault)
 
     def _answer_with(self, command: ReceivedCommand, result: int, fault: CommandFault | None) -> None:
-        """Send the acknowledgement as ``fault`` changes it: with progress, repeated, delayed or not at all."""
+        """Send the acknowledgement. A fault may send progress before it, or repeat, delay or lose it."""
         fault = CommandFault() if fault is None else fault
         if fault.progress:
             # The final acknowledgement follows the progress. `final_fault` repeats, delays or drops it.
@@ -83,8 +83,9 @@ class Setpoint:
     velocity: Ned
     acceleration: Ned
     yaw: float | None
+    """Yaw in radians; None if the mask ignores it."""
     yaw_rate: float | None
-    """Yaw is in radians, the yaw rate in radians per second. None if the mask ignores the value."""
+    """Yaw rate in radians per second; None if the mask ignores it."""
 
     @classmethod
     def of(cls, message: PositionTarget) -> Setpoint:

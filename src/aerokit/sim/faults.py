@@ -82,12 +82,7 @@ class Faults:
             super().__setattr__(name, value)
 
     def refuse(
-        self,
-        command: int,
-        result: int = MavResult.DENIED,
-        text: str | None = None,
-        *,
-        times: int | None = None,
+        self, command: int, result: int = MavResult.DENIED, text: str | None = None, *, times: int | None = None
     ) -> None:
         """Do not execute a MAV_CMD, but answer with this MAV_RESULT and an optional status text."""
         self.commands[command] = CommandFault(times, refuse_with=result, text=text)

@@ -5,6 +5,7 @@ The protocol is documented with its messages only: https://mavlink.io/en/message
 
 from __future__ import annotations
 
+import math
 import random
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -12,15 +13,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from aerokit.mavlink.enums import MavSeverity
 from aerokit.mavlink.message import Message
-from aerokit.mavlink.messages import (
-    LogData,
-    LogEntry,
-    LogErase,
-    LogRequestData,
-    LogRequestEnd,
-    LogRequestList,
-)
+from aerokit.mavlink.messages import LogData, LogEntry, LogErase, LogRequestData, LogRequestEnd, LogRequestList
 from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import SimulatedVehicle
 
@@ -44,7 +39,7 @@ class SimulatedLog:
 
     def make(self) -> bytes:
         """Return the content. Of two logs with the same seed, the longer one starts with the shorter one."""
-        words = -(-self.size // 4)  # The number of 32-bit words, rounded up.
+        words = math.ceil(self.size / 4)  # A word has 32 bits.
         return (SAMPLE_LOG + random.Random(self._content_seed).randbytes(4 * words))[: self.size]
 
     def grown(self, count: int, time_utc: int) -> SimulatedLog:
@@ -76,11 +71,14 @@ class LogServer:
         self.logs: list[SimulatedLog] = list(logs)
         self.rate_hz = rate_hz
         self._vehicle = vehicle
-        self._erase_files, self._append_to_file = erase_files, append_to_file
+        self._erase_files = erase_files
+        self._append_to_file = append_to_file
         self._outgoing: deque[Callable[[], Message]] = deque()
         self._channel: Channel | None = None
         self._transfer_number = 0
-        self._content: tuple[int, bytes] = (-1, b"")
+        # Content of the log that was requested last, and its index; -1 if there is none.
+        self._content = b""
+        self._content_number = -1
         vehicle.on(LogRequestList, self._on_list)
         vehicle.on(LogRequestData, self._on_data)
         vehicle.on(LogErase, self._on_erase)
@@ -105,7 +103,7 @@ class LogServer:
     def _on_erase(self, request: LogErase, channel: Channel) -> None:
         self.restart()
         self.logs.clear()
-        self._content = (-1, b"")
+        self._content_number = -1
         self._erase_files()
 
     def _on_end(self, request: LogRequestEnd, channel: Channel) -> None:
@@ -113,9 +111,11 @@ class LogServer:
 
     def content(self, number: int) -> bytes:
         """Return the content of the log at this index."""
-        if (self._content[0], len(self._content[1])) != (number, self.logs[number].size):
-            self._content = (number, self.logs[number].make())
-        return self._content[1]
+        log = self.logs[number]
+        if number != self._content_number or len(self._content) != log.size:  # The size differs if the log has grown.
+            self._content_number = number
+            self._content = log.make()
+        return self._content
 
     def write_on(self, count: int, time_utc: int) -> None:
         """Extend the newest log by ``count`` bytes, and set its time to ``time_utc``."""
@@ -127,8 +127,8 @@ class LogServer:
         """Return functions that create the LOG_DATA messages of a range. A range without data has one empty block."""
         data = self.content(number)
         end = min(len(data), offset + count)
-        starts = range(offset, end, _BLOCK) if offset < end else range(offset, offset + 1)
-        return [partial(_block, data, log_id, start, end) for start in starts]
+        starts: Sequence[int] = range(offset, end, _BLOCK) if offset < end else [offset]
+        return [partial(_log_data, data, log_id, start, end) for start in starts]
 
     def transfer(self, messages: Sequence[Callable[[], Message]], channel: Channel) -> None:
         """Abort the running transfer, if any, and send these messages."""
@@ -153,12 +153,7 @@ class ArduPilotLogServer(LogServer):
     """
 
     def __init__(
-        self,
-        vehicle: SimulatedVehicle,
-        logs: Sequence[SimulatedLog],
-        *,
-        is_armed: Callable[[], bool],
-        **options: Any,
+        self, vehicle: SimulatedVehicle, logs: Sequence[SimulatedLog], *, is_armed: Callable[[], bool], **options: Any
     ) -> None:
         super().__init__(vehicle, logs, **options)
         self._is_armed = is_armed
@@ -178,7 +173,7 @@ class ArduPilotLogServer(LogServer):
 
     def _entry(self, number: int, last: int) -> LogEntry:
         if number == 0:
-            return LogEntry(0, 0, 0, 0, 0)
+            return LogEntry(id=0, num_logs=0, last_log_num=0, time_utc=0, size=0)
         log = self.logs[number - 1]
         return LogEntry(number, len(self.logs), last, log.time_utc, log.size)
 
@@ -201,7 +196,7 @@ class ArduPilotLogServer(LogServer):
     def _refuses(self) -> bool:
         armed = self._is_armed()
         if armed and not self._has_warned:
-            self._vehicle.send_text(3, "Disarm for log download")
+            self._vehicle.send_text(MavSeverity.ERROR, "Disarm for log download")
         self._has_warned = armed
         return armed
 
@@ -231,10 +226,10 @@ class Px4LogServer(LogServer):
         if not is_available or request.ofs >= self.logs[request.id].size:
             self.restart()
             return
-        whole_blocks = max(1, -(-request.count // _BLOCK))  # The number of blocks, rounded up.
+        whole_blocks = max(1, math.ceil(request.count / _BLOCK))
         self.transfer(self.blocks(request.id, request.id, request.ofs, whole_blocks * _BLOCK), channel)
 
 
-def _block(data: bytes, log_id: int, start: int, end: int) -> LogData:
+def _log_data(data: bytes, log_id: int, start: int, end: int) -> LogData:
     piece = data[start : min(end, start + _BLOCK)]
     return LogData(log_id, start, len(piece), piece)

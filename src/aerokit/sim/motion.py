@@ -86,9 +86,9 @@ _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
 BRAKING_SHARE = 0.7  # A vehicle plans to brake with 70 % of the acceleration limit, and keeps the rest in reserve.
 _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
-# Motion within these limits counts as steady, so steps of 0.12 s are exact enough: a jerk of 4 m/s³ changes the
-# position by only 4 · 0.12³ / 6 m, which is 1.2 mm. Motion near the ground does not count as steady, because the time
-# and speed of a touchdown need short steps.
+# Motion within these limits counts as steady, so steps of 0.12 s are exact enough. For example, a jerk of 4 m/s³ only
+# changes the position by 4 · 0.12³ / 6 m, which is 1.2 mm. Motion near the ground does not count as steady, because the
+# time and speed of a touchdown need short steps.
 _STEADY_JERK_M_S3 = 4.0
 _STEADY_LEAN_RATE_RAD_S = 0.6
 _STEADY_ABOVE_GROUND_S = 0.3
@@ -111,7 +111,7 @@ def _clamp(value: float, limit: float) -> float:
 
 
 def velocity_to_landing_target(north: float, east: float) -> tuple[float, float]:
-    """Return the horizontal velocity (m/s) towards the target of a precision landing, which is this far away (m)."""
+    """Return the horizontal velocity (m/s) towards a landing target that is ``north`` and ``east`` metres away."""
     gain_per_s = min(_APPROACH_PER_S, _MAX_APPROACH_M_S / max(math.hypot(north, east), 1e-6))
     return (north * gain_per_s, east * gain_per_s)
 
@@ -211,7 +211,9 @@ class Motion:
     def _set_target(
         self, target: Ned, *, is_acceleration: bool = False, lean: tuple[float, float] | None = None
     ) -> None:
-        self._target, self._target_is_acceleration, self._target_lean = target, is_acceleration, lean
+        self._target = target
+        self._target_is_acceleration = is_acceleration
+        self._target_lean = lean
 
     def seek_position(
         self, north: float, east: float, down: float, *, speed: float, climb: float, descent: float
@@ -219,13 +221,14 @@ class Motion:
         """Fly to a point and stop there, with limits of the horizontal speed, climb rate and sink rate in m/s."""
         offset_north, offset_east, offset_down = north - self.north, east - self.east, down - self.down
         distance = math.hypot(offset_north, offset_east)
-        scale = 0.0
+        speed_per_metre = 0.0
         if distance > 1e-6:  # At the point, the direction is undefined.
             deceleration = BRAKING_SHARE * self.limits.acceleration_m_s2
-            scale = min(speed, approach_speed(distance, 1.0, deceleration)) / distance
+            speed_per_metre = min(speed, approach_speed(distance, 1.0, deceleration)) / distance
         vertical = approach_speed(abs(offset_down), 1.0, BRAKING_SHARE * self.limits.vertical_acceleration_m_s2)
         vertical = min(vertical, descent if offset_down > 0 else climb)
-        self.seek_velocity(offset_north * scale, offset_east * scale, math.copysign(vertical, offset_down))
+        velocity_down = math.copysign(vertical, offset_down)
+        self.seek_velocity(offset_north * speed_per_metre, offset_east * speed_per_metre, velocity_down)
 
     def face(self, yaw: float) -> None:
         """Turn to this heading (rad)."""
@@ -233,7 +236,8 @@ class Motion:
 
     def turn(self, rate: float) -> None:
         """Turn at this rate (rad/s)."""
-        self._wanted_yaw, self._wanted_yaw_rate = None, rate
+        self._wanted_yaw = None
+        self._wanted_yaw_rate = rate
 
     @property
     def is_on_ground(self) -> bool:
@@ -270,9 +274,10 @@ class Motion:
         if powered:
             north, east, down = self._commanded_acceleration()
         else:
-            drag = GRAVITY_M_S2 / _TERMINAL_SPEED_M_S  # At the terminal speed, the drag equals the weight.
-            north, east = -drag * self.velocity_north, -drag * self.velocity_east
-            down = GRAVITY_M_S2 - drag * self.velocity_down
+            drag_per_s = GRAVITY_M_S2 / _TERMINAL_SPEED_M_S  # At the terminal speed, the drag equals the weight.
+            north = -drag_per_s * self.velocity_north
+            east = -drag_per_s * self.velocity_east
+            down = GRAVITY_M_S2 - drag_per_s * self.velocity_down
         change = abs(north - self.acceleration_north) + abs(east - self.acceleration_east)
         self._jerk_m_s3 = (change + abs(down - self.acceleration_down)) / dt
         self._integrate(north, east, down, dt)
@@ -289,12 +294,14 @@ class Motion:
         self._wanted_yaw, self._wanted_yaw_rate = None, 0.0
 
     def _update_gusts(self, dt: float) -> None:
-        decay, kick = 1.0 - dt / 2.0, self.wind.gusts_m_s * math.sqrt(dt)
+        # The gusts are a random walk that returns to zero. Its standard deviation is `gusts_m_s`.
+        decay = 1.0 - dt / 2.0
+        kick = self.wind.gusts_m_s * math.sqrt(dt)
         self._gust_north = self._gust_north * decay + self._rng.gauss(0.0, kick)
         self._gust_east = self._gust_east * decay + self._rng.gauss(0.0, kick)
 
     def _commanded_acceleration(self) -> tuple[float, float, float]:
-        """Return the acceleration (north, east, down) towards the target, limited as the motion limits require."""
+        """Return the acceleration (north, east, down) towards the target, within `limits`."""
         limits = self.limits
         north, east, down = self._target
         if not self._target_is_acceleration:
@@ -318,10 +325,7 @@ class Motion:
         right = GRAVITY_M_S2 * math.tan(_clamp(roll, max_lean))
         cos_yaw, sin_yaw = math.cos(self.yaw), math.sin(self.yaw)
         drag_north, drag_east = self._drag()
-        return (
-            forward * cos_yaw - right * sin_yaw - drag_north,
-            forward * sin_yaw + right * cos_yaw - drag_east,
-        )
+        return (forward * cos_yaw - right * sin_yaw - drag_north, forward * sin_yaw + right * cos_yaw - drag_east)
 
     def _drag(self) -> tuple[float, float]:
         return (
@@ -330,6 +334,7 @@ class Motion:
         )
 
     def _integrate(self, north: float, east: float, down: float, dt: float) -> None:
+        """Accelerate for ``dt`` seconds. On the ground, the vehicle stops."""
         self.acceleration_north = north
         self.acceleration_east = east
         self.acceleration_down = down
@@ -349,6 +354,7 @@ class Motion:
             self.velocity_down = 0.0
 
     def _lean(self, north: float, east: float, dt: float, *, powered: bool) -> None:
+        """Lean in the direction of the acceleration. Without power, or on the ground, become level."""
         roll = pitch = 0.0
         if powered and not self.is_on_ground:
             # The copter also leans against its drag.

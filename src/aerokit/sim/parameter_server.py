@@ -22,12 +22,7 @@ class ParameterServer(servers.ParameterProtocolServer):
     """Base of the parameter servers, which answer parameter requests. The `Faults` of the vehicle apply."""
 
     def __init__(
-        self,
-        vehicle: SimulatedVehicle,
-        parameters: SimParameters,
-        *,
-        list_rate_hz: float = 1000.0,
-        errors: bool = True,
+        self, vehicle: SimulatedVehicle, parameters: SimParameters, *, list_rate_hz: float = 1000.0, errors: bool = True
     ) -> None:
         super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz)
         self.errors = errors

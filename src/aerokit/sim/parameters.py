@@ -48,8 +48,9 @@ class SimParameter:
     def as_parameter(self, index: int | None = None) -> Parameter:
         """Convert to a `Parameter`, the client's class. Values of integer types become int."""
         type_ = ParameterType(self.type)
-        value, default = (int(x) if type_.is_integer else x for x in (self.value, self.default))
-        return Parameter(self.name, value, type_, default, index)
+        if type_.is_integer:
+            return Parameter(self.name, int(self.value), type_, int(self.default), index)
+        return Parameter(self.name, self.value, type_, self.default, index)
 
 
 class SimParameters:
@@ -60,7 +61,8 @@ class SimParameters:
 
     def __init__(self, rows: Iterable[SimParameter]) -> None:
         self._rows: dict[str, SimParameter | str] = {row.name: row for row in rows}
-        self._switches = {row.name: row.switch for row in self._all() if row.switch is not None}
+        # Maps the name of a parameter to the name of the parameter that enables it.
+        self._switches = {row.name: row.switch for row in self._all_rows() if row.switch is not None}
         self._names: tuple[str, ...] | None = None
         self._indices: dict[str, int] = {}
 
@@ -88,7 +90,7 @@ class SimParameters:
     def __setitem__(self, name: str, value: float) -> None:
         """Set a value. Raises KeyError for an unknown name."""
         row = self.row(name)
-        row.value = stored(value, row.type)
+        row.value = stored_value(value, row.type)
         if name in self._switches.values():
             self._names = None  # `names` is made again, because the switch may show or hide parameters.
 
@@ -141,7 +143,7 @@ class SimParameters:
 
     def add(self, name: str, value: float, type: int = MavParamType.REAL32) -> None:  # noqa: A002
         """Append a parameter, like a firmware on which a feature is enabled at run time."""
-        self._rows[name] = SimParameter(name, type, stored(value, type), stored(value, type))
+        self._rows[name] = SimParameter(name, type, stored_value(value, type), stored_value(value, type))
         self._names = None
 
     def remove(self, name: str) -> None:
@@ -149,16 +151,17 @@ class SimParameters:
         self._switches.pop(name, None)
         self._names = None
 
-    def _all(self) -> Iterator[SimParameter]:
+    def _all_rows(self) -> Iterator[SimParameter]:
         return (self.row(name) for name in list(self._rows))
 
 
-def stored(value: float, type_: int) -> float:
+def stored_value(value: float, type_: int) -> float:
     """Return the value that a parameter of this MAV_PARAM_TYPE stores."""
-    range_ = _RANGES.get(MavParamType(type_))
-    if range_ is None:
+    integer_range = _RANGES.get(MavParamType(type_))
+    if integer_range is None:
         return float(struct.unpack("<f", struct.pack("<f", value))[0]) if math.isfinite(value) else value
-    return float(max(range_[0], min(range_[1], int(value))))
+    low, high = integer_range
+    return float(max(low, min(high, int(value))))
 
 
 def _row(fields: list[str]) -> SimParameter:
@@ -167,7 +170,7 @@ def _row(fields: list[str]) -> SimParameter:
     switch_or_mark = fields[4] if len(fields) > 4 else None
     is_volatile = switch_or_mark == _VOLATILE
     switch = None if is_volatile else switch_or_mark
-    return SimParameter(name, type_, stored(value, type_), stored(default, type_), is_volatile, switch)
+    return SimParameter(name, type_, stored_value(value, type_), stored_value(default, type_), is_volatile, switch)
 
 
 def _switch_of(line: str) -> str | None:
@@ -274,7 +277,8 @@ class _Reader(FileHandle):
     def read(self, offset: int, size: int) -> bytes:
         if size == 0:
             return b""
-        self._block = self._block or size
+        if self._block == 0:
+            self._block = size
         if self._block != size:
             raise FileFault(EINVAL)
         return self.content[offset : offset + size]

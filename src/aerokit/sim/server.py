@@ -65,7 +65,7 @@ class SimulatorServer:
                 " pass one entry for each link"
             )
         self._speedup = speedup
-        self._dues = [0.0] * len(self.vehicles)  # The simulated time of each vehicle's next event.
+        self._dues = [0.0] * len(self.vehicles)  # simulated time of each vehicle's next event
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
         runs_several_ticks = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD  # in one callback
         self._min_wait_s = _MIN_WAIT_S if runs_several_ticks else 0.0
@@ -76,7 +76,8 @@ class SimulatorServer:
         self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)
         self._ports: list[_Port] = []
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_due = self._timer_at = 0.0
+        self._timer_due = 0.0  # simulated time of the event that the timer is for
+        self._timer_at = 0.0  # loop time at which the timer fires
         self._exit = AsyncExitStack()
         # The task that entered the `async with` block. A failing vehicle cancels this task.
         self._owner: asyncio.Task[Any] | None = None
@@ -101,7 +102,8 @@ class SimulatorServer:
     async def __aenter__(self) -> Self:
         if self._loop is not None:
             raise BusyError("this SimulatorServer was already started once; create a new SimulatorServer")
-        self._loop, self._owner = asyncio.get_running_loop(), asyncio.current_task()
+        self._loop = asyncio.get_running_loop()
+        self._owner = asyncio.current_task()
         add_source = getattr(self._loop, "add_event_source", None)  # None unless the loop is a `VirtualClockLoop`
         if add_source is None and len(self.vehicles) > _BATCH_THRESHOLD:
             self._min_wait_s = max(_MIN_WAIT_S, _BATCH_INTERVAL_S / self._speedup)
@@ -136,7 +138,8 @@ class SimulatorServer:
     def _end(self, error: BaseException | None) -> None:
         """Stop. If a vehicle has failed, raise its exception instead of the cancellation that the failure caused."""
         self._stop()
-        owner, self._owner = self._owner, None
+        owner = self._owner
+        self._owner = None
         if self._cancels_owner and owner is not None and owner is asyncio.current_task():
             _uncancel(owner)
         if self.failure is not None and self.failure is not error:
@@ -243,11 +246,12 @@ class SimulatorServer:
         when = self._loop_time(due)
         if self._min_wait_s:
             when = max(when, loop.time() + self._min_wait_s)
-        self._timer_due, self._timer_at = due, when
+        self._timer_due = due
+        self._timer_at = when
         self._timer = loop.call_at(when, self._on_due)
 
     def _skip_lateness(self) -> None:
-        """Skip the time by which the timer is late beyond ``_MAX_CATCH_UP_S``. In real time, skip nothing."""
+        """If the timer is more than ``_MAX_CATCH_UP_S`` late, skip the rest. In real time, skip nothing."""
         has_nothing_scheduled = self._timer is None and self._end_source is None
         if self._loop is None or self._speedup == 1.0 or has_nothing_scheduled:
             return
@@ -266,11 +270,7 @@ class _Port:
     """A link with its vehicles and their channels."""
 
     def __init__(
-        self,
-        server: SimulatorServer,
-        link: Link,
-        vehicles: Sequence[SimulatedVehicle],
-        channels: Sequence[Channel],
+        self, server: SimulatorServer, link: Link, vehicles: Sequence[SimulatedVehicle], channels: Sequence[Channel]
     ) -> None:
         self._server = server
         self.link = link

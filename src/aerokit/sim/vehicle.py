@@ -83,8 +83,9 @@ class ExtraComponent:
 
     def join(self, vehicle: SimulatedVehicle) -> None:
         """Send heartbeats from the next power-on."""
-        # The field mavlink_version is 3.
-        heartbeat = Heartbeat(self.type, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3)
+        heartbeat = Heartbeat(
+            self.type, self.autopilot, self.base_mode, self.custom_mode, self.system_status, mavlink_version=3
+        )
         system_id = vehicle.system_id if self.system_id is None else self.system_id
         sender = (system_id, self.component_id)
         vehicle.on_power_on(lambda: vehicle.every(1.0, lambda: vehicle.send(heartbeat, sender=sender)))
@@ -115,8 +116,8 @@ class SimulatedVehicle:
         self._observers: dict[int, list[Handler]] = {}
         self._timers: list[tuple[float, int, Callable[[], None]]] = []
         self._timer_count = 0
-        self._ticks_from = self._next_tick = math.inf
-        self._ticks_done = 0
+        self._first_tick_at = self._next_tick_at = math.inf  # infinity while the vehicle does not tick
+        self._ticks_done = 0  # since `_first_tick_at`, in units of TICK_S
         self._text_id = 0
         self._is_on = False
         self._at_power_on: list[Callable[[], None]] = []
@@ -142,8 +143,8 @@ class SimulatedVehicle:
         messages = channel.messages(data, now, peer)
         if not messages:
             return
-        # In steady flight, the running tick may be long. Finish the tick before the messages change the targets, and
-        # let the next tick be short.
+        # In steady flight, the running tick may be long. It ends before the messages change the targets, and the next
+        # tick is short.
         self._tick_until(now)
         for message in messages:
             if sender_of(message) != (self.system_id, self.component_id):
@@ -167,13 +168,15 @@ class SimulatedVehicle:
     @property
     def next_due(self) -> float:
         """Time of the next event; infinity if there is none."""
-        if not self._is_on and math.isnan(self.booted_at):  # The power-on, which `step` does, is due at once.
+        if not self._is_on and math.isnan(self.booted_at):  # `step` must switch on the vehicle at once.
             return self.now
         if self.faults.frozen:
             return self.now + TICK_S  # `step` must be called even if nothing happens, because it advances the time.
-        due = self._next_tick
-        if self._timers and self._timers[0][0] < due:
-            due = self._timers[0][0]
+        due = self._next_tick_at
+        if self._timers:
+            timer_due, _, _ = self._timers[0]
+            if timer_due < due:
+                due = timer_due
         for channel in self.channels:
             stream_due = channel.streams.next_due
             if stream_due < due:
@@ -276,23 +279,24 @@ class SimulatedVehicle:
 
     def set_ticking(self, ticking: bool) -> None:
         """Start or stop calling ``tick`` at 50 Hz, and in steady flight at 8 Hz or more."""
-        if ticking == (self._ticks_from != math.inf):
+        is_ticking = self._first_tick_at != math.inf
+        if ticking == is_ticking:
             return
         # Ticks are multiples of TICK_S since the boot, so that ticks, timers and streams are due at the same instants.
-        self._ticks_from = self.booted_at + _whole_ticks(self.uptime) * TICK_S if ticking else math.inf
+        self._first_tick_at = self.booted_at + _whole_ticks(self.uptime) * TICK_S if ticking else math.inf
         self._ticks_done = 0
         self._schedule_tick(1)
 
     def _schedule_tick(self, ticks: int) -> None:
         """Schedule the next tick after this many intervals of TICK_S. An event may cause an earlier tick."""
-        next_tick = self._ticks_from + (self._ticks_done + ticks) * TICK_S
-        self._next_tick = round(next_tick * NS_PER_S) / NS_PER_S if next_tick < math.inf else math.inf
+        next_tick = self._first_tick_at + (self._ticks_done + ticks) * TICK_S
+        self._next_tick_at = round(next_tick * NS_PER_S) / NS_PER_S if next_tick < math.inf else math.inf
 
     def _tick_until(self, now: float) -> None:
         """Advance to ``now`` by a single tick that stands for all ticks since the last one."""
-        if now < self._ticks_from:
+        if now < self._first_tick_at:
             return
-        ticks = _whole_ticks(now - self._ticks_from) - self._ticks_done
+        ticks = _whole_ticks(now - self._first_tick_at) - self._ticks_done
         if ticks > 0:
             self._ticks_done += ticks
             self.tick(ticks * TICK_S)
@@ -317,7 +321,7 @@ class SimulatedVehicle:
             return
         self.now = now
         self._timers = [(when + delay, count, action) for when, count, action in self._timers]
-        self._ticks_from += delay
+        self._first_tick_at += delay
         self._schedule_tick(1)
         for channel in self.channels:
             channel.streams.postpone(delay)

@@ -20,6 +20,7 @@ _TURN_GAIN_PER_S = 0.8
 _HEIGHT_GAIN_PER_S = 0.4
 _ANGLE_OF_ATTACK_RAD = math.radians(2.0)
 _GLIDE_SPEED_FACTOR = 1.3  # The airspeed of a glide without power, divided by the minimum airspeed.
+_MAX_SLOPE = 0.7  # sine of the steepest path
 _STOPPED_M_S = 0.3
 
 
@@ -58,7 +59,7 @@ class FixedWing(Motion):
         self.wing_limits: WingLimits = wing if wing is not None else WingLimits()
         self.throttle: float = 0.0
         """Engine throttle, 0 to 1."""
-        self._speed = 0.0
+        self._speed = 0.0  # airspeed in flight, ground speed on the ground
         self._wanted_airspeed = 0.0
         self._wanted_bank = 0.0
         self._wanted_climb = 0.0
@@ -89,7 +90,8 @@ class FixedWing(Motion):
 
     def circle(self, north: float, east: float, down: float, *, radius: float, airspeed: float) -> None:
         """Circle a point with this radius in metres, clockwise or, with a negative radius, counter-clockwise."""
-        radius, turn_sign = max(1.0, abs(radius)), math.copysign(1.0, radius)
+        turn_sign = math.copysign(1.0, radius)
+        radius = max(1.0, abs(radius))
         distance = math.hypot(north - self.north, east - self.east)
         course_to_centre = math.atan2(east - self.east, north - self.north)
         # Far away, the course points to the centre. On the circle, the course is the tangent. In between, the course
@@ -137,19 +139,20 @@ class FixedWing(Motion):
     def _roll_on_ground(self, dt: float, *, powered: bool) -> None:
         """Roll along the nose on the level ground. Without power, the plane brakes."""
         wanted_speed = self._wanted_airspeed if powered else 0.0
-        self._approach_speed(wanted_speed, dt)
+        self._change_airspeed(wanted_speed, dt)
         self.throttle = 1.0 if powered and wanted_speed > self._speed else 0.0
         self.roll = self.pitch = 0.0
         self.roll_rate = self.pitch_rate = self.yaw_rate = 0.0
         self.velocity_north, self.velocity_east = self._along_nose(self._speed)
-        self.velocity_down, self.down = 0.0, self.ground_down
+        self.velocity_down = 0.0
+        self.down = self.ground_down
         self._advance(dt)
 
     def _fly(self, dt: float, *, powered: bool) -> None:
         wing = self.wing_limits
         wanted_climb = self._wanted_climb if powered else -wing.glide_sink_m_s
         wanted_speed = max(wing.airspeed_min_m_s, min(wing.airspeed_max_m_s, self._wanted_airspeed))
-        self._approach_speed(wanted_speed if powered else _GLIDE_SPEED_FACTOR * wing.airspeed_min_m_s, dt)
+        self._change_airspeed(wanted_speed if powered else _GLIDE_SPEED_FACTOR * wing.airspeed_min_m_s, dt)
         self._bank(self._wanted_bank if powered else 0.0, dt)
         acceleration_down = (-wanted_climb - self.velocity_down) / _CLIMB_TIME_CONSTANT_S
         limit = wing.vertical_acceleration_m_s2
@@ -173,7 +176,7 @@ class FixedWing(Motion):
         self.velocity_down: float = 0.0
         self.roll = self.pitch = 0.0
 
-    def _approach_speed(self, wanted: float, dt: float) -> None:
+    def _change_airspeed(self, wanted: float, dt: float) -> None:
         deceleration = self.wing_limits.roll_out_m_s2 if self.is_on_ground else self.wing_limits.acceleration_m_s2
         self._speed += max(-deceleration * dt, min(self.wing_limits.acceleration_m_s2 * dt, wanted - self._speed))
 
@@ -185,7 +188,8 @@ class FixedWing(Motion):
         self.yaw: float = wrap_pi(self.yaw + self.yaw_rate * dt)
 
     def _pitch(self, dt: float) -> None:
-        slope = math.asin(max(-0.7, min(0.7, -self.velocity_down / max(self._speed, 1.0))))
+        sine_of_slope = -self.velocity_down / max(self._speed, 1.0)
+        slope = math.asin(max(-_MAX_SLOPE, min(_MAX_SLOPE, sine_of_slope)))
         step = (slope + _ANGLE_OF_ATTACK_RAD - self.pitch) * min(1.0, dt / _PITCH_TIME_CONSTANT_S)
         self.pitch += step
         self.pitch_rate: float = step / dt
@@ -244,14 +248,16 @@ class GroundMotion(Motion):
         self._wanted_speed = 0.0
         self._wanted_turn_rate = 0.0
         self._wanted_heading: float | None = None
-        """Heading to turn to, which replaces the turn rate; None without such a heading."""
+        """Heading to turn to, which replaces the turn rate; None if the turn rate applies."""
 
     def stop(self) -> None:
         self.drive(0.0, 0.0)
 
     def drive(self, speed: float, turn_rate: float) -> None:
         """Drive at this speed in m/s (negative: backwards), with this turn rate in rad/s."""
-        self._wanted_speed, self._wanted_turn_rate, self._wanted_heading = speed, turn_rate, None
+        self._wanted_speed = speed
+        self._wanted_turn_rate = turn_rate
+        self._wanted_heading = None
 
     def head(self, speed: float, heading: float) -> None:
         """Drive at this speed in m/s, and turn to this heading in radians."""
@@ -297,10 +303,11 @@ class GroundMotion(Motion):
         self.stop()
 
     def _turn_rate(self) -> float:
-        wheels, rate = self.wheels, self._wanted_turn_rate
+        """Return the wanted turn rate, limited by the steering, which turns only while the vehicle moves."""
+        rate = self._wanted_turn_rate
         if self._wanted_heading is not None:
             rate = _HEADING_GAIN_PER_S * wrap_pi(self._wanted_heading - self.yaw)
-        limit = min(wheels.turn_rate_rad_s, abs(self.speed_m_s) / wheels.turn_radius_m)
+        limit = min(self.wheels.turn_rate_rad_s, abs(self.speed_m_s) / self.wheels.turn_radius_m)
         return max(-limit, min(limit, rate))
 
     def _curve_speed(self, rate: float) -> float:
@@ -368,13 +375,14 @@ class UnderwaterMotion(Motion):
 
     def step(self, dt: float, *, powered: bool = True) -> None:
         """Advance by ``dt`` seconds. A submarine without power rises."""
-        # Acceleration without thrust: buoyancy is upwards, and the drag is against the velocity.
+        # Without thrust, the buoyancy accelerates upwards, and the drag against the velocity.
         floating_down = -self.buoyancy_m_s2 - _DRAG_PER_S * self.velocity_down
         if powered:
             north, east, commanded_down = self._commanded_acceleration()
             down = floating_down if self._is_floating else commanded_down
         else:
-            north, east = -_DRAG_PER_S * self.velocity_north, -_DRAG_PER_S * self.velocity_east
+            north = -_DRAG_PER_S * self.velocity_north
+            east = -_DRAG_PER_S * self.velocity_east
             down = floating_down
         self._integrate(north, east, down, dt)
         self._turn(dt, powered=powered)
@@ -382,7 +390,8 @@ class UnderwaterMotion(Motion):
     def _integrate(self, north: float, east: float, down: float, dt: float) -> None:
         super()._integrate(north, east, down, dt)
         if self.down < self.ground_down:
-            self.down, self.velocity_down = self.ground_down, max(0.0, self.velocity_down)
+            self.down = self.ground_down
+            self.velocity_down = max(0.0, self.velocity_down)
         elif self.down > self.bottom_down:
             self.down: float = self.bottom_down
             self.velocity_down: float = min(0.0, self.velocity_down)

@@ -143,7 +143,7 @@ class RecordedMissions(MissionServer):
         recorded = (self.items(request.mission_type) or ())[request.seq]
         return _item_message(recorded, request.seq, sender_of(request), isinstance(request, m.MissionRequest))
 
-    def _put(self, upload: ListUpload, message: AnyItem) -> int:
+    def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
         self._received[message.seq :] = [message]
         return MavMissionResult.ACCEPTED
 

@@ -10,7 +10,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraCapFlags, VideoStreamEncoding, VideoStreamStatusFlags, VideoStreamType
 from aerokit.mavlink.message import Message
 from aerokit.protocols.servers.camera_device import CameraDevice
-from aerokit.protocols.servers.commands import ReceivedCommand, whole
+from aerokit.protocols.servers.commands import ReceivedCommand, to_int
 from aerokit.protocols.servers.intervals import Builder
 
 # Handlers are coroutine functions, because a device may need time. The handlers of simulated devices never suspend.
@@ -50,26 +50,20 @@ def camera_settings(camera: CameraDevice) -> m.CameraSettings:
 
 def _number(command: ReceivedCommand | None) -> int:
     """Return param 2 of a request: the number of a storage or stream; 0 (all) for a message that is streamed."""
-    return 0 if command is None else whole(command.param2)
+    return 0 if command is None else to_int(command.param2)
 
 
 def _information(camera: CameraDevice) -> m.CameraInformation:
+    sensor_width_mm, sensor_height_mm = camera.sensor_mm
+    width, height = camera.resolution
     return m.CameraInformation(
-        time_boot_ms=camera.host.time_boot_ms,
-        vendor_name=camera.vendor.encode()[:32].ljust(32, b"\0"),
-        model_name=camera.model.encode()[:32].ljust(32, b"\0"),
-        firmware_version=camera.firmware_version,
-        focal_length=camera.focal_length_mm,
-        sensor_size_h=camera.sensor_mm[0],
-        sensor_size_v=camera.sensor_mm[1],
-        resolution_h=camera.resolution[0],
-        resolution_v=camera.resolution[1],
-        lens_id=0,
-        flags=camera.capabilities,
+        time_boot_ms=camera.host.time_boot_ms, vendor_name=camera.vendor.encode()[:32].ljust(32, b"\0"),
+        model_name=camera.model.encode()[:32].ljust(32, b"\0"), firmware_version=camera.firmware_version,
+        focal_length=camera.focal_length_mm, sensor_size_h=sensor_width_mm, sensor_size_v=sensor_height_mm,
+        resolution_h=width, resolution_v=height, lens_id=0, flags=camera.capabilities,
         cam_definition_version=camera.definition_version if camera.definition_uri else 0,
-        cam_definition_uri=camera.definition_uri,
-        gimbal_device_id=camera.gimbal_device_id,
-    )
+        cam_definition_uri=camera.definition_uri, gimbal_device_id=camera.gimbal_device_id,
+    )  # fmt: skip
 
 
 def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[Message]:
@@ -79,7 +73,7 @@ def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[M
     """
     if command is None:
         return camera.captures.images[-1:]
-    first, last = whole(command.param2), whole(command.param3)
+    first, last = to_int(command.param2), to_int(command.param3)
     if first < 0:
         return list(camera.captures.images)
     return camera.captures.between(first, None if last == _TO_THE_END else max(first, last))
@@ -89,16 +83,13 @@ def _streams(camera: CameraDevice, number: int) -> list[m.VideoStreamInformation
     """Return VIDEO_STREAM_INFORMATION for one stream, or for all streams if ``number`` is 0."""
     return [
         m.VideoStreamInformation(
-            **_stream_fields(camera, stream),
-            count=len(camera.streams),
-            type=VideoStreamType.RTSP if uri.startswith("rtsp") else VideoStreamType.RTPUDP,
-            name=f"Stream {stream}",
-            uri=uri,
-            encoding=VideoStreamEncoding.H264,
+            **_stream_fields(camera, stream), count=len(camera.streams),
+            type=VideoStreamType.RTSP if uri.startswith("rtsp") else VideoStreamType.RTPUDP, name=f"Stream {stream}",
+            uri=uri, encoding=VideoStreamEncoding.H264,
         )
         for stream, uri in enumerate(camera.streams, start=1)
         if number in (0, stream)
-    ]
+    ]  # fmt: skip
 
 
 def _stream_status(camera: CameraDevice, number: int) -> list[m.VideoStreamStatus]:
@@ -108,12 +99,13 @@ def _stream_status(camera: CameraDevice, number: int) -> list[m.VideoStreamStatu
 
 def _stream_fields(camera: CameraDevice, stream: int) -> dict[str, Any]:
     """Return the fields that VIDEO_STREAM_INFORMATION and VIDEO_STREAM_STATUS have in common."""
+    width, height = camera.stream_size
     return {
         "stream_id": stream,
         "flags": _flags(camera, stream),
         "framerate": camera.stream_hz,
-        "resolution_h": camera.stream_size[0],
-        "resolution_v": camera.stream_size[1],
+        "resolution_h": width,
+        "resolution_v": height,
         "bitrate": camera.stream_bits_s,
         "rotation": 0,
         "hfov": _field_of_view(camera),
@@ -132,11 +124,16 @@ def _thermal_range(camera: CameraDevice) -> list[m.CameraThermalRange]:
     if camera.thermal_celsius is None:
         return []
     coldest, hottest = camera.thermal_celsius
-    stream, now_ms = len(camera.streams), camera.host.time_boot_ms
-    return [m.CameraThermalRange(now_ms, stream, 0, hottest, 1.0, 1.0, coldest, 0.0, 0.0)]
+    return [
+        m.CameraThermalRange(
+            time_boot_ms=camera.host.time_boot_ms, stream_id=len(camera.streams), camera_device_id=0, max=hottest,
+            max_point_x=1.0, max_point_y=1.0, min=coldest, min_point_x=0.0, min_point_y=0.0,
+        )
+    ]  # fmt: skip
 
 
 def _field_of_view(camera: CameraDevice) -> int:
     """Return the horizontal field of view in degrees; 0 if unknown."""
-    width, focal = camera.sensor_mm[0], camera.focal_length_mm
-    return 0 if math.isnan(width / focal) else round(math.degrees(2 * math.atan(width / 2 / focal)))
+    sensor_width_mm, _ = camera.sensor_mm
+    tangent = sensor_width_mm / 2 / camera.focal_length_mm
+    return 0 if math.isnan(tangent) else round(math.degrees(2 * math.atan(tangent)))

@@ -10,7 +10,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraCapFlags, CameraMode, MavCmd, MavResult
 from aerokit.protocols.servers.camera import AsyncHandler, camera_settings
 from aerokit.protocols.servers.camera_device import CameraDevice
-from aerokit.protocols.servers.commands import ReceivedCommand, whole
+from aerokit.protocols.servers.commands import ReceivedCommand, to_int
 
 if TYPE_CHECKING:
     from aerokit.protocols.servers.commands import CommandHandler
@@ -26,7 +26,7 @@ def camera_commands(camera: CameraDevice) -> dict[int, AsyncHandler]:
     return {
         MavCmd.IMAGE_START_CAPTURE: pictures.start,
         MavCmd.IMAGE_STOP_CAPTURE: pictures.stop,
-        MavCmd.DO_DIGICAM_CONTROL: pictures.control,
+        MavCmd.DO_DIGICAM_CONTROL: pictures.digicam_control,
         MavCmd.STORAGE_FORMAT: pictures.format,
         MavCmd.VIDEO_START_CAPTURE: videos.start,
         MavCmd.VIDEO_STOP_CAPTURE: videos.stop,
@@ -77,7 +77,7 @@ class _Pictures:
         """
         camera, captures = self._camera, self._camera.captures
         interval_s = command.param2 if math.isfinite(command.param2) else 0.0
-        count, number = whole(command.param3), whole(command.param4)
+        count, number = to_int(command.param3), to_int(command.param4)
         in_wrong_mode = _has_wrong_mode(camera, CameraMode.VIDEO, _CAN_ALWAYS_CAPTURE)
         if not camera.can(CameraCapFlags.CAPTURE_IMAGE):
             return MavResult.UNSUPPORTED
@@ -100,7 +100,7 @@ class _Pictures:
         self._camera.captures.stop()
         return MavResult.ACCEPTED
 
-    async def control(self, command: ReceivedCommand) -> int:
+    async def digicam_control(self, command: ReceivedCommand) -> int:
         """Execute DO_DIGICAM_CONTROL, a command of the older camera protocol. Param 5 is 1 to take an image."""
         if command.x == 1:
             self._camera.captures.take()
@@ -151,7 +151,7 @@ class _Videos:
 
     async def stream(self, command: ReceivedCommand, *, runs: bool) -> int:
         """Start or stop the stream with the number in param 1; 0 selects all streams."""
-        camera, number = self._camera, whole(command.param1)
+        camera, number = self._camera, to_int(command.param1)
         available = range(1, len(camera.streams) + 1)
         if not available:
             return MavResult.UNSUPPORTED
@@ -174,7 +174,7 @@ class _Settings:
 
     async def set_mode(self, command: ReceivedCommand) -> int:
         """Set the CAMERA_MODE in param 2, unless the camera is taking images or recording."""
-        camera, mode = self._camera, whole(command.param2)
+        camera, mode = self._camera, to_int(command.param2)
         if not camera.can(CameraCapFlags.HAS_MODES):
             return MavResult.UNSUPPORTED
         needed_capabilities = {
@@ -194,7 +194,7 @@ class _Settings:
         camera = self._camera
         if not camera.can(CameraCapFlags.HAS_BASIC_ZOOM):
             return MavResult.UNSUPPORTED
-        if not await camera.set_zoom(whole(command.param1), command.param2):
+        if not await camera.set_zoom(to_int(command.param1), command.param2):
             return MavResult.DENIED
         return self._send_settings()
 
@@ -202,12 +202,12 @@ class _Settings:
         camera = self._camera
         if not camera.can(CameraCapFlags.HAS_BASIC_FOCUS):
             return MavResult.UNSUPPORTED
-        if not await camera.set_focus(whole(command.param1), command.param2):
+        if not await camera.set_focus(to_int(command.param1), command.param2):
             return MavResult.DENIED
         return self._send_settings()
 
     async def set_source(self, command: ReceivedCommand) -> int:
-        source = whole(command.param2)
+        source = to_int(command.param2)
         if not await self._camera.set_source(source):
             return MavResult.DENIED
         self._camera.source = source

@@ -101,7 +101,10 @@ class CameraDevice:
 
     def failed_shot(self) -> Shot:
         """Return the content of CAMERA_IMAGE_CAPTURED for an image that could not be taken."""
-        return partial(CameraImageCaptured, self.host.time_boot_ms, 0, 0, 0, 0, 0, 0, UNKNOWN_ATTITUDE, file_url="")
+        return partial(
+            CameraImageCaptured, time_boot_ms=self.host.time_boot_ms, time_utc=0, camera_id=0, lat=0, lon=0, alt=0,
+            relative_alt=0, q=UNKNOWN_ATTITUDE, file_url="",
+        )  # fmt: skip
 
     def has_space(self) -> bool:
         """Return True if another image fits."""
@@ -175,7 +178,9 @@ class Captures:
 
     def switch_off(self) -> None:
         """End the series and the video at once, as a power failure does. The image log is kept."""
-        self._remaining, self._is_exposing, self._is_late, self._recording_since = 0, False, False, math.nan
+        self._remaining = 0
+        self._is_exposing = self._is_late = False
+        self._recording_since = math.nan
         self._series += 1
 
     @property
@@ -289,14 +294,10 @@ class Captures:
             image_status = _CAPTURING if self._is_exposing else _IDLE
         recording_s = camera.host.now - self._recording_since if self.is_recording else 0.0
         return CameraCaptureStatus(
-            time_boot_ms=camera.host.time_boot_ms,
-            image_status=image_status,
-            video_status=int(self.is_recording),
-            image_interval=self.interval_s if is_series else 0.0,
-            recording_time_ms=round(recording_s * 1000),
-            available_capacity=camera.free_mib,
-            image_count=self.image_count,
-        )
+            time_boot_ms=camera.host.time_boot_ms, image_status=image_status, video_status=int(self.is_recording),
+            image_interval=self.interval_s if is_series else 0.0, recording_time_ms=round(recording_s * 1000),
+            available_capacity=camera.free_mib, image_count=self.image_count,
+        )  # fmt: skip
 
 
 _UNKNOWN = math.nan

@@ -48,7 +48,7 @@ class ReceivedCommand:
     def place(self) -> tuple[int, int]:
         """Return latitude and longitude in degrees times 1e7."""
         scale = 1e7 if self.is_long else 1
-        return (whole(self.x * scale), whole(self.y * scale))
+        return (to_int(self.x * scale), to_int(self.y * scale))
 
     @property
     def altitude_frame(self) -> int:
@@ -92,18 +92,23 @@ class CommandDispatcher:
         host.on(CommandInt, self._on_int)
 
     def _on_long(self, message: CommandLong, channel: Channel) -> None:
-        params = (message.param1, message.param2, message.param3, message.param4)
-        position = (message.param5, message.param6, message.param7)
-        sender, confirmation = sender_of(message), message.confirmation
-        self.execute(ReceivedCommand(message.command, *params, *position, None, channel, sender, confirmation))
+        command = ReceivedCommand(
+            command=message.command, param1=message.param1, param2=message.param2, param3=message.param3,
+            param4=message.param4, x=message.param5, y=message.param6, z=message.param7, frame=None, channel=channel,
+            sender=sender_of(message), confirmation=message.confirmation,
+        )  # fmt: skip
+        self.execute(command)
 
     def _on_int(self, message: CommandInt, channel: Channel) -> None:
-        params = (message.param1, message.param2, message.param3, message.param4)
-        position = (message.x, message.y, message.z)
-        self.execute(ReceivedCommand(message.command, *params, *position, message.frame, channel, sender_of(message)))
+        command = ReceivedCommand(
+            command=message.command, param1=message.param1, param2=message.param2, param3=message.param3,
+            param4=message.param4, x=message.x, y=message.y, z=message.z, frame=message.frame, channel=channel,
+            sender=sender_of(message),
+        )  # fmt: skip
+        self.execute(command)
 
     def execute(self, command: ReceivedCommand) -> None:
-        """Answer a command with the refusal, if there is one; otherwise dispatch the command."""
+        """Refuse a command, or dispatch it to its handler."""
         refusal = self._refusal(command)
         if refusal is not None:
             self.answer(command, refusal)
@@ -191,8 +196,8 @@ class RunningCommands:
         self._host = host
         self._server = server
         self._running: dict[int, RunningCommand] = {}
-        # Maps MAV_CMD and sender to the sender's last such command that has ended, its result, and the time of its end.
-        # The command that ended last is the last entry.
+        # Maps (MAV_CMD, sender) to the last command that has ended, its result, and the time of its end. The command
+        # that ended last is the last entry.
         self._ended: dict[tuple[int, tuple[int, int]], tuple[ReceivedCommand, Outcome, float]] = {}
         host.on(CommandCancel, self._on_cancel)
 
@@ -265,6 +270,6 @@ def _is_repeated(command: ReceivedCommand, first: ReceivedCommand) -> bool:
     return all(param == earlier or (math.isnan(param) and math.isnan(earlier)) for param, earlier in pairs)
 
 
-def whole(value: float) -> int:
+def to_int(value: float) -> int:
     """Return a parameter as an integer; 0 for NaN (unset) and for values beyond 32 bits."""
     return int(value) if not math.isnan(value) and abs(value) < 2**31 else 0

@@ -114,7 +114,7 @@ class TextMount(Mount):
     """Read-only text files, such as ArduPilot's ``@SYS``. Each is reported with a size of 100,000 bytes when opened."""
 
     is_listed = True
-    _PLACEHOLDER = 100_000
+    _REPORTED_SIZE = 100_000
 
     def __init__(self, texts: dict[str, str]) -> None:
         self._texts = texts
@@ -122,7 +122,7 @@ class TextMount(Mount):
     def size(self, path: str) -> int:
         if path not in self._texts:
             raise FileFault(ENOENT)
-        return self._PLACEHOLDER
+        return self._REPORTED_SIZE
 
     def open(self, path: str, *, writing: bool) -> FileHandle:
         if writing:
@@ -132,27 +132,28 @@ class TextMount(Mount):
         return _Opened(None, _File(self._texts[path].encode()))
 
     def entries(self) -> list[Entry]:
-        return [(name, self._PLACEHOLDER) for name in self._texts]
+        return [(name, self._REPORTED_SIZE) for name in self._texts]
 
 
 class _File:
     """A file in memory. Its content may be given by a function, which is called on first access."""
 
     def __init__(self, content: bytes | Callable[[], bytes] = b"", size: int | None = None) -> None:
-        self._make = content if callable(content) else None
+        self._make_content = content if callable(content) else None
         self._content = bytearray() if callable(content) else bytearray(content)
         self._size = size
 
     @property
     def content(self) -> bytearray:
-        if self._make is not None:
-            self._content, self._make = bytearray(self._make()), None
+        if self._make_content is not None:
+            self._content = bytearray(self._make_content())
+            self._make_content = None
         return self._content
 
     @property
     def size(self) -> int:
-        """Size in bytes. If the size was given, the content is not created only to determine the size."""
-        if self._make is not None and self._size is not None:
+        """Size in bytes. A size that was given is returned without creating the content."""
+        if self._make_content is not None and self._size is not None:
             return self._size
         return len(self.content)
 
@@ -293,8 +294,7 @@ class FileTree:
         """
         if self.free_bytes is None:
             return
-        is_full = self.free_bytes == 0  # A new name has size 0, but does not fit either if no byte is free.
-        if size >= 0 and (size > self.free_bytes or is_full):
+        if size >= 0 and max(size, 1) > self.free_bytes:
             raise FileFault(ENOSPC)
         self.free_bytes -= size
 

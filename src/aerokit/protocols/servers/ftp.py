@@ -141,7 +141,7 @@ class SessionFtpServer(Generic[FilesT]):
             return request.session
         return next(number for number in range(self.max_sessions) if number not in peer.sessions)
 
-    def _fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
+    def _answer_fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
         """Return the answer to a request that failed."""
         return request.refuse_errno(fault.errno)
 
@@ -174,13 +174,14 @@ class SessionFtpServer(Generic[FilesT]):
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
         """Execute a request. A handler that returns None answers later."""
         handler = _HANDLERS.get(request.opcode)
-        peer.request, peer.reply = request, None  # The reply to the previous request must not be sent again.
+        peer.request = request
+        peer.reply = None  # The reply to the previous request must not be sent again.
         try:
             answer = self._unknown(request) if handler is None else handler(self, peer, request)
         except Refused as refused:
             answer = request.refuse(refused.code)
         except FileFault as fault:
-            answer = self._fault(peer, request, fault)
+            answer = self._answer_fault(peer, request, fault)
         if answer is not None:
             self._reply(peer, self._adapted(peer, request, answer))
 
@@ -198,7 +199,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _path(self, request: FtpPacket) -> str:
         return checked_path(request.data[: request.size])
 
-    def _opened(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
+    def _session_of(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
         """Return the session that a request names; raises Refused if it is not open."""
         session = peer.sessions.get(request.session)
         if session is None:
@@ -212,7 +213,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge(request.data[: request.size])
 
     def _terminate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        session = self._opened(peer, request)
+        session = self._session_of(peer, request)
         del peer.sessions[request.session]
         session.burst = None
         session.file.close()
@@ -281,22 +282,23 @@ class SessionFtpServer(Generic[FilesT]):
         self._host.call_at(peer.used_at + self.session_timeout_s, close_if_due)
 
     def _read(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        session = self._opened(peer, request)
+        session = self._session_of(peer, request)
         if request.offset >= session.size:
             return request.refuse(MavFtpErr.EOF)
         return request.acknowledge(session.file.read(request.offset, request.size))
 
     def _write(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        session = self._opened(peer, request)
+        session = self._session_of(peer, request)
         session.file.write(request.offset, request.data[: request.size])
         return request.acknowledge(request.size.to_bytes(4, "little"))
 
     def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
         """Start a burst, or move a running one to another offset. Return None, because the blocks are the answer."""
-        session = self._opened(peer, request)
+        session = self._session_of(peer, request)
         is_running = session.burst is not None
         first_sequence = (request.sequence + 1) & 0xFFFF
-        session.burst, session.burst_sent = request.replace(sequence=first_sequence), 0
+        session.burst = request.replace(sequence=first_sequence)
+        session.burst_sent = 0
         if not is_running:
             self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
         return None
@@ -313,6 +315,7 @@ class SessionFtpServer(Generic[FilesT]):
         self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
 
     def _send_block(self, peer: FtpPeer, session: FtpSession, burst: FtpPacket, *, may_end: bool) -> None:
+        """Send a block of a burst. At the end of the file, or on an error, send the refusal that ends the burst."""
         # Unlike in a request, the sequence number in `burst` is already that of the reply.
         number = session.number
         answer = burst.acknowledge(offset=burst.offset, session=number).replace(sequence=burst.sequence)
@@ -320,7 +323,8 @@ class SessionFtpServer(Generic[FilesT]):
         try:
             data = b"" if burst.offset >= session.size else session.file.read(burst.offset, DATA_SIZE)
         except FileFault as fault:
-            data, peer.errno = b"", fault.errno
+            data = b""
+            peer.errno = fault.errno
             refusal = refusal.replace(data=bytes([MavFtpErr.FAILERRNO, peer.errno]), size=2)
         if not data:
             session.burst = None
@@ -335,12 +339,12 @@ class SessionFtpServer(Generic[FilesT]):
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         """Answer with the folder's entries from number ``offset`` on: as many as fit into one message."""
-        entries = self._entries(self._path(request))
+        lines = [*self.list_prefix, *map(_line, self._entries(self._path(request)))]
         listing = b""
-        for text in [*self.list_prefix, *map(_line, entries)][request.offset :]:
-            if len(listing) + len(text) + len(self.line_end) > DATA_SIZE:
+        for line in lines[request.offset :]:
+            if len(listing) + len(line) + len(self.line_end) > DATA_SIZE:
                 break
-            listing += text + self.line_end
+            listing += line + self.line_end
         if not listing:
             return request.refuse(MavFtpErr.EOF)
         return request.acknowledge(listing)
@@ -362,7 +366,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         old_path, _, new_path = request.data[: request.size].partition(b"\0")
         if len(old_path) + 2 >= request.size:  # The data ends after the old path, so there is no new path.
-            return self._fault(peer, request, FileFault(EINVAL))
+            return self._answer_fault(peer, request, FileFault(EINVAL))
         self.files.rename(checked_path(old_path), checked_path(new_path))
         return request.acknowledge()
 
@@ -371,11 +375,13 @@ class SessionFtpServer(Generic[FilesT]):
         path = self._path(request)
         is_repeated = peer.checksum is not None and request.repeats(peer.checksum)
         if not is_repeated:  # The running computation also answers a repeated request.
-            file, peer.checksum = self.files.open(path), request
-            self._continue_crc32(peer, request, file, 0, 0)
+            file = self.files.open(path)
+            peer.checksum = request
+            self._continue_crc32(peer, request, file, offset=0, checksum=0)
         return None
 
     def _continue_crc32(self, peer: FtpPeer, request: FtpPacket, file: FileHandle, offset: int, checksum: int) -> None:
+        """Add the next slice of the file to the checksum, and schedule the slice after it, or answer at the end."""
         has_more = True
         try:
             for _ in range(self.crc_blocks_at_once):
@@ -383,17 +389,20 @@ class SessionFtpServer(Generic[FilesT]):
                 if not data:
                     has_more = False
                     break
-                checksum, offset = crc32(data, checksum), offset + len(data)
+                checksum = crc32(data, checksum)
+                offset += len(data)
             answer = request.acknowledge(checksum.to_bytes(4, "little"))
         except FileFault as fault:
-            has_more, answer = False, self._fault(peer, request, fault)
+            has_more = False
+            answer = self._answer_fault(peer, request, fault)
         if peer.checksum is request and has_more:
             self._host.call_later(_CRC_PAUSE_S, lambda: self._continue_crc32(peer, request, file, offset, checksum))
             return
         with suppress(FileFault):
             file.close()
         if peer.checksum is request:  # A newer request may have replaced this one, which then gets no answer.
-            peer.checksum, peer.used_at = None, self._host.now
+            peer.checksum = None
+            peer.used_at = self._host.now
             self._reply(peer, self._adapted(peer, request, answer))
 
 

@@ -25,7 +25,7 @@ class FtpPacket(FtpMessage):
         return cls.decode(message.payload, cut=False).replace(client=sender_of(message))
 
     def repeats(self, other: FtpPacket) -> bool:
-        """Return True if this request equals another one; bytes after their ``size`` do not matter."""
+        """Return True if this request equals ``other``. Only the first ``size`` bytes of ``data`` are compared."""
         fields = ("client", "sequence", "session", "opcode", "offset", "size")
         are_equal = all(getattr(self, field) == getattr(other, field) for field in fields)
         return are_equal and self.data[: self.size] == other.data[: other.size]
@@ -35,11 +35,11 @@ class FtpPacket(FtpMessage):
 
     def acknowledge(self, data: bytes = b"", *, offset: int = 0, session: int | None = None) -> FtpPacket:
         """Return the ACK of this request."""
-        session = self.session if session is None else session
-        sequence, opcode = (self.sequence + 1) & 0xFFFF, MavFtpOpcode.ACK
         return FtpPacket(
-            sequence, opcode, session, len(data), self.opcode, offset=offset & 0xFFFFFFFF, data=data, client=self.client
-        )
+            sequence=(self.sequence + 1) & 0xFFFF, opcode=MavFtpOpcode.ACK,
+            session=self.session if session is None else session, size=len(data), request_opcode=self.opcode,
+            offset=offset & 0xFFFFFFFF, data=data, client=self.client,
+        )  # fmt: skip
 
     def refuse(self, code: int, errno: int | None = None) -> FtpPacket:
         """Return the NAK of this request."""

@@ -15,7 +15,7 @@ from aerokit.mavlink.enums import (
     MavResult,
 )
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
-from aerokit.protocols.servers.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.protocols.servers.commands import CommandHandler, ReceivedCommand, to_int
 from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
 from aerokit.protocols.servers.intervals import Builder
 
@@ -134,44 +134,25 @@ def _flags(gimbal: GimbalMount) -> int:
 
 
 def _attitude_status(gimbal: GimbalMount) -> m.GimbalDeviceAttitudeStatus:
-    """Return the attitude of the gimbal, to all (0). Its yaw is from north if it is locked, else from the nose."""
+    """Return the attitude as a broadcast. The yaw is relative to north if it is locked, otherwise to the nose."""
     is_from_north = gimbal.is_yaw_locked
     angles = gimbal.angles_from_north() if is_from_north else gimbal.angles()
     return m.GimbalDeviceAttitudeStatus(
-        target_system=0,
-        target_component=0,
-        time_boot_ms=gimbal.host.time_boot_ms,
-        flags=_flags(gimbal) | GimbalDeviceFlags.ACCEPTS_YAW_IN_EARTH_FRAME,
-        q=quaternion_from_euler(*angles),
-        angular_velocity_x=math.nan,
-        angular_velocity_y=math.nan,
-        angular_velocity_z=math.nan,
-        failure_flags=0,
-        delta_yaw=gimbal.heading(),
-        delta_yaw_velocity=math.nan,
-        gimbal_device_id=0,
-    )
+        target_system=0, target_component=0, time_boot_ms=gimbal.host.time_boot_ms,
+        flags=_flags(gimbal) | GimbalDeviceFlags.ACCEPTS_YAW_IN_EARTH_FRAME, q=quaternion_from_euler(*angles),
+        angular_velocity_x=math.nan, angular_velocity_y=math.nan, angular_velocity_z=math.nan, failure_flags=0,
+        delta_yaw=gimbal.heading(), delta_yaw_velocity=math.nan, gimbal_device_id=0,
+    )  # fmt: skip
 
 
 def _device_information(gimbal: GimbalMount) -> m.GimbalDeviceInformation:
     (roll_min, roll_max), (pitch_min, pitch_max), (yaw_min, yaw_max) = gimbal.limits
     return m.GimbalDeviceInformation(
-        time_boot_ms=gimbal.host.time_boot_ms,
-        vendor_name=gimbal.vendor,
-        model_name=gimbal.model,
-        custom_name="",
-        firmware_version=_FIRMWARE,
-        hardware_version=_FIRMWARE,
-        uid=gimbal.device_id,
-        cap_flags=gimbal.capabilities,
-        custom_cap_flags=0,
-        roll_min=roll_min,
-        roll_max=roll_max,
-        pitch_min=pitch_min,
-        pitch_max=pitch_max,
-        yaw_min=yaw_min,
-        yaw_max=yaw_max,
-    )
+        time_boot_ms=gimbal.host.time_boot_ms, vendor_name=gimbal.vendor, model_name=gimbal.model, custom_name="",
+        firmware_version=_FIRMWARE, hardware_version=_FIRMWARE, uid=gimbal.device_id, cap_flags=gimbal.capabilities,
+        custom_cap_flags=0, roll_min=roll_min, roll_max=roll_max, pitch_min=pitch_min, pitch_max=pitch_max,
+        yaw_min=yaw_min, yaw_max=yaw_max,
+    )  # fmt: skip
 
 
 def _manager_information(gimbal: GimbalMount) -> m.GimbalManagerInformation:
@@ -195,7 +176,7 @@ class GimbalRequests:
 
     def _selects_gimbal(self, device_id: float) -> bool:
         """Return True if a device id in a command or message selects this gimbal; 0 selects all."""
-        return whole(device_id) in (0, self._gimbal.device_id)
+        return to_int(device_id) in (0, self._gimbal.device_id)
 
     def configure(self, command: ReceivedCommand) -> int:
         """Set primary control (params 1 and 2) and secondary control (params 3 and 4).
@@ -203,11 +184,12 @@ class GimbalRequests:
         Each pair is a system and component id. -1 means unchanged, -2 the sender, -3 release.
         """
         gimbal, sender = self._gimbal, command.sender
-        numbers = [command.param1, command.param2, command.param3, command.param4]
-        if not self._selects_gimbal(command.z) or not all(_RELEASE <= number <= 255 for number in numbers):
+        ids = (command.param1, command.param2, command.param3, command.param4)
+        if not self._selects_gimbal(command.z) or not all(_RELEASE <= number <= 255 for number in ids):
             return MavResult.DENIED
-        primary = _owner(gimbal.primary, (int(numbers[0]), int(numbers[1])), sender)
-        secondary = _owner(gimbal.secondary, (int(numbers[2]), int(numbers[3])), sender)
+        system1, component1, system2, component2 = map(int, ids)
+        primary = _owner(gimbal.primary, (system1, component1), sender)
+        secondary = _owner(gimbal.secondary, (system2, component2), sender)
         gimbal.set_control(primary, secondary)
         return MavResult.ACCEPTED
 
@@ -218,7 +200,7 @@ class GimbalRequests:
         pitch, yaw, pitch_rate, yaw_rate = map(
             math.radians, (command.param1, command.param2, command.param3, command.param4)
         )
-        is_applied = self.apply(whole(command.x), (0.0, pitch, yaw), (0.0, pitch_rate, yaw_rate))
+        is_applied = self.apply(to_int(command.x), (0.0, pitch, yaw), (0.0, pitch_rate, yaw_rate))
         return MavResult.ACCEPTED if is_applied else MavResult.DENIED
 
     def _refusal(self, device_id: float, command: ReceivedCommand) -> int | None:
@@ -244,12 +226,13 @@ class GimbalRequests:
         """Follow the vehicle whose system id is param 1."""
         if (refusal := self._refusal(command.param2, command)) is not None:
             return refusal
-        self._gimbal.follow(whole(command.param1))
+        self._gimbal.follow(to_int(command.param1))
         return MavResult.ACCEPTED
 
     def on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
         """Update the target if the message comes from the followed vehicle."""
-        self._gimbal.update_followed(sender_of(message)[0], (message.lat, message.lon, message.alt * 1e-3))
+        system_id, _component = sender_of(message)
+        self._gimbal.update_followed(system_id, (message.lat, message.lon, message.alt * 1e-3))
 
     def look_ahead(self, command: ReceivedCommand) -> int:
         if (refusal := self._refusal(command.param1, command)) is not None:
@@ -282,9 +265,9 @@ class GimbalRequests:
 
     def _apply_attitude(self, message: m.GimbalManagerSetAttitude | m.GimbalDeviceSetAttitude) -> None:
         has_angles = not any(map(math.isnan, message.q))
-        angles = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
+        roll, pitch, yaw = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
         rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
-        self.apply(message.flags, (angles[0], angles[1], angles[2]), rates)
+        self.apply(message.flags, (roll, pitch, yaw), rates)
 
     def on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
         if self._selects_gimbal(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):

@@ -10,12 +10,15 @@ from collections.abc import Callable, Iterable
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import MessageInterval
-from aerokit.protocols.servers.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.protocols.servers.commands import CommandHandler, ReceivedCommand, to_int
 from aerokit.protocols.servers.host import Channel, ServerHost
 
 # Function that returns the current messages with one id. Its argument is the REQUEST_MESSAGE command, or None when the
 # messages are streamed.
 Builder = Callable[["ReceivedCommand | None"], "Iterable[Message]"]
+
+
+_NOT_STREAMED = -1  # interval in MESSAGE_INTERVAL
 
 
 class MessageStreams:
@@ -62,7 +65,7 @@ class MessageStreams:
         return True
 
     def _send_stream(self, key: tuple[Channel, int], stream: _Stream) -> None:
-        if self._streams.get(key) is not stream:  # This stream was stopped, or replaced by another one.
+        if self._streams.get(key) is not stream:  # This stream was stopped, or replaced by a new one.
             return
         channel, message_id = key
         try:
@@ -85,25 +88,25 @@ class MessageStreams:
         return MavResult.ACCEPTED if messages else MavResult.FAILED
 
     def _request_message(self, command: ReceivedCommand) -> int:
-        return self.answer_with(whole(command.param1), command)
+        return self.answer_with(to_int(command.param1), command)
 
     def _set_interval(self, command: ReceivedCommand) -> int:
         """Set or stop a stream. Both 0 (default rate) and -1 stop it, because streams have no default rate."""
-        message_id = whole(command.param1)
+        message_id = to_int(command.param1)
         if message_id not in self.builders:
             return MavResult.DENIED
         # A stream to all channels would also be sent to this channel, in addition to the requested stream.
         self._streams.pop((None, message_id), None)
-        is_accepted = self.stream(message_id, whole(command.param2) / 1e6, command.channel)
+        is_accepted = self.stream(message_id, to_int(command.param2) / 1e6, command.channel)
         return MavResult.ACCEPTED if is_accepted else MavResult.TEMPORARILY_REJECTED
 
     def _get_interval(self, command: ReceivedCommand) -> int:
-        message_id = whole(command.param1)
+        message_id = to_int(command.param1)
         if message_id not in self.builders:
             return MavResult.DENIED
-        stream_to_all = self._streams.get((None, message_id), _Stream(0.0))
-        interval_s = self._streams.get((command.channel, message_id), stream_to_all).interval_s
-        interval_us = round(interval_s * 1e6) or -1  # -1: the message is not streamed
+        stream_to_all = self._streams.get((None, message_id))
+        stream = self._streams.get((command.channel, message_id), stream_to_all)
+        interval_us = _NOT_STREAMED if stream is None else round(stream.interval_s * 1e6)
         self._host.send(MessageInterval(message_id, interval_us), command.channel)
         return MavResult.ACCEPTED
 

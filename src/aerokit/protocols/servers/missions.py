@@ -178,7 +178,7 @@ class MissionServer:
         return items[seq] if 0 <= seq < len(items) else _R.INVALID_SEQUENCE
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
-        """Return the item as MISSION_ITEM_INT or MISSION_ITEM, like the request."""
+        """Return the item as MISSION_ITEM_INT or MISSION_ITEM, whichever was requested."""
         seq, kind = request.seq, request.mission_type
         system, component = sender_of(request)
         current = seq == self.current and kind == MavMissionType.MISSION
@@ -188,7 +188,7 @@ class MissionServer:
             item, seq, target_system=system, target_component=component, mission_type=kind, current=current
         )
 
-    def _put(self, upload: ListUpload, message: AnyItem) -> int:
+    def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
         """Store the expected item of an upload; return the MAV_MISSION_RESULT."""
         upload.uses_int = isinstance(message, m.MissionItemInt)
         upload.items.append(from_wire(message))
@@ -312,11 +312,12 @@ class MissionServer:
 
     def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
         """Store the expected item of an upload, and request the next one."""
-        result = self._put(upload, message)
+        result = self._store_item(upload, message)
         if result != _R.ACCEPTED:
             self._end(upload, result)
             return
-        upload.received_at, upload.next = self._host.now, upload.next + 1
+        upload.received_at = self._host.now
+        upload.next += 1
         if upload.next < upload.end:
             self._request_item(upload)
         else:
@@ -370,8 +371,9 @@ class MissionServer:
             if self._clearing is not request:  # The server was reset before the answer arrived.
                 return
             if result == _R.ACCEPTED and kinds:
-                self.store(kinds[0], ())
-                self._clear(kinds[1:], request, channel)
+                first, *others = kinds
+                self.store(first, ())
+                self._clear(others, request, channel)
                 return
             self._clearing = None
             self._acknowledge(sender_of(request), request.mission_type, result, channel)

@@ -227,7 +227,7 @@ class ExtendedParameterServer(ParameterLists):
         raise NotImplementedError
 
     def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
-        """Set a value; return PARAM_ACK, and the value and type to report."""
+        """Set a value; return PARAM_ACK, and the value (encoded) and MAV_PARAM_EXT_TYPE to report."""
         raise NotImplementedError
 
     def _on_list(self, _: m.ParamExtRequestList, channel: Channel) -> None:

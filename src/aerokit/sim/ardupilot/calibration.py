@@ -14,7 +14,7 @@ from aerokit.mavlink.enums import (
     PreflightCalibrationAccelerometer,
 )
 from aerokit.sim.ardupilot.host import ArduPilotHost
-from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, to_int
 
 _SAMPLE_S, _REPEAT_INTERVAL_S = 1.3, 1.0
 _LAST = AccelcalVehiclePos.BACK
@@ -52,7 +52,7 @@ class AccelerometerCalibration:
         if not self.is_waiting or command.param1 != self._requested:
             return MavResult.FAILED
         self._requested = None
-        run_number, position = self._run_number, whole(command.param1)
+        run_number, position = self._run_number, to_int(command.param1)
         self._vehicle.call_later(_SAMPLE_S, lambda: self._on_sample(run_number, position))
         return MavResult.ACCEPTED
 
@@ -77,8 +77,10 @@ class AccelerometerCalibration:
 
         def request_until_confirmed() -> None:
             if run_number == self._run_number and self._requested == position:
-                params = (float(position), 0, 0, 0, 0, 0, 0)
-                self._vehicle.send(m.CommandLong(0, 0, MavCmd.ACCELCAL_VEHICLE_POS, 0, *params))
+                target, confirmation, unused_params = (0, 0), 0, (0.0,) * 6
+                self._vehicle.send(
+                    m.CommandLong(*target, MavCmd.ACCELCAL_VEHICLE_POS, confirmation, float(position), *unused_params)
+                )
                 self._vehicle.call_later(_REPEAT_INTERVAL_S, request_until_confirmed)
 
         request_until_confirmed()
@@ -106,7 +108,8 @@ class CompassCalibration:
         self._reported_compass = 0
 
     def reset(self) -> None:
-        self._compass_mask, self._started_at = 0, math.inf
+        self._compass_mask = 0
+        self._started_at = math.inf
 
     @property
     def is_running(self) -> bool:
@@ -136,9 +139,10 @@ class CompassCalibration:
             return MavResult.FAILED
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
-        requested = whole(command.param1) & _ALL_COMPASSES  # Bits of compasses that are not fitted are ignored.
+        requested = to_int(command.param1) & _ALL_COMPASSES  # Bits of compasses that are not fitted are ignored.
         self._compass_mask = _ALL_COMPASSES if requested == 0 else requested
-        self._started_at, self._saves_at_once = self._vehicle.now, command.param3 != 0.0
+        self._started_at = self._vehicle.now
+        self._saves_at_once = command.param3 != 0.0
         return MavResult.ACCEPTED
 
     def _accept(self, command: ReceivedCommand) -> int:
@@ -150,7 +154,8 @@ class CompassCalibration:
     def _cancel(self, command: ReceivedCommand) -> int:
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
-        self._compass_mask &= ~(whole(command.param1) or _ALL_COMPASSES)
+        cancelled = to_int(command.param1)
+        self._compass_mask &= ~(_ALL_COMPASSES if cancelled == 0 else cancelled)
         return MavResult.ACCEPTED
 
     def progress(self) -> m.MagCalProgress | None:
@@ -164,10 +169,10 @@ class CompassCalibration:
         # The mask of ten bytes has one bit for each of 80 directions in which the vehicle can point.
         direction_count = percent * 80 // 100
         directions = ((1 << direction_count) - 1).to_bytes(10, "little")
-        attempt, no_direction = 1, (0.0, 0.0, 0.0)
         return m.MagCalProgress(
-            self._progress_compass, self._compass_mask, status, attempt, percent, directions, *no_direction
-        )
+            compass_id=self._progress_compass, cal_mask=self._compass_mask, cal_status=status, attempt=1,
+            completion_pct=percent, completion_mask=directions, direction_x=0.0, direction_y=0.0, direction_z=0.0,
+        )  # fmt: skip
 
     def report(self) -> m.MagCalReport | None:
         """Return the results of the compasses in turn, after a calibration, until they are accepted or cancelled."""
@@ -182,6 +187,7 @@ class CompassCalibration:
         )
 
     def _next_compass(self, compass: int) -> int:
+        """Return the next compass after this one that is being calibrated. After the last compass follows the first."""
         candidates = ((compass + step) % _COMPASSES for step in range(1, _COMPASSES + 1))
         return next(number for number in candidates if self._compass_mask & 1 << number)
 
@@ -227,7 +233,8 @@ class Calibrations:
         if vehicle.motors.is_armed:
             vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow calibration")
             return MavResult.FAILED
-        is_gyro_requested, is_barometer_requested = command.param1 == 1.0, command.param3 == 1.0
+        is_gyro_requested = command.param1 == 1.0
+        is_barometer_requested = command.param3 == 1.0
         if is_gyro_requested:
             vehicle.info("Initialising ArduPilot")
             return CommandProgress(percents=(), interval_s=_GYROS_S)  # Without percentages, only the result is sent.

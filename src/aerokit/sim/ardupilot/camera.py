@@ -8,7 +8,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult, SetFocusType
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import ArduPilotHost
-from aerokit.sim.commands import ReceivedCommand, whole
+from aerokit.sim.commands import ReceivedCommand, to_int
 
 _PERIOD_S, _SHUTTER_S = 0.02, 0.1
 _IDLE, _INTERVAL_SET = 0, 2
@@ -51,8 +51,9 @@ class ArduPilotCamera:
             return False
         motion = self._vehicle.motion
         self.image_count += 1
-        self._taken_at, self._taken_place = self._vehicle.now, (motion.north, motion.east)
-        self.feedback = self._take_feedback()
+        self._taken_at = self._vehicle.now
+        self._taken_place = (motion.north, motion.east)
+        self.feedback = self._make_feedback()
         self._vehicle.send(self.feedback)
         return True
 
@@ -60,7 +61,8 @@ class ArduPilotCamera:
         """Take ``count`` images (-1: until `stop`), one every ``interval_s`` seconds, the first one at once."""
         if not self.is_fitted:
             return False
-        self.interval_s, self.remaining = interval_s, count
+        self.interval_s = interval_s
+        self.remaining = count
         self._schedule_update()
         return True
 
@@ -119,7 +121,7 @@ class ArduPilotCamera:
     def _start(self, interval_s: float, count: float) -> bool:
         if count == 1.0 or (interval_s == 0.0 and count == 0.0):
             return self.take()
-        return self.take_series(interval_s if math.isfinite(interval_s) else 0.0, whole(count) or _UNLIMITED)
+        return self.take_series(interval_s if math.isfinite(interval_s) else 0.0, to_int(count) or _UNLIMITED)
 
     def start_capture(self, command: ReceivedCommand) -> int:
         """Handle MAV_CMD_IMAGE_START_CAPTURE. Param 1 is the number of the camera, or 0 for all cameras."""
@@ -135,7 +137,7 @@ class ArduPilotCamera:
             self.stop()
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
-    def control(self, command: ReceivedCommand) -> int:
+    def digicam_control(self, command: ReceivedCommand) -> int:
         """Handle MAV_CMD_DO_DIGICAM_CONTROL, which is accepted even without a camera. Param 5 is 1 to take an image."""
         if command.x == 1:
             self.take()
@@ -155,7 +157,7 @@ class ArduPilotCamera:
 
     def focus(self, command: ReceivedCommand) -> int:
         """Handle MAV_CMD_SET_CAMERA_FOCUS. Focus by rate or in percent is accepted. Autofocus is UNSUPPORTED."""
-        kind = whole(command.param1)
+        kind = to_int(command.param1)
         # The firmware denies these types even without a camera (AP_Camera.cpp).
         is_unsupported = kind in (SetFocusType.STEP, SetFocusType.METERS)
         if is_unsupported or kind not in list(SetFocusType):
@@ -165,25 +167,15 @@ class ArduPilotCamera:
         is_autofocus = kind not in (SetFocusType.CONTINUOUS, SetFocusType.RANGE)
         return MavResult.UNSUPPORTED if is_autofocus else MavResult.ACCEPTED
 
-    def _take_feedback(self) -> m.CameraFeedback:
+    def _make_feedback(self) -> m.CameraFeedback:
         motion, nav = self._vehicle.motion, self._vehicle.navigation
         place = self._vehicle.frame.to_global(*motion.place)
         return m.CameraFeedback(
-            time_usec=round(self._vehicle.unix_time * 1e6),
-            target_system=0,
-            cam_idx=0,
-            img_idx=self.image_count,
-            lat=place.latitude_e7,
-            lng=place.longitude_e7,
-            alt_msl=place.altitude_m,
-            alt_rel=nav.altitude_above_home,
-            roll=math.degrees(motion.roll),
-            pitch=math.degrees(motion.pitch),
-            yaw=math.degrees(motion.yaw) % 360.0,
-            foc_len=0.0,
-            flags=CameraFeedbackFlags.PHOTO,
-            completed_captures=0,
-        )
+            time_usec=round(self._vehicle.unix_time * 1e6), target_system=0, cam_idx=0, img_idx=self.image_count,
+            lat=place.latitude_e7, lng=place.longitude_e7, alt_msl=place.altitude_m, alt_rel=nav.altitude_above_home,
+            roll=math.degrees(motion.roll), pitch=math.degrees(motion.pitch), yaw=math.degrees(motion.yaw) % 360.0,
+            foc_len=0.0, flags=CameraFeedbackFlags.PHOTO, completed_captures=0,
+        )  # fmt: skip
 
     def last_feedback(self) -> m.CameraFeedback | None:
         return self.feedback if self.is_fitted else None
@@ -192,26 +184,16 @@ class ArduPilotCamera:
         if not self.is_fitted:
             return None
         return m.CameraInformation(
-            time_boot_ms=self._vehicle.time_boot_ms,
-            vendor_name=bytes(32),
-            model_name=bytes(32),
-            firmware_version=0,
-            focal_length=0.0,
-            sensor_size_h=0.0,
-            sensor_size_v=0.0,
-            resolution_h=0,
-            resolution_v=0,
-            lens_id=0,
-            flags=0,
-            cam_definition_version=0,
-            cam_definition_uri="",
+            time_boot_ms=self._vehicle.time_boot_ms, vendor_name=bytes(32), model_name=bytes(32), firmware_version=0,
+            focal_length=0.0, sensor_size_h=0.0, sensor_size_v=0.0, resolution_h=0, resolution_v=0, lens_id=0, flags=0,
+            cam_definition_version=0, cam_definition_uri="",
             gimbal_device_id=1 if self._vehicle.gimbal.is_fitted else 0,
-        )
+        )  # fmt: skip
 
     def settings(self) -> m.CameraSettings | None:
         if not self.is_fitted:
             return None
-        return m.CameraSettings(self._vehicle.time_boot_ms, 0, math.nan, math.nan)
+        return m.CameraSettings(self._vehicle.time_boot_ms, mode_id=0, zoomLevel=math.nan, focusLevel=math.nan)
 
     def capture_status(self) -> m.CameraCaptureStatus | None:
         if not self.is_fitted:
@@ -219,11 +201,7 @@ class ArduPilotCamera:
         # `remaining` is -1 during an unlimited series, which the firmware reports as idle (AP_Camera_Backend.cpp).
         is_series_reported = self.remaining > 0
         return m.CameraCaptureStatus(
-            time_boot_ms=self._vehicle.time_boot_ms,
-            image_status=_INTERVAL_SET if is_series_reported else _IDLE,
-            video_status=0,
-            image_interval=self.interval_s,
-            recording_time_ms=0,
-            available_capacity=math.nan,
+            time_boot_ms=self._vehicle.time_boot_ms, image_status=_INTERVAL_SET if is_series_reported else _IDLE,
+            video_status=0, image_interval=self.interval_s, recording_time_ms=0, available_capacity=math.nan,
             image_count=self.image_count,
-        )
+        )  # fmt: skip

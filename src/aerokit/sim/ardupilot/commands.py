@@ -15,7 +15,7 @@ from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
 from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 from aerokit.sim.motion import Ned, euler_from_quaternion
 
 _FORCE_ARM_OR_DISARM, _FORCE_ARM = 21196.0, 2989.0
@@ -38,7 +38,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     common, requests = _CommonCommands(vehicle), vehicle.requests
     # The table lists commands that the simulation does not execute, and the MAV_RESULT that answers each of them.
     handlers: dict[int, CommandHandler] = {
-        Cmd[command]: common.fixed(Result[result], _FIXED_TEXTS.get((Cmd[command], vehicle.KIND), ()))
+        Cmd[command]: common.constant_answer(Result[result], _FIXED_TEXTS.get((Cmd[command], vehicle.KIND), ()))
         for command, result in rows_of(vehicle.KIND, "fixed_results.csv")
     }
     if vehicle.KIND != "sub":
@@ -60,7 +60,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         Cmd.DO_FENCE_ENABLE: lambda command: vehicle.fence.command(command),
         Cmd.IMAGE_START_CAPTURE: lambda command: vehicle.camera.start_capture(command),
         Cmd.IMAGE_STOP_CAPTURE: lambda command: vehicle.camera.stop_capture(command),
-        Cmd.DO_DIGICAM_CONTROL: lambda command: vehicle.camera.control(command),
+        Cmd.DO_DIGICAM_CONTROL: lambda command: vehicle.camera.digicam_control(command),
         Cmd.DO_SET_CAM_TRIGG_DIST: lambda command: vehicle.camera.set_trigger_distance(command),
         Cmd.SET_CAMERA_ZOOM: lambda command: vehicle.camera.zoom(command),
         Cmd.SET_CAMERA_FOCUS: lambda command: vehicle.camera.focus(command),
@@ -73,7 +73,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         Cmd.BATTERY_RESET: common.reset_battery,
         Cmd.CONTROL_HIGH_LATENCY: common.control_high_latency,
         Cmd.COMPONENT_ARM_DISARM: common.arm_or_disarm,
-        Cmd.DO_SET_MODE: lambda command: vehicle.set_mode_from(whole(command.param1), whole(command.param2)),
+        Cmd.DO_SET_MODE: lambda command: vehicle.set_mode_from(to_int(command.param1), to_int(command.param2)),
         Cmd.DO_SET_MISSION_CURRENT: common.set_mission_current,
         Cmd.DO_FLIGHTTERMINATION: common.terminate,
         Cmd.MISSION_START: common.start_mission,
@@ -112,7 +112,7 @@ class _CommonCommands:
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
 
-    def fixed(self, result: int, texts: tuple[tuple[int, str], ...]) -> CommandHandler:
+    def constant_answer(self, result: int, texts: tuple[tuple[int, str], ...]) -> CommandHandler:
         """Return a handler that always sends these texts and answers ``result``."""
 
         def handle(_: ReceivedCommand) -> int:
@@ -136,12 +136,13 @@ class _CommonCommands:
         return Result.ACCEPTED if is_done else Result.FAILED
 
     def set_mission_current(self, command: ReceivedCommand) -> int:
-        vehicle, resets_mission = self._vehicle, command.param2 == 1.0
+        vehicle = self._vehicle
+        resets_mission = command.param2 == 1.0
         if not 0 <= command.param1 < vehicle.missions.commands.count:
             return Result.DENIED
         if resets_mission:
             vehicle.mission.reset()  # sets the counters of jumps to 0
-        if not vehicle.mission.set_current(whole(command.param1)):
+        if not vehicle.mission.set_current(to_int(command.param1)):
             return Result.FAILED
         if resets_mission:
             vehicle.mission.start_or_resume()  # After a reset, even a complete mission starts again.
@@ -164,13 +165,13 @@ class _CommonCommands:
         vehicle, guided = self._vehicle, self._vehicle.guided
         if command.is_long:  # ArduPilot requires an altitude frame here, and COMMAND_LONG has none.
             return Result.UNSUPPORTED
-        if vehicle.mode is not guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
+        if vehicle.mode is not guided and not to_int(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
             return Result.DENIED
         point = vehicle.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:
             return Result.DENIED
         # Check the target first, so that the mode stays unchanged if the vehicle may not fly to the target.
-        if not vehicle.may_go_to(point) or not vehicle.set_mode(guided.number):
+        if not vehicle.accept_reposition(point) or not vehicle.set_mode(guided.number):
             return Result.FAILED
         guided.go_to(point)
         return Result.ACCEPTED
@@ -207,7 +208,7 @@ class _CommonCommands:
 
     def reset_battery(self, command: ReceivedCommand) -> int:
         """Set the charge of the first battery to param 2 (percent), if the mask in param 1 selects that battery."""
-        if whole(command.param1) & 1:
+        if to_int(command.param1) & 1:
             self._vehicle.battery.percent = max(0.0, min(100.0, command.param2))
         return Result.ACCEPTED
 
@@ -232,7 +233,7 @@ class _CommonCommands:
         return Result.ACCEPTED
 
     def look_at_vehicle(self, command: ReceivedCommand) -> int:
-        self._vehicle.gimbal.follow(whole(command.param1))
+        self._vehicle.gimbal.follow(to_int(command.param1))
         return Result.ACCEPTED
 
 
@@ -316,7 +317,7 @@ class GimbalCommands:
         self.commands: dict[int, CommandHandler] = {
             Cmd.DO_MOUNT_CONFIGURE: self._configure_mount,
             Cmd.DO_MOUNT_CONTROL: self._control_mount,
-            Cmd.DO_GIMBAL_MANAGER_PITCHYAW: self._manage,
+            Cmd.DO_GIMBAL_MANAGER_PITCHYAW: self._point_or_turn,
             Cmd.DO_GIMBAL_MANAGER_CONFIGURE: self._configure_manager,
         }
         vehicle.on(m.GimbalManagerSetAttitude, self._on_attitude)
@@ -325,17 +326,18 @@ class GimbalCommands:
     def _gimbal(self, device_id: float = 0) -> ArduPilotGimbal | None:
         """Return the gimbal if it is fitted and ``device_id`` is 1, or 0 for all gimbals. Otherwise return None."""
         gimbal = self._vehicle.gimbal
-        return gimbal if gimbal.is_fitted and whole(device_id) in (0, 1) else None
+        return gimbal if gimbal.is_fitted and to_int(device_id) in (0, 1) else None
 
     def _configure_mount(self, command: ReceivedCommand) -> int:
         gimbal = self._gimbal()
         if gimbal is None:
             return Result.FAILED
-        gimbal.set_mode(whole(command.param1))
+        gimbal.set_mode(to_int(command.param1))
         return Result.ACCEPTED
 
     def _control_mount(self, command: ReceivedCommand) -> int:
-        gimbal, mode = self._gimbal(), whole(command.z)
+        gimbal = self._gimbal()
+        mode = to_int(command.z)
         if gimbal is None:
             return Result.FAILED
         if mode in _PLAIN_MOUNT_MODES:
@@ -352,22 +354,22 @@ class GimbalCommands:
         # (AP_Mount_Backend.cpp).
         has_place_in_params = command.param1 and command.param2 and not command.x and not command.y
         if mode == MavMountMode.GPS_POINT and not has_place_in_params:
-            altitude = float(whole(command.param4))  # The firmware uses whole metres (AP_Mount_Backend.cpp).
+            altitude = float(to_int(command.param4))  # The firmware uses whole metres (AP_Mount_Backend.cpp).
             frame = MavFrame.GLOBAL_RELATIVE_ALT
-            gimbal.look_at(self._vehicle.world_point(whole(command.x), whole(command.y), altitude, frame))
+            gimbal.look_at(self._vehicle.world_point(to_int(command.x), to_int(command.y), altitude, frame))
             return Result.ACCEPTED
         return Result.FAILED
 
-    def _manage(self, command: ReceivedCommand) -> int:
+    def _point_or_turn(self, command: ReceivedCommand) -> int:
         gimbal = self._gimbal(command.z)
         if gimbal is None:
             return Result.FAILED
         angles = (0.0, command.param1, command.param2)
-        return gimbal.manage(whole(command.x), angles, (0.0, command.param3, command.param4))
+        return gimbal.manage(to_int(command.x), angles, (0.0, command.param3, command.param4))
 
     def _configure_manager(self, command: ReceivedCommand) -> int:
         gimbal = self._gimbal(command.z)
-        ids = (whole(command.param1), whole(command.param2))
+        ids = (to_int(command.param1), to_int(command.param2))
         is_done = gimbal is not None and gimbal.set_control(command.sender, *ids)
         return Result.ACCEPTED if is_done else Result.FAILED
 
@@ -386,7 +388,8 @@ class GimbalCommands:
         values = (message.pitch, message.yaw, message.pitch_rate, message.yaw_rate)
         has_angles_and_rates = not any(map(math.isnan, values))
         if gimbal is not None and not has_angles_and_rates:
-            angles, rates = (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate)
+            angles = (0.0, message.pitch, message.yaw)
+            rates = (0.0, message.pitch_rate, message.yaw_rate)
             gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
 
 

@@ -29,7 +29,7 @@ from aerokit.sim.ardupilot.fence import ArduPilotFence
 from aerokit.sim.ardupilot.host import ArduPilotMode, ConditionTimer, variant
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 from aerokit.sim.motion import Ned
 
 _MAX_S = 600.0
@@ -78,7 +78,7 @@ class MotorTest:
         if not is_valid:
             return 0.0
         seconds_per_motor = max(0.0, min(command.param4, _MAX_S))
-        motor_count = max(1, whole(command.x))
+        motor_count = max(1, to_int(command.x))
         return seconds_per_motor * (motor_count + (motor_count - 1) * _PAUSE_SHARE)
 
     def _stop(self, number: int) -> None:
@@ -126,12 +126,7 @@ _GUIDED_MODES = frozenset((
 ))  # fmt: skip
 
 _refusing = partial(
-    variant,
-    CopterHold,
-    is_available=False,
-    needs_position=False,
-    can_arm=False,
-    entry_severity=MavSeverity.WARNING,
+    variant, CopterHold, is_available=False, needs_position=False, can_arm=False, entry_severity=MavSeverity.WARNING
 )
 
 # Modes in the order of AVAILABLE_MODES. SPORT and AUTOROTATE do not exist, as in the firmware for quadrotors.
@@ -224,7 +219,8 @@ class SimulatedCopter(CopterHost):
     def base_mode(self) -> int:
         if not self.has_left_boot:  # During the boot, GUIDED_ENABLED is set in every mode.
             return _BASE | _GUIDED
-        flags, mode_name = _BASE, self.mode.name
+        flags = _BASE
+        mode_name = self.mode.name
         # GUIDED_ENABLED is set in modes that use a position, in RTL only while armed.
         if mode_name in _GUIDED_MODES and (self.motors.is_armed or mode_name != "RTL"):
             flags |= _GUIDED
@@ -257,14 +253,15 @@ class SimulatedCopter(CopterHost):
         is_accepted = self.mode.take_off(command.z, must_navigate=must_navigate)
         return MavResult.ACCEPTED if is_accepted else MavResult.FAILED
 
-    def may_go_to(self, place: Ned) -> bool:
+    def accept_reposition(self, place: Ned) -> bool:
         if not self.fence.contains(place):
             return False
         self.yaw.apply_default()  # A new target position ends a commanded heading.
         return True
 
     def _change_speed(self, command: ReceivedCommand) -> int:
-        mode, speed = self.mode, command.param2
+        mode = self.mode
+        speed = command.param2
         if not speed > 0:  # also refuses NaN
             return MavResult.DENIED
         if not mode.can_change_speed:

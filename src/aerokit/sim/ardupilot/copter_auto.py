@@ -18,7 +18,7 @@ from aerokit.mavlink.messages import MissionItemReached
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterRtl, CopterTakeOff
 from aerokit.sim.ardupilot.host import RC_THROTTLE
-from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance, set_home_from
+from aerokit.sim.ardupilot.mission_run import MissionCommand, MissionMode, horizontal_distance, set_home_from
 from aerokit.sim.motion import Ned, wrap_pi
 
 _STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
@@ -57,16 +57,19 @@ class _CircleLeg:
     """Flight to the nearest point of a circle, and then around the circle. A negative radius is anticlockwise."""
 
     def __init__(self, auto: CopterAuto, centre: Ned, *, turns: float, radius: float) -> None:
-        self._copter, self._turns, self._centre = auto.vehicle, turns, centre
+        self._copter = auto.vehicle
+        self._turns = turns
+        self._centre_north, self._centre_east, self._centre_down = centre
         parameters, motion = self._copter.parameters, self._copter.motion
         self._radius = abs(radius) or parameters["CIRCLE_RADIUS"] / 100.0  # 0 selects the parameter.
         self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
-        north, east = motion.north - centre[0], motion.east - centre[1]
+        north, east = motion.north - self._centre_north, motion.east - self._centre_east
         self._angle = math.atan2(east, north)
-        self._turned_rad, self._reported_turns = 0.0, -1  # -1: not even turn 0 is reported yet.
+        self._turned_rad = 0.0
+        self._reported_turns = -1  # Not even turn 0 is reported yet.
         self._approach: _FlyLeg | None = None
         distance_to_circle = abs(math.hypot(north, east) - self._radius)
-        if distance_to_circle > _ON_CIRCLE_M or abs(motion.down - centre[2]) > _ON_CIRCLE_M:
+        if distance_to_circle > _ON_CIRCLE_M or abs(motion.down - self._centre_down) > _ON_CIRCLE_M:
             self._approach = _FlyLeg(auto, self._point(), stops=True)
 
     @property
@@ -87,15 +90,18 @@ class _CircleLeg:
         self._turned_rad += abs(rate) * dt
         self._report_new_turn()
         # Follow a point on the circle: command the velocity of the point, plus 1 m/s for each metre of distance.
-        (north, east, down), speed = self._point(), rate * self._radius
-        velocity_north, velocity_east = -speed * math.sin(self._angle), speed * math.cos(self._angle)
+        north, east, down = self._point()
+        speed = rate * self._radius
+        velocity_north = -speed * math.sin(self._angle)
+        velocity_east = speed * math.cos(self._angle)
         motion.seek_velocity(
             north - motion.north + velocity_north, east - motion.east + velocity_east, down - motion.down
         )
 
     def _point(self) -> Ned:
-        north = self._centre[0] + self._radius * math.cos(self._angle)
-        return (north, self._centre[1] + self._radius * math.sin(self._angle), self._centre[2])
+        north = self._centre_north + self._radius * math.cos(self._angle)
+        east = self._centre_east + self._radius * math.sin(self._angle)
+        return (north, east, self._centre_down)
 
     def _report_new_turn(self) -> None:
         number = int(self._turned_rad / math.tau)
@@ -173,9 +179,10 @@ class CopterAuto(MissionMode):
         self.descent: float = 0.0  # Maximum sink rate in m/s.
         self._leg: _Leg | None = None  # None: hold the position.
         self._last_reached = 0
-        self._reached_at = self._condition_started_at = self._delay_until = 0.0
+        self._reached_at: float | None = None  # None until the copter reaches the waypoint.
+        self._condition_started_at = self._delay_until = 0.0
         self._list_version = -1
-        self._upcoming: tuple[tuple[int, MissionItem], ...] = ()
+        self._upcoming: tuple[MissionCommand, ...] = ()
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             **dict.fromkeys(_TAKE_OFFS, self._take_off),
             **dict.fromkeys((*_WAYPOINTS, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TO_ALT), self._fly),
@@ -262,12 +269,13 @@ class CopterAuto(MissionMode):
     def _check_upcoming(self) -> bool:
         """Record the current and the next commands. Return True if an upload, not the progress, has changed them."""
         run, commands = self.vehicle.mission, self.vehicle.missions.commands
-        has_same_index = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
+        has_same_index = bool(self._upcoming) and self._upcoming[0].seq == run.nav_index
         if commands.version == self._list_version and has_same_index:
             return False
         upcoming = tuple(islice(run.navigation_from(max(1, run.nav_index)), _CHECKED_COMMANDS))  # Item 0 is home.
         has_changed = upcoming != self._upcoming
-        self._list_version, self._upcoming = commands.version, upcoming
+        self._list_version = commands.version
+        self._upcoming = upcoming
         return has_changed and has_same_index
 
     def _restart_command(self) -> None:
@@ -288,8 +296,8 @@ class CopterAuto(MissionMode):
 
     def _report_reached(self) -> None:
         # The firmware reports only the last of several commands that complete in the same tick.
-        index, self._last_reached = self._last_reached, 0
-        self.vehicle.send(MissionItemReached(index))
+        self.vehicle.send(MissionItemReached(self._last_reached))
+        self._last_reached = 0
 
     def end_mission(self) -> None:
         """Hold the position in the air, or disarm on the ground."""
@@ -326,7 +334,8 @@ class CopterAuto(MissionMode):
         """Return True if the copter has reached a waypoint and has waited there for ``seconds``."""
         if not self._is_leg_complete:
             return False
-        self._reached_at = self._reached_at or self.vehicle.now  # 0 until the copter reaches the waypoint.
+        if self._reached_at is None:
+            self._reached_at = self.vehicle.now
         # The firmware counts whole seconds (mode_auto.cpp, verify_nav_wp).
         if math.floor(self.vehicle.now - self._reached_at) < seconds:
             return False
@@ -356,11 +365,15 @@ class CopterAuto(MissionMode):
         point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
         if point is None:
             return current
-        north, east = current[:2] if (item.x, item.y) == (0, 0) else point[:2]
-        return (north, east, current[2] if item.z == 0 else point[2])
+        north, east, down = point
+        if (item.x, item.y) == (0, 0):
+            north, east, _ = current
+        if item.z == 0:
+            _, _, down = current
+        return (north, east, down)
 
     def _go(self, place: Ned, *, stops: bool = True) -> None:
-        self._reached_at = 0.0
+        self._reached_at = None
         self.is_paused: bool = False
         if not self.vehicle.yaw.has_region_of_interest:
             self.vehicle.yaw.apply_default()
@@ -371,16 +384,19 @@ class CopterAuto(MissionMode):
         stops = item.command not in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT) or item.param1 > 0
         if not stops:
             following = next(run.navigation_from(run.nav_index + 1), None)
-            stops = following is None or following[1].command not in _PASSED_BEFORE
+            stops = following is None or following.item.command not in _PASSED_BEFORE
         self._go(self._place(item), stops=stops)
 
     def _take_off(self, item: MissionItem) -> None:
-        copter, down = self.vehicle, self.vehicle.motion.down
+        copter = self.vehicle
         point = copter.world_point(0, 0, item.z, item.frame)  # Only the altitude is used.
         copter.yaw.hold()
         # A take-off never descends, and climbs at least `_MIN_TAKE_OFF_M` from the ground.
         min_climb = _MIN_TAKE_OFF_M if copter.is_landed else 0.0
-        target_down = min(down - min_climb, down if point is None else point[2])
+        target_down = copter.motion.down - min_climb
+        if point is not None:
+            _, _, down = point
+            target_down = min(target_down, down)
         self._leg = _ClimbLeg(self, copter.ground_or_home_down - target_down)
 
     def _circle(self, item: MissionItem) -> None:

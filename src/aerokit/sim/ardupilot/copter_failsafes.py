@@ -322,8 +322,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
         modes = _FENCE_ACTIONS.get(action, _FENCE_ACTIONS[_FENCE_RTL])
         if self.beyond_m(new_breaches) > _LAND_BEYOND_M:
             modes = (CopterMode.LAND,)
-        # Try the modes in turn; `any` stops at the first mode that the vehicle accepts.
-        self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
+        self.enter_first(modes)
 
     def on_cleared(self) -> None:
         if not self.vehicle.is_landed:

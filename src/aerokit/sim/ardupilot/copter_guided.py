@@ -106,7 +106,9 @@ class CopterGuided(CopterModeBase):
     def lean(self, roll: float, pitch: float, climb: float) -> None:
         """Hold roll and pitch (radians) and a climb rate (m/s). On the ground, a positive climb rate takes off."""
         self.submode = GuidedSubmode.ATTITUDE
-        self._attitude, self._attitude_climb, self._body_rates = (roll, pitch), climb, None
+        self._attitude = (roll, pitch)
+        self._attitude_climb = climb
+        self._body_rates = None
         self._updated_at = self.vehicle.now
 
     def rotate(self, roll_rate: float, pitch_rate: float, climb: float) -> None:
@@ -114,7 +116,8 @@ class CopterGuided(CopterModeBase):
         if self.submode is not GuidedSubmode.ATTITUDE or self._body_rates is None:
             self._attitude = (self.vehicle.motion.roll, self.vehicle.motion.pitch)
         self.submode = GuidedSubmode.ATTITUDE
-        self._attitude_climb, self._body_rates = climb, (roll_rate, pitch_rate)
+        self._attitude_climb = climb
+        self._body_rates = (roll_rate, pitch_rate)
         self._updated_at = self.vehicle.now
 
     def pause(self) -> bool:
@@ -132,7 +135,8 @@ class CopterGuided(CopterModeBase):
     def _start(self, submode: GuidedSubmode) -> None:
         copter = self.vehicle
         self.submode = submode
-        self._take_off, self.is_taking_off = None, False
+        self._take_off = None
+        self.is_taking_off = False
         self.speed = copter.speed_limit("WPNAV_SPEED")
         self.climb, self.descent = copter.speed_limit("WPNAV_SPEED_UP"), copter.speed_limit("WPNAV_SPEED_DN")
         copter.yaw.apply_default()
@@ -164,7 +168,8 @@ class CopterGuided(CopterModeBase):
         if self._body_rates is not None and not copter.is_landed:  # The body rates change the commanded attitude.
             roll, pitch = (angle + rate * dt for angle, rate in zip(self._attitude, self._body_rates, strict=True))
             self._attitude = (roll, pitch)
-        (roll, pitch), climb = self._attitude, self._attitude_climb
+        roll, pitch = self._attitude
+        climb = self._attitude_climb
         if self._is_stale:  # The firmware levels the copter after GUID_TIMEOUT.
             roll = pitch = climb = 0.0
         copter.motors.spool_up_requested = not copter.is_landed or climb > 0
@@ -272,7 +277,8 @@ class CopterSetpoints:
         guided = copter.mode
         if not isinstance(guided, CopterGuided):
             return
-        has_attitude, ignored_rates = not mask & AttitudeMask.ATTITUDE_IGNORE, mask & _ALL_RATES
+        has_attitude = not mask & AttitudeMask.ATTITUDE_IGNORE
+        ignored_rates = mask & _ALL_RATES
         quaternion_norm = math.sqrt(sum(component * component for component in target.q))
         has_one_or_two_rates = ignored_rates not in (0, _ALL_RATES)  # The firmware needs all rates or none.
         is_thrust_missing = mask & AttitudeMask.THROTTLE_IGNORE

@@ -11,6 +11,7 @@ from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.commands import rotated
 from aerokit.sim.motion import Ned, wrap_pi
 
+_YAW_AHEAD, _YAW_AHEAD_EXCEPT_RTL = 1, 2  # values of WP_YAW_BEHAVIOR
 _MIN_LOOK_AHEAD_M_S = 0.5
 _HEADING_TOLERANCE_RAD = 0.02
 
@@ -34,10 +35,10 @@ class AutoYaw:
     def apply_default(self, *, returning: bool = False) -> None:
         """Apply WP_YAW_BEHAVIOR: hold (0), look ahead (1), look ahead except when returning home (2).
 
-        Every new guided target calls this, which ends a commanded heading or region of interest.
+        Called at every new guided target, which ends a commanded heading or region of interest.
         """
         behaviour = int(self._copter.parameters["WP_YAW_BEHAVIOR"])
-        if behaviour == 1 or (behaviour == 2 and not returning):
+        if behaviour == _YAW_AHEAD or (behaviour == _YAW_AHEAD_EXCEPT_RTL and not returning):
             self._control = self._look_ahead
         else:
             self.hold()
@@ -48,7 +49,8 @@ class AutoYaw:
         ``direction`` is 1 for clockwise, -1 for anticlockwise, and 0 for the shorter way.
         """
         motion = self._copter.motion
-        self._heading, self._control = wrap_pi(heading), self._go_to_heading
+        self._heading = wrap_pi(heading)
+        self._control = self._go_to_heading
         self._rate = 0.0
         offset = wrap_pi(self._heading - motion.yaw)
         is_longer_way = direction != 0 and math.copysign(1, offset) != direction
@@ -67,16 +69,18 @@ class AutoYaw:
 
     def turn(self, rate: float) -> None:
         """Turn continuously, in radians per second."""
-        self._rate, self._control = rate, self._turn
+        self._rate = rate
+        self._control = self._turn
 
     def set_region_of_interest(self, point: Ned | None) -> None:
-        """Turn towards a place until the next target. None ends this. A fitted gimbal turns instead of the copter."""
+        """Face a place until the next target, or face none again. A fitted gimbal turns instead of the copter."""
         gimbal = self._copter.gimbal
         gimbal.look_at(point)
         if point is None:
             self.apply_default()
         elif not gimbal.is_fitted:
-            self._roi = point[:2]
+            north, east, _ = point
+            self._roi = (north, east)
             self._control = self._look_at_roi
 
     def stop_turning(self) -> None:
@@ -109,8 +113,9 @@ class AutoYaw:
 
     def _look_at_roi(self) -> None:
         assert self._roi is not None
+        north, east = self._roi
         motion = self._copter.motion
-        motion.face(math.atan2(self._roi[1] - motion.east, self._roi[0] - motion.north))
+        motion.face(math.atan2(east - motion.east, north - motion.north))
 
 
 class CopterHost(ArduPilotVehicle):
@@ -130,8 +135,8 @@ class CopterHost(ArduPilotVehicle):
     @property
     def ground_or_home_down(self) -> float:
         """Down coordinate of home, or of the ground while home is not set."""
-        home = self.navigation.home
-        return self.motion.ground_down if home is None else home[2]
+        _, _, home_down = self.navigation.home or (0.0, 0.0, self.motion.ground_down)
+        return home_down
 
     def speed_limit(self, name: str) -> float:
         """Return a parameter in cm/s as m/s."""
@@ -187,6 +192,7 @@ class CopterTakeOff:
 
     def update(self, climb_m_s: float) -> None:
         copter, motion = self._copter, self._copter.motion
+        _, _, target_down = self.target
         copter.motors.spool_up_requested = True
         if copter.is_landed:  # Leave the ground as soon as the motors have spooled up.
             copter.is_landed = not copter.motors.can_lift
@@ -194,7 +200,7 @@ class CopterTakeOff:
         motion.seek_position(
             *self.target, speed=_DRIFT_CORRECTION_M_S, climb=climb_m_s, descent=_OVERSHOOT_CORRECTION_M_S
         )
-        if abs(motion.down - self.target[2]) < _REACHED_M and abs(motion.velocity_down) < _AT_REST_M_S:
+        if abs(motion.down - target_down) < _REACHED_M and abs(motion.velocity_down) < _AT_REST_M_S:
             self.is_complete = True
 
 
@@ -219,7 +225,8 @@ class CopterPilotedMode(CopterModeBase):
         self._take_off: CopterTakeOff | None = None
 
     def enter(self, *, force: bool) -> bool:
-        self._take_off, self.is_taking_off = None, False
+        self._take_off = None
+        self.is_taking_off = False
         return True
 
     def climb_from_stick(self) -> float:
@@ -235,7 +242,8 @@ class CopterPilotedMode(CopterModeBase):
         if self._take_off is not None:
             self._take_off.update(copter.speed_limit("PILOT_SPEED_UP"))
             if self._take_off.is_complete:
-                self._take_off, self.is_taking_off = None, False
+                self._take_off = None
+                self.is_taking_off = False
             return
         climb = self.climb_from_stick()
         # On the ground, a throttle stick above its middle starts the copter.
@@ -320,17 +328,19 @@ class CopterRtl(CopterModeBase):
 
     def enter(self, *, force: bool) -> bool:
         copter = self.vehicle
-        self._phase, self.is_landing = "climb", False
+        self._phase = "climb"
+        self.is_landing = False
         # The value 0 of RTL_SPEED selects WPNAV_SPEED.
         self.speed = copter.speed_limit("RTL_SPEED") or copter.speed_limit("WPNAV_SPEED")
         # Without home, return to the place of the power-on.
         home = copter.navigation.home or (0.0, 0.0, copter.motion.ground_down)
+        _, _, home_down = home
         self._place = best_return_place(copter, home, is_allowed=copter.fence.contains)
         north, east, down = self._place
         distance = math.hypot(north - copter.motion.north, east - copter.motion.east)
         # The copter returns at the return altitude or at the altitude of `_place`, whichever is higher: `min`, because
         # a smaller down coordinate is higher.
-        self._return_down = min(down, home[2] - self._return_altitude(distance))
+        self._return_down = min(down, home_down - self._return_altitude(distance))
         copter.yaw.apply_default(returning=True)
         return True
 
@@ -368,7 +378,8 @@ class CopterRtl(CopterModeBase):
         if self._phase == "climb" and has_arrived:
             self._phase = "return"
         elif self._phase == "return" and has_arrived:
-            self._phase, self._waiting_since = "wait", self.vehicle.now
+            self._phase = "wait"
+            self._waiting_since = self.vehicle.now
         elif self._phase == "wait":
             waited = self.vehicle.now - self._waiting_since
             if waited >= self.vehicle.parameters["RTL_LOIT_TIME"] / 1000.0:
@@ -389,7 +400,8 @@ class CopterSmartRtl(CopterModeBase):
     def enter(self, *, force: bool) -> bool:
         if not self.vehicle.path.is_active:
             return False
-        self._way_back, self.is_landing = self.vehicle.path.take_way_back(), False
+        self._way_back = self.vehicle.path.take_way_back()
+        self.is_landing = False
         self._raise_last(_SMART_RTL_EXTRA_ALTITUDE_M)  # The last point is the start of the landing.
         self.vehicle.yaw.apply_default(returning=True)
         return True
@@ -415,7 +427,8 @@ class CopterSmartRtl(CopterModeBase):
             self.is_landing: bool = True
             copter.land()
             return
-        next_point, is_last = self._way_back[0], len(self._way_back) == 1
+        next_point = self._way_back[0]
+        is_last = len(self._way_back) == 1
         distance = copter.fly_to(next_point, copter.speed_limit("WPNAV_SPEED"))
         # The copter stops only at the last point, where it lands.
         max_distance = _ARRIVED_M if is_last else copter.parameters["WPNAV_RADIUS"] / 100

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GripperActions, MavSeverity, ParachuteAction, WinchActions
 from aerokit.mavlink.enums import MavResult as Result
-from aerokit.sim.commands import ReceivedCommand, whole
+from aerokit.sim.commands import ReceivedCommand, to_int
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.host import ArduPilotHost
@@ -78,11 +78,12 @@ class ArduPilotDevices:
 
     def move_winch(self, command: ReceivedCommand) -> int:
         """Start or stop the winch (MAV_CMD_DO_WINCH)."""
-        action, length_m, rate_m_s = whole(command.param2), command.param3, command.param4
+        action, length_m, rate_m_s = to_int(command.param2), command.param3, command.param4
         if not self._is_set("WINCH_TYPE") or action > WinchActions.RATE_CONTROL:
             return Result.FAILED
         was_moving = self.line_rate_m_s != 0.0
-        self._goal_m, self.line_rate_m_s = None, 0.0  # This line is the whole action RELAXED.
+        self._goal_m = None
+        self.line_rate_m_s = 0.0  # The action RELAXED only stops the winch.
         if action == WinchActions.RATE_CONTROL:
             self.line_rate_m_s = max(-_WINCH_RATE_M_S, min(_WINCH_RATE_M_S, rate_m_s))
         elif action == WinchActions.RELATIVE_LENGTH_CONTROL:

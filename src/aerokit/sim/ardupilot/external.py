@@ -53,8 +53,9 @@ class ArduPilotExternal:
         """Return the horizontal velocity towards the landing target; zero unless the target was seen recently."""
         if self._vehicle.now - self._target_at > _TARGET_TIMEOUT_S:
             return (0.0, 0.0)
+        north, east = self._target
         motion = self._vehicle.motion
-        return velocity_to_landing_target(self._target[0] - motion.north, self._target[1] - motion.east)
+        return velocity_to_landing_target(north - motion.north, east - motion.east)
 
     def _on_navigation(self, message: Message, _: Channel) -> None:
         if not self._vehicle.parameters.get("VISO_TYPE", 0.0):
@@ -76,7 +77,8 @@ class ArduPilotExternal:
         self.latest[type(target)] = target
         # The offset of the target is relative to the vehicle, and turned with its heading.
         north, east, _down = rotated((target.x, target.y, target.z), motion.yaw)
-        self._target, self._target_at = (motion.north + north, motion.east + east), self._vehicle.now
+        self._target = (motion.north + north, motion.east + east)
+        self._target_at = self._vehicle.now
 
     def set_wind(self, command: ReceivedCommand) -> int:
         """Record the wind of EXTERNAL_WIND_ESTIMATE. It has no effect on the flight."""

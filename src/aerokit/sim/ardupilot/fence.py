@@ -7,18 +7,10 @@ from collections.abc import Sequence
 from typing import ClassVar, Generic
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import (
-    FenceBreach,
-    FenceMitigate,
-    FenceType,
-    MavCmd,
-    MavMissionType,
-    MavResult,
-    MavSeverity,
-)
+from aerokit.mavlink.enums import FenceBreach, FenceMitigate, FenceType, MavCmd, MavMissionType, MavResult, MavSeverity
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import ArduPilotMode, HostT
-from aerokit.sim.commands import ReceivedCommand, whole
+from aerokit.sim.commands import ReceivedCommand, to_int
 from aerokit.sim.motion import LocalFrame, Ned
 
 _IN, _OUT = MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION
@@ -94,21 +86,24 @@ class PolygonZone:
 
 
 def _distance_to_side(place: Point, start: Point, end: Point) -> float:
-    north, east = end[0] - start[0], end[1] - start[1]
+    (place_north, place_east), (start_north, start_east), (end_north, end_east) = place, start, end
+    north, east = end_north - start_north, end_east - start_east
     squared_length = north * north + east * east
     share = 0.0  # Point of the side that is nearest to the place: 0 is the start, 1 the end.
     if squared_length > 0.0:
-        projection = ((place[0] - start[0]) * north + (place[1] - start[1]) * east) / squared_length
+        projection = ((place_north - start_north) * north + (place_east - start_east) * east) / squared_length
         share = min(1.0, max(0.0, projection))
-    return math.dist(place, (start[0] + share * north, start[1] + share * east))
+    return math.dist(place, (start_north + share * north, start_east + share * east))
 
 
 def _crosses(place: Point, start: Point, end: Point) -> bool:
     """Return True if a ray from ``place`` to the north crosses the side."""
-    if (start[1] > place[1]) == (end[1] > place[1]):
+    (place_north, place_east), (start_north, start_east), (end_north, end_east) = place, start, end
+    are_ends_on_same_side = (start_east > place_east) == (end_east > place_east)
+    if are_ends_on_same_side:
         return False
-    share = (place[1] - start[1]) / (end[1] - start[1])
-    return place[0] < start[0] + share * (end[0] - start[0])
+    share = (place_east - start_east) / (end_east - start_east)
+    return place_north < start_north + share * (end_north - start_north)
 
 
 # Bits of FENCE_TYPE.
@@ -152,7 +147,7 @@ class ArduPilotFence(Generic[HostT]):
         self.breach_time_ms: int = 0  # Start of the latest breach, in milliseconds since boot.
         self.caused_mode: bool = False  # True while the present mode is the result of FENCE_ACTION.
         self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE when they were read last.
-        # By kind of fence: a breached fence is breached again if the vehicle is this many metres beyond the limit.
+        # Maps a kind of fence to the metres beyond its limit at which a further breach counts as new.
         self._new_breach_m: dict[int, float] = {}
         # True if the last command about the lower limit enabled the limit, False if it disabled it; None without a
         # command.
@@ -209,7 +204,7 @@ class ArduPilotFence(Generic[HostT]):
 
     def command(self, command: ReceivedCommand) -> int:
         """Execute DO_FENCE_ENABLE. Param 1 is 0 to disable, 1 to enable, and 2 to disable only the lower limit."""
-        kinds = whole(command.param2) or _ALL  # The value 0 selects all kinds.
+        kinds = to_int(command.param2) or _ALL  # The value 0 selects all kinds.
         if command.param1 == 1.0:
             if not self.present & kinds:
                 return MavResult.FAILED
@@ -232,11 +227,10 @@ class ArduPilotFence(Generic[HostT]):
             self.report("auto-disabled", self.enable(False, by_command=False))
 
     def _follow_parameters(self) -> None:
-        parameters = (int(self.vehicle.parameters["FENCE_ENABLE"]), int(self._value("FENCE_AUTOENABLE")))
-        if parameters != self._enabling_parameters:
-            self._enabling_parameters = parameters
-            is_enabled = parameters[0] != 0
-            self.enabled = self.configured & ~_MIN_ALT if is_enabled else 0
+        enable, auto_enable = int(self.vehicle.parameters["FENCE_ENABLE"]), int(self._value("FENCE_AUTOENABLE"))
+        if (enable, auto_enable) != self._enabling_parameters:
+            self._enabling_parameters = (enable, auto_enable)
+            self.enabled = self.configured & ~_MIN_ALT if enable else 0
         self._clear(_ALL & ~self.configured)
 
     def update(self) -> None:
@@ -249,7 +243,8 @@ class ArduPilotFence(Generic[HostT]):
         is_due = vehicle.now - self._checked_at > self.PERIOD_S - 1e-6  # tolerates rounding errors
         if not is_due or not (self.CHECKS_DISARMED or vehicle.is_armed):
             return
-        self._checked_at, breached_before = vehicle.now, self.breached
+        self._checked_at = vehicle.now
+        breached_before = self.breached
         new_breaches = self._check() if vehicle.navigation.home is not None else 0
         if breached_before and not self.breached:
             self.on_cleared()
@@ -291,14 +286,15 @@ class ArduPilotFence(Generic[HostT]):
     def _beyond(self, place: Ned) -> dict[int, float]:
         """Return the distance in metres beyond the limit of each kind; negative values are within the limit."""
         parameters = self.vehicle.parameters
-        home = self.vehicle.navigation.home or (0.0, 0.0, 0.0)
-        height = home[2] - place[2]
+        home_north, home_east, home_down = self.vehicle.navigation.home or (0.0, 0.0, 0.0)
+        north, east, down = place
+        height = home_down - down
         union = bool(int(parameters["FENCE_OPTIONS"]) & _UNION)
         return {
             _MAX_ALT: height - self._value("FENCE_ALT_MAX"),
             _MIN_ALT: self._value("FENCE_ALT_MIN") - height,
-            _CIRCLE: math.dist(home[:2], place[:2]) - parameters["FENCE_RADIUS"],
-            _POLYGON: self.zones.breach_m(place[:2], union=union),
+            _CIRCLE: math.hypot(north - home_north, east - home_east) - parameters["FENCE_RADIUS"],
+            _POLYGON: self.zones.breach_m((north, east), union=union),
         }
 
     def _enable_floor_above(self) -> None:
@@ -338,6 +334,10 @@ class ArduPilotFence(Generic[HostT]):
 
     def act(self, new_breaches: int) -> None:
         """React to a new breach of these kinds while armed."""
+
+    def enter_first(self, modes: Sequence[int]) -> None:
+        """Change to the first of these modes that the vehicle accepts, because of a breach."""
+        self.caused_mode = any(self.vehicle.set_mode(mode) for mode in modes)  # stops at the first accepted mode
 
     def on_cleared(self) -> None:
         """Called when the last breach has ended."""
@@ -423,7 +423,7 @@ class ArduPilotFence(Generic[HostT]):
 
 def _joined_names(kinds: int) -> str:
     """Join the names of fences as the firmware does, for example "Max Alt, Circle and Polygon fences"."""
-    words = [name for kind, name in _NAMES.items() if kinds & kind]
-    if len(words) == 1:
-        return f"{words[0]} fence"
-    return f"{', '.join(words[:-1])} and {words[-1]} fences"
+    *first_names, last_name = (name for kind, name in _NAMES.items() if kinds & kind)
+    if not first_names:
+        return f"{last_name} fence"
+    return f"{', '.join(first_names)} and {last_name} fences"

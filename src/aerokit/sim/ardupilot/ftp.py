@@ -72,7 +72,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             self._host.call_later(_WORKER_PERIOD_S, self._work)
 
     def _work(self) -> None:
-        """Process the queued requests. A burst interrupts this. The end of the burst calls this method again."""
+        """Process the queued requests until one starts a burst. The end of the burst calls this method again."""
         while self._queue and not self._is_bursting:
             request, channel = self._queue.popleft()
             peer = self._peer(request, channel)
@@ -124,7 +124,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             self._is_banner_due = False
             self._send_banner()
 
-    def _fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
+    def _answer_fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
         is_opening = request.opcode in (Op.OPENFILERO, Op.OPENFILEWO, Op.CREATEFILE)
         # If a folder is opened as a file, the firmware reports a missing file.
         errno = ENOENT if is_opening and fault.errno == EISDIR else fault.errno
@@ -141,7 +141,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             raise Refused(MavFtpErr.INVALIDDATASIZE)
         return path_in(request.data)
 
-    def _opened(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
+    def _session_of(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
         session = peer.sessions.get(request.session)
         if session is None:
             raise Refused(MavFtpErr.FILENOTFOUND)
@@ -174,11 +174,11 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return answer
 
     def _read(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        data = self._opened(peer, request).file.read(request.offset, request.size)
+        data = self._session_of(peer, request).file.read(request.offset, request.size)
         return request.acknowledge(data) if data else request.refuse(MavFtpErr.EOF)
 
     def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> None:
-        session = self._opened(peer, request)
+        session = self._session_of(peer, request)
         self._is_bursting = True
         self._send_next(peer, session, request, 0)
 
@@ -191,7 +191,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         try:
             data = session.file.read(offset, block_size)
         except FileFault as fault:
-            data, refusal = b"", request.refuse_errno(fault.errno)
+            data = b""
+            refusal = request.refuse_errno(fault.errno)
         if not data:
             # The firmware sends the refusal with the offset and the flag burst_complete of the previous block.
             previous = peer.reply if block_number and peer.reply is not None else refusal
@@ -199,7 +200,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             self._reply(peer, end)
             self._end_burst()
             return
-        is_short, is_last = len(data) < block_size, block_number == _BURST_BLOCKS - 1
+        is_short = len(data) < block_size
+        is_last = block_number == _BURST_BLOCKS - 1
         block = request.acknowledge(data, offset=offset)
         block = block.replace(sequence=sequence, burst_complete=is_short or is_last)
         self._reply(peer, block)
@@ -242,7 +244,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
 
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         old_name, _, remainder = request.data.partition(b"\0")
-        new_name = remainder.partition(b"\0")[0]
+        new_name, _, _ = remainder.partition(b"\0")
         length = len(old_name) + len(new_name)
         if request.size == 0 or request.size not in (length + 1, length + 2):  # with or without the final NUL
             raise Refused(MavFtpErr.INVALIDDATASIZE)

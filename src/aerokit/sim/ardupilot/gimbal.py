@@ -55,14 +55,14 @@ _FIXED_ANGLE_MODES = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
 
 @dataclass(frozen=True)
 class MountTarget:
-    """Target angles in degrees at the time ``since``. From then on, ``rates`` (degrees per second) change them."""
+    """Target angles in degrees at the time ``set_at``. From then on, ``rates`` (degrees per second) change them."""
 
     roll: float = 0.0
     pitch: float = 0.0
     yaw: float = 0.0
     is_from_north: bool = False
     rates: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    since: float = 0.0
+    set_at: float = 0.0
 
 
 class ArduPilotGimbal:
@@ -122,10 +122,11 @@ class ArduPilotGimbal:
         """Return the target as its rates have moved it until now. Angles relative to the vehicle are limited."""
         if not any(target.rates):
             return target
-        seconds = self._vehicle.now - target.since
-        roll = self._limited("ROLL", target.roll + target.rates[0] * seconds)
-        pitch = self._limited("PITCH", target.pitch + target.rates[1] * seconds)
-        yaw = target.yaw + target.rates[2] * seconds
+        seconds = self._vehicle.now - target.set_at
+        roll_rate, pitch_rate, yaw_rate = target.rates
+        roll = self._limited("ROLL", target.roll + roll_rate * seconds)
+        pitch = self._limited("PITCH", target.pitch + pitch_rate * seconds)
+        yaw = target.yaw + yaw_rate * seconds
         yaw = math.remainder(yaw, 360.0) if target.is_from_north else self._limited("YAW", yaw)
         return replace(target, roll=roll, pitch=pitch, yaw=yaw)
 
@@ -133,7 +134,8 @@ class ArduPilotGimbal:
         """Return the angles to a place. If the place or the vehicle's position is unknown, keep the last target."""
         motion = self._vehicle.motion
         if place is not None and self._vehicle.navigation.has_position:
-            north, east, down = place[0] - motion.north, place[1] - motion.east, place[2] - motion.down
+            place_north, place_east, place_down = place
+            north, east, down = place_north - motion.north, place_east - motion.east, place_down - motion.down
             pitch = math.degrees(math.atan2(-down, math.hypot(north, east)))
             yaw = math.degrees(math.atan2(east, north))
             self._target = MountTarget(0.0, pitch, yaw, is_from_north=True)
@@ -185,13 +187,17 @@ class ArduPilotGimbal:
 
     def follow(self, system_id: int) -> None:
         """Point at another vehicle as soon as a position of that vehicle is received."""
-        self._followed_id, self._followed_place = system_id, None
+        self._followed_id = system_id
+        self._followed_place = None
         self.set_mode(MavMountMode.SYSID_TARGET)
 
     def _on_global_position(self, message: GlobalPositionInt, _: Channel) -> None:
-        if sender_of(message)[0] == self._followed_id:
-            place = self._vehicle.world_point(message.lat, message.lon, message.alt * 1e-3, MavFrame.GLOBAL)
-            self._followed_place = self._followed_place if place is None else place
+        sender_system, _component = sender_of(message)
+        if sender_system != self._followed_id:
+            return
+        place = self._vehicle.world_point(message.lat, message.lon, message.alt * 1e-3, MavFrame.GLOBAL)
+        if place is not None:
+            self._followed_place = place
 
     def set_control(self, sender: tuple[int, int], system: int, component: int) -> bool:
         """Handle MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Return False for invalid ids."""
@@ -217,6 +223,7 @@ class ArduPilotGimbal:
     def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
         """Apply GIMBAL_MANAGER_FLAGS with angles or rates, which are NaN if not given. Return the MAV_RESULT."""
         from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
+        (_, pitch, yaw), (_, pitch_rate, yaw_rate) = angles, rates
         if flags & GimbalManagerFlags.RETRACT:
             self.set_mode(MavMountMode.RETRACT)
         elif flags & GimbalManagerFlags.NEUTRAL:
@@ -225,7 +232,7 @@ class ArduPilotGimbal:
             self.point(*angles, from_north=from_north)
         elif not any(map(math.isnan, rates)):
             self.turn(*rates, from_north=from_north)
-        elif all(map(math.isnan, (*angles[1:], *rates[1:]))):  # Only the yaw lock changes.
+        elif all(map(math.isnan, (pitch, yaw, pitch_rate, yaw_rate))):  # Only the yaw lock changes.
             self.is_yaw_locked = from_north
         else:
             return MavResult.FAILED
@@ -271,7 +278,11 @@ class ArduPilotGimbal:
         if self.is_yaw_locked:
             flags |= GimbalManagerFlags.YAW_LOCK
         system, component = self.in_control
-        return m.GimbalManagerStatus(self._vehicle.time_boot_ms, flags, _DEVICE_ID, system, component, 0, 0)
+        return m.GimbalManagerStatus(
+            time_boot_ms=self._vehicle.time_boot_ms, flags=flags, gimbal_device_id=_DEVICE_ID,
+            primary_control_sysid=system, primary_control_compid=component, secondary_control_sysid=0,
+            secondary_control_compid=0,
+        )  # fmt: skip
 
 
 def _device_flags(gimbal: ArduPilotGimbal) -> int:

@@ -96,7 +96,8 @@ def variant(
 
     def make_variant(host: HostT) -> ArduPilotMode:
         mode = make_mode(host)
-        mode.number, mode.name = number, name
+        mode.number = number
+        mode.name = name
         for trait, value in traits.items():
             assert hasattr(mode, trait), trait
             setattr(mode, trait, value)
@@ -114,7 +115,7 @@ class ConditionTimer:
     def seconds(self, condition: bool, now: float) -> float:
         """Return the seconds since the condition became true, or 0 while the condition is false.
 
-        A condition becomes true at the first call with ``condition`` True, which returns 0.
+        The first call with ``condition`` True returns 0.
         """
         if not condition:
             self._since = None
@@ -130,6 +131,7 @@ _ARMING_DELAY_S = 2.0
 _SPOOL_UP_S = 1.3
 _SPOOL_DOWN_S = 1.1
 _HOVER_THROTTLE, _IDLE_THROTTLE = 0.36, 0.05
+_ELECTRONICS_A = 0.08  # current of the electronics while armed
 _AMPERES_AT_FULL = 78.0
 _STOPPED_PWM, _IDLE_PWM, _FULL_PWM = 1000, 1100, 2000
 
@@ -162,7 +164,8 @@ class ArduPilotMotors:
     @property
     def current_a(self) -> float:
         """Current in amperes of motors and electronics."""
-        return 0.08 * self.is_armed + self.throttle * _AMPERES_AT_FULL
+        electronics_a = _ELECTRONICS_A if self.is_armed else 0.0
+        return electronics_a + self.throttle * _AMPERES_AT_FULL
 
     @property
     def pwm(self) -> int:
@@ -174,7 +177,8 @@ class ArduPilotMotors:
     def set_armed(self, armed: bool, now: float) -> None:
         if self.is_armed and not armed:
             self.disarmed_at = now
-        self.is_armed, self.armed_at = armed, now
+        self.is_armed = armed
+        self.armed_at = now
         self.may_turn = self.spool_up_requested = False
         self.spool = self.throttle = 0.0
 
@@ -379,7 +383,8 @@ class ArduPilotHost(SimulatedAutopilot):
             return self.navigation.world(offset)
         if target.coordinate_frame in body_frames:
             offset = rotated(offset, motion.yaw)
-        return (motion.north + offset[0], motion.east + offset[1], motion.down + offset[2])
+        north, east, down = offset
+        return (motion.north + north, motion.east + east, motion.down + down)
 
     def send_banner(self) -> None:
         """Send texts with firmware version, board id and frame."""
@@ -395,8 +400,7 @@ class ArduPilotHost(SimulatedAutopilot):
             return None
         north, east = self.frame.to_local(latitude_e7, longitude_e7)
         if frame in _RELATIVE:
-            home = self.navigation.home
-            home_down = self.motion.ground_down if home is None else home[2]
+            _, _, home_down = self.navigation.home or (0.0, 0.0, self.motion.ground_down)
             return (north, east, home_down - altitude)
         if frame in _TERRAIN:
             return (north, east, self.motion.ground_down - altitude)

@@ -54,8 +54,8 @@ class BootTimeline:
     """The attitude estimate is healthy. About a second after this time, modes without GPS can be armed."""
     position_good: float = 41.55
     """The estimator uses GPS, so that modes that need a position become available."""
-    estimator_leads_early: bool = True
-    """True if the estimator provides the attitude as soon as it is active; False if it first has to use GPS."""
+    uses_dcm_until_gps: bool = False
+    """True if DCM provides the attitude until the estimator uses GPS; False if only until the estimator is active."""
 
     def scaled(self, seconds: float) -> BootTimeline:
         """Return this timeline, scaled so that it ends after ``seconds``. With 0, the vehicle is ready at once."""
@@ -64,10 +64,19 @@ class BootTimeline:
         return replace(self, **times)
 
 
-# Times that were measured in SITL with default parameters, in the order of the fields of `BootTimeline`.
+# Times that were measured in SITL with default parameters.
 BOOT_TIMELINES: dict[Kind, BootTimeline] = {
     "copter": BootTimeline(),
-    "plane": BootTimeline(0.92, 2.04, 9.94, 12.08, 12.12, 8.74, 8.94, 19.12, 21.40, 20.15, False),
-    "rover": BootTimeline(0.92, 3.05, 4.00, 5.05, 5.90, 9.05, 9.90, 19.05, 22.90, 42.05, False),
-    "sub": BootTimeline(0.92, 1.80, 3.70, 5.30, 5.33, 9.00, 9.10, 19.20, 21.80, 41.00),
-}
+    "plane": BootTimeline(
+        ready=2.04, estimator_active=9.94, tilt_aligned=12.08, yaw_aligned=12.12, gps_detected=8.74, gps_fix=8.94,
+        origin_set=19.12, healthy=21.40, position_good=20.15, uses_dcm_until_gps=True,
+    ),
+    "rover": BootTimeline(
+        ready=3.05, estimator_active=4.00, tilt_aligned=5.05, yaw_aligned=5.90, gps_detected=9.05, gps_fix=9.90,
+        origin_set=19.05, healthy=22.90, position_good=42.05, uses_dcm_until_gps=True,
+    ),
+    "sub": BootTimeline(
+        ready=1.80, estimator_active=3.70, tilt_aligned=5.30, yaw_aligned=5.33, gps_detected=9.00, gps_fix=9.10,
+        origin_set=19.20, healthy=21.80, position_good=41.00,
+    ),
+}  # fmt: skip

@@ -1,6 +1,6 @@
 """Storage of mission items in ArduPilot: fifteen bytes per item, so that params lose digits or are dropped.
 
-`stored` converts an uploaded item to the item that a client downloads afterwards.
+`as_stored` converts an uploaded item to the item that a client downloads afterwards.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def altitude_frame(frame: int) -> int | None:
     return _DOWNLOADED_FRAMES.get(frame)
 
 
-def stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
+def as_stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
     """Return the item as a download sends it after this upload, or the MAV_MISSION_RESULT of a refusal."""
     result = _check_numbers(item)
     if result != MavMissionResult.ACCEPTED:
@@ -162,7 +162,7 @@ def _stored_turns(item: MissionItem) -> tuple[float, float, float, float]:
     return (turn_byte * float(turn_unit), 0.0, sign * radius_byte * radius_unit, exits_at_tangent)
 
 
-def whole(value: float) -> int:
+def to_int(value: float) -> int:
     """Truncate a number towards zero, like C. Values beyond 32 bits become 0."""
     return int(value) if abs(value) < 2**31 else 0
 
@@ -188,15 +188,15 @@ _CONVERSIONS: dict[str, Callable[[float], float]] = {
     _NOT_STORED: lambda _: 0.0,
     "f": float32,
     "e": _half,
-    "B": lambda value: float(whole(value) & 0xFF),
-    "H": lambda value: float(whole(value) & 0xFFFF),
-    "b": lambda value: _signed(whole(value), 8),
-    "h": lambda value: _signed(whole(value), 16),
-    "c": lambda value: float32((whole(value * 100.0) & 0xFFFF) * float32(0.01)),
-    "r": lambda value: math.copysign(float(whole(abs(value)) & 0xFFFF), value) + 0.0,
+    "B": lambda value: float(to_int(value) & 0xFF),
+    "H": lambda value: float(to_int(value) & 0xFFFF),
+    "b": lambda value: _signed(to_int(value), 8),
+    "h": lambda value: _signed(to_int(value), 16),
+    "c": lambda value: float32((to_int(value * 100.0) & 0xFFFF) * float32(0.01)),
+    "r": lambda value: math.copysign(float(to_int(abs(value)) & 0xFFFF), value) + 0.0,
     "s": lambda value: -1.0 if value < 0 else 1.0,
     "+": lambda value: 1.0 if value > 0 else 0.0,
-    "1": lambda value: float(whole(value) & 1),
+    "1": lambda value: float(to_int(value) & 1),
     "2": lambda _: 2.0,
     "t": lambda value: float(int(max(0.0, min(65535.0, value)))),
     "a": lambda value: float(_whole_within(value, -180, 180)),

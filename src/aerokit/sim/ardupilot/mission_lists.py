@@ -13,7 +13,7 @@ from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.kinds import Kind
-from aerokit.sim.ardupilot.mission_items import altitude_frame, check_place, stored, whole
+from aerokit.sim.ardupilot.mission_items import altitude_frame, as_stored, check_place, to_int
 from aerokit.sim.missions import float32
 
 _MIN_RALLY_M, _MAX_RALLY_M = -32768, 32767
@@ -70,15 +70,12 @@ class CommandList(ItemList):
     name = "Mission"
 
     def __init__(
-        self,
-        capacity: int,
-        home: Callable[[], MissionItem],
-        is_running: Callable[[], bool],
-        kind: Kind = "copter",
+        self, capacity: int, home: Callable[[], MissionItem], is_running: Callable[[], bool], kind: Kind = "copter"
     ) -> None:
         super().__init__(capacity)
         self._kind: Kind = kind
-        self._home, self._is_running = home, is_running
+        self._home = home
+        self._is_running = is_running
         self._commands: list[MissionItem] = []  # The item at index 0 is a placeholder for home.
         self.version: int = 0  # Every change of an item increments the version.
 
@@ -106,7 +103,7 @@ class CommandList(ItemList):
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
         """Replace or append an item. Item 0 is checked, but not stored, because it is home."""
-        stored_item = stored(item, self._kind)
+        stored_item = as_stored(item, self._kind)
         if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             return stored_item
         if stored_item.command == Cmd.DO_JUMP and not self._is_jump_target(stored_item.param1, last):
@@ -118,8 +115,9 @@ class CommandList(ItemList):
 
     def _write(self, seq: int, stored_item: MissionItem) -> int:
         count = len(self._commands)
-        # A list with space only for home refuses every item. With `max`, it refuses even item 0, which is never stored.
-        if seq > count or max(seq, 1) >= self.capacity:
+        # A list with space only for home refuses every item, even item 0, which is never stored.
+        has_space = self.capacity > 1 and seq < self.capacity
+        if seq > count or not has_space:
             return MavMissionResult.ERROR
         if seq == count:
             self.add_home()  # The first uploaded item follows the placeholder for home.
@@ -138,7 +136,7 @@ class CommandList(ItemList):
     def write_file(self, items: list[MissionItem], start: int) -> int:
         """Store the items of an uploaded file, and return the MAV_MISSION_RESULT. Stop at the first refused item."""
         for seq, item in enumerate(items):
-            stored_item = stored(item, self._kind)
+            stored_item = as_stored(item, self._kind)
             if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
                 return stored_item
             if stored_item.command == Cmd.DO_JUMP and not 0 < stored_item.param1 < len(items):
@@ -197,8 +195,8 @@ def _stored_rally_point(item: MissionItem) -> MissionItem | int:
     frame = altitude_frame(item.frame)
     if frame is None or item.frame == MavFrame.MISSION:
         return MavMissionResult.UNSUPPORTED_FRAME
-    place, height = (int(item.x), int(item.y)), float32(int(item.z))
-    return MissionItem(item.command, frame, 0.0, 0.0, 0.0, 0.0, *place, height, autocontinue=False)
+    height = float32(int(item.z))
+    return MissionItem(item.command, frame, x=int(item.x), y=int(item.y), z=height, autocontinue=False)
 
 
 _POLYGONS = (Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
@@ -294,7 +292,7 @@ def _stored_fence_item(item: MissionItem) -> MissionItem | int:
     if item.command in _POLYGONS:
         if item.param1 > _MAX_VERTICES:
             return MavMissionResult.INVALID_PARAM1
-        size = float(whole(item.param1) & 0xFF)  # The number of vertices is stored in one byte.
+        size = float(to_int(item.param1) & 0xFF)  # The number of vertices is stored in one byte.
     elif item.command in _CIRCLES:
         size = float32(item.param1)
     elif item.command != Cmd.NAV_FENCE_RETURN_POINT:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavSeverity, MissionState
@@ -35,6 +36,13 @@ _INSTANT = frozenset(
         Cmd.VIDEO_STOP_CAPTURE,
     }
 )  # fmt: skip
+
+
+class MissionCommand(NamedTuple):
+    """A command of the mission; ``seq`` is its index in the list."""
+
+    seq: int
+    item: MissionItem
 
 
 class MissionMode(ArduPilotMode):
@@ -79,7 +87,7 @@ class MissionMode(ArduPilotMode):
         """Called after the mission has started or resumed in this mode."""
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
-        """Return True as soon as the command is complete. This is polled at every tick."""
+        """Return True as soon as the command is complete. Called at every tick."""
         raise NotImplementedError
 
     def end_mission(self) -> None:
@@ -112,8 +120,7 @@ class MissionRun:
         self._state = MissionState.NOT_STARTED
         self.nav_index: int = 0  # Index of the navigation command that runs or will be resumed.
         self._running_nav: MissionItem | None = None  # The running navigation command.
-        # Index and item of the running "do" or "condition" command.
-        self._running_do: tuple[int, MissionItem] | None = None
+        self._running_do: MissionCommand | None = None  # The running "do" or "condition" command.
         self._last_do_index = 0  # Index of the "do" or "condition" command that was started last; 0 if none.
         self._jumps: dict[int, int] = {}  # Number of jumps that each jump command has done, by its index.
 
@@ -161,21 +168,21 @@ class MissionRun:
                 return item.command in _TAKE_OFFS
         return False
 
-    def navigation_from(self, index: int) -> Iterator[tuple[int, MissionItem]]:
+    def navigation_from(self, index: int) -> Iterator[MissionCommand]:
         """Yield the next navigation commands in the order of execution (with jumps), at most `_MAX_LOOK_AHEAD`."""
         for _ in range(_MAX_LOOK_AHEAD):  # Jumps may form an endless loop.
-            navigation = self._next_navigation(index)
-            if navigation is None:
+            command = self._next_navigation(index)
+            if command is None:
                 return
-            yield navigation
-            index = navigation[0] + 1
+            yield command
+            index = command.seq + 1
 
-    def _next_navigation(self, index: int) -> tuple[int, MissionItem] | None:
+    def _next_navigation(self, index: int) -> MissionCommand | None:
         for _ in range(1 + _MAX_STEPS):
             command = self._next(index, count_jumps=False)
-            if command is None or is_navigation(command[1]):
+            if command is None or is_navigation(command.item):
                 return command
-            index = command[0] + 1
+            index = command.seq + 1
         return None
 
     @property
@@ -190,7 +197,7 @@ class MissionRun:
         else:
             self._state = MissionState.ACTIVE
             # A running "do" command precedes the navigation command, so the mission resumes at the "do" command.
-            resume_index = self.nav_index if self._running_do is None else self._running_do[0]
+            resume_index = self.nav_index if self._running_do is None else self._running_do.seq
             self.set_current(resume_index)
 
     def _start(self) -> None:
@@ -206,8 +213,13 @@ class MissionRun:
 
     def reset(self) -> None:
         """Reset progress and jump counters, e.g. because the vehicle was disarmed."""
-        self.nav_index, self._running_nav, self._running_do, self._last_do_index = 0, None, None, 0
+        self.nav_index = 0
+        self._forget_running()
         self._jumps.clear()
+
+    def _forget_running(self) -> None:
+        self._running_nav = self._running_do = None
+        self._last_do_index = 0
 
     def on_disarmed(self) -> None:
         self.reset()
@@ -223,7 +235,7 @@ class MissionRun:
         has_only_home = self._list.count == 1
         if index >= self._list.count or has_only_home:
             return False
-        self._running_do, self._last_do_index, self._running_nav = None, 0, None
+        self._forget_running()
         if index == 0 or self._state == MissionState.COMPLETE:
             self._jumps.clear()
         index = max(index, _FIRST)
@@ -240,15 +252,16 @@ class MissionRun:
             command = self._next(index, count_jumps=True)
             if command is None:
                 break
-            command_index, item = command
-            if is_navigation(item):
-                self.nav_index, self._running_nav = command
+            if is_navigation(command.item):
+                self.nav_index = command.seq
+                self._running_nav = command.item
                 self._state = MissionState.NOT_STARTED
                 return True
             # Store the first "do" command before the navigation command, because the mission resumes there.
             if self._running_do is None:
-                self._running_do, self._last_do_index = command, command_index
-            index = command_index + 1
+                self._running_do = command
+                self._last_do_index = command.seq
+            index = command.seq + 1
         self.nav_index = 0
         return False
 
@@ -273,33 +286,36 @@ class MissionRun:
         """
         index_after_current = self.nav_index + 1 if self.nav_index else _FIRST
         index = start or index_after_current
-        self._running_do, self._last_do_index = None, 0
+        self._running_do = None
+        self._last_do_index = 0
         for _ in range(_MAX_STEPS):
             command = self._next(index, count_jumps=True)
             if command is None:
                 return False
-            command_index, item = command
-            index = command_index + 1
-            if is_navigation(item):
-                self.nav_index = command_index
-                is_supported = self._begin(command_index, item)
+            index = command.seq + 1
+            if is_navigation(command.item):
+                self.nav_index = command.seq
+                is_supported = self._begin(*command)
                 if is_supported:  # An unsupported command is skipped.
-                    self._running_nav = item
+                    self._running_nav = command.item
                     return True
             elif self._running_do is None:
-                self._running_do, self._last_do_index = command, command_index
-                self._begin(command_index, item)
+                self._begin_do(command)
         return False
 
     def _start_next_do(self) -> None:
         """Start the next "do" command, if one is left in front of the next navigation command."""
         if not self._last_do_index:
             return
-        command = self._next(self._last_do_index + 1, count_jumps=False)  # (index, item)
-        if command is None or is_navigation(command[1]):
+        command = self._next(self._last_do_index + 1, count_jumps=False)
+        if command is None or is_navigation(command.item):
             self._last_do_index = 0
             return
-        self._running_do, self._last_do_index = command, command[0]
+        self._begin_do(command)
+
+    def _begin_do(self, command: MissionCommand) -> None:
+        self._running_do = command
+        self._last_do_index = command.seq
         self._begin(*command)
 
     def _begin(self, index: int, item: MissionItem) -> bool:
@@ -316,8 +332,8 @@ class MissionRun:
         self._state = MissionState.COMPLETE
         self._mode.end_mission()
 
-    def _next(self, index: int, *, count_jumps: bool) -> tuple[int, MissionItem] | None:
-        """Return the first command at or after ``index``, with its index. Jump commands are followed, not returned.
+    def _next(self, index: int, *, count_jumps: bool) -> MissionCommand | None:
+        """Return the first command at or after ``index``. Jump commands are followed, not returned.
 
         With ``count_jumps``, each followed jump uses up one of its repetitions. Without, the call only looks ahead.
         """
@@ -327,7 +343,7 @@ class MissionRun:
             if item is None:
                 return None
             if item.command not in (Cmd.DO_JUMP, Cmd.DO_JUMP_TAG):
-                return index, item
+                return MissionCommand(index, item)
             target = self._jump_target(item)
             # Without `count_jumps`, no jump is used up, so the loop is endless if the first jump is reached again.
             is_endless = not count_jumps and first_jump == index
@@ -368,8 +384,10 @@ class MissionRun:
 
 def horizontal_distance(vehicle: ArduPilotHost, place: Ned | None) -> float:
     """Return the horizontal distance to a place in metres, or 0 if ``place`` is None."""
-    motion = vehicle.motion
-    return 0.0 if place is None else math.hypot(place[0] - motion.north, place[1] - motion.east)
+    if place is None:
+        return 0.0
+    north, east, _ = place
+    return math.hypot(north - vehicle.motion.north, east - vehicle.motion.east)
 
 
 def set_home_from(vehicle: ArduPilotHost, item: MissionItem) -> None:

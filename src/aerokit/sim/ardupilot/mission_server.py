@@ -26,7 +26,7 @@ from aerokit.protocols.servers.missions import (
     item_message_int,
 )
 from aerokit.sim.ardupilot.host import ArduPilotHost
-from aerokit.sim.ardupilot.mission_items import has_location, stored, whole
+from aerokit.sim.ardupilot.mission_items import as_stored, has_location, to_int
 from aerokit.sim.ardupilot.mission_lists import CommandList, FenceList, ItemList, RallyList
 from aerokit.sim.channel import Channel
 from aerokit.sim.missions import float32
@@ -72,7 +72,7 @@ class ArduPilotMissionServer(MissionServer):
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
         """Store a list of items, as the upload of a file does, and return the MAV_MISSION_RESULT.
 
-        Only a mission can be changed from the index ``start`` on and without deleting its other items (``clear``).
+        Only a mission can be replaced from the index ``start`` on, or keep its other items (``clear`` is False).
         """
         if mission_type == MavMissionType.MISSION:
             if clear:
@@ -109,8 +109,9 @@ class ArduPilotMissionServer(MissionServer):
 
     def capacity(self, mission_type: int) -> int:
         """Return the capacity of a list. The capacity of the mission is 0 until the vehicle is initialised."""
-        is_late = mission_type == MavMissionType.MISSION and not self._vehicle.is_initialised
-        return 0 if is_late else self._lists[mission_type].capacity
+        if mission_type == MavMissionType.MISSION and not self._vehicle.is_initialised:
+            return 0
+        return self._lists[mission_type].capacity
 
     def count(self, mission_type: int) -> int:
         return self._lists[mission_type].count
@@ -197,7 +198,8 @@ class ArduPilotMissionServer(MissionServer):
         super()._time_out(upload)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
-        item, kind = _without_floats(message), message.mission_type
+        item = _with_integer_position(message)
+        kind = message.mission_type
         if isinstance(item, int):  # The position is refused with this MAV_MISSION_RESULT.
             self._answer_item(message, item, channel)
         elif kind == MavMissionType.MISSION and message.current in (_GUIDED_TARGET, _ALTITUDE_CHANGE):
@@ -213,8 +215,8 @@ class ArduPilotMissionServer(MissionServer):
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
         self._acknowledge(sender_of(message), message.mission_type, result, channel)
 
-    def _put(self, upload: ListUpload, message: AnyItem) -> int:
-        item = _without_floats(message)
+    def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
+        item = _with_integer_position(message)
         assert not isinstance(item, int)
         return self._lists[upload.mission_type].put(message.seq, item, upload.end - 1)
 
@@ -254,7 +256,7 @@ class ArduPilotMissionServer(MissionServer):
 
     def _guide(self, item: MissionItem, current: int) -> int:
         """Handle an item that is a target for GUIDED, because of the special value of its field ``current``."""
-        stored_item = stored(item, self._vehicle.KIND)
+        stored_item = as_stored(item, self._vehicle.KIND)
         if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             return stored_item
         if current == _ALTITUDE_CHANGE:  # The altitude change has no effect in the simulation.
@@ -268,7 +270,7 @@ class ArduPilotMissionServer(MissionServer):
         return Result.ACCEPTED
 
 
-def _without_floats(message: AnyItem) -> MissionItem | int:
+def _with_integer_position(message: AnyItem) -> MissionItem | int:
     """Return the item with x and y as integers, or the MAV_MISSION_RESULT of an invalid position.
 
     Like the firmware, convert the degrees of a MISSION_ITEM in single precision.
@@ -277,7 +279,7 @@ def _without_floats(message: AnyItem) -> MissionItem | int:
     if isinstance(message, m.MissionItemInt):
         return item
     if not has_location(item.command):
-        return item.replace(x=whole(item.x), y=whole(item.y))
+        return item.replace(x=to_int(item.x), y=to_int(item.y))
     if not abs(item.x) <= 90.0:
         return Result.INVALID_PARAM5_X
     if not abs(item.y) <= 180.0:

@@ -54,9 +54,9 @@ class ArduPilotNavigation:
         call_later(timeline.yaw_aligned, self._align)
         call_later(timeline.gps_detected, self._detect_gps)
         call_later(timeline.gps_fix, self._get_fix)
-        call_later(timeline.origin_set, self._set_origin)
+        call_later(timeline.origin_set, self._set_origin_when_possible)
         call_later(timeline.healthy, self._become_healthy)
-        call_later(timeline.position_good, self._use_gps)
+        call_later(timeline.position_good, self._use_gps_when_possible)
         call_later(timeline.yaw_aligned, self._watch_external)
 
     @property
@@ -86,18 +86,21 @@ class ArduPilotNavigation:
     @property
     def altitude_above_home(self) -> float:
         """Metres above home, or above the ground while home is not set."""
-        reference = self._vehicle.motion.ground_down if self.home is None else self.home[2]
-        return reference - self._vehicle.motion.down
+        motion = self._vehicle.motion
+        _, _, home_down = self.home or (0.0, 0.0, motion.ground_down)
+        return home_down - motion.down
 
     def local(self, point: Ned) -> Ned:
         """Convert a point of the world frame to the estimator's frame."""
-        north, east, down = (0.0, 0.0, 0.0) if self.origin is None else self.origin
-        return (point[0] - north, point[1] - east, point[2] - down)
+        north, east, down = point
+        origin_north, origin_east, origin_down = self.origin or (0.0, 0.0, 0.0)
+        return (north - origin_north, east - origin_east, down - origin_down)
 
     def world(self, local: Ned) -> Ned:
         """Convert a point of the estimator's frame to the world frame."""
-        north, east, down = (0.0, 0.0, 0.0) if self.origin is None else self.origin
-        return (local[0] + north, local[1] + east, local[2] + down)
+        north, east, down = local
+        origin_north, origin_east, origin_down = self.origin or (0.0, 0.0, 0.0)
+        return (north + origin_north, east + origin_east, down + origin_down)
 
     def set_home(self, point: Ned, *, lock: bool) -> None:
         """Set home and broadcast its position. With ``lock``, arming no longer moves home."""
@@ -113,7 +116,8 @@ class ArduPilotNavigation:
         self.origin = point
         self._report_cores("origin set")
         if self._vehicle.KIND != "sub":
-            self._vehicle.info(f"Field Elevation Set: {self.frame.origin.altitude_m - point[2]:.0f}m")
+            _, _, down = point
+            self._vehicle.info(f"Field Elevation Set: {self.frame.origin.altitude_m - down:.0f}m")
         return True
 
     @property
@@ -148,7 +152,7 @@ class ArduPilotNavigation:
     def _activate(self) -> None:
         self.flags = 0
         self._report_cores("initialised")
-        if self._vehicle.timeline.estimator_leads_early:
+        if not self._vehicle.timeline.uses_dcm_until_gps:
             self._vehicle.info("AHRS: EKF3 active")
 
     def _align(self) -> None:
@@ -166,13 +170,13 @@ class ArduPilotNavigation:
     def _get_fix(self) -> None:
         if self.is_gps_detected and not self.gps_is_lost:
             self.fix_type = GpsFixType.RTK_FIXED
-            if not self._vehicle.timeline.estimator_leads_early:
+            if self._vehicle.timeline.uses_dcm_until_gps:
                 self._set_first_home()
         self._vehicle.every(_GPS_CHECK_INTERVAL_S, self._check_gps)
 
-    def _set_origin(self) -> None:
+    def _set_origin_when_possible(self) -> None:
         if self.fix_type < GpsFixType.TYPE_3D_FIX:
-            self._vehicle.call_later(1.0, self._set_origin)
+            self._vehicle.call_later(1.0, self._set_origin_when_possible)
             return
         self.set_origin(self._vehicle.motion.place)
         if not self.home_is_locked:
@@ -186,27 +190,30 @@ class ArduPilotNavigation:
     def _become_healthy(self) -> None:
         self.is_healthy = True
 
-    def _use_gps(self) -> None:
+    def _use_gps_when_possible(self) -> None:
+        """Let the estimator use GPS, or check again in a second if that is not possible yet."""
         if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX or self.uses_external:
-            self._vehicle.call_later(1.0, self._use_gps)  # Check again in a second.
+            self._vehicle.call_later(1.0, self._use_gps_when_possible)
             return
         self.flags = _WITH_POSITION
         self._report_cores("is using GPS")
-        if not self._vehicle.timeline.estimator_leads_early:
+        if self._vehicle.timeline.uses_dcm_until_gps:
             self._vehicle.info("AHRS: EKF3 active")
 
     def _check_gps(self) -> None:
         if self.gps_is_lost or not self.is_gps_detected:
             self._follow_gps_loss()
         elif self.fix_type < GpsFixType.TYPE_3D_FIX:
-            self._gps_lost_at, self.fix_type = math.nan, GpsFixType.RTK_FIXED
+            self._gps_lost_at = math.nan
+            self.fix_type = GpsFixType.RTK_FIXED
             if self.origin is not None and not self.has_position and not self.uses_external:
-                self._use_gps()
+                self._use_gps_when_possible()
 
     def _follow_gps_loss(self) -> None:
         """Report no fix at once, and no position after 7 s. After 15 s, GPS stops aiding the estimator."""
         if math.isnan(self._gps_lost_at):
-            self._gps_lost_at, self.fix_type = self._vehicle.now, GpsFixType.NO_FIX
+            self._gps_lost_at = self._vehicle.now
+            self.fix_type = GpsFixType.NO_FIX
             return
         lost_for = self._vehicle.now - self._gps_lost_at
         if self.uses_external:  # External navigation provides the position, even without GPS.
@@ -236,7 +243,8 @@ def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable
     if not places:
         return home
     nearest = min(places, key=lambda place: math.dist(place[:2], current))
-    distance, limit = math.dist(nearest[:2], current), parameters["RALLY_LIMIT_KM"] * 1000.0
+    distance = math.dist(nearest[:2], current)
+    limit = parameters["RALLY_LIMIT_KM"] * 1000.0
     if limit > 0 and distance > limit:
         return home
     if parameters["RALLY_INCL_HOME"] and distance >= math.dist(home[:2], current):
@@ -264,7 +272,7 @@ class SmartPath:
         self._only_armed = only_armed
         self._points: list[Ned] = []
         self._cleaned_count = 0  # Number of points after the last simplification.
-        # Times at which the position was good, a point was recorded and a warning was sent for the last time.
+        # Times of the last good position, the last recorded point and the last warning.
         self._good_at = self._saved_at = self._warned_at = -math.inf
         self._is_started = False
         self.is_active: bool = False  # True while SMART_RTL is possible.
@@ -280,7 +288,9 @@ class SmartPath:
         """Discard the path and start a new path at the vehicle. Without a position, the path stays inactive."""
         parameters = self._vehicle.parameters
         self._points.clear()
-        self._cleaned_count, self.is_active, self._is_started = 0, False, True
+        self._cleaned_count = 0
+        self.is_active = False
+        self._is_started = True
         is_disabled = parameters["SRTL_POINTS"] <= 0 or parameters["SRTL_ACCURACY"] <= 0
         if is_disabled:
             return

@@ -26,7 +26,7 @@ from aerokit.sim.ardupilot.plane_auto import PlaneAuto, PlaneGuided, PlaneSetpoi
 from aerokit.sim.ardupilot.plane_failsafes import PlaneFailsafes, PlaneFence
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneModeBase, PlaneNavigatingMode
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 
 _SHORT_DISABLED = 3
 _MIN_ANGLE_DEG, _MIN_AIRSPEED_M_S = 3.0, 5
@@ -43,10 +43,7 @@ class PlaneArming(ArduPilotArming[PlaneHost]):
         # The long failsafe follows the short failsafe, so FS_LONG_TIMEOUT must not be shorter than FS_SHORT_TIMEOUT.
         is_long_shorter = parameters["FS_LONG_TIMEOUT"] < parameters["FS_SHORT_TIMEOUT"]
         checks = (
-            (
-                is_long_shorter and parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED,
-                "FS_LONG_TIMEOUT < FS_SHORT_TIMEOUT",
-            ),
+            (is_long_shorter and parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED, "FS_LONG_TIMEOUT < FS_SHORT_TIMEOUT"),
             (max_roll < _MIN_ANGLE_DEG, f"ROLL_LIMIT_DEG too small ({max_roll:.1f})"),
             (max_pitch < _MIN_ANGLE_DEG, f"PTCH_LIM_MAX_DEG too small ({max_pitch:.1f})"),
             (min_pitch > -_MIN_ANGLE_DEG, f"PTCH_LIM_MIN_DEG too large ({min_pitch:.1f})"),
@@ -190,7 +187,7 @@ class SimulatedPlane(PlaneHost):
         point = self.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:
             return MavResult.DENIED
-        if self.mode is not self.guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
+        if self.mode is not self.guided and not to_int(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
             return MavResult.FAILED
         if not self.set_mode(PlaneMode.GUIDED):
             return MavResult.FAILED

@@ -19,7 +19,7 @@ from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneLanding, PlaneNavigatingMode
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 
 _FLY, _LOITER, _CLIMB, _LAND = range(4)
@@ -102,7 +102,8 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         wing = self.vehicle.wing
         if self._place is None:
             return
-        bearing = math.atan2(wing.east - self._place[1], wing.north - self._place[0])
+        north, east, _ = self._place
+        bearing = math.atan2(wing.east - east, wing.north - north)
         was_on_circle = not math.isnan(self._on_circle_since)
         if was_on_circle:
             self._turned_rad += abs(wrap_pi(bearing - self._last_bearing))
@@ -133,23 +134,20 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
         plane, command = self.vehicle, item.command
-        # `_report` sends a text and returns True.
         if command == Cmd.NAV_TAKEOFF:
-            assert self._place is not None
-            is_altitude_reached = plane.wing.down <= self._place[2]
-            return is_altitude_reached and self._report(f"Takeoff complete at {plane.altitude_m:.2f}m")
+            is_altitude_reached = plane.wing.down <= self._place_down
+            return self._report_if(is_altitude_reached, f"Takeoff complete at {plane.altitude_m:.2f}m")
         if command in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT):
             return self._has_passed(index)
         if command == Cmd.NAV_LOITER_TIME:
             # Before the plane has reached the circle, the time is NaN, and the comparison is false.
             time_on_circle_s = plane.now - self._on_circle_since
-            return time_on_circle_s >= item.param1 and self._report("Loiter time complete")
+            return self._report_if(time_on_circle_s >= item.param1, "Loiter time complete")
         if command == Cmd.NAV_LOITER_TURNS:
-            return self._turned_rad >= 2 * math.pi * item.param1 and self._report("Loiter orbits complete")
+            return self._report_if(self._turned_rad >= 2 * math.pi * item.param1, "Loiter orbits complete")
         if command == Cmd.NAV_LOITER_TO_ALT:
-            assert self._place is not None
-            is_at_height = abs(plane.wing.down - self._place[2]) < _REACHED_HEIGHT_M
-            return is_at_height and self._is_on_circle and self._report("Loiter to alt complete")
+            is_at_height = abs(plane.wing.down - self._place_down) < _REACHED_HEIGHT_M
+            return self._report_if(is_at_height and self._is_on_circle, "Loiter to alt complete")
         if command == Cmd.CONDITION_DELAY:
             return plane.now - self._condition_started_at > max(0.0, item.param1)
         if command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH):
@@ -157,33 +155,45 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self.warn_if_unknown(item)
         return True
 
-    def _report(self, text: str) -> bool:
-        """Send the text about a completed command, and return True."""
-        self.vehicle.info(text)
-        return True
+    @property
+    def _place_down(self) -> float:
+        assert self._place is not None
+        _, _, down = self._place
+        return down
+
+    def _report_if(self, is_complete: bool, text: str) -> bool:
+        """Send a text if the command is complete, and return ``is_complete``."""
+        if is_complete:
+            self.vehicle.info(text)
+        return is_complete
 
     def _has_passed(self, index: int) -> bool:
         """Return True if the plane is within WP_RADIUS of the waypoint or has passed the waypoint."""
         assert self._place is not None
-        wing, (north, east, _), start = self.vehicle.wing, self._place, self._leg_start
+        wing = self.vehicle.wing
+        north, east, _ = self._place
+        start_north, start_east, _ = self._leg_start
         distance = horizontal_distance(self.vehicle, self._place)
         if distance <= self.vehicle.parameters["WP_RADIUS"]:
-            return self._report(f"Reached waypoint #{index} dist {int(distance)}m")
+            self.vehicle.info(f"Reached waypoint #{index} dist {int(distance)}m")
+            return True
         # The plane has passed the waypoint if its offset from the waypoint points in the direction of the leg.
-        # `_report` returns True.
-        dot_product = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
-        return dot_product > 0 and self._report(f"Passed waypoint #{index} dist {int(distance)}m")
+        dot_product = (north - start_north) * (wing.north - north) + (east - start_east) * (wing.east - east)
+        return self._report_if(dot_product > 0, f"Passed waypoint #{index} dist {int(distance)}m")
 
     def _go(self, item: MissionItem, manoeuvre: int) -> None:
         """Start a leg. Zero coordinates mean the plane's coordinates, a zero altitude that of the previous leg."""
         self._leg_start = self.vehicle.wing.place
         point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or self._leg_start
-        north, east = self._leg_start[:2] if (item.x, item.y) == (0, 0) else point[:2]
-        down = point[2]
+        north, east, down = point
+        if (item.x, item.y) == (0, 0):
+            north, east, _ = self._leg_start
         if item.z == 0:
-            down = self._leg_start[2] if self._place is None else self._place[2]
-        self._place, self._manoeuvre = (north, east, down), manoeuvre
-        self._on_circle_since, self._turned_rad, self.radius = math.nan, 0.0, 0.0
+            _, _, down = self._place or self._leg_start
+        self._place = (north, east, down)
+        self._manoeuvre = manoeuvre
+        self._on_circle_since = math.nan
+        self._turned_rad = self.radius = 0.0
 
     def _loiter(self, item: MissionItem) -> None:
         self._go(item, _LOITER)
@@ -193,9 +203,10 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._go(item, _LAND)
         wing, plane = self.vehicle.wing, self.vehicle
         point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
-        north, east, down = (*self._leg_start[:2], wing.ground_down) if point is None else point
+        start_north, start_east, _ = self._leg_start
+        north, east, down = (start_north, start_east, wing.ground_down) if point is None else point
         if (item.x, item.y) == (0, 0):  # Zero coordinates mean the plane's coordinates.
-            north, east = self._leg_start[:2]
+            north, east = start_north, start_east
         self._landing = PlaneLanding(plane, (north, east, down))
         plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
 
@@ -231,7 +242,7 @@ class _TimedValue:
     """A value of a set-point, and the time at which the set-point was received."""
 
     value: float
-    since: float
+    received_at: float
 
 
 class PlaneGuided(PlaneNavigatingMode):
@@ -253,15 +264,18 @@ class PlaneGuided(PlaneNavigatingMode):
 
     def go_to(self, position: Ned) -> None:
         """Fly to a point of the world frame and circle there."""
-        self._place, self._course, self._climb_limit = position, None, _UNLIMITED_M_S
+        self._place = position
+        self._course = None
+        self._climb_limit = _UNLIMITED_M_S
 
     def change_altitude(self, down: float, climb_m_s: float = _UNLIMITED_M_S) -> None:
         if self._place is not None:
-            self._place = (self._place[0], self._place[1], down)
+            north, east, _ = self._place
+            self._place = (north, east, down)
             self._climb_limit = climb_m_s
 
     def change_course(self, course: float | None) -> None:
-        """Fly on a course in radians from north. None ends this, so that the plane circles again."""
+        """Fly on a course in radians from north. With None, the plane circles again."""
         self._course = course
 
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
@@ -282,9 +296,10 @@ class PlaneGuided(PlaneNavigatingMode):
             self._throttle = _TimedValue(max(0.0, min(1.0, message.thrust)), now)
 
     def update(self, dt: float) -> None:
+        """Follow the latest attitude or course that was commanded. Without one, circle the target."""
         wing, now = self.vehicle.wing, self.vehicle.now
         has_bank, has_pitch, has_throttle = (
-            now - target.since < _ATTITUDE_TIMEOUT_S for target in (self._bank, self._pitch, self._throttle)
+            now - target.received_at < _ATTITUDE_TIMEOUT_S for target in (self._bank, self._pitch, self._throttle)
         )
         has_target = has_bank or has_pitch or has_throttle or self._course is not None
         if self.vehicle.is_landed or not has_target:
@@ -293,7 +308,7 @@ class PlaneGuided(PlaneNavigatingMode):
         limits = wing.wing_limits
         # Half throttle flies at cruise speed.
         speed = 2.0 * self._throttle.value * self.vehicle.cruise_m_s if has_throttle else self.airspeed
-        target_down = wing.down if self._place is None else self._place[2]
+        _, _, target_down = self._place or wing.place
         climb = max(-self._climb_limit, min(self._climb_limit, wing.climb_to(target_down)))
         if has_pitch:  # A commanded pitch replaces the altitude.
             climb = max(-limits.sink_m_s, min(limits.climb_m_s, speed * math.sin(self._pitch.value)))
@@ -326,9 +341,11 @@ class PlaneSetpoints:
         plane, target = self._plane, self._guided.destination
         if not self._is_guided or message.coordinate_frame != MavFrame.LOCAL_OFFSET_NED or target is None:
             return
-        down = target[2] + message.z
+        _north, _east, target_down = target
+        _north, _east, home_down = plane.home_or_ground
+        down = target_down + message.z
         self._guided.change_altitude(down)
-        plane.info(f"Change alt to {plane.home_or_ground[2] - down:.1f}")
+        plane.info(f"Change alt to {home_down - down:.1f}")
 
     def _on_global(self, message: m.SetPositionTargetGlobalInt, _: Channel) -> None:
         plane = self._plane
@@ -339,7 +356,8 @@ class PlaneSetpoints:
             plane.info(f"Unknown mavlink coordinate frame {message.coordinate_frame}")
             plane.send_text(MavSeverity.WARNING, "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT")
         elif not message.type_mask & PositionMask.Z_IGNORE:
-            self._guided.change_altitude(point[2])
+            _north, _east, down = point
+            self._guided.change_altitude(down)
 
     def _on_attitude(self, message: m.SetAttitudeTarget, _: Channel) -> None:
         if self._is_guided:
@@ -365,7 +383,7 @@ def guided_commands(plane: PlaneHost) -> dict[int, CommandHandler]:
 
 
 def _change_speed(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    if whole(command.param1) != SpeedType.AIRSPEED:
+    if to_int(command.param1) != SpeedType.AIRSPEED:
         return MavResult.DENIED
     if not plane.is_valid_airspeed(command.param2):
         return MavResult.FAILED
@@ -378,7 +396,8 @@ def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCom
     point = plane.world_point(0, 0, command.z, command.altitude_frame)  # Only the altitude is used.
     if command.z in _INVALID_ALTITUDES or point is None:
         return MavResult.DENIED
-    guided.change_altitude(point[2], abs(command.param3) or _UNLIMITED_M_S)
+    _, _, down = point
+    guided.change_altitude(down, abs(command.param3) or _UNLIMITED_M_S)
     return MavResult.ACCEPTED
 
 
@@ -397,10 +416,11 @@ def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand)
 
 def _change_target_altitude(plane: PlaneHost, command: ReceivedCommand) -> int:
     """Change the altitude to param 1 metres (MAV_FRAME param 2). Only GUIDED uses the altitude; all modes accept it."""
-    point = plane.world_point(0, 0, command.param1, whole(command.param2))  # Only the altitude is used.
+    point = plane.world_point(0, 0, command.param1, to_int(command.param2))  # Only the altitude is used.
     if point is None:
         return MavResult.DENIED
     guided = plane.mode_of(PlaneGuided)
     if plane.mode is guided:
-        guided.change_altitude(point[2])
+        _, _, down = point
+        guided.change_altitude(down)
     return MavResult.ACCEPTED

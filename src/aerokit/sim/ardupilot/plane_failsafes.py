@@ -304,5 +304,5 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
         return int(self.vehicle.parameters["FENCE_ACTION"])
 
     def _turn_back(self, mode_before: int, *modes: int) -> None:
-        self.caused_mode: bool = any(self.vehicle.set_mode(mode) for mode in modes)
+        self.enter_first(modes)
         self._mode_before = mode_before

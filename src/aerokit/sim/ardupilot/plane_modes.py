@@ -84,7 +84,7 @@ class PlaneLanding:
         self.point: Ned = point
         self._fly_to_first = start  # Place to fly to before the approach; None once the approach has begun.
         self._approach_start: Ned = plane.wing.place
-        self._is_flaring = self._is_reported = False
+        self._is_flaring = self._is_distance_reported = False
         self._stopped_at = math.nan
 
     def update(self, dt: float) -> None:
@@ -100,15 +100,20 @@ class PlaneLanding:
 
     def _fly_to_start(self, start: Ned) -> None:
         wing = self._plane.wing
-        distance = math.hypot(start[0] - wing.north, start[1] - wing.east)
-        if distance < _JOINED_M and abs(wing.down - start[2]) < _JOINED_M / 4:
-            self._approach_start, self._fly_to_first = wing.place, None
+        north, east, down = start
+        distance = math.hypot(north - wing.north, east - wing.east)
+        if distance < _JOINED_M and abs(wing.down - down) < _JOINED_M / 4:
+            self._approach_start = wing.place
+            self._fly_to_first = None
             return
         wing.fly_to(*start, airspeed=self._plane.cruise_m_s)
 
     def _approach(self) -> None:
-        plane, wing, (north, east, down) = self._plane, self._plane.wing, self.point
-        course = math.atan2(east - self._approach_start[1], north - self._approach_start[0])
+        """Descend along the line from the start of the approach to the landing point, and flare above the ground."""
+        plane, wing = self._plane, self._plane.wing
+        north, east, down = self.point
+        start_north, start_east, start_down = self._approach_start
+        course = math.atan2(east - start_east, north - start_north)
         cos_course, sin_course = math.cos(course), math.sin(course)
         # Distances in metres from the landing point: along the approach line (negative once the plane has passed the
         # point), and across that line.
@@ -120,12 +125,14 @@ class PlaneLanding:
         if height < flare_height:
             self._flare(height, remaining)
         if self._is_flaring:
-            climb, speed = -_FLARE_SINK_M_S, wing.wing_limits.airspeed_min_m_s
+            climb = -_FLARE_SINK_M_S
+            speed = wing.wing_limits.airspeed_min_m_s
         else:
-            length = max(1.0, math.hypot(north - self._approach_start[0], east - self._approach_start[1]))
-            down_on_slope = down + (self._approach_start[2] - down) * max(0.0, remaining) / length
-            slope_sink = (down - self._approach_start[2]) * wing.ground_speed_m_s / length
-            climb, speed = -slope_sink + wing.climb_to(down_on_slope), _APPROACH_SHARE * plane.cruise_m_s
+            length = max(1.0, math.hypot(north - start_north, east - start_east))
+            down_on_slope = down + (start_down - down) * max(0.0, remaining) / length
+            slope_sink = (down - start_down) * wing.ground_speed_m_s / length
+            climb = -slope_sink + wing.climb_to(down_on_slope)
+            speed = _APPROACH_SHARE * plane.cruise_m_s
         # The course points to the approach line, more directly the farther the plane is from it.
         wing.head(course + math.atan2(aside, _CORRECTION_LENGTH_M), speed, climb)
 
@@ -146,9 +153,10 @@ class PlaneLanding:
         if plane.is_armed and delay > 0 and plane.now - self._stopped_at >= delay:
             plane.arming.disarm()
             plane.info("Auto disarmed")
-            if not self._is_reported:
-                self._is_reported = True
-                distance = math.hypot(self.point[0] - wing.north, self.point[1] - wing.east)
+            if not self._is_distance_reported:
+                self._is_distance_reported = True
+                north, east, _ = self.point
+                distance = math.hypot(north - wing.north, east - wing.east)
                 plane.info(f"Distance from LAND point={distance:.2f}m")
 
 
@@ -180,7 +188,8 @@ class PlanePilotedMode(PlaneModeBase):
 
     def update(self, dt: float) -> None:
         plane, wing = self.vehicle, self.vehicle.wing
-        throttle_pulse, limits = plane.rc[RC_THROTTLE], wing.wing_limits
+        limits = wing.wing_limits
+        throttle_pulse = plane.rc[RC_THROTTLE]
         is_idle = throttle_pulse <= _LOW_THROTTLE
         if plane.is_landed and is_idle:
             wing.roll_out()
@@ -295,11 +304,12 @@ class PlaneRtl(PlaneNavigatingMode):
     def enter(self, *, force: bool) -> bool:
         super().enter(force=force)
         plane = self.vehicle
-        home, height = plane.home_or_ground, plane.parameters["RTL_ALTITUDE"]
+        north, east, home_down = plane.home_or_ground
+        height = plane.parameters["RTL_ALTITUDE"]
         self.radius: float = plane.parameters["RTL_RADIUS"]
         keeps_altitude = height < 0
-        down = plane.wing.down if keeps_altitude else home[2] - height
-        self._place = best_return_place(plane, (home[0], home[1], down))
+        down = plane.wing.down if keeps_altitude else home_down - height
+        self._place = best_return_place(plane, (north, east, down))
         return True
 
 
@@ -328,14 +338,17 @@ class PlaneTakeOff(PlaneNavigatingMode):
 
     def _missing_height_m(self) -> float:
         assert self._place is not None
-        return self.vehicle.wing.down - self._place[2]
+        _, _, target_down = self._place
+        return self.vehicle.wing.down - target_down
 
     def _start(self) -> None:
         """Set the place to circle: TKOFF_DIST metres ahead of the nose, and TKOFF_ALT metres above home."""
         plane, wing = self.vehicle, self.vehicle.wing
         height, distance = plane.parameters["TKOFF_ALT"], plane.parameters["TKOFF_DIST"]
-        north, east = wing.north + distance * math.cos(wing.yaw), wing.east + distance * math.sin(wing.yaw)
-        self._place = (north, east, plane.home_or_ground[2] - height)
+        north = wing.north + distance * math.cos(wing.yaw)
+        east = wing.east + distance * math.sin(wing.yaw)
+        _, _, home_down = plane.home_or_ground
+        self._place = (north, east, home_down - height)
         self._is_climbing = self._missing_height_m() > _TAKE_OFF_DONE_M
         if plane.is_landed:
             heading = math.degrees(wing.yaw) % 360.0
@@ -364,12 +377,13 @@ class PlaneAutoland(PlaneNavigatingMode):
         if plane.take_off_yaw is None:
             plane.send_text(MavSeverity.WARNING, "Takeoff initial direction not set")
             return False
-        home = plane.home_or_ground
+        home = north, east, down = plane.home_or_ground
         distance, height = plane.parameters["AUTOLAND_WP_DIST"], plane.parameters["AUTOLAND_WP_ALT"]
-        north, east = math.cos(plane.take_off_yaw), math.sin(plane.take_off_yaw)
         # The landing has the direction of the take-off, so the approach starts on the other side of home.
-        start = (home[0] - distance * north, home[1] - distance * east, home[2] - height)
-        self._place, self._landing = home, PlaneLanding(plane, home, start)
+        start_north = north - distance * math.cos(plane.take_off_yaw)
+        start_east = east - distance * math.sin(plane.take_off_yaw)
+        self._place = home
+        self._landing = PlaneLanding(plane, home, (start_north, start_east, down - height))
         return True
 
     def update(self, dt: float) -> None:

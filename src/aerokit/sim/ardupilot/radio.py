@@ -20,7 +20,7 @@ from aerokit.sim.ardupilot.host import (
 )
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import ReceivedCommand, whole
+from aerokit.sim.commands import ReceivedCommand, to_int
 from aerokit.sim.vehicle import sender_of
 
 _AT_REST = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
@@ -41,6 +41,7 @@ class ArduPilotRadio:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self._sticks: list[int] = list(_AT_REST)
+        # Maps a channel index to the pulse width (0: released), and to the time at which it was received.
         self._overrides: dict[int, tuple[int, float]] = {}
 
     def __len__(self) -> int:
@@ -48,8 +49,8 @@ class ArduPilotRadio:
 
     def __getitem__(self, index: int) -> int:
         if index in self._overrides:
-            value, since = self._overrides[index]  # The value 0 means that the channel is released.
-            if value and self._vehicle.now - since < self._override_time():
+            value, received_at = self._overrides[index]
+            if value and self._vehicle.now - received_at < self._override_time():
                 return value
         if index == RC_THROTTLE and self._failure == _LOW_THROTTLE:  # SIM_RC_FAIL simulates a receiver without signal.
             return _LOW_THROTTLE_PWM
@@ -75,7 +76,7 @@ class ArduPilotRadio:
         if not (vehicle.faults.rc_lost or self._failure == _NO_PULSES):
             return True
         expired_before = vehicle.now - self._override_time()
-        return any(value and since > expired_before for value, since in self._overrides.values())
+        return any(value and received_at > expired_before for value, received_at in self._overrides.values())
 
     def override(self, pulses: Mapping[int, int]) -> None:
         """Override channels for RC_OVERRIDE_TIME. ``pulses`` maps a channel index to µs; 0 releases the channel."""
@@ -101,7 +102,8 @@ class ArduPilotRadio:
     def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
         """Apply overrides of the ground station MAV_GCS_SYSID. The value 0 releases only the channels 1 to 8."""
         vehicle = self._vehicle
-        if sender_of(override)[0] != vehicle.parameters["MAV_GCS_SYSID"]:
+        sender_system, _component = sender_of(override)
+        if sender_system != vehicle.parameters["MAV_GCS_SYSID"]:
             return
         vehicle.failsafes.ground_station_seen_at = vehicle.now
         for index in range(_OVERRIDABLE):
@@ -110,7 +112,7 @@ class ArduPilotRadio:
             if value == _UNCHANGED or (value == 0 and is_upper):  # For channels above 8, 0 means unchanged, too.
                 continue
             if value == _RELEASE_UPPER and is_upper:
-                value = 0  # `_overrides` stores 0 for a released channel.
+                value = 0
             self._overrides[index] = (value, vehicle.now)
 
 
@@ -131,7 +133,8 @@ class ArduPilotJoystick:
 
     def _on_message(self, axes: m.ManualControl, _: Channel) -> None:
         vehicle = self._vehicle
-        if sender_of(axes)[0] != vehicle.parameters["MAV_GCS_SYSID"] or axes.target != vehicle.system_id:
+        sender_system, _component = sender_of(axes)
+        if sender_system != vehicle.parameters["MAV_GCS_SYSID"] or axes.target != vehicle.system_id:
             return
         vehicle.rc.override(self.sticks(axes))
         vehicle.failsafes.ground_station_seen_at = vehicle.now
@@ -151,7 +154,8 @@ class ArduPilotJoystick:
         """Scale the value of an axis to RCn_MIN … RCn_MAX. Return 0 if the message has no value for the axis."""
         if value == _NO_VALUE:
             return 0
-        low, high = self.setting(f"RC{channel + 1}_MIN", 1100.0), self.setting(f"RC{channel + 1}_MAX", 1900.0)
+        low = self.setting(f"RC{channel + 1}_MIN", 1100.0)
+        high = self.setting(f"RC{channel + 1}_MAX", 1900.0)
         if reverse:
             value = -value
         share = (value - lowest) / (1000 - lowest)
@@ -224,19 +228,19 @@ class AuxiliaryOutputs:
 
     def set_servo(self, command: ReceivedCommand) -> int:
         """Set a servo output for DO_SET_SERVO, or for the first pulse of DO_REPEAT_SERVO."""
-        output = whole(command.param1)
+        output = to_int(command.param1)
         if not 1 <= output <= _SERVOS:
             return MavResult.FAILED
         if not self.is_free(output):
             self._vehicle.info(f"ServoRelayEvent: Channel {output} is already in use")
             return MavResult.FAILED
-        self.servos[output] = whole(command.param2)
+        self.servos[output] = to_int(command.param2)
         return MavResult.ACCEPTED
 
     def set_relay(self, command: ReceivedCommand) -> int:
         if not 0 <= command.param1 < self.relay_count:
             return MavResult.FAILED
-        bit = 1 << whole(command.param1)
+        bit = 1 << to_int(command.param1)
         self.relays = self.relays | bit if command.param2 else self.relays & ~bit
         return MavResult.ACCEPTED
 
@@ -247,11 +251,11 @@ class AuxiliaryOutputs:
 
     def switch(self, command: ReceivedCommand) -> int:
         """Record the switch position of DO_AUX_FUNCTION. The function itself is not simulated."""
-        function = whole(command.param1)
+        function = to_int(command.param1)
         if command.param2 not in _AUX_POSITIONS:
             return MavResult.DENIED
         if not 0 <= function < _FUNCTIONS or function in _REFUSED_FUNCTIONS[self._vehicle.KIND]:
             self._vehicle.info(f"Invalid channel option ({function})")
             return MavResult.FAILED
-        self.functions[function] = whole(command.param2)
+        self.functions[function] = to_int(command.param2)
         return MavResult.ACCEPTED

@@ -10,7 +10,7 @@ from aerokit.mavlink.enums import MavResult
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import ReceivedCommand, whole
+from aerokit.sim.commands import ReceivedCommand, to_int
 
 # Suffixes of the parameters with the stream rates. The prefix is that of the port: MAV1_EXTRA1 on the first port.
 _RATE_PARAMETERS: dict[int, str] = {
@@ -63,8 +63,8 @@ class ArduPilotMessageRequests:
         self._groups: dict[int, tuple[int, ...]] = dict.fromkeys(_RATE_PARAMETERS, ())
         for stream, message_id, _ in rows_of(vehicle.KIND, "stream_groups.csv"):
             self._groups[Stream[stream]] += (int(message_id),)
-        # By rate parameter: the value after the next reboot, and the value that REQUEST_DATA_STREAM has set until then.
-        self._saved: dict[str, tuple[float, int]] = {}
+        # Maps a rate parameter to its value after the next reboot, and to the value that REQUEST_DATA_STREAM has set.
+        self._changed_rates: dict[str, tuple[float, int]] = {}
         if stream_groups:
             vehicle.on(m.RequestDataStream, self._on_group)
 
@@ -73,7 +73,7 @@ class ArduPilotMessageRequests:
 
         0 selects the default, which is one second for HEARTBEAT and off for other messages.
         """
-        message_id, interval_us = whole(command.param1), whole(command.param2)
+        message_id, interval_us = to_int(command.param1), to_int(command.param2)
         if command.param3 != 0.0:
             return MavResult.DENIED
         if message_id not in self._supported:
@@ -92,24 +92,26 @@ class ArduPilotMessageRequests:
 
     def get_interval(self, command: ReceivedCommand) -> int:
         """Send MESSAGE_INTERVAL, before the acknowledgement."""
-        return self._send_interval(whole(command.param1), command.channel)
+        return self._send_interval(to_int(command.param1), command.channel)
 
     def _send_interval(self, message_id: int, channel: Channel) -> int:
         is_supported = message_id in self._supported
-        interval_us = round(channel.streams.interval(message_id) * 1e6) or -1
+        interval_us = round(channel.streams.interval(message_id) * 1e6)
+        if interval_us == 0:
+            interval_us = -1  # The message is not streamed.
         if message_id < _MESSAGE_INTERVAL_IDS:
             self._vehicle.send(m.MessageInterval(message_id, interval_us if is_supported else 0), channel)
         return MavResult.ACCEPTED if is_supported else MavResult.FAILED
 
     def request_message(self, command: ReceivedCommand) -> int:
         """Send a message once, after the acknowledgement."""
-        message_id = whole(command.param1)
+        message_id = to_int(command.param1)
         if message_id == m.MessageInterval.ID:
-            return self._send_interval(whole(command.param2), command.channel)
+            return self._send_interval(to_int(command.param2), command.channel)
         if message_id not in self._supported:
             return MavResult.FAILED
         if message_id == m.AvailableModes.ID:
-            self._send_modes(whole(command.param2), command.channel)
+            self._send_modes(to_int(command.param2), command.channel)
         else:
             self.send_soon(message_id, command.channel)
         return MavResult.ACCEPTED
@@ -133,8 +135,9 @@ class ArduPilotMessageRequests:
         """
         vehicle = self._vehicle
         modes = vehicle.available_modes()
-        requested_modes = modes[max(0, index - 1) : max(0, index)] if index else modes  # empty if there is no such mode
-        for message in requested_modes:
+        if index != 0:
+            modes = [mode for mode in modes if mode.mode_index == index]
+        for message in modes:
             vehicle.call_later(0.0, partial(vehicle.send, message, channel))
         channel.streams.set_interval(m.AvailableModesMonitor.ID, _MODES_MONITOR_INTERVAL_S, vehicle.now)
 
@@ -143,7 +146,8 @@ class ArduPilotMessageRequests:
             return
         rate = request.req_message_rate if request.start_stop else 0
         requested = request.req_stream_id
-        for stream in self._groups if requested == Stream.ALL else (requested,):
+        streams = list(self._groups) if requested == Stream.ALL else [requested]
+        for stream in streams:
             if stream in self._groups:
                 self._stream_group(stream, rate, channel, self._vehicle.now)
                 self._store_rate(f"{self._prefix(channel)}{_RATE_PARAMETERS[stream]}", rate)
@@ -163,22 +167,22 @@ class ArduPilotMessageRequests:
     def restart(self) -> None:
         """Restore the stream rates that REQUEST_DATA_STREAM has changed, because of a reboot."""
         parameters = self._vehicle.parameters
-        for name, (saved, changed) in self._saved.items():
-            if parameters[name] == changed:  # False if PARAM_SET has set another value, which is kept.
-                parameters[name] = saved
-        self._saved.clear()
+        for name, (value_after_reboot, requested) in self._changed_rates.items():
+            if parameters[name] == requested:  # False if PARAM_SET has set another value, which is kept.
+                parameters[name] = value_after_reboot
+        self._changed_rates.clear()
 
     def _store_rate(self, name: str, rate: int) -> None:
         vehicle, parameters = self._vehicle, self._vehicle.parameters
         if name not in parameters or parameters[name] == rate:
             return
         # A reboot restores the value from before the first change, so a second change keeps the stored value.
-        value_after_reboot, _ = self._saved.get(name, (parameters[name], rate))
+        value_after_reboot, _ = self._changed_rates.get(name, (parameters[name], rate))
         parameters[name] = rate
         if vehicle.KIND == "plane":  # Only ArduPlane saves stream rates beyond a reboot (persist_streamrates).
             vehicle.announce_parameter(name)
         else:
-            self._saved[name] = (value_after_reboot, rate)
+            self._changed_rates[name] = (value_after_reboot, rate)
 
     def _stream_group(self, stream: int, rate: float, channel: Channel, first: float) -> None:
         group_interval = max(1.0 / rate, _MIN_INTERVAL_S) if rate > 0 else 0.0

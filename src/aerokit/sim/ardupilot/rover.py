@@ -7,15 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
-from aerokit.mavlink.enums import (
-    FenceMitigate,
-    MavCmd,
-    MavModeFlag,
-    MavResult,
-    MavSeverity,
-    MavType,
-    RoverMode,
-)
+from aerokit.mavlink.enums import FenceMitigate, MavCmd, MavModeFlag, MavResult, MavSeverity, MavType, RoverMode
 from aerokit.mavlink.messages import SetAttitudeTarget
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes, ArmingCheck
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
@@ -143,7 +135,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     def _update_link(self, name: str, *, is_lost: bool) -> None:
         """Record whether a link is lost, and start or end the common failsafe of both links."""
-        rover, was_any_link_lost = self.vehicle, bool(self._lost)
+        rover = self.vehicle
+        was_any_link_lost = bool(self._lost)
         self._lost = (self._lost | {name}) if is_lost else (self._lost - {name})
         if self._lost and not was_any_link_lost:
             self._lost_since = rover.now
@@ -232,9 +225,7 @@ class RoverFence(ArduPilotFence[RoverHost]):
         elif action == _TERMINATE:
             vehicle.arming.disarm()
         else:
-            modes = _MODES.get(action, ())
-            # Try the modes in turn; `any` stops at the first mode that the vehicle accepts.
-            self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
+            self.enter_first(_MODES.get(action, ()))
 
     def on_mode_changed(self) -> None:
         super().on_mode_changed()

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from aerokit.mavlink.enums import MavSeverity, RoverMode
 from aerokit.mavlink.messages import MissionItemReached
 from aerokit.sim.ardupilot.host import RC_ROLL, RC_THROTTLE, ArduPilotMode, variant
+from aerokit.sim.ardupilot.mission_run import horizontal_distance
 from aerokit.sim.ardupilot.navigation import SmartPath, best_return_place
 from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, RoverSubAuto, RoverSubVehicle
 from aerokit.sim.motion import Ned, wrap_pi
@@ -43,7 +44,8 @@ class RoverHost(RoverSubVehicle):
     def has_arrived(self, place: Ned) -> bool:
         """Return True if the rover has reached, or just passed, a place at which it should stop."""
         motion = self.motion
-        north, east = place[0] - motion.north, place[1] - motion.east
+        place_north, place_east, _ = place
+        north, east = place_north - motion.north, place_east - motion.east
         distance = math.hypot(north, east)
         bearing_from_nose = wrap_pi(math.atan2(east, north) - motion.yaw)
         is_behind = abs(bearing_from_nose) > math.pi / 2
@@ -53,9 +55,7 @@ class RoverHost(RoverSubVehicle):
 
     def has_passed(self, place: Ned) -> bool:
         """Return True if the rover is within WP_RADIUS of a place that it passes without a stop."""
-        motion = self.motion
-        distance = math.hypot(place[0] - motion.north, place[1] - motion.east)
-        return distance <= self.parameters["WP_RADIUS"]
+        return horizontal_distance(self, place) <= self.parameters["WP_RADIUS"]
 
 
 class _Mode(ArduPilotMode):
@@ -93,11 +93,12 @@ class _Rtl(_Mode):
         rover, home = self.vehicle, self.vehicle.navigation.home
         if home is None:
             return False
-        self._set_out([best_return_place(rover, home, is_allowed=rover.fence.contains)])
+        self._start_return([best_return_place(rover, home, is_allowed=rover.fence.contains)])
         return True
 
-    def _set_out(self, path: list[Ned]) -> None:
-        self._path, self._has_arrived = path, False
+    def _start_return(self, path: list[Ned]) -> None:
+        self._path = path
+        self._has_arrived = False
         self.speed = self.vehicle.parameters["RTL_SPEED"] or self.vehicle.parameters["WP_SPEED"]
 
     @property
@@ -112,7 +113,8 @@ class _Rtl(_Mode):
                 self._has_arrived = True
                 rover.info("Reached destination")
             return
-        next_place, is_last = self._path[0], len(self._path) == 1
+        next_place = self._path[0]
+        is_last = len(self._path) == 1
         # The rover stops only at the last place.
         is_reached = rover.has_arrived(next_place) if is_last else rover.has_passed(next_place)
         if is_reached:
@@ -130,7 +132,7 @@ class _SmartRtl(_Rtl):
     def enter(self, *, force: bool) -> bool:
         if not self.vehicle.path.is_active:
             return False
-        self._set_out(self.vehicle.path.take_way_back())
+        self._start_return(self.vehicle.path.take_way_back())
         return True
 
     def leave(self) -> None:
@@ -155,7 +157,8 @@ class RoverAuto(RoverSubAuto):
         if stops and self.has_arrived(place):
             self.vehicle.motion.stop()
         else:
-            self.vehicle.motion.drive_to(place[0], place[1], speed=self.speed, stops=stops)
+            north, east, _ = place
+            self.vehicle.motion.drive_to(north, east, speed=self.speed, stops=stops)
 
     def has_arrived(self, place: Ned) -> bool:
         return self.vehicle.has_arrived(place) if self._stops else self.vehicle.has_passed(place)
@@ -199,7 +202,9 @@ class RoverGuided(_Mode):
         return True
 
     def go_to(self, position: Ned) -> None:
-        self._place, self._has_arrived, self._target = position, False, None
+        self._place = position
+        self._has_arrived = False
+        self._target = None
         self.speed = self.vehicle.waypoint_speed
 
     def set_target(self, target: GuidedTarget) -> None:
@@ -207,7 +212,9 @@ class RoverGuided(_Mode):
         if target.position is not None:
             self.go_to(target.position)
             return
-        self._place, self._target, self._target_at = None, target, self.vehicle.now
+        self._place = None
+        self._target = target
+        self._target_at = self.vehicle.now
 
     def update(self, dt: float) -> None:
         rover, target = self.vehicle, self._target
@@ -230,7 +237,8 @@ class RoverGuided(_Mode):
         if self._has_arrived:
             rover.motion.stop()
         else:
-            rover.motion.drive_to(place[0], place[1], speed=self.speed)
+            north, east, _ = place
+            rover.motion.drive_to(north, east, speed=self.speed)
 
     def _follow(self, target: GuidedTarget) -> None:
         north, east, _ = target.velocity or (0.0, 0.0, 0.0)

@@ -115,7 +115,7 @@ class GuidedSetpoints:
         backwards = message.vx < 0 and (yaw is not None or yaw_rate is not None)
         if velocity is not None and frame in self.BODY_FRAMES:
             velocity = rotated(velocity, self.vehicle.motion.yaw)
-        target = GuidedTarget(position, velocity, backwards, yaw, yaw_rate)
+        target = GuidedTarget(position, velocity, backwards=backwards, yaw=yaw, yaw_rate=yaw_rate)
         if self.is_complete(target):
             self.mode.set_target(target)
 
@@ -232,7 +232,8 @@ class RoverSubAuto(MissionMode):
         if not self.vehicle.mission.is_present:
             self.refuse()
             return False
-        self.speed, self._place = self.default_speed(), None
+        self.speed = self.default_speed()
+        self._place = None
         self.wait_for_origin()
         return True
 
@@ -289,14 +290,19 @@ class RoverSubAuto(MissionMode):
         current: Ned = self._place or vehicle.motion.place
         self._reached_at = None
         if item.command == Cmd.NAV_RETURN_TO_LAUNCH:
-            self._place, self._stops = vehicle.navigation.home or current, True
+            self._place = vehicle.navigation.home or current
+            self._stops = True
             return
         # If the position is invalid or the coordinates are 0, use `current`, where the previous command ended.
         point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or current
-        north, east = current[:2] if (item.x, item.y) == (0, 0) else point[:2]
-        self._place = (north, east, current[2] if item.z == 0 else point[2])
+        north, east, down = point
+        if (item.x, item.y) == (0, 0):
+            north, east, _ = current
+        if item.z == 0:
+            _, _, down = current
+        self._place = (north, east, down)
         following = next(vehicle.mission.navigation_from(vehicle.mission.nav_index + 1), None)
-        is_waypoint_next = following is not None and following[1].command in _WAYPOINTS
+        is_waypoint_next = following is not None and following.item.command in _WAYPOINTS
         has_delay = item.param1 > 0
         self._stops = has_delay or not is_waypoint_next
 

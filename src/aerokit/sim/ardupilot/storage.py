@@ -120,7 +120,8 @@ class ArduPilotSigning(VehicleSigning):
         vehicle.on_power_on(self._keep_time)
 
     def is_for(self, link_id: int) -> bool:
-        name, parameters = f"MAV{link_id + 1}_OPTIONS", self._ardupilot.parameters
+        name = f"MAV{link_id + 1}_OPTIONS"
+        parameters = self._ardupilot.parameters
         return not (name in parameters and int(parameters[name]) & _SIGNING_OFF)
 
     def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:
@@ -146,10 +147,10 @@ class ArduPilotSigning(VehicleSigning):
 
     def _save(self) -> None:
         if self.key is not None:
-            of_ports = [
+            port_timestamps = [
                 channel.signing.timestamp for channel in self._ardupilot.channels if channel.signing is not None
             ]
-            self.timestamp: int = max([self.timestamp, *of_ports])
+            self.timestamp: int = max([self.timestamp, *port_timestamps])
 
 
 def _accept_all(_: Frame) -> bool:

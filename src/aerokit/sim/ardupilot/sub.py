@@ -8,16 +8,7 @@ from itertools import cycle
 from typing import Any, ClassVar
 
 from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
-from aerokit.mavlink.enums import (
-    MavCmd,
-    MavFrame,
-    MavModeFlag,
-    MavResult,
-    MavSeverity,
-    MavType,
-    SpeedType,
-    SubMode,
-)
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavModeFlag, MavResult, MavSeverity, MavType, SpeedType, SubMode
 from aerokit.mavlink.messages import SetAttitudeTarget
 from aerokit.sim.ardupilot.commands import commanded_heading
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes

@@ -41,13 +41,14 @@ class SubHost(RoverSubVehicle):
         """Move towards a place at a speed in m/s. WPNAV_SPEED_UP and WPNAV_SPEED_DN limit the vertical speed."""
         motion, parameters = self.motion, self.parameters
         north, east, down = self._below_surface(place)
-        max_climb, max_descent = parameters["WPNAV_SPEED_UP"] / 100.0, parameters["WPNAV_SPEED_DN"] / 100.0
+        max_climb = parameters["WPNAV_SPEED_UP"] / 100.0
+        max_descent = parameters["WPNAV_SPEED_DN"] / 100.0
         distance = math.hypot(north - motion.north, east - motion.east)
         if looks_ahead and distance > _MIN_LOOK_AHEAD_M:
             motion.face(math.atan2(east - motion.east, north - motion.north))
         depth_difference = abs(down - motion.down)
-        # The longer of the two distances is covered at `speed`, and the shorter one more slowly, so that the path is
-        # straight. 1e-3 avoids a division by zero.
+        # The longer of the two distances is covered at `speed`, the shorter one more slowly, so that the path is
+        # straight. The minimum of 1e-3 avoids a division by zero.
         horizontal = speed * min(1.0, distance / max(depth_difference, 1e-3))
         vertical = speed * min(1.0, depth_difference / max(distance, 1e-3))
         horizontal = max(horizontal, _MIN_TRAVEL_M_S)
@@ -55,7 +56,8 @@ class SubHost(RoverSubVehicle):
         motion.seek_position(north, east, down, speed=horizontal, climb=climb, descent=descent)
 
     def _below_surface(self, place: Ned) -> Ned:
-        return (place[0], place[1], max(place[2], self.motion.ground_down))
+        north, east, down = place
+        return (north, east, max(down, self.motion.ground_down))
 
 
 class _Mode(ArduPilotMode):
@@ -70,7 +72,8 @@ class _Mode(ArduPilotMode):
         """Turn as the yaw stick commands, and return the velocity north and east (m/s) that the sticks command."""
         motion = self.vehicle.motion
         motion.turn(self.stick(RC_YAW) * _FULL_STICK_TURN_RAD_S)
-        forward, right = self.stick(SUB_FORWARD) * _FULL_STICK_M_S, self.stick(SUB_LATERAL) * _FULL_STICK_M_S
+        forward = self.stick(SUB_FORWARD) * _FULL_STICK_M_S
+        right = self.stick(SUB_LATERAL) * _FULL_STICK_M_S
         north, east, _ = rotated((forward, right, 0.0), motion.yaw)
         return north, east
 
@@ -165,7 +168,8 @@ class SubGuided(_Mode):
 
     def go_to(self, position: Ned) -> None:
         """Go to a place and stay there. A place above the surface is lowered to the surface."""
-        self._place, self._target, self._heading = position, None, None
+        self._place = position
+        self._target = self._heading = None
 
     def set_target(self, target: GuidedTarget) -> None:
         """Follow a target. A position has precedence over a velocity. As in SITL, a new position starts from rest."""
@@ -174,7 +178,9 @@ class SubGuided(_Mode):
             motion.velocity_north = motion.velocity_east = motion.velocity_down = 0.0
             self.go_to(target.position)
         else:
-            self._place, self._target, self._target_at = None, target, self.vehicle.now
+            self._place = None
+            self._target = target
+            self._target_at = self.vehicle.now
         self._heading = target.yaw
 
     def face(self, heading: float) -> None:

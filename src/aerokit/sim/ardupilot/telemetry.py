@@ -115,17 +115,20 @@ def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
     enabled = sensors.working | sensors.unhealthy | _PREARM | controls
     health = sensors.working | sensors.only_healthy | _LOGGING | controls
     if nav.is_gps_detected:
-        present, enabled = present | _GPS, enabled | _GPS
+        present |= _GPS
+        enabled |= _GPS
         health |= 0 if nav.gps_is_lost else _GPS
     if nav.is_healthy:
         enabled |= _AHRS
-        is_estimator_in_use = vehicle.timeline.estimator_leads_early or nav.has_position
+        is_estimator_in_use = nav.has_position or not vehicle.timeline.uses_dcm_until_gps
         health |= _AHRS if is_estimator_in_use else 0
     # The firmware continues its log for `_LOG_AFTER_DISARMING_S` after disarming.
     if vehicle.motors.is_armed or vehicle.now - vehicle.motors.disarmed_at < _LOG_AFTER_DISARMING_S:
         enabled |= _LOGGING
     if vehicle.rangefinder_reach_m > 0.0:
-        present, enabled, health = present | _LASER, enabled | _LASER, health | _LASER
+        present |= _LASER
+        enabled |= _LASER
+        health |= _LASER
     has_fence, is_fence_enabled, is_fence_healthy = vehicle.fence.health
     present |= _FENCE if has_fence else 0
     enabled |= _FENCE if is_fence_enabled else 0
@@ -142,7 +145,7 @@ def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
 
 _UNKNOWN_CELL = 0xFFFF
 _UNKNOWN_TEMPERATURE = 32767
-_RSSI = 255
+_UNKNOWN_RSSI = 255
 _NOTHING_REACHED = 0xFFFF
 _AIR_DENSITY = 1.225
 # Output indices of the motors that have ESC telemetry, by firmware.
@@ -157,7 +160,8 @@ _BOOT_MODE: dict[str, tuple[int, int]] = {
 
 def heartbeat(vehicle: ArduPilotVehicle) -> m.Heartbeat:
     """Build HEARTBEAT. During the boot, the state is BOOT, or CALIBRATING if the firmware reports a boot mode."""
-    base_mode, mode, state = vehicle.base_mode, vehicle.mode.number, MavState.BOOT
+    base_mode, mode = vehicle.base_mode, vehicle.mode.number
+    state = MavState.BOOT
     if not vehicle.is_initialised and vehicle.KIND in _BOOT_MODE:
         base_mode, mode = _BOOT_MODE[vehicle.KIND]
         state = MavState.CALIBRATING
@@ -170,8 +174,13 @@ def heartbeat(vehicle: ArduPilotVehicle) -> m.Heartbeat:
 
 def _sys_status(vehicle: ArduPilotVehicle) -> m.SysStatus:
     battery = vehicle.battery
-    voltage, current = round(battery.voltage_v * 1000), round(battery.current_a * 100)
-    return m.SysStatus(*_sensor_status(vehicle), 0, voltage, current, int(battery.percent), 0, 0, 0, 0, 0, 0)
+    present, enabled, health = _sensor_status(vehicle)
+    return m.SysStatus(
+        onboard_control_sensors_present=present, onboard_control_sensors_enabled=enabled,
+        onboard_control_sensors_health=health, load=0, voltage_battery=round(battery.voltage_v * 1000),
+        current_battery=round(battery.current_a * 100), battery_remaining=int(battery.percent), drop_rate_comm=0,
+        errors_comm=0, errors_count1=0, errors_count2=0, errors_count3=0, errors_count4=0,
+    )  # fmt: skip
 
 
 def _extended_sys_state(vehicle: ArduPilotVehicle) -> m.ExtendedSysState:
@@ -193,18 +202,16 @@ def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
     charge = MavBatteryChargeState.LOW if vehicle.failsafes.battery_is_low else MavBatteryChargeState.OK
     if vehicle.failsafes.battery_is_critical:
         charge = MavBatteryChargeState.CRITICAL
-    current, consumed = round(battery.current_a * 100), round(battery.consumed_mah)  # 0.01 A, mAh
-    hectojoules, percent = round(battery.consumed_wh * 36), int(battery.percent)  # 1 Wh is 36 hJ.
     return m.BatteryStatus(
         id=0,
         battery_function=0,
         type=0,
         temperature=_UNKNOWN_TEMPERATURE,
         voltages=voltages,
-        current_battery=current,
-        current_consumed=consumed,
-        energy_consumed=hectojoules,
-        battery_remaining=percent,
+        current_battery=round(battery.current_a * 100),
+        current_consumed=round(battery.consumed_mah),
+        energy_consumed=round(battery.consumed_wh * 36),  # 1 Wh is 36 hJ.
+        battery_remaining=int(battery.percent),
         time_remaining=0,
         charge_state=charge,
     )
@@ -216,18 +223,18 @@ def _system_time(vehicle: ArduPilotVehicle) -> m.SystemTime:
 
 
 def _rc_channels(vehicle: ArduPilotVehicle) -> m.RcChannels:
-    fields = [vehicle.time_boot_ms, len(vehicle.rc), *vehicle.rc.channels, _RSSI]
+    fields = [vehicle.time_boot_ms, len(vehicle.rc), *vehicle.rc.channels, _UNKNOWN_RSSI]
     return m.RcChannels(*fields)
 
 
 def _rc_channels_raw(vehicle: ArduPilotVehicle) -> m.RcChannelsRaw:
-    fields = [vehicle.time_boot_ms, 0, *vehicle.rc, _RSSI]
+    fields = [vehicle.time_boot_ms, 0, *vehicle.rc, _UNKNOWN_RSSI]
     return m.RcChannelsRaw(*fields)
 
 
 def _vibration(vehicle: ArduPilotVehicle) -> m.Vibration:
-    size = 0.003 + 0.3 * vehicle.motors.throttle
-    x, y, z = (abs(vehicle.rng.gauss(0.0, size)) for _ in range(3))
+    deviation = 0.003 + 0.3 * vehicle.motors.throttle
+    x, y, z = (abs(vehicle.rng.gauss(0.0, deviation)) for _ in range(3))
     return m.Vibration(vehicle.time_boot_us, x, y, z, 0, 0, 0)
 
 
@@ -247,12 +254,15 @@ def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
     # Number of received telemetry packets. The field has 16 bits.
     counts = per_motor(int(vehicle.uptime * _ESC_PACKETS_PER_S) & 0xFFFF)
     temperatures = bytes(per_motor(_ESC_TEMPERATURE_C))
-    return m.EscTelemetry1To4(temperatures, voltages, currents, (0,) * 4, rpms, counts)
+    return m.EscTelemetry1To4(temperatures, voltages, currents, totalcurrent=(0,) * 4, rpm=rpms, count=counts)
 
 
 def _autopilot_version(vehicle: ArduPilotVehicle) -> m.AutopilotVersion:
-    hashes = (vehicle.GIT_HASH, bytes(8), bytes(8))
-    return m.AutopilotVersion(vehicle.capabilities, vehicle.version_number, 0, 0, 0, *hashes, 0, 0, 0, vehicle.uid)
+    return m.AutopilotVersion(
+        capabilities=vehicle.capabilities, flight_sw_version=vehicle.version_number, middleware_sw_version=0,
+        os_sw_version=0, board_version=0, flight_custom_version=vehicle.GIT_HASH, middleware_custom_version=bytes(8),
+        os_custom_version=bytes(8), vendor_id=0, product_id=0, uid=0, uid2=vehicle.uid,
+    )  # fmt: skip
 
 
 def _relay_status(vehicle: ArduPilotVehicle) -> m.RelayStatus:
@@ -308,7 +318,8 @@ def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
     else:
         # The motion model has no surfaces. The deflections are derived from the rates of the plane.
         roll_share = wing.roll_rate / _FULL_ROLL_RATE
-        aileron, rudder = _pulse(roll_share), _pulse(0.5 * roll_share)
+        aileron = _pulse(roll_share)
+        rudder = _pulse(0.5 * roll_share)
         elevator = _pulse(wing.pitch_rate / _FULL_PITCH_RATE)  # As in MANUAL, a pulse above the middle raises the nose.
     return _servo_outputs(plane, aileron, elevator, throttle, rudder)
 
@@ -318,8 +329,9 @@ def _rover_outputs(rover: RoverHost) -> m.ServoOutputRaw:
     if rover.mode.has_manual_throttle:
         deflection = rover.rc[RC_ROLL] - _MIDDLE  # The roll stick steers.
         beyond_deadzone = max(0, abs(deflection) - _ROVER_DEADZONE)
-        size = min(_STICK_RANGE, int(beyond_deadzone * _STICK_RANGE / (_STICK_RANGE - _ROVER_DEADZONE)))
-        steering = size if deflection > 0 else -size
+        steering = min(_STICK_RANGE, int(beyond_deadzone * _STICK_RANGE / (_STICK_RANGE - _ROVER_DEADZONE)))
+        if deflection < 0:
+            steering = -steering
     else:
         steering = round(_STICK_RANGE * rover.motion.yaw_rate / rover.motion.wheels.turn_rate_rad_s)
     throttle = round(_STICK_RANGE * rover.motors.throttle)
@@ -367,9 +379,9 @@ _ALL: Builders = {
     m.SysStatus.ID: _sys_status,
     m.ExtendedSysState.ID: _extended_sys_state,
     m.BatteryStatus.ID: _battery_status,
-    m.PowerStatus.ID: lambda _: m.PowerStatus(5000, 0, 0),
-    m.Meminfo.ID: lambda _: m.Meminfo(0, 65535, 524288),
-    m.Hwstatus.ID: lambda _: m.Hwstatus(5000, 0),
+    m.PowerStatus.ID: lambda _: m.PowerStatus(Vcc=5000, Vservo=0, flags=0),
+    m.Meminfo.ID: lambda _: m.Meminfo(brkval=0, freemem=65535, freemem32=524288),
+    m.Hwstatus.ID: lambda _: m.Hwstatus(Vcc=5000, I2Cerr=0),
     m.SystemTime.ID: _system_time,
     m.MissionCurrent.ID: lambda vehicle: vehicle.mission.message(),
     m.MissionItemReached.ID: lambda _: m.MissionItemReached(_NOTHING_REACHED),
@@ -413,7 +425,7 @@ BUILDERS_OF_KIND: dict[Kind, Builders] = {
     "rover": {
         **_without(m.Wind.ID, m.TerrainReport.ID, m.TerrainRequest.ID, m.EscTelemetry1To4.ID, *_COPTER_TARGETS),
         m.ServoOutputRaw.ID: _rover_outputs,
-        m.RcChannelsScaled.ID: lambda rover: m.RcChannelsScaled(rover.time_boot_ms, 0, 0, 0, 0, 0, 0, 0, 0, 0, 255),
+        m.RcChannelsScaled.ID: lambda rover: m.RcChannelsScaled(rover.time_boot_ms, *(0,) * 9, rssi=_UNKNOWN_RSSI),
         m.VfrHud.ID: _rover_hud,
         m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
     },
@@ -422,7 +434,9 @@ BUILDERS_OF_KIND: dict[Kind, Builders] = {
         m.ServoOutputRaw.ID: _sub_outputs,
         m.NamedValueFloat.ID: _display_value,
         # ArduSub uses SCALED_PRESSURE3 to report a thermometer, so the pressure is 0.
-        m.ScaledPressure3.ID: lambda sub: m.ScaledPressure3(sub.time_boot_ms, 0.0, 0.0, 3620, 0),
+        m.ScaledPressure3.ID: lambda sub: m.ScaledPressure3(
+            sub.time_boot_ms, press_abs=0.0, press_diff=0.0, temperature=3620, temperature_press_diff=0
+        ),
         m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
     },
 }

@@ -6,7 +6,14 @@ import math
 from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import EkfStatusFlags, GpsFixType, MavFrame, PlaneMode
+from aerokit.mavlink.enums import (
+    EkfStatusFlags,
+    GpsFixType,
+    MavDistanceSensor,
+    MavFrame,
+    MavSensorOrientation,
+    PlaneMode,
+)
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.message import Message
 from aerokit.sim.ardupilot.copter_guided import CopterGuided
@@ -42,41 +49,50 @@ def _attitude_quaternion(vehicle: ArduPilotVehicle) -> m.AttitudeQuaternion | No
 def _attitude_target(vehicle: ArduPilotVehicle) -> m.AttitudeTarget:
     motion = vehicle.motion
     quaternion = quaternion_from_euler(*_angles(motion))
-    return m.AttitudeTarget(vehicle.time_boot_ms, 0, quaternion, 0.0, 0.0, motion.yaw_rate, vehicle.motors.throttle)
+    return m.AttitudeTarget(
+        time_boot_ms=vehicle.time_boot_ms, type_mask=0, q=quaternion, body_roll_rate=0.0, body_pitch_rate=0.0,
+        body_yaw_rate=motion.yaw_rate, thrust=vehicle.motors.throttle,
+    )  # fmt: skip
 
 
 def _ahrs(vehicle: ArduPilotVehicle) -> m.Ahrs:
     error = 0.01 if vehicle.navigation.has_attitude else 1.0
-    return m.Ahrs(0.0, 0.0, 0.0, 0.0, 0.0, error, error)
+    return m.Ahrs(
+        omegaIx=0.0, omegaIy=0.0, omegaIz=0.0, accel_weight=0.0, renorm_val=0.0, error_rp=error, error_yaw=error
+    )
 
 
 def _ahrs2(vehicle: ArduPilotVehicle) -> m.Ahrs2:
     place = vehicle.navigation.position
     if place is None:
-        return m.Ahrs2(*_angles(vehicle.motion), 0.0, 0, 0)
+        return m.Ahrs2(*_angles(vehicle.motion), altitude=0.0, lat=0, lng=0)
     return m.Ahrs2(*_angles(vehicle.motion), place.altitude_m, place.latitude_e7, place.longitude_e7)
 
 
 def _simstate(vehicle: ArduPilotVehicle) -> m.Simstate:
     motion = vehicle.motion
     place = vehicle.navigation.frame.to_global(*motion.place)
-    gravity, position = (0.0, 0.0, -GRAVITY_M_S2), (place.latitude_e7, place.longitude_e7)
+    gravity = (0.0, 0.0, -GRAVITY_M_S2)
+    position = (place.latitude_e7, place.longitude_e7)
     return m.Simstate(*_angles(motion), *gravity, *_angular_rates(motion), *position)
 
 
 def _vfr_hud(vehicle: ArduPilotVehicle) -> m.VfrHud:
     motion, place = vehicle.motion, vehicle.navigation.position
     airspeed = motion.airspeed_m_s if vehicle.navigation.has_position else 0.0
-    heading, throttle = int(math.degrees(motion.yaw) % 360.0), round(vehicle.motors.throttle * 100)
-    altitude = 0.0 if place is None else place.altitude_m
-    return m.VfrHud(airspeed, motion.ground_speed_m_s, heading, throttle, altitude, -motion.velocity_down)
+    return m.VfrHud(
+        airspeed=airspeed, groundspeed=motion.ground_speed_m_s, heading=int(math.degrees(motion.yaw) % 360.0),
+        throttle=round(vehicle.motors.throttle * 100), alt=0.0 if place is None else place.altitude_m,
+        climb=-motion.velocity_down,
+    )  # fmt: skip
 
 
 def _acceleration(vehicle: ArduPilotVehicle) -> Three:
     """Return the acceleration that the accelerometers measure, in milli-g."""
     motion = vehicle.motion
     acceleration_down = 0.0 if vehicle.is_landed else motion.acceleration_down
-    x, y = 1000 * math.sin(motion.pitch), -1000 * math.sin(motion.roll)
+    x = 1000 * math.sin(motion.pitch)
+    y = -1000 * math.sin(motion.roll)
     return (_int16(x), _int16(y), _int16((-GRAVITY_M_S2 + acceleration_down) / GRAVITY_M_S2 * 1000))
 
 
@@ -105,13 +121,9 @@ def _highres_imu(vehicle: ArduPilotVehicle) -> m.HighresImu:
     sensors = (x, y, z, *_angular_rates(motion), north, east, down, _pressure_hpa(vehicle))
     all_fields = 8191
     return m.HighresImu(
-        vehicle.time_boot_us,
-        *sensors,
-        diff_pressure=0.0,
-        pressure_alt=altitude,
-        temperature=28.0,
+        vehicle.time_boot_us, *sensors, diff_pressure=0.0, pressure_alt=altitude, temperature=28.0,
         fields_updated=all_fields,
-    )
+    )  # fmt: skip
 
 
 def _pressure_hpa(vehicle: ArduPilotVehicle) -> float:
@@ -128,7 +140,6 @@ def _wind(vehicle: ArduPilotVehicle) -> m.Wind | None:
     return m.Wind(comes_from, speed, 0.0)
 
 
-_NAN4 = (math.nan,) * 4
 _POS_HORIZ_ABS = int(EkfStatusFlags.POS_HORIZ_ABS)
 _NO_YAW = Mask.YAW_IGNORE | Mask.YAW_RATE_IGNORE
 _VELOCITY_ONLY = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE | _NO_YAW
@@ -137,19 +148,23 @@ _POSITION_ONLY = (
 )  # fmt: skip
 # Four undefined bits of the type mask, which ArduPilot sets in POSITION_TARGET_GLOBAL_INT, but not in
 # POSITION_TARGET_LOCAL_NED (GCS_MAVLink_Copter.cpp).
-_LAST_BYTE = 0xF000
+_UNDEFINED_BITS = 0xF000
 # Spacing of the terrain grid in metres, and the offset in degrees from the vehicle to the corner of its terrain block.
 _GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
+_GRIDS_PER_BLOCK = 56  # The mask of TERRAIN_REQUEST has one bit for each grid of a block.
 _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which the vehicle stands.
 
 
 def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
     motion, nav = vehicle.motion, vehicle.navigation
-    place, time = nav.position, vehicle.time_boot_ms  # `place` is None until the estimator knows the position.
+    time = vehicle.time_boot_ms
+    place = nav.position  # None until the estimator knows the position
     relative = round(nav.altitude_above_home * 1000)
     heading = centidegrees(motion.yaw) if nav.has_attitude else 0
     if place is None:
-        return m.GlobalPositionInt(time, 0, 0, 0, relative, 0, 0, 0, heading)
+        return m.GlobalPositionInt(
+            time_boot_ms=time, lat=0, lon=0, alt=0, relative_alt=relative, vx=0, vy=0, vz=0, hdg=heading
+        )
     altitude = round(place.altitude_m * 1000)
     north, east, down = (round(speed * 100) for speed in _velocity(motion))
     return m.GlobalPositionInt(
@@ -167,20 +182,24 @@ def _local_position(vehicle: ArduPilotVehicle) -> m.LocalPositionNed | None:
 def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
     motion, nav = vehicle.motion, vehicle.navigation
     if not nav.is_gps_detected:
-        unknown = 65535  # dilution of precision
-        return m.GpsRawInt(0, GpsFixType.NO_GPS, 0, 0, 0, eph=unknown, epv=unknown, vel=0, cog=0, satellites_visible=0)
+        return _gps_without_fix(GpsFixType.NO_GPS, dilution=65535, satellites=0)  # 65535: unknown
     if nav.fix_type < GpsFixType.TYPE_3D_FIX:
-        worst = 9999
-        return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, eph=worst, epv=worst, vel=0, cog=0, satellites_visible=3)
+        return _gps_without_fix(GpsFixType.NO_FIX, dilution=9999, satellites=3)
     place = nav.frame.to_global(*motion.place)
-    altitude, speed = round(place.altitude_m * 1000), round(motion.ground_speed_m_s * 100)
-    course = centidegrees(math.atan2(motion.velocity_east, motion.velocity_north))
-    position = (place.latitude_e7, place.longitude_e7, altitude)
-    # Horizontal and vertical dilution of precision (times 100), and accuracy of position and altitude.
-    precision, satellites, accuracies_mm = (121, 200), 10, (300, 300)
+    altitude = round(place.altitude_m * 1000)
     return m.GpsRawInt(
-        vehicle.time_boot_us, nav.fix_type, *position, *precision, speed, course, satellites, altitude, *accuracies_mm
-    )
+        time_usec=vehicle.time_boot_us, fix_type=nav.fix_type, lat=place.latitude_e7, lon=place.longitude_e7,
+        alt=altitude, eph=121, epv=200, vel=round(motion.ground_speed_m_s * 100),
+        cog=centidegrees(math.atan2(motion.velocity_east, motion.velocity_north)), satellites_visible=10,
+        alt_ellipsoid=altitude, h_acc=300, v_acc=300,
+    )  # fmt: skip
+
+
+def _gps_without_fix(fix_type: int, *, dilution: int, satellites: int) -> m.GpsRawInt:
+    return m.GpsRawInt(
+        time_usec=0, fix_type=fix_type, lat=0, lon=0, alt=0, eph=dilution, epv=dilution, vel=0, cog=0,
+        satellites_visible=satellites,
+    )  # fmt: skip
 
 
 def _ekf_status(vehicle: ArduPilotVehicle) -> m.EkfStatusReport | None:
@@ -188,17 +207,23 @@ def _ekf_status(vehicle: ArduPilotVehicle) -> m.EkfStatusReport | None:
     if flags is None:
         return None
     variance = 0.02 if flags & _POS_HORIZ_ABS else 0.0
-    return m.EkfStatusReport(flags, variance, variance, variance / 2, variance, 0.0, 0.0)
+    return m.EkfStatusReport(
+        flags=flags, velocity_variance=variance, pos_horiz_variance=variance, pos_vert_variance=variance / 2,
+        compass_variance=variance, terrain_alt_variance=0.0, airspeed_variance=0.0,
+    )  # fmt: skip
 
 
 def _home_position(vehicle: ArduPilotVehicle) -> m.HomePosition | None:
     home = vehicle.navigation.home
     if home is None:
         return None
-    place, local = vehicle.navigation.frame.to_global(*home), vehicle.navigation.local(home)
-    position = (place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000))
-    # ArduPilot sends NaN as the quaternion of home.
-    return m.HomePosition(*position, *local, _NAN4, 0.0, 0.0, 0.0, vehicle.time_boot_us)
+    place = vehicle.navigation.frame.to_global(*home)
+    x, y, z = vehicle.navigation.local(home)
+    quaternion = (math.nan,) * 4  # as ArduPilot sends it
+    return m.HomePosition(
+        latitude=place.latitude_e7, longitude=place.longitude_e7, altitude=round(place.altitude_m * 1000),
+        x=x, y=y, z=z, q=quaternion, approach_x=0.0, approach_y=0.0, approach_z=0.0, time_usec=vehicle.time_boot_us,
+    )  # fmt: skip
 
 
 def _global_origin(vehicle: ArduPilotVehicle) -> m.GpsGlobalOrigin | None:
@@ -216,7 +241,7 @@ def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | Non
         return None
     place = vehicle.navigation.frame.to_global(*target)
     position = (place.latitude_e7, place.longitude_e7, place.altitude_m)
-    mask = _POSITION_ONLY | _LAST_BYTE
+    mask = _POSITION_ONLY | _UNDEFINED_BITS
     return m.PositionTargetGlobalInt(vehicle.time_boot_ms, MavFrame.GLOBAL, mask, *position, *(0.0,) * 8)
 
 
@@ -247,18 +272,27 @@ def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput | None:
     roll, pitch, yaw = map(math.degrees, _angles(motion))
     bearing, distance, altitude_error = 0, 0, 0.0
     if target is not None:
-        north, east = target[0] - motion.north, target[1] - motion.east
+        target_north, target_east, target_down = target
+        north, east = target_north - motion.north, target_east - motion.east
         bearing = round(math.degrees(math.atan2(east, north)) % 360.0) % 360  # Rounding may give 360, which is 0.
-        distance, altitude_error = min(65535, int(math.hypot(north, east))), motion.down - target[2]
-    return m.NavControllerOutput(roll, pitch, round(yaw), bearing, distance, altitude_error, 0.0, 0.0)
+        distance = min(65535, int(math.hypot(north, east)))
+        altitude_error = motion.down - target_down
+    return m.NavControllerOutput(
+        nav_roll=roll, nav_pitch=pitch, nav_bearing=round(yaw), target_bearing=bearing, wp_dist=distance,
+        alt_error=altitude_error, aspd_error=0.0, xtrack_error=0.0,
+    )  # fmt: skip
 
 
 def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
     place = vehicle.navigation.position
     if place is None:
-        return m.TerrainReport(0, 0, 100, 0.0, 0.0, 56, 0)
-    pending_blocks = 0 if vehicle.KIND == "sub" else 504
-    return m.TerrainReport(place.latitude_e7, place.longitude_e7, 0, 0.0, place.altitude_m, pending_blocks, 0)
+        return m.TerrainReport(
+            lat=0, lon=0, spacing=_GRID_M, terrain_height=0.0, current_height=0.0, pending=_GRIDS_PER_BLOCK, loaded=0
+        )
+    return m.TerrainReport(
+        lat=place.latitude_e7, lon=place.longitude_e7, spacing=0, terrain_height=0.0, current_height=place.altitude_m,
+        pending=0 if vehicle.KIND == "sub" else 9 * _GRIDS_PER_BLOCK, loaded=0,
+    )  # fmt: skip
 
 
 def _terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
@@ -267,7 +301,8 @@ def _terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
     if place is None:
         return None
     south, west = (round(1e7 * degrees) for degrees in _GRID_CORNER)
-    return m.TerrainRequest(place.latitude_e7 - south, place.longitude_e7 - west, _GRID_M, (1 << 56) - 1)
+    all_grids = (1 << _GRIDS_PER_BLOCK) - 1
+    return m.TerrainRequest(place.latitude_e7 - south, place.longitude_e7 - west, _GRID_M, all_grids)
 
 
 def _rangefinder(vehicle: ArduPilotVehicle) -> m.Rangefinder | None:
@@ -279,9 +314,12 @@ def _distance_sensor(vehicle: ArduPilotVehicle) -> m.DistanceSensor | None:
     distance = _height_above_ground(vehicle)
     if distance is None:
         return None
-    reach = round(vehicle.rangefinder_reach_m * 100)
-    current = min(reach + 10, round(distance * 100))
-    return m.DistanceSensor(vehicle.time_boot_ms, 20, reach, current, 0, 0, 25, 0, signal_quality=100)
+    reach_cm = round(vehicle.rangefinder_reach_m * 100)
+    return m.DistanceSensor(
+        time_boot_ms=vehicle.time_boot_ms, min_distance=20, max_distance=reach_cm,
+        current_distance=min(reach_cm + 10, round(distance * 100)), type=MavDistanceSensor.LASER, id=0,
+        orientation=MavSensorOrientation.PITCH_270, covariance=0, signal_quality=100,
+    )  # fmt: skip
 
 
 def _height_above_ground(vehicle: ArduPilotVehicle) -> float | None:
@@ -298,9 +336,9 @@ MOTION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.Ahrs2.ID: _ahrs2,
     m.Simstate.ID: _simstate,
     m.VfrHud.ID: _vfr_hud,
-    m.RawImu.ID: lambda v: m.RawImu(v.time_boot_us, *_imu(v), 0, 3500),
-    m.ScaledImu.ID: lambda v: m.ScaledImu(v.time_boot_ms, *_imu(v), 3500),
-    m.ScaledImu2.ID: lambda v: m.ScaledImu2(v.time_boot_ms, *_imu(v), 3500),
+    m.RawImu.ID: lambda v: m.RawImu(v.time_boot_us, *_imu(v), id=0, temperature=3500),
+    m.ScaledImu.ID: lambda v: m.ScaledImu(v.time_boot_ms, *_imu(v), temperature=3500),
+    m.ScaledImu2.ID: lambda v: m.ScaledImu2(v.time_boot_ms, *_imu(v), temperature=3500),
     m.ScaledImu3.ID: lambda v: m.ScaledImu3(v.time_boot_ms, 0, 0, 0, 0, 0, 0, *_magnetic_field(v)),
     m.HighresImu.ID: _highres_imu,
     m.ScaledPressure.ID: lambda v: m.ScaledPressure(v.time_boot_ms, _pressure_hpa(v), 0.0, 2800, 0),

@@ -128,7 +128,8 @@ class ArduPilotVehicle(ArduPilotHost):
         self.calibrations: Calibrations = Calibrations(self)
         self._boot_text = boot_text
         self._stream_groups = stream_groups
-        self.frame: LocalFrame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
+        latitude, longitude, altitude_m = home
+        self.frame: LocalFrame = LocalFrame(GlobalPoint(round(latitude * 1e7), round(longitude * 1e7), altitude_m))
         self.external: ArduPilotExternal = ArduPilotExternal(self)
         """Measurements received from companion computers."""
         self.missions: ArduPilotMissionServer = ArduPilotMissionServer(self)
@@ -192,11 +193,11 @@ class ArduPilotVehicle(ArduPilotHost):
         """Register the handlers of set-point messages."""
 
     def look_at(self, place: Ned | None) -> None:
-        """Point the gimbal, if there is one, at a place. None ends this."""
+        """Point the gimbal, if there is one, at a place. None returns it to its default mode."""
         self.gimbal.look_at(place)
 
-    def may_go_to(self, place: Ned) -> bool:
-        """Prepare the execution of DO_REPOSITION. Return False to refuse the command."""
+    def accept_reposition(self, place: Ned) -> bool:
+        """Called before DO_REPOSITION is executed. Return False to refuse the command."""
         return True
 
     def reset_controllers(self) -> None:
@@ -235,7 +236,10 @@ class ArduPilotVehicle(ArduPilotHost):
         return self.storage.ftp
 
     def is_addressed(self, message: Message) -> bool:
-        """Return True for this system. As in the firmware (MAVLink_routing.cpp), absent components are included."""
+        """Return True for this system, except its other components.
+
+        As in the firmware (MAVLink_routing.cpp), messages to components that do not exist are included.
+        """
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         return system in (0, self.system_id) and all(component != present.component_id for present in self.components)
 
@@ -264,11 +268,12 @@ class ArduPilotVehicle(ArduPilotHost):
 
     def start_channel(self, channel: Channel) -> None:
         """Start heartbeats, TIMESYNC and the streams that the port's parameters (MAV1_EXTRA1 …) select."""
-        first, ready = self.booted_at + self.timeline.heartbeat, self.booted_at + self.timeline.ready
-        timesync = self.booted_at + _TIMESYNC_INTERVAL_S
-        channel.streams.set_interval(m.Heartbeat.ID, 1.0, max(self.now, first))
-        channel.streams.set_interval(m.Timesync.ID, _TIMESYNC_INTERVAL_S, max(self.now, timesync))
-        self.requests.start_channel(channel, max(self.now, ready))
+        heartbeat_at = self.booted_at + self.timeline.heartbeat
+        timesync_at = self.booted_at + _TIMESYNC_INTERVAL_S
+        ready_at = self.booted_at + self.timeline.ready
+        channel.streams.set_interval(m.Heartbeat.ID, 1.0, max(self.now, heartbeat_at))
+        channel.streams.set_interval(m.Timesync.ID, _TIMESYNC_INTERVAL_S, max(self.now, timesync_at))
+        self.requests.start_channel(channel, max(self.now, ready_at))
 
     def restart(self) -> None:
         """Reboot: send nothing for a while, then boot again. Stream rates and estimates are reset."""
@@ -280,7 +285,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Queue a text. As in the firmware, the reason of a refusal is thus sent after the acknowledgement."""
+        """Queue a text, because the firmware sends the reason of a refusal after the acknowledgement."""
         if self.is_initialised:
             self.call_later(0.0, lambda: super(ArduPilotVehicle, self).send_text(severity, text))
         else:
@@ -333,9 +338,12 @@ class ArduPilotVehicle(ArduPilotHost):
 
     def available_modes(self) -> list[m.AvailableModes]:
         return [
-            m.AvailableModes(len(self._modes), index, 0, mode.number, 0, mode.name)
+            m.AvailableModes(
+                number_modes=len(self._modes), mode_index=index, standard_mode=0, custom_mode=mode.number, properties=0,
+                mode_name=mode.name,
+            )
             for index, mode in enumerate(self._modes.values(), start=1)
-        ]
+        ]  # fmt: skip
 
     def build(self, message_id: int) -> Message | None:
         """Build the message with this id. Return None if the firmware does not send the message at present."""
@@ -343,8 +351,8 @@ class ArduPilotVehicle(ArduPilotHost):
         if builder is not None:
             return builder(self) if self.is_initialised or message_id in _BEFORE_READY else None
         if message_id == m.Timesync.ID:
-            # A request (tc1 is 0) with the time in nanoseconds. The firmware adds its system id.
-            return m.Timesync(0, int(self.uptime * 1e9) + self.system_id)
+            # A request (tc1 is 0) with the time in nanoseconds. The firmware adds its system id to the time.
+            return m.Timesync(tc1=0, ts1=int(self.uptime * 1e9) + self.system_id)
         if message_id == m.AvailableModesMonitor.ID:
             return m.AvailableModesMonitor(0)
         return None
@@ -363,5 +371,6 @@ class ArduPilotVehicle(ArduPilotHost):
         self.set_mode_from(request.base_mode, request.custom_mode)
 
     def _on_heartbeat(self, message: m.Heartbeat, _: Channel) -> None:
-        if sender_of(message)[0] == self.parameters["MAV_GCS_SYSID"]:
+        sender_system, _component = sender_of(message)
+        if sender_system == self.parameters["MAV_GCS_SYSID"]:
             self.failsafes.ground_station_seen_at = self.now

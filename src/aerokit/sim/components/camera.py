@@ -34,7 +34,8 @@ class CameraParameters(ExtendedParameters):
             values[MODE] = int(camera.mode)
         has_iso_and_shutter = {ISO, SHUTTER} <= values.keys()
         if values.get(EXPOSURE) == AUTO and has_iso_and_shutter:
-            values[ISO], values[SHUTTER] = AUTO_ISO, AUTO_SHUTTER_S
+            values[ISO] = AUTO_ISO
+            values[SHUTTER] = AUTO_SHUTTER_S
         iso = values.get(ISO)
         if camera.mode == CameraMode.VIDEO and isinstance(iso, int) and iso > MAX_VIDEO_ISO:
             values[ISO] = MAX_VIDEO_ISO

@@ -132,10 +132,9 @@ class CameraBody(SimulatedComponent, CameraDevice):
 
     def angles(self) -> tuple[float, float, float] | None:
         """Roll, pitch and yaw (from north) of the view in radians; None if unknown."""
-        pose = pose_of(self.vehicle)
         if self.gimbal is not None:
-            roll, pitch, yaw = self.gimbal.angles_from_north()
-            return roll, pitch, yaw
+            return self.gimbal.angles_from_north()
+        pose = pose_of(self.vehicle)
         return None if pose is None else (pose.roll, pose.pitch, pose.yaw)
 
     async def stop_video(self) -> None:
@@ -177,7 +176,9 @@ class CameraBody(SimulatedComponent, CameraDevice):
 
     def clear_files(self) -> None:
         """Delete all images."""
-        for name, _ in self.files.entries("/DCIM") if "/DCIM" in self.files else ():
+        if "/DCIM" not in self.files:  # No image was taken yet.
+            return
+        for name, _ in self.files.entries("/DCIM"):
             self.files.remove_file(f"/DCIM/{name}")
 
     def expose(self, done: Callable[[Shot | None], None]) -> None:
@@ -193,14 +194,14 @@ class CameraBody(SimulatedComponent, CameraDevice):
         place = None if pose is None else pose.place
         return partial(
             CameraImageCaptured,
-            self.time_boot_ms,
-            round(getattr(self.vehicle, "unix_time", 0.0) * 1e6),
-            0,  # The camera_id is 0 for a camera that is a separate component.
-            0 if place is None else place.latitude_e7,
-            0 if place is None else place.longitude_e7,
-            0 if place is None else round(place.altitude_m * 1000),
-            0 if pose is None else round(pose.height_m * 1000),
-            UNKNOWN_ATTITUDE if angles is None else quaternion_from_euler(*angles),
+            time_boot_ms=self.time_boot_ms,
+            time_utc=round(getattr(self.vehicle, "unix_time", 0.0) * 1e6),
+            camera_id=0,  # A camera that is a separate component has the id 0.
+            lat=0 if place is None else place.latitude_e7,
+            lon=0 if place is None else place.longitude_e7,
+            alt=0 if place is None else round(place.altitude_m * 1000),
+            relative_alt=0 if pose is None else round(pose.height_m * 1000),
+            q=UNKNOWN_ATTITUDE if angles is None else quaternion_from_euler(*angles),
             file_url="",
         )
 

@@ -7,13 +7,7 @@ import math
 from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import (
-    CameraZoomType,
-    SetFocusType,
-    StorageStatus,
-    StorageType,
-    StorageUsageFlag,
-)
+from aerokit.mavlink.enums import CameraZoomType, SetFocusType, StorageStatus, StorageType, StorageUsageFlag
 from aerokit.mavlink.messages import StorageInformation
 from aerokit.sim.components.component import SimulatedComponent, pose_of
 from aerokit.sim.motion import LocalFrame
@@ -27,7 +21,7 @@ GREY_JPEG = base64.b85decode(
 Angles = tuple[float, float, float]
 
 _READ_MIB_S, _WRITE_MIB_S = 90.0, 45.0
-_NUMBER = 1
+_STORAGE_ID = 1
 
 
 class MemoryCard:
@@ -55,25 +49,19 @@ class MemoryCard:
 
     def information(self, camera: SimulatedComponent, number: int) -> list[StorageInformation]:
         """Return STORAGE_INFORMATION of the card with this number; 0 selects all cards."""
-        if number not in (0, _NUMBER):
+        if number not in (0, _STORAGE_ID):
             return []
         is_inserted = self.is_inserted
         return [
             StorageInformation(
-                time_boot_ms=camera.time_boot_ms,
-                storage_id=_NUMBER,
-                storage_count=1,
+                time_boot_ms=camera.time_boot_ms, storage_id=_STORAGE_ID, storage_count=1,
                 status=StorageStatus.READY if is_inserted else StorageStatus.EMPTY,
                 total_capacity=self.capacity_mib if is_inserted else 0.0,
-                used_capacity=self.used_mib if is_inserted else 0.0,
-                available_capacity=self.free_mib,
-                read_speed=_READ_MIB_S,
-                write_speed=_WRITE_MIB_S,
-                type=StorageType.MICROSD,
-                name="SD",
+                used_capacity=self.used_mib if is_inserted else 0.0, available_capacity=self.free_mib,
+                read_speed=_READ_MIB_S, write_speed=_WRITE_MIB_S, type=StorageType.MICROSD, name="SD",
                 storage_usage=StorageUsageFlag.SET | StorageUsageFlag.PHOTO | StorageUsageFlag.VIDEO,
             )
-        ]
+        ]  # fmt: skip
 
 
 FOCAL_LENGTH_MM = 4.5
@@ -90,19 +78,22 @@ class Axis:
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
-        self._from, self._since, self._speed = 0.0, 0.0, 0.0
+        # The setting had `_start_percent` at the time `_start_at`, and changes by `_speed` percent per second.
+        self._start_percent = self._start_at = self._speed = 0.0
 
     @property
     def percent(self) -> float:
-        moved = (self._now() - self._since) * self._speed if self._speed else 0.0
-        return max(0.0, min(100.0, self._from + moved))
+        moved = (self._now() - self._start_at) * self._speed if self._speed else 0.0
+        return max(0.0, min(100.0, self._start_percent + moved))
 
     def set(self, percent: float) -> None:
-        self._from, self._speed = max(0.0, min(100.0, percent)), 0.0
+        self._start_percent = max(0.0, min(100.0, percent))
+        self._speed = 0.0
 
     def move(self, speed: float) -> None:
         """Move at this speed, from -1 to 1. 0 stops the movement."""
-        self._from, self._since = self.percent, self._now()
+        self._start_percent = self.percent
+        self._start_at = self._now()
         self._speed = max(-1.0, min(1.0, speed)) * _PERCENT_S
 
     def step(self, steps: float) -> None:
@@ -165,25 +156,17 @@ def tracked_place(component: SimulatedComponent, flags: int, angles: Angles | No
     The ground is level, at the altitude of home. The list is empty if the point is unknown or too far away.
     """
     pose = pose_of(component.vehicle)
-    if pose is None or angles is None or angles[1] > _MAX_GROUND_PITCH_RAD:
+    if pose is None or angles is None:
         return []
     _, pitch, yaw = angles
+    if pitch > _MAX_GROUND_PITCH_RAD:
+        return []
     distance = pose.height_m / math.tan(-pitch)
     place = LocalFrame(pose.place).to_global(distance * math.cos(yaw), distance * math.sin(yaw), pose.height_m)
     return [
         m.CameraTrackingGeoStatus(
-            flags,
-            place.latitude_e7,
-            place.longitude_e7,
-            place.altitude_m,
-            _ACCURACY_M,
-            _ACCURACY_M,
-            0.0,  # The velocity north, east and down of the tracked point is zero.
-            0.0,
-            0.0,
-            _UNKNOWN,  # The accuracy of the velocity.
-            math.hypot(distance, pose.height_m),
-            _UNKNOWN,  # The heading and its accuracy.
-            _UNKNOWN,
+            tracking_status=flags, lat=place.latitude_e7, lon=place.longitude_e7, alt=place.altitude_m,
+            h_acc=_ACCURACY_M, v_acc=_ACCURACY_M, vel_n=0.0, vel_e=0.0, vel_d=0.0, vel_acc=_UNKNOWN,
+            dist=math.hypot(distance, pose.height_m), hdg=_UNKNOWN, hdg_acc=_UNKNOWN,
         )
-    ]
+    ]  # fmt: skip

@@ -74,10 +74,10 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         """Position to point at; None without a region of interest."""
         self.followed: int = 0
         """System id of the followed vehicle; 0 if none."""
-        # At the time `_since`, the gimbal had the angles `_from`. From then on, the gimbal turns towards `_target`, and
-        # `_target` turns at `_rates`.
-        self._from: Angles = _ZERO
-        self._since = 0.0
+        # At the time `_start_at`, the gimbal had the angles `_start_angles`. From then on, the gimbal turns towards
+        # `_target`, and `_target` turns at `_rates`.
+        self._start_angles: Angles = _ZERO
+        self._start_at = 0.0
         self._target: Angles = _ZERO
         self._rates: Angles = _ZERO
         self._is_locked = False
@@ -85,7 +85,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
     def start(self) -> None:
         """Called at power-on: reset control and direction, and start the streams."""
         self._reset()
-        self._since = self.now
+        self._start_at = self.now
         self.stream(m.GimbalManagerStatus.ID, _STATUS_INTERVAL_S)
         if self._attitude_rate_hz > 0:
             self.stream(m.GimbalDeviceAttitudeStatus.ID, 1.0 / self._attitude_rate_hz)
@@ -118,24 +118,27 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
 
     def angles(self) -> Angles:
         """Return roll and pitch (from the horizon) and yaw (from the vehicle's nose) in radians."""
-        angles = [
-            _towards(start, target, self.slew_rad_s * (self.now - self._since))
-            for start, target in zip(self._from, self._wanted(), strict=True)
-        ]
-        return (angles[0], angles[1], angles[2])
+        max_change = self.slew_rad_s * (self.now - self._start_at)
+        roll, pitch, yaw = (
+            _towards(start, target, max_change)
+            for start, target in zip(self._start_angles, self._wanted_angles(), strict=True)
+        )
+        return (roll, pitch, yaw)
 
     def heading(self) -> float:
         """Return the heading of the vehicle in radians; 0 if unknown."""
         pose = pose_of(self.vehicle)
         return 0.0 if pose is None else pose.yaw
 
-    def _wanted(self) -> Angles:
+    def _wanted_angles(self) -> Angles:
+        """Return the angles towards which the gimbal turns now: roll, pitch, and yaw from the nose."""
         target = self._target if self.region is None else self._angles_to(self.region)
-        seconds = self.now - self._since
+        seconds = self.now - self._start_at
         roll, pitch, yaw = (angle + rate * seconds for angle, rate in zip(target, self._rates, strict=True))
         if self.is_yaw_locked:  # The target is relative to north, the result to the nose.
             yaw = math.remainder(yaw - self.heading(), math.tau)
-        return (self._limited(0, roll), self._limited(1, pitch), self._limited(2, yaw))
+        roll_limits, pitch_limits, yaw_limits = self.limits
+        return (_clamped(roll, roll_limits), _clamped(pitch, pitch_limits), _clamped(yaw, yaw_limits))
 
     def _angles_to(self, region: GlobalPoint) -> Angles:
         """Return the angles to a position (yaw from north), or the present target if the vehicle has no position."""
@@ -149,14 +152,11 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         pitch = math.atan2(region.altitude_m - pose.place.altitude_m, math.hypot(north, east))
         return (0.0, pitch, math.atan2(east, north))
 
-    def _limited(self, axis: int, angle: float) -> float:
-        low, high = self.limits[axis]
-        return max(low, min(high, angle))
-
     def point(self, angles: Angles, flags: int, *, locked: bool) -> None:
         """Turn to angles in radians. Yaw is relative to north if ``locked``, otherwise to the vehicle's nose."""
         self._begin(flags)
-        self._target, self._is_locked = angles, locked
+        self._target = angles
+        self._is_locked = locked
 
     def turn(self, rates: Angles, flags: int, *, locked: bool) -> None:
         """Turn at these rates in radians per second. The slew rate limits them."""
@@ -164,7 +164,9 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         self._begin(flags)
         limit = self.slew_rad_s
         roll, pitch, yaw = (max(-limit, min(limit, rate)) for rate in rates)
-        self._target, self._rates, self._is_locked = current, (roll, pitch, yaw), locked
+        self._target = current
+        self._rates = (roll, pitch, yaw)
+        self._is_locked = locked
 
     def look_at(self, place: Place | None) -> None:
         """Point at a position. None points ahead again."""
@@ -180,18 +182,25 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
     def update_followed(self, system_id: int, place: Place) -> None:
         """Update the position of the followed vehicle."""
         if system_id == self.followed:
-            self._from, self._since = self.angles(), self.now
+            self._start_angles = self.angles()
+            self._start_at = self.now
             self.region = GlobalPoint(*place)
 
     def _begin(self, flags: int) -> None:
         """Start a movement at the present angles. Forget the previous target, which the caller then replaces."""
-        self._from, self._since = self.angles(), self.now
+        self._start_angles = self.angles()
+        self._start_at = self.now
         self._target = _ZERO
         self._rates = _ZERO
         self.region = None
         self.followed = 0
         self.flags = flags
         self._is_locked = False
+
+
+def _clamped(angle: float, limits: tuple[float, float]) -> float:
+    low, high = limits
+    return max(low, min(high, angle))
 
 
 def _towards(start: float, target: float, max_change: float) -> float:

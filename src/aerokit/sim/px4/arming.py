@@ -152,8 +152,9 @@ class Px4Arming:
     """Arming and disarming, with the arming checks. Each arming starts a log."""
 
     def __init__(self, px4: Px4Host, calibration: Px4Calibration) -> None:
-        self._px4, self._calibration = px4, calibration
-        self.since: float = -math.inf  # Time at which the vehicle was armed last.
+        self._px4 = px4
+        self._calibration = calibration
+        self.armed_at: float = -math.inf
         self.is_terminated: bool = False
         """True after a flight termination, which stops the motors until a restart."""
         self._is_logging = False
@@ -210,7 +211,7 @@ class Px4Arming:
         if not self._throttle_is_safe:
             px4.send_text(MavSeverity.CRITICAL, "Arming denied: throttle not in safe position")
             return False
-        self.since = px4.now
+        self.armed_at = px4.now
         px4.info(f"Armed by {by}")
         px4.on_armed()
         self._start_log()

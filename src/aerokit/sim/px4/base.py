@@ -18,15 +18,7 @@ from aerokit.sim.autopilot import SimulatedBattery
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer
 from aerokit.sim.logs import SimulatedLog
-from aerokit.sim.motion import (
-    GRAVITY_M_S2,
-    HOME,
-    GlobalPoint,
-    LocalFrame,
-    Motion,
-    MotionLimits,
-    SimulatedWind,
-)
+from aerokit.sim.motion import GRAVITY_M_S2, HOME, GlobalPoint, LocalFrame, Motion, MotionLimits, SimulatedWind
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.arming import Px4Arming, Px4Calibration
@@ -47,7 +39,7 @@ from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Px4Storage, px4_pa
 from aerokit.sim.vehicle import AttachableComponent, sender_of
 
 # Shares of the boot time after which events happen.
-_HEARTBEAT_BOOT_SHARE, _WARNING_SHARE_OF_BOOT = 0.15, 0.3
+_HEARTBEAT_BOOT_SHARE, _WARNING_BOOT_SHARE = 0.15, 0.3
 _REBOOT_SILENCE_S = 1.5
 _LAND_DETECTOR_S = 1.0
 _HOVER_THROTTLE = 0.5
@@ -99,7 +91,8 @@ class Px4Vehicle(Px4Host):
             unix_time_at_boot=unix_time_at_boot,
             signing_key=signing_key,
         )
-        self.frame: LocalFrame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
+        latitude, longitude, altitude_m = home
+        self.frame: LocalFrame = LocalFrame(GlobalPoint(round(latitude * 1e7), round(longitude * 1e7), altitude_m))
         self.battery: SimulatedBattery = SimulatedBattery(5000.0, cells=4, percent=battery_percent)
         self.motion: Motion = self._make_motion(wind)
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
@@ -203,14 +196,15 @@ class Px4Vehicle(Px4Host):
 
     def next_ping(self) -> int:
         """Return the sequence number of the next PING."""
+        sequence = self._pings
         self._pings += 1
-        return self._pings - 1
+        return sequence
 
     def boot(self) -> None:
         self.storage.restart()
         self.camera_trigger.restart()
         self.gimbal.start()
-        self.call_later(_WARNING_SHARE_OF_BOOT * self._boot_time_s, self._warn_while_booting)
+        self.call_later(_WARNING_BOOT_SHARE * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
         self.failsafes.listen()  # A restart has created a new object, which has to listen, too.
         self.failsafes.start()
@@ -248,14 +242,17 @@ class Px4Vehicle(Px4Host):
         """Queue a status text, with an id and usually a final tab, which is sent after the answer to the command."""
         self.call_later(0.0, partial(self.events.send_for, text))
         text = on_the_wire(text)
-        number, self._next_text_id = self._next_text_id, (self._next_text_id + 1) & 0xFFFF
-        self.call_later(0.0, lambda: self.send_chunks(severity, text, number))
+        text_id = self._next_text_id
+        self._next_text_id = (text_id + 1) & 0xFFFF
+        self.call_later(0.0, lambda: self.send_chunks(severity, text, text_id))
 
     def send_parts(self, chunks: list[m.Statustext]) -> None:
         self.text_links.send(chunks)
 
     def on_armed(self) -> None:
-        self.is_armed, self._has_flown, self._landed_at = True, False, math.nan
+        self.is_armed = True
+        self._has_flown = False
+        self._landed_at = math.nan
         if not self.home_is_set_by_client:
             self.home = self.motion.place
         self.failsafes.on_armed()
@@ -321,7 +318,9 @@ class Px4Vehicle(Px4Host):
             self.send(m.CommandLong(self.system_id, 0, MavCmd.NAV_RETURN_TO_LAUNCH, 0, *(0.0,) * 7))
 
     def leave_ground(self) -> None:
-        self.is_landed, self._has_flown, self._touchdown_at = False, True, math.nan
+        self.is_landed = False
+        self._has_flown = True
+        self._touchdown_at = math.nan
         self.info("Takeoff detected")
 
     def on_sticks_moved(self, size: float) -> None:
@@ -335,7 +334,7 @@ class Px4Vehicle(Px4Host):
         if self.is_armed:
             self.offboard.watch()
             self.flight.update()
-        if self._moves():
+        if self._is_moving():
             self.motion.step(dt, powered=self.has_power)
         if not self.is_landed:
             self._detect_landing()
@@ -349,10 +348,10 @@ class Px4Vehicle(Px4Host):
         """True while the motors run."""
         return self.is_armed and not self.faults.motor_failed and not self.arming.is_terminated
 
-    def _moves(self) -> bool:
+    def _is_moving(self) -> bool:
         return not self.is_landed
 
-    def _is_down(self) -> bool:
+    def _has_touched_down(self) -> bool:
         return self.motion.is_on_ground
 
     def _run_motors(self, dt: float) -> None:
@@ -366,7 +365,7 @@ class Px4Vehicle(Px4Host):
     def _detect_landing(self) -> None:
         """Detect the landing `_LAND_DETECTOR_S` after the touchdown or, without running motors, at once."""
         is_lifting_off = self.is_armed and self.flight.lifts_off
-        if not self._is_down() or is_lifting_off or self.arming.is_terminated:
+        if not self._has_touched_down() or is_lifting_off or self.arming.is_terminated:
             self._touchdown_at = math.nan
         elif math.isnan(self._touchdown_at):
             self._touchdown_at = self.now
@@ -383,7 +382,7 @@ class Px4Vehicle(Px4Host):
         if self._has_flown:
             if self.now - self._landed_at >= self.parameters["COM_DISARM_LAND"]:
                 self.arming.disarm("landing")
-        elif 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.since:  # The value 0 turns this off.
+        elif 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.armed_at:  # The value 0 turns this off.
             self.arming.disarm("auto preflight disarming")
 
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:

@@ -18,7 +18,7 @@ from aerokit.mavlink.enums import (
     MavVtolState,
 )
 from aerokit.mavlink.enums import MavCmd as Cmd
-from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, to_int
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.modes import Px4Mode
@@ -41,7 +41,8 @@ _UNANSWERED = (
 
 _GRIP_DURATION_S = 1.3
 _TUNING_STEP_S, _TUNING_PROGRESS = 2.0, (0, 20, 40, 60, 80, 95)
-_TRANSITION_S, _NO_TRANSITION = 4.0, frozenset({modes.TAKEOFF, modes.LAND, modes.RTL, modes.ORBIT})
+_TRANSITION_S = 4.0
+_NO_TRANSITION = frozenset({modes.TAKEOFF, modes.LAND, modes.RTL, modes.ORBIT})
 _UNKNOWN_PROGRESS = 255
 _STORAGE_ACTIONS = range(5)
 _MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000
@@ -73,7 +74,7 @@ def _inject_failure(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
     """Acknowledge a failure of the motors or the battery, as SIH does, but without an effect."""
     if not px4.parameters.get("SYS_FAILURE_EN", 0):
         return MavResult.DENIED
-    unit, failure_type = whole(command.param1), whole(command.param2)
+    unit, failure_type = to_int(command.param1), to_int(command.param2)
     if unit not in _FAILURES:
         return None
     return MavResult.ACCEPTED if failure_type in _FAILURES[FailureUnit(unit)] else MavResult.UNSUPPORTED
@@ -88,7 +89,7 @@ def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
     """Accept a test of a motor, a servo or (numbers from 1000 on) an output function, without a visible effect."""
     if px4.is_armed:
         return MavResult.DENIED
-    function = whole(command.x)
+    function = to_int(command.x)
     is_known = function in _MOTORS or function in _SERVOS or function >= _FIRST_OUTPUT_FUNCTION
     return MavResult.ACCEPTED if is_known else None
 
@@ -97,7 +98,7 @@ def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
     """Accept known storage actions, without a visible effect. Unknown actions are not answered."""
     if px4.is_armed:
         return MavResult.TEMPORARILY_REJECTED
-    return MavResult.ACCEPTED if whole(command.param1) in _STORAGE_ACTIONS else None
+    return MavResult.ACCEPTED if to_int(command.param1) in _STORAGE_ACTIONS else None
 
 
 _FORCE_MAGIC = 21196.0
@@ -155,7 +156,8 @@ def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
         return MavResult.TEMPORARILY_REJECTED
     mode = _ALIASES.get(mode, mode)
     if mode not in modes.SELECTABLE:
-        level = "auto" if mode[0] == modes.AUTO else "main"
+        main_mode, _ = mode
+        level = "auto" if main_mode == modes.AUTO else "main"
         px4.send_text(MavSeverity.CRITICAL, f"Unsupported {level} mode")
         # PX4 1.16 accepts an unknown mode, but does not enter the mode.
         return MavResult.ACCEPTED if px4.version.startswith("1.16") else MavResult.TEMPORARILY_REJECTED
@@ -189,10 +191,10 @@ class _Flight:
     def set_mode(self, command: ReceivedCommand) -> int:
         """Set a mode and acknowledge twice. PX4's link module always accepts. Then the commander sends the result."""
         self._px4.commands.answer(command, MavResult.ACCEPTED)
-        return set_mode(self._px4, whole(command.param1), (whole(command.param2), whole(command.param3)))
+        return set_mode(self._px4, to_int(command.param1), (to_int(command.param2), to_int(command.param3)))
 
     def set_standard_mode(self, command: ReceivedCommand) -> int:
-        mode = modes.STANDARD_MODES.get(whole(command.param1))
+        mode = modes.STANDARD_MODES.get(to_int(command.param1))
         if mode is None:
             return MavResult.FAILED
         return MavResult.ACCEPTED if self._px4.change_mode(mode) else MavResult.TEMPORARILY_REJECTED
@@ -205,7 +207,8 @@ class _Flight:
 
     def take_off(self, command: ReceivedCommand) -> int:
         """Take off to the altitude in param 7 (AMSL), or to MIS_TAKEOFF_ALT above home if param 7 is NaN."""
-        px4, result = self._px4, self._change(modes.TAKEOFF)
+        px4 = self._px4
+        result = self._change(modes.TAKEOFF)
         if result == MavResult.ACCEPTED and math.isfinite(command.z):
             down = px4.frame.origin.altitude_m - command.z
             if px4.is_armed and down > px4.motion.down and not px4.is_landed:
@@ -230,8 +233,8 @@ class _Flight:
             return MavResult.DENIED
         if not -1 <= command.param1 < px4.mission.count:
             return MavResult.DENIED
-        if command.param1 >= 0 and whole(command.param1) != px4.mission.current:
-            px4.mission.set_current(whole(command.param1))  # even if PX4 refuses the mode below (navigator_main.cpp)
+        if command.param1 >= 0 and to_int(command.param1) != px4.mission.current:
+            px4.mission.set_current(to_int(command.param1))  # even if PX4 refuses the mode below (navigator_main.cpp)
         result = self._change(modes.MISSION)
         if result == MavResult.ACCEPTED and not px4.arming.arm("mission start"):
             return MavResult.TEMPORARILY_REJECTED
@@ -242,7 +245,7 @@ class _Flight:
 
         A latitude or longitude that is NaN or INT32_MAX keeps the place, and an altitude that is NaN keeps the height.
         """
-        if whole(command.param2) != MavDoRepositionFlags.CHANGE_MODE:  # PX4 requires this flag, and no other flag.
+        if to_int(command.param2) != MavDoRepositionFlags.CHANGE_MODE:  # PX4 requires this flag, and no other flag.
             return MavResult.UNSUPPORTED
         result = self._change(modes.HOLD)
         if result != MavResult.ACCEPTED:
@@ -279,7 +282,8 @@ class _Flight:
         speed = abs(command.param2) if math.isfinite(command.param2) else orbit.speed_m_s
         if px4.VEHICLE_TYPE == MavType.FIXED_WING:  # A plane has no ORBIT, but circles its target in HOLD.
             result = self._change(modes.HOLD)  # sets the target to the current position; the next line replaces it
-            px4.flight.target, px4.flight.radius_m = (north, east, down), radius
+            px4.flight.target = (north, east, down)
+            px4.flight.radius_m = radius
             return result
         if not orbit.plan(radius, speed, (north, east), down):
             px4.send_text(MavSeverity.CRITICAL, "Orbit radius limit exceeded")
@@ -297,13 +301,13 @@ class _Flight:
             self._tuning_since = px4.now
         steps = (px4.now - self._tuning_since) / _TUNING_STEP_S  # NaN while disarmed
         progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), len(_TUNING_PROGRESS) - 1)]
-        answer = m.CommandAck(command.command, MavResult.IN_PROGRESS, progress, 0, *command.sender)
-        px4.send(answer, command.channel)
+        px4.commands.answer(command, MavResult.IN_PROGRESS, progress)
         return None
 
     def transition(self, command: ReceivedCommand) -> int | None:
         """Change to the VTOL state in param 1, after a transition. A vehicle that is no VTOL does not answer."""
-        px4, requested_state = self._px4, whole(command.param1)
+        px4 = self._px4
+        requested_state = to_int(command.param1)
         if not px4.vtol_state:
             return None
         if requested_state not in (MavVtolState.MC, MavVtolState.FW) or px4.mode in _NO_TRANSITION:
@@ -319,7 +323,8 @@ class _Flight:
         result = self._change(modes.HOLD)
         if result == MavResult.ACCEPTED and math.isfinite(command.param1):
             flight = self._px4.flight
-            flight.target = (*flight.target[:2], self._px4.frame.origin.altitude_m - command.param1)
+            north, east, _ = flight.target
+            flight.target = (north, east, self._px4.frame.origin.altitude_m - command.param1)
         return result
 
     def terminate(self, command: ReceivedCommand) -> int:
@@ -406,10 +411,13 @@ class _Requests:
             return self._send_interval(_number(command.param2), command)
         if message_id != m.AvailableModes.ID:
             return self.send_now(message_id, command)
-        if not 0 <= (index := _number(command.param2)) <= len(messages := available_modes(self._px4)):
+        index = _number(command.param2)
+        messages = available_modes(self._px4)
+        if not 0 <= index <= len(messages):
             return MavResult.DENIED
-        for message in messages[index - 1 : index] if index else messages:  # The index 0 selects all modes.
-            self._px4.send(message, command.channel)
+        for message in messages:
+            if index in (0, message.mode_index):  # The index 0 selects all modes.
+                self._px4.send(message, command.channel)
         return MavResult.ACCEPTED
 
     def set_interval(self, command: ReceivedCommand) -> int:

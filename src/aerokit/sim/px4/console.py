@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
     from aerokit.sim.vehicle import SimulatedVehicle
 
-# Sizes of the data fields of SERIAL_CONTROL and of LOGGING_DATA, in bytes.
-_PIECE, _DATA = 70, 249
+# Sizes of the fields `data` of SERIAL_CONTROL and LOGGING_DATA.
+_SERIAL_BYTES, _LOGGING_BYTES = 70, 249
 _STEP_S, _MAX_TRIES = 0.05, 50
 _DEFINITION_BLOCKS = 2
 _HEADER = b"ULog\x01\x12\x35\x01" + bytes(8)
@@ -24,7 +24,8 @@ class Px4Shell:
     """Answers each line with an echo, its output and the prompt. The answer goes to the sender of the line."""
 
     def __init__(self, px4: SimulatedVehicle) -> None:
-        self._px4, self._line = px4, b""
+        self._px4 = px4
+        self._line = b""
         self.is_open: bool = False
         px4.on(m.SerialControl, self._on_input)
 
@@ -37,13 +38,17 @@ class Px4Shell:
         is_complete = self._line.endswith(b"\n")
         if not self.is_open or not is_complete:
             return
-        line, self._line = self._line, b""
+        line = self._line
+        self._line = b""
         output = line + self._output(line.decode(errors="replace").strip()) + b"pxh> "
-        for start in range(0, len(output), _PIECE):
-            piece = output[start : start + _PIECE]
-            shell, is_reply = SerialControlDev.DEV_SHELL, SerialControlFlag.REPLY
-            data = piece.ljust(_PIECE, b"\0")
-            reply = m.SerialControl(shell, is_reply, 0, 0, len(piece), data, *sender_of(message))
+        for start in range(0, len(output), _SERIAL_BYTES):
+            piece = output[start : start + _SERIAL_BYTES]
+            target_system, target_component = sender_of(message)
+            reply = m.SerialControl(
+                device=SerialControlDev.DEV_SHELL, flags=SerialControlFlag.REPLY, timeout=0, baudrate=0,
+                count=len(piece), data=piece.ljust(_SERIAL_BYTES, b"\0"), target_system=target_system,
+                target_component=target_component,
+            )  # fmt: skip
             self._px4.send(reply, channel)
 
     def _output(self, command: str) -> bytes:
@@ -70,7 +75,8 @@ class Px4LogStream:
         log_format = command.param1
         if log_format:  # PX4 supports only ULog (0).
             return MavResult.UNSUPPORTED
-        self._station, self._channel = command.sender, command.channel
+        self._station = command.sender
+        self._channel = command.channel
         self._sequence = self._tries = self._acknowledged = 0
         self._px4.call_later(_STEP_S, self._run)
         return MavResult.ACCEPTED
@@ -90,17 +96,20 @@ class Px4LogStream:
         return self._acknowledged < _DEFINITION_BLOCKS
 
     def _run(self) -> None:
+        """Send the next block, or repeat a definition block that was not acknowledged."""
         if self._station is None:
             return
         self._tries += 1
         if self._tries > _MAX_TRIES and self._sends_definitions:
             self._station = None
             return
+        # Each block contains two text messages, and the first block begins with the header of the file.
         message_class = m.LoggingDataAcked if self._sends_definitions else m.LoggingData
         header = _HEADER if self._acknowledged == 0 else b""
         data = header + b"".join(_ulog_message(number) for number in range(2))
-        sequence, first_message_offset = self._sequence & 0xFFFF, len(header)
-        padded = data.ljust(_DATA, b"\0")
+        sequence = self._sequence & 0xFFFF
+        first_message_offset = len(header)
+        padded = data.ljust(_LOGGING_BYTES, b"\0")
         block = message_class(*self._station, sequence, len(data), first_message_offset, padded)
         self._px4.send(block, self._channel)
         if not self._sends_definitions:  # A definition block keeps its number until it is acknowledged.

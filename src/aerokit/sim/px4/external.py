@@ -76,7 +76,8 @@ class Px4External:
     def _on_target(self, target: m.LandingTarget, _: Channel) -> None:
         if target.position_valid and target.frame == MavFrame.LOCAL_NED:
             self.latest[type(target)] = target
-            self._target, self._target_at = (target.x, target.y), self._px4.now
+            self._target = (target.x, target.y)
+            self._target_at = self._px4.now
 
     def _on_origin(self, message: m.SetGpsGlobalOrigin, channel: Channel) -> None:
         if message.target_system == self._px4.system_id:
@@ -85,7 +86,8 @@ class Px4External:
 
     def _on_timesync(self, message: m.Timesync, _: Channel) -> None:
         is_answer = message.tc1 != 0
-        self.clock_answers += is_answer
+        if is_answer:
+            self.clock_answers += 1
 
 
 class PrecisionLanding:
@@ -100,29 +102,33 @@ class PrecisionLanding:
         self._search_count = 0
 
     def enter(self) -> None:
-        self._search_began_at, self._search_count = None, 0
+        self._search_began_at = None
+        self._search_count = 0
 
     def update(self) -> None:
-        px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
+        px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
         target = px4.external.target
-        if target is None or self._search_count > limits["PLD_MAX_SRCH"]:
+        if target is None or self._search_count > parameters["PLD_MAX_SRCH"]:
             self._search()
             return
         self._search_began_at = None
-        north, east = target[0] - motion.north, target[1] - motion.east
+        target_north, target_east = target
+        north, east = target_north - motion.north, target_east - motion.east
         # The vehicle never is exactly above the target, so a minimum tolerance replaces a parameter of 0.
-        is_above = math.hypot(north, east) <= max(limits["PLD_HACC_RAD"], _MIN_TOLERANCE_M)
+        is_above = math.hypot(north, east) <= max(parameters["PLD_HACC_RAD"], _MIN_TOLERANCE_M)
         descent = px4.flight.descent_speed_m_s if is_above else 0.0
         motion.seek_velocity(*velocity_to_landing_target(north, east), descent)
 
     def _search(self) -> None:
-        px4, motion, limits = self._px4, self._px4.motion, self._px4.parameters
+        px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
         if self._search_began_at is None:
-            self._search_began_at, self._search_count = px4.now, self._search_count + 1
-        is_over = px4.now - self._search_began_at > limits["PLD_SRCH_TOUT"]
-        if is_over or self._search_count > limits["PLD_MAX_SRCH"]:
+            self._search_began_at = px4.now
+            self._search_count += 1
+        has_timed_out = px4.now - self._search_began_at > parameters["PLD_SRCH_TOUT"]
+        if has_timed_out or self._search_count > parameters["PLD_MAX_SRCH"]:
             px4.flight.descend()
             return
-        search_down = px4.home[2] - limits["PLD_SRCH_ALT"]
+        _, _, home_down = px4.home
+        search_down = home_down - parameters["PLD_SRCH_ALT"]
         # Search from above: hold the place, and climb to the search altitude.
         motion.seek_position(motion.north, motion.east, search_down, speed=1.0, climb=2.0, descent=1.0)

@@ -15,7 +15,7 @@ from aerokit.sim.px4.manual import Px4ManualFlight
 from aerokit.sim.px4.modes import Px4Mode
 
 _MIN_CLIMB_SHARE = 0.05
-_RADII_M = (1.0, 100.0)
+_MIN_RADIUS_M, _MAX_RADIUS_M = 1.0, 100.0
 _BACK_TO_CIRCLE_PER_S = 0.5
 
 
@@ -31,7 +31,7 @@ class Px4Orbit:
 
     def plan(self, radius_m: float, speed_m_s: float, place: tuple[float, float], down: float) -> bool:
         """Set a new circle. If the radius is out of range, keep the old circle and return False."""
-        if not _RADII_M[0] <= abs(radius_m) <= _RADII_M[1]:
+        if not _MIN_RADIUS_M <= abs(radius_m) <= _MAX_RADIUS_M:
             return False
         self.radius_m = radius_m
         self.speed_m_s = speed_m_s
@@ -41,7 +41,8 @@ class Px4Orbit:
 
     def update(self) -> None:
         motion = self._px4.motion
-        north, east = motion.north - self.middle[0], motion.east - self.middle[1]
+        middle_north, middle_east = self.middle
+        north, east = motion.north - middle_north, motion.east - middle_east
         # Bearing and distance of the vehicle, seen from the middle of the circle.
         angle, distance = math.atan2(east, north), math.hypot(north, east)
         turn_sign = math.copysign(1.0, self.radius_m)
@@ -70,7 +71,7 @@ _RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def return_destination(px4: Px4Host) -> Ned:
-    """Return the destination of RTL: north, east, and the down coordinate from which the heights of RTL count."""
+    """Return the destination of RTL: north, east, and the down coordinate to which the heights of RTL are relative."""
     rtl_type = round(px4.parameters["RTL_TYPE"])
     rally_points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
     if rtl_type not in (*_NEAREST, _RALLY_FIRST) or not rally_points:
@@ -82,8 +83,9 @@ def return_destination(px4: Px4Host) -> Ned:
 
 def _place(px4: Px4Host, item: MissionItem) -> Ned:
     north, east = px4.frame.to_local(round(item.x), round(item.y))
-    level = px4.home[2] if item.frame in _RELATIVE else px4.frame.origin.altitude_m
-    return (north, east, level - item.z)
+    _, _, home_down = px4.home
+    reference = home_down if item.frame in _RELATIVE else px4.frame.origin.altitude_m
+    return (north, east, reference - item.z)
 
 
 _SPOOL_UP_S = 1.8
@@ -170,7 +172,7 @@ class Px4Flight:
 
     def _lift_off(self) -> None:
         vehicle = self._vehicle
-        if self.lifts_off and vehicle.now - vehicle.arming.since >= _SPOOL_UP_S:
+        if self.lifts_off and vehicle.now - vehicle.arming.armed_at >= _SPOOL_UP_S:
             self._ramp_began_at = vehicle.now
             vehicle.leave_ground()
 
@@ -181,8 +183,9 @@ class Px4Flight:
         climb_share = max(_MIN_CLIMB_SHARE, min(1.0, ramp))  # The climb rate grows during MPC_TKO_RAMP_T.
         climb = vehicle.parameters["MPC_TKO_SPEED"] * climb_share
         vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=climb, descent=1.0)
-        if abs(vehicle.motion.down - self.target[2]) < _ARRIVED_M:
-            target = self.target
+        target = self.target
+        _, _, target_down = target
+        if abs(vehicle.motion.down - target_down) < _ARRIVED_M:
             vehicle.switch_to(modes.HOLD)  # This sets the target to the current position.
             self.target = target
 
@@ -192,7 +195,8 @@ class Px4Flight:
         self._is_default_height = down is None
         if down is None:
             # A smaller down coordinate is higher.
-            down = min(vehicle.home[2] - vehicle.parameters["MIS_TAKEOFF_ALT"], motion.down)
+            _, _, home_down = vehicle.home
+            down = min(home_down - vehicle.parameters["MIS_TAKEOFF_ALT"], motion.down)
         self.target = (motion.north, motion.east, down)
         if vehicle.is_armed:
             vehicle.call_later(0.0, self.announce_take_off)
@@ -232,16 +236,18 @@ class Px4Flight:
         """Plan a return at RTL_RETURN_ALT above the landing point, or at RTL_DESCEND_ALT to a near landing point."""
         vehicle = self._vehicle
         self.destination = return_destination(vehicle)
-        north, east, down = vehicle.motion.north, vehicle.motion.east, vehicle.motion.down
-        current_height = self.destination[2] - down
-        distance = math.hypot(north - self.destination[0], east - self.destination[1])
+        north, east, down = vehicle.motion.place
+        destination_north, destination_east, destination_down = self.destination
+        current_height = destination_down - down
+        distance = math.hypot(north - destination_north, east - destination_east)
         height = max(vehicle.parameters["RTL_RETURN_ALT"], current_height)
         if distance < vehicle.parameters["RTL_MIN_DIST"]:
             height = max(vehicle.parameters["RTL_DESCEND_ALT"], current_height)
         # The return begins with a climb at the present place. `min` prevents a descent, because a smaller down
         # coordinate is higher.
-        self.target = (north, east, min(down, self.destination[2] - height))
-        amsl = vehicle.frame.origin.altitude_m - self.target[2]
+        return_down = min(down, destination_down - height)
+        self.target = (north, east, return_down)
+        amsl = vehicle.frame.origin.altitude_m - return_down
         text = f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)"
         vehicle.call_later(0.0, lambda: vehicle.info(text))  # PX4 sends this text after the text of the command.
 
@@ -257,7 +263,9 @@ class Px4Flight:
         # above the destination.
         if self._phase == "climb":
             self._phase = "return"
-            self.target = (*self.destination[:2], self.target[2])
+            north, east, _ = self.destination
+            _, _, return_down = self.target
+            self.target = (north, east, return_down)
         else:
             self._phase = "land"
             vehicle.info("RTL: land at destination")

@@ -38,7 +38,7 @@ class Px4Ftp(SessionFtpServer[FileTree]):
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
         return 0
 
-    def _fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
+    def _answer_fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
         if request.opcode in (MavFtpOpcode.TRUNCATEFILE, MavFtpOpcode.CALCFILECRC):
             return request.refuse_errno(peer.errno)  # The firmware reports the errno of an earlier failure.
         peer.errno = fault.errno
@@ -57,7 +57,7 @@ class Px4Ftp(SessionFtpServer[FileTree]):
         return answer
 
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        old_name = request.data[: request.size].partition(b"\0")[0]
+        old_name, _, _ = request.data[: request.size].partition(b"\0")
         has_new_name = len(old_name) + 2 < request.size
         if not has_new_name:
             return request.refuse_errno(peer.errno)  # As above, the errno is that of an earlier failure.

@@ -31,7 +31,7 @@ class Px4SticksInterface(Protocol):
 
 
 class Px4ArmingInterface(Protocol):
-    since: float
+    armed_at: float
     is_terminated: bool
 
     def disarm(self, by: str, *, force: bool = False) -> bool: ...
@@ -151,7 +151,8 @@ class Px4Host(SimulatedAutopilot):
     @property
     def altitude_m(self) -> float:
         """Metres above home."""
-        return self.home[2] - self.motion.down
+        _, _, home_down = self.home
+        return home_down - self.motion.down
 
     @property
     def has_position(self) -> bool:

@@ -54,7 +54,12 @@ class Px4Events:
             return
         event_id, arguments = event
         px4 = self._px4
-        px4.send(Event(0, 0, event_id, px4.time_boot_ms, self._next_sequence, _INFO_LEVELS, arguments))
+        px4.send(
+            Event(
+                destination_component=0, destination_system=0, id=event_id, event_time_boot_ms=px4.time_boot_ms,
+                sequence=self._next_sequence, log_levels=_INFO_LEVELS, arguments=arguments,
+            )
+        )  # fmt: skip
         self._next_sequence = (self._next_sequence + 1) & 0xFFFF
 
 
@@ -68,10 +73,10 @@ def _event_of(text: str) -> tuple[int, bytes] | None:
     if text.startswith("Disarmed by "):
         reason = _DISARMED_BY.get(text.removeprefix("Disarmed by "), _OTHER_REASON)
         return _DISARMED, bytes([reason])
-    return_text = _RETURN_TEXT.fullmatch(text)
-    if return_text is None:
+    match = _RETURN_TEXT.fullmatch(text)
+    if match is None:
         return None
-    altitude, height = int(return_text[1]), int(return_text[2])
+    altitude, height = map(int, match.groups())
     return _RETURN, struct.pack("<ii", altitude, height)
 
 
@@ -161,13 +166,15 @@ class Px4StreamRates:
         if unknown or not modes:
             reason = f"contains the unknown mode {unknown[0]!r}" if unknown else "is empty"
             raise ValueError(f"link_modes {reason}; modes: {', '.join(LINK_MODES)}")
-        self._modes, self._is_built, self._fast_hz = tuple(modes), is_built, fast_hz
+        self._modes = tuple(modes)
+        self._is_built = is_built
+        self._fast_hz = fast_hz
         self._intervals_us: dict[Channel, dict[int, int]] = {}
         self._mode_of: dict[Channel, str] = {}
 
     def start(self, channel: Channel, number: int, first: float) -> None:
         """Start the streams of link ``number`` at time ``first``."""
-        mode = self._modes[min(number, len(self._modes) - 1)]  # Links without an own mode have the last mode.
+        mode = self._modes[min(number, len(self._modes) - 1)]  # Further links have the last mode.
         self._mode_of[channel] = mode
         intervals_us = self._intervals_us[channel] = {}
         for message_id, rate in self._rates_at_start(mode).items():

@@ -52,18 +52,20 @@ class Px4Sticks:
         values = (control.x, control.y, control.z, control.r)
         if any(not -1000 <= value <= 1000 for value in values):
             return
-        self._move(control.y / 1000, control.x / 1000, control.r / 1000, control.z / 500 - 1.0)
+        self._move(roll=control.y / 1000, pitch=control.x / 1000, yaw=control.r / 1000, throttle=control.z / 500 - 1.0)
 
     def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
         values = [getattr(override, f"chan{number}_raw") for number in range(1, _CHANNELS + 1)]
-        self.channels, self._channels_at = tuple(values), self._px4.now
+        self.channels = tuple(values)
+        self._channels_at = self._px4.now
         numbers = [round(self._px4.parameters[name]) for name in _CHANNEL_PARAMETERS]
         if all(0 < number <= _CHANNELS for number in numbers):
             roll, pitch, yaw, throttle = (_stick_position(values[number - 1]) for number in numbers)
             self._move(roll, pitch, yaw, throttle)
 
     def _move(self, roll: float, pitch: float, yaw: float, throttle: float) -> None:
-        previous, were_fresh = (self.roll, self.pitch, self.yaw, self.throttle), self.are_fresh
+        previous = (self.roll, self.pitch, self.yaw, self.throttle)
+        were_fresh = self.are_fresh
         self.roll = roll
         self.pitch = pitch
         self.yaw = yaw
@@ -95,8 +97,7 @@ _EXPO, _DEAD_ZONE = 0.6, 0.1
 _SLOW_SHARE = 0.3
 _LIFTS_OFF_ABOVE = 0.05
 _AT_REST_M_S = 0.3
-# Time constant of the velocity control of `Motion`. `_velocity_of_thrust` multiplies an acceleration by it.
-_THRUST_AHEAD_S = 0.3
+_VELOCITY_TIME_CONSTANT_S = 0.3  # as in `Motion`
 
 _HOLDS_HEIGHT = frozenset({ALTITUDE, ALTITUDE_CRUISE, POSITION, POSITION_SLOW})
 _HOLDS_PLACE = frozenset({POSITION, POSITION_SLOW})
@@ -157,8 +158,8 @@ class Px4ManualFlight:
                 motion.seek_velocity(0.0, 0.0, down)
                 return
             self._place = (motion.north, motion.east)
-        offset_north, offset_east = self._place[0] - motion.north, self._place[1] - motion.east
-        motion.seek_velocity(offset_north, offset_east, down)  # 1 m/s for each metre of distance
+        north, east = self._place
+        motion.seek_velocity(north - motion.north, east - motion.east, down)  # 1 m/s for each metre of distance
 
     def _height_velocity(self) -> float:
         """Return the vertical velocity (m/s down) that the throttle stick commands. The centre holds the height."""
@@ -181,11 +182,11 @@ class Px4ManualFlight:
         """Thrust divided by the thrust of hovering. A centred stick commands 1, the lowest stick MPC_MANTHR_MIN."""
         parameters, throttle = self._px4.parameters, self._px4.sticks.throttle
         hover, min_thrust = parameters["MPC_THR_HOVER"], parameters["MPC_MANTHR_MIN"]
-        range_ = 1.0 - hover if throttle > 0 else hover - min_thrust
-        return (hover + throttle * range_) / hover
+        thrust_range = 1.0 - hover if throttle > 0 else hover - min_thrust
+        return (hover + throttle * thrust_range) / hover
 
     def _velocity_of_thrust(self) -> float:
-        """Return the target velocity (m/s down) with which `Motion` accelerates as the thrust does."""
+        """Return the target velocity (m/s down) towards which `Motion` accelerates as the thrust does."""
         motion = self._px4.motion
         lift = self._thrust * math.cos(motion.roll) * math.cos(motion.pitch)
-        return motion.velocity_down + (1.0 - lift) * GRAVITY_M_S2 * _THRUST_AHEAD_S
+        return motion.velocity_down + (1.0 - lift) * GRAVITY_M_S2 * _VELOCITY_TIME_CONSTANT_S

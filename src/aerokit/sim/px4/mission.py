@@ -75,7 +75,8 @@ def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
 
 
 def _height_above_home(px4: Px4Host, item: MissionItem) -> float:
-    home_amsl = px4.frame.origin.altitude_m - px4.home[2]
+    _, _, home_down = px4.home
+    home_amsl = px4.frame.origin.altitude_m - home_down
     return item.z - home_amsl if item.frame == MavFrame.GLOBAL else item.z
 
 
@@ -100,20 +101,23 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
 
 def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
     """Return the number of the first item outside the geofence, or None. The first item has the number 1."""
+    _, _, home_down = px4.home
     for number, item in enumerate(items, start=1):
         if item.command in _WITH_PLACE:
             north, east = px4.frame.to_local(round(item.x), round(item.y))
-            if not px4.failsafes.fence.allows((north, east, px4.home[2] - _height_above_home(px4, item))):
+            down = home_down - _height_above_home(px4, item)
+            if not px4.failsafes.fence.allows((north, east, down)):
                 return number
     return None
 
 
 def warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     """Return a warning if the first waypoint of a mission is far away, otherwise None."""
+    home_north, home_east, _ = px4.home
     for item in items:
         if item.command in _WITH_PLACE:
             north, east = px4.frame.to_local(round(item.x), round(item.y))
-            distance = math.hypot(north - px4.home[0], east - px4.home[1])
+            distance = math.hypot(north - home_north, east - home_east)
             if distance < _MAX_FIRST_DISTANCE_M:
                 return None
             return f"First waypoint far away from home: {int(distance)}m. Correct mission loaded?"
@@ -183,7 +187,8 @@ class Px4Mission:
 
     def on_replaced(self, current: int) -> None:
         """Handle the upload of a mission. In mission mode, start the new mission at once."""
-        self.current, self.is_finished = max(0, current), False
+        self.current = max(0, current)
+        self.is_finished = False
         self.forget_reached()
         self._jumps.clear()
         self._check()
@@ -198,7 +203,8 @@ class Px4Mission:
     def _check(self) -> None:
         """Check the stored mission and report its problems. An invalid mission stays stored, but is not flown."""
         items = self._px4.missions.commands
-        problem, warning_text = rejection(self._px4, items), warning(self._px4, items)
+        problem = rejection(self._px4, items)
+        warning_text = warning(self._px4, items)
         outside_number = outside_fence(self._px4, items)
         self.is_valid = bool(items) and problem is None and outside_number is None
         if outside_number is not None:
@@ -210,7 +216,8 @@ class Px4Mission:
 
     def forget_reached(self) -> None:
         """Forget which item was reached last."""
-        self.reached, self._repeats_left = -1, 0
+        self.reached = -1
+        self._repeats_left = 0
 
     def set_current(self, seq: int) -> None:
         self.current = seq
@@ -237,7 +244,8 @@ class Px4Mission:
     def _begin_item(self) -> None:
         """Make the current item the target. Execute commands without a position, until an item has a position."""
         for _ in range(_MAX_JUMPS + self.count):  # The number of steps is limited, because DO_JUMPs can form a loop.
-            item, self._arrived_at = self._item, math.nan
+            item = self._item
+            self._arrived_at = math.nan
             if item is None:
                 self._finish()
                 return
@@ -267,7 +275,8 @@ class Px4Mission:
 
     def _index_after_jump(self, item: MissionItem) -> int:
         """Return the index of the item after a DO_JUMP. PX4 counts its jumps, and sends the item to the last client."""
-        jumps_done, index = self._jumps.get(self.current, 0), self.current
+        index = self.current
+        jumps_done = self._jumps.get(index, 0)
         if jumps_done >= item.param2:
             self._jumps.pop(index, None)  # The next execution of this DO_JUMP counts again from 0.
             return index + 1
@@ -282,25 +291,26 @@ class Px4Mission:
         if item.command == Cmd.NAV_DELAY:
             px4.flight.stay_here()
             return
-        target = self._place(item)
+        target = north, east, down = self._place(item)
         px4.flight.heading = math.radians(item.param4) if self._has_heading(item) else None  # None: look ahead.
         if px4.is_landed or item.command in _TAKE_OFFS:  # On the ground, every item begins with a climb.
-            self._climb(target[2] if item.command in _TAKE_OFFS else None)
+            self._climb(down if item.command in _TAKE_OFFS else None)
         elif item.command in _LANDINGS:
             # Fly to the landing point at the present height; `update` then descends.
-            px4.flight.target = (target[0], target[1], motion.down)
+            px4.flight.target = (north, east, motion.down)
         else:
             px4.flight.target = target
 
     def _climb(self, down: float | None) -> None:
         """Start a vertical climb to ``down``. None selects MIS_TAKEOFF_ALT above home."""
         px4, motion = self._px4, self._px4.motion
+        _, _, home_down = px4.home
         if down is None:
-            down = px4.home[2] - px4.parameters["MIS_TAKEOFF_ALT"]
+            down = home_down - px4.parameters["MIS_TAKEOFF_ALT"]
         self._phase = "climb"
         px4.flight.target = (motion.north, motion.east, min(down, motion.down))
         if px4.is_armed:
-            px4.info(f"Climb to {px4.home[2] - down:.1f} meters above home")
+            px4.info(f"Climb to {home_down - down:.1f} meters above home")
 
     def _has_heading(self, item: MissionItem) -> bool:
         return item.command == Cmd.NAV_WAYPOINT and math.isfinite(item.param4)
@@ -311,8 +321,9 @@ class Px4Mission:
         north, east = px4.frame.to_local(round(item.x), round(item.y))
         if not math.isfinite(item.z):
             return (north, east, motion.down)
-        reference = px4.home[2] if item.frame == MavFrame.GLOBAL_RELATIVE_ALT else px4.frame.origin.altitude_m
-        return (north, east, reference - item.z)
+        _, _, home_down = px4.home
+        is_relative = item.frame == MavFrame.GLOBAL_RELATIVE_ALT
+        return (north, east, (home_down if is_relative else px4.frame.origin.altitude_m) - item.z)
 
     def update(self) -> None:
         """Run one tick in flight: set the motion target and check if the item is reached."""
@@ -343,7 +354,8 @@ class Px4Mission:
     def _is_at_target(self, item: MissionItem) -> bool:
         if item.command == Cmd.NAV_DELAY:
             return True
-        motion, (north, east, down) = self._px4.motion, self._px4.flight.target
+        motion = self._px4.motion
+        north, east, down = self._px4.flight.target
         radius = self._px4.parameters["NAV_ACC_RAD"]
         acceptance_radius = item.param2
         if item.command == Cmd.NAV_WAYPOINT and acceptance_radius > 0:

@@ -41,7 +41,7 @@ _TURN = float32(math.tau)
 _RADIANS_PER_DEGREE, _DEGREES_PER_RADIAN = float32(_PI / 180.0), float32(180.0 / _PI)
 
 
-def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> MissionItem | int:
+def as_stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> MissionItem | int:
     """Return the item as PX4 stores it (with frame 0, 2 or 3), or the MAV_MISSION_RESULT of a refusal.
 
     ``is_int`` is True for an item of a MISSION_ITEM_INT. PX4 accepts the frames 5 and 6 only in this message.
@@ -100,7 +100,7 @@ def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
         return MavMissionResult.UNSUPPORTED
     command = item.command
     if command in _ROI_COMMANDS:
-        if _whole(item.param1) not in _ROI_WITH_PLACE:
+        if _to_int(item.param1) not in _ROI_WITH_PLACE:
             return MavMissionResult.INVALID_PARAM1
         command = Cmd.DO_SET_ROI  # PX4 stores both commands as DO_SET_ROI (mavlink_mission.cpp).
     params = (item.param1, item.param2, item.param3, item.param4)
@@ -114,12 +114,12 @@ def _without_place(item: MissionItem) -> MissionItem | int:
         return MavMissionResult.UNSUPPORTED
     p1, p2, command = item.param1, item.param2, item.command
     if command == Cmd.DO_JUMP:  # PX4 stores the target as int16 and the number of repetitions as uint16.
-        target = _whole(p1) & 0xFFFF
+        target = _to_int(p1) & 0xFFFF
         if target & 0x8000:  # The highest bit of an int16 is its sign.
             target -= 0x10000
-        p1, p2 = float(target), float(_whole(p2) & 0xFFFF)
+        p1, p2 = float(target), float(_to_int(p2) & 0xFFFF)
     if command in _ROI_COMMANDS:
-        if _whole(p1) not in _ROI_WITHOUT_PLACE:
+        if _to_int(p1) not in _ROI_WITHOUT_PLACE:
             return MavMissionResult.INVALID_PARAM1
         command = Cmd.DO_SET_ROI  # PX4 stores both commands as DO_SET_ROI (mavlink_mission.cpp).
     # PX4 stores x and y as floats, and rounds them to integers for a download (mavlink_mission.cpp).
@@ -127,7 +127,7 @@ def _without_place(item: MissionItem) -> MissionItem | int:
     return item.replace(command=command, frame=Frame.MISSION, param1=p1, param2=p2, x=x, y=y)
 
 
-def _whole(value: float) -> int:
+def _to_int(value: float) -> int:
     return int(value) if abs(value) < 2**31 else 0
 
 
@@ -150,8 +150,8 @@ def _heading(degrees: float) -> float:
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
     "-": lambda _: 0.0,
     "f": float32,
-    "u": lambda value: float(_whole(value) & 0xFFFF),
-    "v": lambda value: float(_whole(value + 0.5) & 0xFFFF),
+    "u": lambda value: float(_to_int(value) & 0xFFFF),
+    "v": lambda value: float(_to_int(value + 0.5) & 0xFFFF),
     "?": lambda value: 1.0 if value > 0 else 0.0,
     "y": _heading,
 }

@@ -27,15 +27,11 @@ from aerokit.protocols.servers.missions import (
 )
 from aerokit.sim.channel import Channel
 from aerokit.sim.px4.host import Px4Host
-from aerokit.sim.px4.mission_items import as_downloaded, checksum, stored
+from aerokit.sim.px4.mission_items import as_downloaded, as_stored, checksum
 from aerokit.sim.vehicle import sender_of
 
 _NO_PARTNER = (0, 0)
-_CAPACITIES: dict[int, int] = {
-    MavMissionType.MISSION: 10_000,
-    MavMissionType.FENCE: 64,
-    MavMissionType.RALLY: 32,
-}
+_CAPACITIES: dict[int, int] = {MavMissionType.MISSION: 10_000, MavMissionType.FENCE: 64, MavMissionType.RALLY: 32}
 
 
 class TransferState(Enum):
@@ -69,8 +65,13 @@ class Px4MissionServer(MissionServer):
         self.requests_int: bool = not px4.version.startswith("1.16")
 
     def _link(self, channel: Channel) -> _Link:
-        unused = _Link(_NO_PARTNER, channel, 0, 0, 0, 0.0, 0.0, self.requests_int)
-        return self._links.setdefault(channel, unused)
+        """Return the state of a link; idle if the link has had no transfer yet."""
+        if channel not in self._links:
+            self._links[channel] = _Link(
+                _NO_PARTNER, channel, mission_type=0, next=0, end=0, received_at=0.0, requested_at=0.0,
+                uses_int=self.requests_int,
+            )  # fmt: skip
+        return self._links[channel]
 
     def reset(self) -> None:
         super().reset()
@@ -91,7 +92,7 @@ class Px4MissionServer(MissionServer):
             return Result.ERROR
         stored_items: list[MissionItem] = []
         for item in items:
-            stored_item = stored(item, mission_type)
+            stored_item = as_stored(item, mission_type)
             if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
                 return stored_item
             stored_items.append(stored_item)
@@ -158,7 +159,8 @@ class Px4MissionServer(MissionServer):
         item = self.item(link.mission_type, seq)
         assert item is not None
         link.requested_at = self._px4.now
-        client, kind, is_current = link.client, link.mission_type, self._px4.mission.current == seq
+        client, kind = link.client, link.mission_type
+        is_current = self._px4.mission.current == seq
         downloaded = as_downloaded(item, as_int=link.uses_int)
         if link.uses_int:
             message: AnyItem = item_message_int(downloaded, seq, client, kind, current=is_current)
@@ -265,7 +267,8 @@ class Px4MissionServer(MissionServer):
         if self._uploads:  # PX4 has one upload at a time, on all links.
             self._answer(link, Result.ERROR, sender_of(count))
             return
-        link.client, link.mission_type = sender_of(count), count.mission_type
+        link.client = sender_of(count)
+        link.mission_type = count.mission_type
         self._px4.mission.forget_reached()
         if count.count > self.capacity(link.mission_type):
             self._answer(link, Result.NO_SPACE)
@@ -273,7 +276,9 @@ class Px4MissionServer(MissionServer):
             self._store(link.mission_type, [], opaque_id=0, current=0)
             self._answer(link, Result.ACCEPTED)
         else:
-            link.items, link.opaque_id, link.current = [], 0, -1
+            link.items = []
+            link.opaque_id = 0
+            link.current = -1
             link = self._begin_transfer(TransferState.GETTING, count, link.channel, count.count)
             self._uploads[self._key(link.mission_type)] = link
             self._request_item(link)
@@ -297,13 +302,14 @@ class Px4MissionServer(MissionServer):
             self._warn(f"IGN MISSION_ITEM: {reason}")
             self._answer(link, Result.ERROR)
 
-    def _put(self, upload: ListUpload, message: AnyItem) -> int:
-        link, item = self._link(upload.channel), item_from(message)
+    def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
+        link = self._link(upload.channel)
+        item = item_from(message)
         is_int = isinstance(message, m.MissionItemInt)
         item_in_e7 = item  # has its latitude and longitude in degrees times 1e7, also if received in MISSION_ITEM
         if not is_int and item.frame != MavFrame.MISSION:
             item_in_e7 = item.replace(x=_e7(item.x), y=_e7(item.y))
-        stored_item = stored(item_in_e7, link.mission_type, is_int=is_int)
+        stored_item = as_stored(item_in_e7, link.mission_type, is_int=is_int)
         if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             if stored_item != Result.ERROR:
                 self._warn("IGN MISSION_ITEM: Invalid item")

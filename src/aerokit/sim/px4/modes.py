@@ -96,7 +96,8 @@ STANDARD_MODES: Final[dict[int, Px4Mode]] = {
 
 
 def custom_mode(mode: Px4Mode) -> int:
-    return mode[0] << 16 | mode[1] << 24
+    main, sub = mode
+    return main << 16 | sub << 24
 
 
 def mode_from_custom(value: int) -> Px4Mode:

@@ -27,6 +27,7 @@ _NAN3: Ned = (math.nan, math.nan, math.nan)
 # The simulated ground is level, so altitudes above terrain are treated as altitudes above home.
 _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFrame.GLOBAL_TERRAIN_ALT_INT)
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
+_UPWARDS = 0.1  # A set-point lifts the vehicle off if it is more than this upwards, in m, m/s or m/s².
 _VERSION_1_14 = 1 << 24 | 14 << 16  # One byte each for the major and the minor version.
 _FLIGHT_CONTROL_GROUP, _THRUST_CONTROL = 0, 3
 
@@ -67,8 +68,11 @@ class Px4Offboard:
     def wants_up(self) -> bool:
         if self._attitude is not None:
             return self._thrust > 0.5
-        down = self._position[2] - self._vehicle.motion.down
-        return down < -0.1 or self._velocity[2] < -0.1 or self._acceleration[2] < -0.1
+        _, _, position_down = self._position
+        _, _, velocity_down = self._velocity
+        _, _, acceleration_down = self._acceleration
+        components = (position_down - self._vehicle.motion.down, velocity_down, acceleration_down)
+        return any(down < -_UPWARDS for down in components)  # False for components that are NaN
 
     def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
         frame = target.coordinate_frame
@@ -90,7 +94,8 @@ class Px4Offboard:
         north, east = local_frame.to_local(target.lat_int, target.lon_int)
         down = local_frame.origin.altitude_m - target.alt
         if target.coordinate_frame != MavFrame.GLOBAL_INT:  # In the other frames, the altitude is relative to home.
-            down = self._vehicle.home[2] - target.alt
+            _north, _east, home_down = self._vehicle.home
+            down = home_down - target.alt
         self._store(target, (north, east, down), is_body=False)
 
     def _warn(self, text: str) -> None:
@@ -108,7 +113,8 @@ class Px4Offboard:
         self._position, self._velocity, self._acceleration = position, velocity, acceleration
         self._yaw = math.nan if setpoint.yaw is None else setpoint.yaw
         self._yaw_rate = math.nan if setpoint.yaw_rate is None else setpoint.yaw_rate
-        self._attitude, self.updated_at = None, self._vehicle.now
+        self._attitude = None
+        self.updated_at = self._vehicle.now
         return True
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
@@ -118,7 +124,8 @@ class Px4Offboard:
                 self._attitude = (motion.roll, motion.pitch, motion.yaw)
             self._body_rates = (target.body_roll_rate, target.body_pitch_rate, target.body_yaw_rate)
         elif all(map(math.isfinite, target.q)):
-            self._attitude, self._body_rates = euler_from_quaternion(*target.q), None
+            self._attitude = euler_from_quaternion(*target.q)
+            self._body_rates = None
         if math.isfinite(target.thrust):
             self._thrust = target.thrust
         self.updated_at = self._vehicle.now
@@ -129,7 +136,8 @@ class Px4Offboard:
             return
         motion = self._vehicle.motion
         # Of the controls, only the thrust is simulated. The vehicle keeps its present attitude.
-        self._attitude, self._body_rates = (motion.roll, motion.pitch, motion.yaw), None
+        self._attitude = (motion.roll, motion.pitch, motion.yaw)
+        self._body_rates = None
         if target.group_mlx == _FLIGHT_CONTROL_GROUP:
             self._thrust = target.controls[_THRUST_CONTROL]
         self.updated_at = self._vehicle.now
@@ -151,7 +159,8 @@ class Px4Offboard:
         motion = self._vehicle.motion
         # `fly` is called only in OFFBOARD. If the last call was before another mode, the elapsed time is limited to
         # MAX_TICK_S.
-        elapsed, self._flown_at = min(MAX_TICK_S, self._vehicle.now - self._flown_at), self._vehicle.now
+        elapsed = min(MAX_TICK_S, self._vehicle.now - self._flown_at)
+        self._flown_at = self._vehicle.now
         if self._attitude is not None:
             self._fly_attitude(self._attitude, elapsed)
             return

@@ -16,7 +16,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GimbalDeviceFlags, GimbalManagerCapFlags, MavCmd, MavMountMode, MavResult
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 from aerokit.sim.components.component import pose_of
 from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
 from aerokit.sim.px4.host import Px4Host
@@ -49,7 +49,9 @@ class Px4Gimbal:
         self._px4 = px4
         # System id and component id of the component in control; zeros if there is none.
         self.in_control: tuple[int, int] = (0, 0)
-        self._target, self._rates, self._since = _NEUTRAL, _NEUTRAL, 0.0
+        # At the time `_target_at`, the set-point was `_target`. From then on, it turns at `_rates`.
+        self._target = self._rates = _NEUTRAL
+        self._target_at = 0.0
         self._flags = 0
         self._place: tuple[int, int, float] | None = None
         self._was_returning = False
@@ -85,7 +87,7 @@ class Px4Gimbal:
         """Return roll, pitch and yaw (radians) to which the gimbal is set at present."""
         if self._place is not None:
             return self._angles_to(self._place)
-        seconds = min(self._px4.now - self._since, _RATE_TIMEOUT_S) * _RATE_FACTOR
+        seconds = min(self._px4.now - self._target_at, _RATE_TIMEOUT_S) * _RATE_FACTOR
         angles = [angle + rate * seconds for angle, rate in zip(self._target, self._rates, strict=True)]
         roll, pitch, yaw = (
             max(math.radians(low), min(math.radians(high), angle))
@@ -101,7 +103,7 @@ class Px4Gimbal:
         north, east = place_north - motion.north, place_east - motion.east
         own_altitude_m = self._px4.frame.to_global(*motion.place).altitude_m
         pitch = math.atan2(altitude_m - own_altitude_m, math.hypot(north, east))
-        (min_pitch_deg, _max_pitch_deg) = _LIMITS[1]
+        _, (min_pitch_deg, _max_pitch_deg), _ = _LIMITS
         return (0.0, max(math.radians(min_pitch_deg), pitch), math.atan2(east, north))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
@@ -112,13 +114,17 @@ class Px4Gimbal:
         if flags & Flags.NEUTRAL:
             self.rest()
             return
-        self._place, self._flags, self._since = None, flags, self._px4.now
+        self._place = None
+        self._flags = flags
+        self._target_at = self._px4.now
         self._target = current if any(map(math.isnan, angles)) else angles
         roll, pitch, yaw = (0.0 if math.isnan(rate) else rate for rate in rates)
         self._rates = (roll, pitch, yaw)
 
     def rest(self) -> None:
-        self._place, self._flags, self._target, self._rates = None, 0, _NEUTRAL, _NEUTRAL
+        self._place = None
+        self._flags = 0
+        self._target = self._rates = _NEUTRAL
 
     def look_at(self, latitude_e7: int, longitude_e7: int, altitude_m: float) -> None:
         """Point at a position (altitude AMSL)."""
@@ -135,17 +141,19 @@ class Px4Gimbal:
         if not self.is_fitted or sender_of(message) != self.in_control:
             return
         has_angles = not any(map(math.isnan, message.q))
-        angles = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
+        roll, pitch, yaw = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
         rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
-        self.apply(message.flags, (angles[0], angles[1], angles[2]), rates)
+        self.apply(message.flags, (roll, pitch, yaw), rates)
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
         if not self.is_fitted:
             return None
         quaternion = quaternion_from_euler(*self.angles())
         return m.GimbalDeviceAttitudeStatus(
-            0, 0, self._px4.time_boot_ms, self.flags, quaternion, 0.0, 0.0, 0.0, 0, 0.0, 0.0, _DEVICE_ID
-        )
+            target_system=0, target_component=0, time_boot_ms=self._px4.time_boot_ms, flags=self.flags, q=quaternion,
+            angular_velocity_x=0.0, angular_velocity_y=0.0, angular_velocity_z=0.0, failure_flags=0, delta_yaw=0.0,
+            delta_yaw_velocity=0.0, gimbal_device_id=_DEVICE_ID,
+        )  # fmt: skip
 
     def manager_information(self) -> m.GimbalManagerInformation | None:
         if not self.is_fitted:
@@ -156,7 +164,8 @@ class Px4Gimbal:
     def manager_status(self) -> m.GimbalManagerStatus | None:
         if not self.is_fitted:
             return None
-        return m.GimbalManagerStatus(self._px4.time_boot_ms, self.flags, _DEVICE_ID, *self.in_control, 0, 0)
+        no_secondary = (0, 0)
+        return m.GimbalManagerStatus(self._px4.time_boot_ms, self.flags, _DEVICE_ID, *self.in_control, *no_secondary)
 
 
 _SELF, _RELEASE = -2, -3
@@ -184,9 +193,8 @@ def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
     In PX4, unlike in the standard, -2 gives control to the autopilot instead of the sender. -3 releases control.
     """
     # The firmware applies special values to the system id (param 1) and to the component id (param 2) separately.
-    present, own, sender = gimbal.in_control, gimbal.own_ids, command.sender
-    system = _id_in_control(whole(command.param1), present[0], own[0], sender[0])
-    component = _id_in_control(whole(command.param2), present[1], own[1], sender[1])
+    requested = (to_int(command.param1), to_int(command.param2))
+    system, component = map(_id_in_control, requested, gimbal.in_control, gimbal.own_ids, command.sender)
     gimbal.in_control = (system, component)
     return MavResult.ACCEPTED
 
@@ -204,13 +212,13 @@ def _pitch_and_yaw(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
         return MavResult.DENIED
     angles = (0.0, math.radians(command.param1), math.radians(command.param2))
     rates = (math.nan, math.radians(command.param3), math.radians(command.param4))
-    gimbal.apply(whole(command.x), angles, rates)
+    gimbal.apply(to_int(command.x), angles, rates)
     return MavResult.ACCEPTED
 
 
 def _control_mount(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
     """Handle DO_MOUNT_CONTROL. Unknown modes are accepted, but have no effect."""
-    mode = whole(command.z)
+    mode = to_int(command.z)
     if mode in (MavMountMode.RETRACT, MavMountMode.NEUTRAL):
         gimbal.rest()
     elif mode == MavMountMode.MAVLINK_TARGETING:
@@ -262,17 +270,18 @@ class Px4CameraTrigger:
         return self._is_enabled and not self._is_paused
 
     def restart(self) -> None:
-        self.sequence, self._is_enabled, self._is_paused = 0, False, False
+        self.sequence = 0
+        self._is_enabled = self._is_paused = False
         self._series_number += 1
 
     def commands(self) -> dict[int, CommandHandler]:
         return {
-            MavCmd.DO_DIGICAM_CONTROL: self._control,
+            MavCmd.DO_DIGICAM_CONTROL: self._digicam_control,
             MavCmd.DO_TRIGGER_CONTROL: self._enable_or_pause,
             MavCmd.DO_SET_CAM_TRIGG_INTERVAL: self._set_interval,
         }
 
-    def _control(self, command: ReceivedCommand) -> int | None:
+    def _digicam_control(self, command: ReceivedCommand) -> int | None:
         if not self.is_fitted:
             return None
         if self._px4.now - self._last_at < _MIN_INTERVAL_S:  # The camera is not ready for another image.
@@ -290,7 +299,7 @@ class Px4CameraTrigger:
         if not self.is_fitted:
             return None
         was_running = self.is_running
-        enable, reset, pause = whole(command.param1), whole(command.param2), whole(command.param3)
+        enable, reset, pause = to_int(command.param1), to_int(command.param2), to_int(command.param3)
         if pause in (0, 1):
             self._is_paused = pause == 1
         if reset == 1:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pkgutil
 from collections.abc import Callable, Sequence
-from typing import NoReturn
 
 from aerokit.errors import RemoteProtocolError
 from aerokit.mavlink.enums import MavSeverity
@@ -76,8 +75,8 @@ class _Writer(FileHandle):
         self._apply = apply
         self._pending = b""  # Received bytes that are not yet a complete entry.
         self._written = 0
-        self._header: tuple[int, int] | None = None  # Number of entries and file size; None before the header.
-        self._count = 0
+        self._announced: tuple[int, int] | None = None  # Number of entries and file size; None before the header.
+        self._count = 0  # number of entries that were applied
         self._previous_name = b""
         self._is_rejected = False
 
@@ -88,31 +87,35 @@ class _Writer(FileHandle):
         new_bytes = data[max(0, self._written - offset) :]  # A repeated write contains bytes that were received before.
         has_gap = offset > self._written
         if self._is_rejected or has_gap:
-            self._raise_rejected()
+            raise self._rejection()
         self._pending += new_bytes
         self._written += len(new_bytes)
         self._parse()
-        if self._header is not None and self._written > self._header[1]:
-            self._raise_rejected()
+        if self._announced is not None:
+            _, size = self._announced
+            if self._written > size:
+                raise self._rejection()
 
     def close(self) -> None:
-        is_complete = not self._pending and self._header == (self._count, self._written)
+        is_complete = not self._pending and self._announced == (self._count, self._written)
         if self._is_rejected or not is_complete:
             raise FileFault(EINVAL)
 
-    def _raise_rejected(self) -> NoReturn:
+    def _rejection(self) -> FileFault:
+        """Return the error of an invalid upload. All later requests fail, too."""
         self._is_rejected = True
-        raise FileFault(EINVAL)
+        return FileFault(EINVAL)
 
     def _parse(self) -> None:
         """Apply the entries of which all bytes were received."""
-        if self._header is None:
+        if self._announced is None:
             if len(self._pending) < HEADER.size:
                 return
             magic, count, size = read_header(self._pending)
             if magic != MAGIC or size < HEADER.size:
-                self._raise_rejected()
-            self._header, self._pending = (count, size), self._pending[HEADER.size :]
+                raise self._rejection()
+            self._announced = (count, size)
+            self._pending = self._pending[HEADER.size :]
         while self._parse_row():
             pass
 
@@ -122,15 +125,16 @@ class _Writer(FileHandle):
         try:
             entry = read_entry(pending, 0, self._previous_name) if pending else None
         except RemoteProtocolError:
-            self._raise_rejected()
+            raise self._rejection() from None
         if entry is None:
             return False
         if entry.default is not None:
-            self._raise_rejected()
+            raise self._rejection()
         name = entry.name.decode("ascii", "replace")
         if name in self._parameters:
             self._apply(name, entry.value)
-        self._pending, self._previous_name = pending[entry.end :], entry.name
+        self._pending = pending[entry.end :]
+        self._previous_name = entry.name
         self._count += 1
         return True
 
@@ -150,12 +154,7 @@ class Px4Storage:
     """
 
     def __init__(
-        self,
-        px4: Px4Host,
-        logs: Sequence[SimulatedLog],
-        *,
-        parameter_file: bool,
-        link_bytes_per_s: float | None,
+        self, px4: Px4Host, logs: Sequence[SimulatedLog], *, parameter_file: bool, link_bytes_per_s: float | None
     ) -> None:
         self._px4 = px4
         self.files: FileTree = FileTree()

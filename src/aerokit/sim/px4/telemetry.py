@@ -83,15 +83,21 @@ def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
         health &= ~_PREARM_BIT
     if px4.faults.gps_lost:
         health &= ~_GPS_BIT
-    voltage = round(px4.battery.voltage_v * 1000)
-    percent = int(px4.battery.percent)
-    present, enabled = _PRESENT, _ENABLED
     if px4.sticks.are_fresh:
         health |= _RC_BIT
-    load, current = 120, -100  # A load of 12 %, and a current that is not measured (-1 A).
-    no_errors = (0, 0, 0, 0, 0, 0)  # communication: drop rate and errors, then four counters of the autopilot
-    extended = (0, 0, 1)  # present, enabled and healthy sensors of the extended masks
-    return m.SysStatus(present, enabled, health, load, voltage, current, percent, *no_errors, *extended)
+    return m.SysStatus(
+        onboard_control_sensors_present=_PRESENT,
+        onboard_control_sensors_enabled=_ENABLED,
+        onboard_control_sensors_health=health,
+        load=120,  # 12 %
+        voltage_battery=round(px4.battery.voltage_v * 1000),
+        current_battery=-100,  # In 0.01 A; PX4 sends -1 A for a current that is not measured.
+        battery_remaining=int(px4.battery.percent),
+        drop_rate_comm=0, errors_comm=0, errors_count1=0, errors_count2=0, errors_count3=0, errors_count4=0,
+        onboard_control_sensors_present_extended=0,
+        onboard_control_sensors_enabled_extended=0,
+        onboard_control_sensors_health_extended=1,
+    )  # fmt: skip
 
 
 def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
@@ -105,17 +111,9 @@ def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
         flags = _BOOT_FLAGS
     ratio = 0.02 if px4.is_ready else math.nan  # The test ratio of velocity, position and magnetometer.
     return m.EstimatorStatus(
-        px4.time_boot_us,
-        flags,
-        vel_ratio=ratio,
-        pos_horiz_ratio=ratio,
-        pos_vert_ratio=0.003,
-        mag_ratio=ratio,
-        hagl_ratio=0.002,
-        tas_ratio=math.nan,
-        pos_horiz_accuracy=0.3,
-        pos_vert_accuracy=0.3,
-    )
+        px4.time_boot_us, flags, vel_ratio=ratio, pos_horiz_ratio=ratio, pos_vert_ratio=0.003, mag_ratio=ratio,
+        hagl_ratio=0.002, tas_ratio=math.nan, pos_horiz_accuracy=0.3, pos_vert_accuracy=0.3,
+    )  # fmt: skip
 
 
 def _extended_sys_state(px4: Px4Vehicle) -> m.ExtendedSysState:
@@ -150,14 +148,8 @@ def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
 def _attitude(px4: Px4Vehicle) -> m.Attitude:
     motion = px4.motion
     return m.Attitude(
-        px4.time_boot_ms,
-        motion.roll,
-        motion.pitch,
-        motion.yaw,
-        motion.roll_rate,
-        motion.pitch_rate,
-        motion.yaw_rate,
-    )
+        px4.time_boot_ms, motion.roll, motion.pitch, motion.yaw, motion.roll_rate, motion.pitch_rate, motion.yaw_rate,
+    )  # fmt: skip
 
 
 def _attitude_quaternion(px4: Px4Vehicle) -> m.AttitudeQuaternion:
@@ -169,7 +161,10 @@ def _attitude_quaternion(px4: Px4Vehicle) -> m.AttitudeQuaternion:
 def _attitude_target(px4: Px4Vehicle) -> m.AttitudeTarget:
     motion = px4.motion
     quaternion = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
-    return m.AttitudeTarget(px4.time_boot_ms, 0, quaternion, 0.0, 0.0, motion.yaw_rate, px4.throttle)
+    return m.AttitudeTarget(
+        px4.time_boot_ms, type_mask=0, q=quaternion, body_roll_rate=0.0, body_pitch_rate=0.0,
+        body_yaw_rate=motion.yaw_rate, thrust=px4.throttle,
+    )  # fmt: skip
 
 
 def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
@@ -182,16 +177,10 @@ def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
     motion = px4.motion
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
     return m.GlobalPositionInt(
-        px4.time_boot_ms,
-        place.latitude_e7,
-        place.longitude_e7,
-        round(place.altitude_m * 1000),
-        round(px4.altitude_m * 1000),
-        round(motion.velocity_north * 100),
-        round(motion.velocity_east * 100),
-        round(motion.velocity_down * 100),
-        centidegrees(motion.yaw),
-    )
+        px4.time_boot_ms, place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000),
+        round(px4.altitude_m * 1000), round(motion.velocity_north * 100), round(motion.velocity_east * 100),
+        round(motion.velocity_down * 100), centidegrees(motion.yaw),
+    )  # fmt: skip
 
 
 def _local_position(px4: Px4Vehicle) -> m.LocalPositionNed:
@@ -202,9 +191,11 @@ def _local_position(px4: Px4Vehicle) -> m.LocalPositionNed:
 
 def _altitude(px4: Px4Vehicle) -> m.Altitude:
     amsl = px4.frame.origin.altitude_m - px4.motion.down
-    above_home, ground_down = px4.altitude_m, px4.motion.ground_down
-    above_ground = ground_down - px4.motion.down
-    return m.Altitude(px4.time_boot_us, amsl, amsl, -px4.motion.down, above_home, -ground_down, above_ground)
+    ground_down = px4.motion.ground_down
+    return m.Altitude(
+        px4.time_boot_us, altitude_monotonic=amsl, altitude_amsl=amsl, altitude_local=-px4.motion.down,
+        altitude_relative=px4.altitude_m, altitude_terrain=-ground_down, bottom_clearance=ground_down - px4.motion.down,
+    )  # fmt: skip
 
 
 def _vfr_hud(px4: Px4Vehicle) -> m.VfrHud:
@@ -212,13 +203,8 @@ def _vfr_hud(px4: Px4Vehicle) -> m.VfrHud:
     heading = int(math.degrees(motion.yaw) % 360.0)
     amsl = px4.frame.origin.altitude_m - motion.down
     return m.VfrHud(
-        px4.airspeed_m_s,
-        motion.ground_speed_m_s,
-        heading,
-        round(px4.throttle * 100),
-        amsl,
-        -motion.velocity_down,
-    )
+        px4.airspeed_m_s, motion.ground_speed_m_s, heading, round(px4.throttle * 100), amsl, -motion.velocity_down,
+    )  # fmt: skip
 
 
 def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
@@ -226,27 +212,17 @@ def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
     if px4.faults.gps_lost:
         worst, unknown = 9999, 65535
         return m.GpsRawInt(
-            0, GpsFixType.NO_FIX, 0, 0, 0, eph=worst, epv=worst, vel=unknown, cog=unknown, satellites_visible=0
-        )
+            time_usec=0, fix_type=GpsFixType.NO_FIX, lat=0, lon=0, alt=0, eph=worst, epv=worst, vel=unknown,
+            cog=unknown, satellites_visible=0,
+        )  # fmt: skip
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
     altitude = round(place.altitude_m * 1000)
     course = centidegrees(math.atan2(motion.velocity_east, motion.velocity_north))
     return m.GpsRawInt(
-        px4.time_boot_us,
-        GpsFixType.RTK_FIXED if px4.corrections.is_recent else GpsFixType.TYPE_3D_FIX,
-        place.latitude_e7,
-        place.longitude_e7,
-        altitude,
-        eph=70,
-        epv=110,
-        vel=round(motion.ground_speed_m_s * 100),
-        cog=course,
-        satellites_visible=10,
-        alt_ellipsoid=altitude,
-        h_acc=900,
-        v_acc=1780,
-        vel_acc=400,
-    )
+        px4.time_boot_us, GpsFixType.RTK_FIXED if px4.corrections.is_recent else GpsFixType.TYPE_3D_FIX,
+        place.latitude_e7, place.longitude_e7, altitude, eph=70, epv=110, vel=round(motion.ground_speed_m_s * 100),
+        cog=course, satellites_visible=10, alt_ellipsoid=altitude, h_acc=900, v_acc=1780, vel_acc=400,
+    )  # fmt: skip
 
 
 def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
@@ -257,8 +233,9 @@ def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
     # The yaw at a home that a client has set is unknown, so the quaternion is NaN.
     quaternion = (math.nan,) * 4 if px4.home_is_set_by_client else (1.0, 0.0, 0.0, 0.0)
     return m.HomePosition(
-        place.latitude_e7, place.longitude_e7, altitude, *px4.home, quaternion, 0.0, 0.0, 0.0, px4.time_boot_us
-    )
+        place.latitude_e7, place.longitude_e7, altitude, *px4.home, quaternion,
+        approach_x=0.0, approach_y=0.0, approach_z=0.0, time_usec=px4.time_boot_us,
+    )  # fmt: skip
 
 
 def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin | None:
@@ -279,7 +256,8 @@ def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
     yaw = motion.yaw
     if not px4.is_armed:
         # The downward acceleration ensures that there is no thrust (MulticopterPositionControl.cpp).
-        unknown, acceleration = (math.nan, math.nan, math.nan), (0.0, 0.0, 100.0)
+        unknown = (math.nan, math.nan, math.nan)
+        acceleration = (0.0, 0.0, 100.0)
         mask = _IGNORE_POSITION_AND_VELOCITY
         return m.PositionTargetLocalNed(
             px4.time_boot_ms, MavFrame.LOCAL_NED, mask, *unknown, *unknown, *acceleration, yaw, 0.0
@@ -331,9 +309,14 @@ def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
         messages.append(m.AvailableModes(count, index, standard_mode, modes.custom_mode(mode), properties, name))
     # PX4 also lists modes for external programs, even if no program has registered a mode.
     for number in range(_EXTERNAL_MODES):
-        mode, index = (modes.AUTO, modes.EXTERNAL_1[1] + number), len(_AVAILABLE_MODES) + 1 + number
-        properties = MavModeProperty.NOT_USER_SELECTABLE
-        messages.append(m.AvailableModes(count, index, 0, modes.custom_mode(mode), properties, "(Mode not available)"))
+        main_mode, first_sub_mode = modes.EXTERNAL_1
+        messages.append(
+            m.AvailableModes(
+                number_modes=count, mode_index=len(_AVAILABLE_MODES) + 1 + number, standard_mode=0,
+                custom_mode=modes.custom_mode((main_mode, first_sub_mode + number)),
+                properties=MavModeProperty.NOT_USER_SELECTABLE, mode_name="(Mode not available)",
+            )
+        )  # fmt: skip
     return messages
 
 

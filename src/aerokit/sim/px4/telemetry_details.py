@@ -6,7 +6,15 @@ import math
 from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavEstimatorType, MavFrame, MavOdidStatus, StorageStatus
+from aerokit.mavlink.enums import (
+    MagCalStatus,
+    MavDistanceSensor,
+    MavEstimatorType,
+    MavFrame,
+    MavOdidStatus,
+    MavSensorOrientation,
+    StorageStatus,
+)
 from aerokit.mavlink.message import Message
 from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
 from aerokit.sim.px4.base import Px4Vehicle
@@ -18,26 +26,32 @@ _CAPACITY_MIB, _USED_MIB = 258_019.6, 192_146.9
 
 
 def _autopilot_version(px4: Px4Vehicle) -> m.AutopilotVersion:
-    number, commit = px4.version_number, b"\0\0\0\xfd\xaf\xd6\xde\x59"
+    commit = b"\0\0\0\xfd\xaf\xd6\xde\x59"
     return m.AutopilotVersion(
-        px4.capabilities, number, number, 101854463, 1, commit, commit, bytes(8), 0, 0, 5283920058631409231
-    )
+        px4.capabilities, flight_sw_version=px4.version_number, middleware_sw_version=px4.version_number,
+        os_sw_version=101854463, board_version=1, flight_custom_version=commit, middleware_custom_version=commit,
+        os_custom_version=bytes(8), vendor_id=0, product_id=0, uid=5283920058631409231,
+    )  # fmt: skip
 
 
 def _protocol_version(_: Px4Vehicle) -> m.ProtocolVersion:
-    return m.ProtocolVersion(200, 100, 203, bytes(8), _LIBRARY_HASH)
+    return m.ProtocolVersion(
+        version=200, min_version=100, max_version=203, spec_version_hash=bytes(8), library_version_hash=_LIBRARY_HASH
+    )
 
 
 def _storage_information(px4: Px4Vehicle) -> m.StorageInformation:
-    free = _CAPACITY_MIB - _USED_MIB
-    return m.StorageInformation(px4.time_boot_ms, 1, 1, StorageStatus.READY, _CAPACITY_MIB, _USED_MIB, free, 0.0, 0.0)
+    return m.StorageInformation(
+        px4.time_boot_ms, storage_id=1, storage_count=1, status=StorageStatus.READY, total_capacity=_CAPACITY_MIB,
+        used_capacity=_USED_MIB, available_capacity=_CAPACITY_MIB - _USED_MIB, read_speed=0.0, write_speed=0.0,
+    )  # fmt: skip
 
 
 def _flight_information(px4: Px4Vehicle) -> m.FlightInformation:
-    armed_for = px4.now - px4.arming.since
+    armed_for = px4.now - px4.arming.armed_at
     armed_at_us = int((px4.unix_time - armed_for) * 1e6) if px4.is_armed else 0
     take_off_us = 0 if px4.is_landed else armed_at_us
-    return m.FlightInformation(px4.time_boot_ms, armed_at_us, take_off_us, 0)
+    return m.FlightInformation(px4.time_boot_ms, armed_at_us, take_off_us, flight_uuid=0)
 
 
 def _component_metadata(px4: Px4Vehicle) -> m.ComponentMetadata:
@@ -45,7 +59,11 @@ def _component_metadata(px4: Px4Vehicle) -> m.ComponentMetadata:
 
 
 def _mag_cal_report(_: Px4Vehicle) -> m.MagCalReport:
-    return m.MagCalReport(0, 0, 4, 0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0, 0, 1.0)
+    return m.MagCalReport(
+        compass_id=0, cal_mask=0, cal_status=MagCalStatus.SUCCESS, autosaved=0, fitness=0.0, ofs_x=0.0, ofs_y=0.0,
+        ofs_z=0.0, diag_x=1.0, diag_y=1.0, diag_z=1.0, offdiag_x=0.0, offdiag_y=0.0, offdiag_z=0.0,
+        orientation_confidence=1.0, old_orientation=0, new_orientation=0, scale_factor=1.0,
+    )  # fmt: skip
 
 
 _REMOTE_ID_EPOCH = 1_546_300_800
@@ -57,29 +75,17 @@ def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
         return None
     motion = px4.motion
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
-    # The course in hundredths of a degree, rounded to whole degrees. Rounding may give 360, which is 0.
-    course = round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0) % 360 * 100
+    course_deg = math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0
+    direction = 100 * (round(course_deg) % 360)  # Hundredths of a degree. Rounding may give 360 degrees, which is 0.
+    unknown_time = 65535.0
     return m.OpenDroneIdLocation(
-        target_system=0,
-        target_component=0,
-        id_or_mac=_BROADCAST_ID,
-        status=MavOdidStatus.GROUND if px4.is_landed else MavOdidStatus.AIRBORNE,
-        direction=course,
-        speed_horizontal=round(motion.ground_speed_m_s * 100),
-        speed_vertical=round(-motion.velocity_down * 100),
-        latitude=place.latitude_e7,
-        longitude=place.longitude_e7,
-        altitude_barometric=place.altitude_m,
-        altitude_geodetic=place.altitude_m,
-        height_reference=0,
-        height=px4.altitude_m,
-        horizontal_accuracy=12,
-        vertical_accuracy=5,
-        barometer_accuracy=0,
-        speed_accuracy=3,
-        timestamp=65535.0,  # unknown
-        timestamp_accuracy=0,
-    )
+        target_system=0, target_component=0, id_or_mac=_BROADCAST_ID,
+        status=MavOdidStatus.GROUND if px4.is_landed else MavOdidStatus.AIRBORNE, direction=direction,
+        speed_horizontal=round(motion.ground_speed_m_s * 100), speed_vertical=round(-motion.velocity_down * 100),
+        latitude=place.latitude_e7, longitude=place.longitude_e7, altitude_barometric=place.altitude_m,
+        altitude_geodetic=place.altitude_m, height_reference=0, height=px4.altitude_m, horizontal_accuracy=12,
+        vertical_accuracy=5, barometer_accuracy=0, speed_accuracy=3, timestamp=unknown_time, timestamp_accuracy=0,
+    )  # fmt: skip
 
 
 def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
@@ -87,23 +93,13 @@ def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
         return None
     home = px4.frame.to_global(*px4.home)
     seconds = max(0, int(px4.unix_time) - _REMOTE_ID_EPOCH)
+    unknown_m = -1000.0
     return m.OpenDroneIdSystem(
-        target_system=0,
-        target_component=0,
-        id_or_mac=_BROADCAST_ID,
-        operator_location_type=0,
-        classification_type=0,
-        operator_latitude=home.latitude_e7,
-        operator_longitude=home.longitude_e7,
-        area_count=1,
-        area_radius=0,
-        area_ceiling=-1000.0,  # unknown, as is the floor
-        area_floor=-1000.0,
-        category_eu=0,
-        class_eu=0,
-        operator_altitude_geo=home.altitude_m,
-        timestamp=seconds,
-    )
+        target_system=0, target_component=0, id_or_mac=_BROADCAST_ID, operator_location_type=0, classification_type=0,
+        operator_latitude=home.latitude_e7, operator_longitude=home.longitude_e7, area_count=1, area_radius=0,
+        area_ceiling=unknown_m, area_floor=unknown_m, category_eu=0, class_eu=0,
+        operator_altitude_geo=home.altitude_m, timestamp=seconds,
+    )  # fmt: skip
 
 
 IDENTITY_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
@@ -125,6 +121,7 @@ _FIELD_GAUSS = (0.215, 0.0, 0.426)
 _IMU_FIELDS = 7167
 _COVARIANCE = tuple([math.nan] * 21)
 _UNUSED_CHANNEL = 65535
+_UNKNOWN_TIME = -1
 _CLIMB_M_S, _DESCENT_M_S = 3.0, 0.7
 
 
@@ -137,27 +134,29 @@ def _pressure_hpa(px4: Px4Vehicle) -> float:
 
 
 def _scaled_pressure(px4: Px4Vehicle) -> m.ScaledPressure:
-    temperature = _SEA_LEVEL_C - _LAPSE_C_PER_M * _height(px4)
-    return m.ScaledPressure(px4.time_boot_ms, _pressure_hpa(px4), 0.0, round(temperature * 100), 0)
+    temperature = round(100 * (_SEA_LEVEL_C - _LAPSE_C_PER_M * _height(px4)))
+    return m.ScaledPressure(px4.time_boot_ms, _pressure_hpa(px4), press_diff=0.0, temperature=temperature)
 
 
 def _distance_sensor(px4: Px4Vehicle) -> m.DistanceSensor:
     height = px4.motion.ground_down - px4.motion.down
-    distance = min(_RANGE_FINDER_CM[1], max(0, round(height * 100)))
-    return m.DistanceSensor(px4.time_boot_ms, *_RANGE_FINDER_CM, distance, 0, 0, 25, 0)
+    min_cm, max_cm = _RANGE_FINDER_CM
+    return m.DistanceSensor(
+        px4.time_boot_ms, min_distance=min_cm, max_distance=max_cm,
+        current_distance=min(max_cm, max(0, round(height * 100))), type=MavDistanceSensor.LASER, id=0,
+        orientation=MavSensorOrientation.PITCH_270, covariance=0,
+    )  # fmt: skip
 
 
 def _measured_acceleration(px4: Px4Vehicle) -> tuple[float, float, float]:
     """Return the acceleration that the accelerometers measure, in m/s² forward, right and down."""
     motion = px4.motion
     # At rest, accelerometers measure the force of the ground: 1 g upwards.
-    north, east, down = (
-        motion.acceleration_north,
-        motion.acceleration_east,
-        motion.acceleration_down - GRAVITY_M_S2,
-    )
+    north, east = motion.acceleration_north, motion.acceleration_east
+    down = motion.acceleration_down - GRAVITY_M_S2
     cos_yaw, sin_yaw = math.cos(motion.yaw), math.sin(motion.yaw)
-    forward, right = north * cos_yaw + east * sin_yaw, east * cos_yaw - north * sin_yaw
+    forward = north * cos_yaw + east * sin_yaw
+    right = east * cos_yaw - north * sin_yaw
     # The products of roll and pitch are small, and are left out.
     return (
         forward * math.cos(motion.pitch) - down * math.sin(motion.pitch),
@@ -176,16 +175,9 @@ def _highres_imu(px4: Px4Vehicle) -> m.HighresImu:
     rates = (motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
     pressure = _pressure_hpa(px4)
     return m.HighresImu(
-        px4.time_boot_us,
-        *_measured_acceleration(px4),
-        *rates,
-        *_magnetic_field_gauss(px4),
-        abs_pressure=pressure,
-        diff_pressure=0.0,
-        pressure_alt=height,
-        temperature=_SEA_LEVEL_C,
-        fields_updated=_IMU_FIELDS,
-    )
+        px4.time_boot_us, *_measured_acceleration(px4), *rates, *_magnetic_field_gauss(px4), abs_pressure=pressure,
+        diff_pressure=0.0, pressure_alt=height, temperature=_SEA_LEVEL_C, fields_updated=_IMU_FIELDS,
+    )  # fmt: skip
 
 
 def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
@@ -206,21 +198,10 @@ def _odometry(px4: Px4Vehicle) -> m.Odometry:
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     rates = (motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
     return m.Odometry(
-        px4.time_boot_us,
-        MavFrame.LOCAL_NED,
-        MavFrame.LOCAL_NED,
-        motion.north,
-        motion.east,
-        motion.down,
-        quaternion,
-        *velocity,
-        *rates,
-        _COVARIANCE,
-        _COVARIANCE,
-        reset_counter=0,
-        estimator_type=MavEstimatorType.AUTOPILOT,
+        px4.time_boot_us, MavFrame.LOCAL_NED, MavFrame.LOCAL_NED, motion.north, motion.east, motion.down, quaternion,
+        *velocity, *rates, _COVARIANCE, _COVARIANCE, reset_counter=0, estimator_type=MavEstimatorType.AUTOPILOT,
         quality=0,
-    )
+    )  # fmt: skip
 
 
 def _rc_channels(px4: Px4Vehicle) -> m.RcChannels | None:
@@ -238,7 +219,7 @@ def _manual_control(px4: Px4Vehicle) -> m.ManualControl:
     sticks = px4.sticks
     throttle = round((sticks.throttle + 1) * 500)
     pitch, roll, yaw = (round(axis * 1000) for axis in (sticks.pitch, sticks.roll, sticks.yaw))
-    return m.ManualControl(px4.system_id, pitch, roll, throttle, yaw, 0)
+    return m.ManualControl(px4.system_id, x=pitch, y=roll, z=throttle, r=yaw, buttons=0)
 
 
 def _timesync(px4: Px4Vehicle) -> m.Timesync:
@@ -253,25 +234,33 @@ def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None
     # The simulation has no target for the velocity and the yaw, so it sends the present values.
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     yaw_and_rate = (motion.yaw, motion.yaw_rate)
-    frame, no_mask, no_acceleration = MavFrame.GLOBAL_INT, 0, (0.0, 0.0, 0.0)
+    no_mask, no_acceleration = 0, (0.0, 0.0, 0.0)
     return m.PositionTargetGlobalInt(
-        px4.time_boot_ms, frame, no_mask, *place, *velocity, *no_acceleration, *yaw_and_rate
+        px4.time_boot_ms, MavFrame.GLOBAL_INT, no_mask, *place, *velocity, *no_acceleration, *yaw_and_rate
     )
 
 
 def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:
     """Build TIME_ESTIMATE_TO_TARGET with the duration of a return: the climb, the flight home and the descent."""
-    if px4.is_landed:
-        return m.TimeEstimateToTarget(-1, -1, -1, -1, -1)
-    motion, flight = px4.motion, px4.flight
-    height = max(px4.parameters["RTL_RETURN_ALT"], px4.altitude_m)
-    distance = math.hypot(motion.north - px4.home[0], motion.east - px4.home[1])
-    climb_s, descent_s = (height - px4.altitude_m) / _CLIMB_M_S, height / _DESCENT_M_S
-    return m.TimeEstimateToTarget(round(climb_s + distance / flight.cruise_speed_m_s + descent_s), -1, -1, -1, -1)
+    return_s = _UNKNOWN_TIME
+    if not px4.is_landed:
+        height = max(px4.parameters["RTL_RETURN_ALT"], px4.altitude_m)
+        home_north, home_east, _ = px4.home
+        distance = math.hypot(px4.motion.north - home_north, px4.motion.east - home_east)
+        climb_s = (height - px4.altitude_m) / _CLIMB_M_S
+        descent_s = height / _DESCENT_M_S
+        return_s = round(climb_s + distance / px4.flight.cruise_speed_m_s + descent_s)
+    return m.TimeEstimateToTarget(
+        safe_return=return_s,
+        land=_UNKNOWN_TIME,
+        mission_next_item=_UNKNOWN_TIME,
+        mission_end=_UNKNOWN_TIME,
+        commanded_action=_UNKNOWN_TIME,
+    )
 
 
 def _link_status(px4: Px4Vehicle) -> m.LinkNodeStatus:
-    return m.LinkNodeStatus(px4.time_boot_us, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+    return m.LinkNodeStatus(px4.time_boot_us, *(0,) * 10)
 
 
 def _orbit_status(px4: Px4Vehicle) -> m.OrbitExecutionStatus | None:

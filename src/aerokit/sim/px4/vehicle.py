@@ -62,11 +62,13 @@ class SimulatedPx4(Px4Vehicle):
 
     def _on_set_mode(self, request: m.SetMode, channel: Channel) -> None:
         """Handle SET_MODE, which PX4 acknowledges like DO_SET_MODE."""
-        main, sub = modes.mode_from_custom(request.custom_mode)
+        mode = modes.mode_from_custom(request.custom_mode)
+        main_mode, sub_mode = mode
         command = ReceivedCommand(
-            Cmd.DO_SET_MODE, request.base_mode, main, sub, 0, 0, 0, 0, None, channel, sender_of(request)
-        )
-        self.commands.answer(command, set_mode(self, request.base_mode, (main, sub)))
+            Cmd.DO_SET_MODE, param1=request.base_mode, param2=main_mode, param3=sub_mode, param4=0, x=0, y=0, z=0,
+            frame=None, channel=channel, sender=sender_of(request),
+        )  # fmt: skip
+        self.commands.answer(command, set_mode(self, request.base_mode, mode))
 
 
 _FLARE_M = 3.0
@@ -98,7 +100,9 @@ class Px4PlaneFlight(Px4Flight):
 
     @property
     def is_rolling(self) -> bool:
-        return self.lifts_off and self._plane.now - self._plane.arming.since >= self._plane.parameters["RWTO_RAMP_TIME"]
+        return (
+            self.lifts_off and self._plane.now - self._plane.arming.armed_at >= self._plane.parameters["RWTO_RAMP_TIME"]
+        )
 
     def enter(self, mode: Px4Mode) -> None:
         self.radius_m = self._plane.parameters["NAV_LOITER_RAD"]
@@ -156,15 +160,17 @@ class Px4PlaneFlight(Px4Flight):
     def _take_off(self) -> None:
         """Climb straight on, and circle the point at which the altitude is reached."""
         self.climb_out()
-        if self._motion.down > self.target[2]:
+        _, _, target_down = self.target
+        if self._motion.down > target_down:
             return
-        place = (self._motion.north, self._motion.east, self.target[2])
+        place = (self._motion.north, self._motion.east, target_down)
         self._plane.switch_to_hold()  # This sets the target to the current altitude.
         self.target = place
 
     def circle_down(self) -> None:
         sink = self._plane.parameters["FW_T_SINK_MIN"]
-        self.target = (*self.target[:2], self._motion.down + sink * _SINK_TARGET_S)
+        north, east, _ = self.target
+        self.target = (north, east, self._motion.down + sink * _SINK_TARGET_S)
         self._touch_down(self.circle)
 
     def descend(self) -> None:
@@ -183,7 +189,8 @@ class Px4PlaneFlight(Px4Flight):
 
     def _glide(self) -> None:
         motion = self._motion
-        north, east = self.target[0] - motion.north, self.target[1] - motion.east
+        target_north, target_east, _ = self.target
+        north, east = target_north - motion.north, target_east - motion.east
         height = math.hypot(north, east) * math.tan(math.radians(self._plane.parameters["FW_LND_ANG"]))
         climb = min(0.0, motion.climb_to(motion.ground_down - height))
         motion.head(math.atan2(east, north), self._plane.parameters["FW_AIRSPD_MIN"] * _GLIDE_SPEED_FACTOR, climb)
@@ -195,15 +202,18 @@ class Px4PlaneFlight(Px4Flight):
             self.circle_down()
             return
         self.circle()
-        if abs(motion.down - self.target[2]) > _HEIGHT_REACHED_M or not self._is_near():
+        _, _, target_down = self.target
+        if abs(motion.down - target_down) > _HEIGHT_REACHED_M or not self._is_near():
             return
+        north, east, down = self.destination
         if self._phase == "climb":
-            self._phase, self.target = "return", (*self.destination[:2], self.target[2])
+            self._phase = "return"
+            self.target: Ned = (north, east, target_down)
         elif self._phase == "return":
-            loiter_down = self.destination[2] - plane.parameters["RTL_DESCEND_ALT"]
+            loiter_down = down - plane.parameters["RTL_DESCEND_ALT"]
             self.radius_m = plane.parameters["RTL_LOITER_RAD"]
             self._phase = "loiter"
-            self.target: Ned = (*self.destination[:2], max(self.target[2], loiter_down))
+            self.target = (north, east, max(target_down, loiter_down))
         elif self._phase == "loiter" and plane.parameters["RTL_LAND_DELAY"] < 0:
             self._phase = "done"
             plane.info("RTL: completed, loitering")
@@ -212,7 +222,8 @@ class Px4PlaneFlight(Px4Flight):
             plane.info("RTL: land at destination")
 
     def _is_near(self) -> bool:
-        distance = math.hypot(self.target[0] - self._motion.north, self.target[1] - self._motion.east)
+        north, east, _ = self.target
+        distance = math.hypot(north - self._motion.north, east - self._motion.east)
         return distance <= abs(self.radius_m) + self._plane.parameters["NAV_ACC_RAD"]
 
 
@@ -256,7 +267,8 @@ class Px4PlaneMission(Px4Mission):
             flight.descend()
         elif self._phase == "climb":
             flight.climb_out()
-            if self._plane.motion.down <= flight.target[2]:
+            _, _, target_down = flight.target
+            if self._plane.motion.down <= target_down:
                 self._end_climb(item)
         else:
             self._go(item)
@@ -352,10 +364,10 @@ class SimulatedPx4Plane(SimulatedPx4):
         """Change to HOLD, because the take-off is complete."""
         self.switch_to(modes.HOLD)
 
-    def _moves(self) -> bool:
-        return super()._moves() or self.flight.is_rolling
+    def _is_moving(self) -> bool:
+        return super()._is_moving() or self.flight.is_rolling
 
-    def _is_down(self) -> bool:
+    def _has_touched_down(self) -> bool:
         return self.motion.is_at_rest
 
     def _run_motors(self, dt: float) -> None:
