@@ -60,16 +60,20 @@ async def test_position_is_no_reason_against_arming_with_failing_check() -> None
         assert found.against_flight[0] == "no GPS receiver has a 3D fix (GPS_RAW_INT)"
 
 
-async def test_disarmed_copter_in_rtl_is_not_ready_anywhere() -> None:
+async def test_copter_in_rtl_is_armed_in_other_mode() -> None:
     async with open_flight() as flight:
         vehicle = flight.vehicle
         await vehicle.wait_ready()
         assert VehicleText(vehicle).all_missing() == "Nothing is missing."
         await vehicle.set_mode("RTL")
-        text = "ArduCopter cannot arm in RTL"
+        text = "ArduCopter cannot arm in RTL (Vehicle.arm changes the mode to GUIDED)"
         assert readiness(vehicle).against_arming == (text,)
         assert VehicleText(vehicle).row(is_selected=True, more=True).plain.endswith(f"cannot arm: {text} ")
-        assert readiness(vehicle, await vehicle.why_not_armable()).against_arming[0].startswith(text)
+        assert (
+            readiness(vehicle, await vehicle.why_not_armable())
+            .against_arming[0]
+            .startswith("ArduCopter cannot arm in RTL")
+        )
         assert readiness(vehicle, changes_mode=True).against_arming == ()
 
 

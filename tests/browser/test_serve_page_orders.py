@@ -173,12 +173,12 @@ def test_readiness_shows_all_reasons_and_notes(browser: Any, copters: tuple[list
         assert page.evaluate(READINESS, {"states": armed}) == ["Armed: propellers may turn"]
         after_return = {"mode": "RTL", "arms_in": "GUIDED", "unless": None}
         assert page.evaluate(READINESS, {"unarmable_mode": after_return}) == [
-            "Cannot arm in RTL",
+            "Ready to arm",
             "Arm changes the mode to GUIDED first: ArduCopter cannot arm in RTL",
         ]
         after_mission = {"mode": "AUTO", "arms_in": "GUIDED", "unless": "AUTO_OPTIONS"}
         assert page.evaluate(READINESS, {"unarmable_mode": after_mission}) == [
-            "May refuse to arm in AUTO",
+            "Ready to arm",
             "If the vehicle refuses to arm in AUTO (AUTO_OPTIONS), Arm changes the mode to GUIDED and arms there",
         ]
         sensors = {"sensors": {"value": {}, "age_s": 0}}

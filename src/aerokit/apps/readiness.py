@@ -144,7 +144,8 @@ def _refused_mode(vehicle: Vehicle) -> list[str]:
     if unarmable is None:
         return []
     unless = f" unless {unarmable['unless']} allows it" if unarmable["unless"] else ""
-    return [f"{vehicle.autopilot.firmware} cannot arm in {unarmable['mode']}{unless}"]
+    change = f" (Vehicle.arm changes the mode to {unarmable['arms_in']})" if unarmable["arms_in"] else ""
+    return [f"{vehicle.autopilot.firmware} cannot arm in {unarmable['mode']}{unless}{change}"]
 
 
 def own_flight_modes(vehicle: Vehicle) -> str:

@@ -155,8 +155,6 @@ function readiness(vehicle, page, heartbeatAge) {
     const forFlight = missing.filter((reason) => !against.includes(reason));
     return ["warn", "Cannot arm", [...against, ...(disarmed ? [disarmed] : [])], forFlight];
   }
-  const mode = vehicle.unarmable_mode;
-  if (mode?.arms_in) return ["warn", `${mode.unless ? "May refuse to" : "Cannot"} arm in ${mode.mode}`, [...notes, ...missing]];
   return missing.length ? ["warn", flightGap(vehicle), [...missing, ...notes]] : ["good", "Ready to arm", notes];
 }
 
