@@ -279,7 +279,7 @@ def test_orders_tell_when_mission_finished(browser: Any) -> None:
         order(page, "mission/start")
         for _ in range(2):
             page.get_by_role("tab", name="Orders").click()
-            text = re.compile(r"mission started at item 0, finished at \d+:\d\d:\d\d")
+            text = re.compile(r"mission started at item 0, all items done at \d+:\d\d:\d\d")
             page.locator("#panel .done", has_text=text).wait_for(timeout=60_000)
             page.reload()
 

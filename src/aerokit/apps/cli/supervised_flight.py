@@ -29,6 +29,7 @@ from aerokit.events import SILENT_AFTER_S
 from aerokit.logs.flights.recording import ClockComparison, is_real_time
 from aerokit.mavlink.messages import GlobalPositionInt
 from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
+from aerokit.vehicle.commanding.ground import IMPACT_M_S
 from aerokit.vehicle.commanding.progress import HIT_GROUND
 from aerokit.vehicle.state.telemetry import is_reported_on_ground
 
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
     from aerokit.apps.cli.terminal import InterruptStack
     from aerokit.position import Position
+    from aerokit.vehicle.state.movement import Velocity
     from aerokit.vehicle.vehicle import Vehicle
 
     Purpose = Literal["mission", "hold", "land", "return", "take_off", "setpoint"]
@@ -231,6 +233,7 @@ class FlightReport:
         # Seconds of this computer's clock, not of the vehicle's, which a simulation may speed up.
         self._armed_at: float | None = None
         self._armed_s = 0.0
+        self._fast_sink_at: float | None = None  # when the vehicle last sank as fast as before an impact
         self._impact_s: float | None = None  # seconds from arming to an impact on the ground
         self._started_at = self._last_line_at = vehicle.connection.now()
         self._highest_m = self._fastest_m_s = self._flown_m = 0.0
@@ -255,6 +258,7 @@ class FlightReport:
         detach_all = [
             self._vehicle.position.observe(self._on_position),
             self._vehicle.armed.observe(self._on_armed),
+            self._vehicle.velocity.observe(self._on_velocity, every_arrival=True),
         ]
         tasks = [
             asyncio.create_task(coroutine)
@@ -273,7 +277,9 @@ class FlightReport:
     def record_impact(self) -> None:
         """Record that the vehicle has just hit the ground, so that the summary distinguishes the time before."""
         if self._impact_s is None and self._armed_at is not None:
-            self._impact_s = self._armed_s + self._vehicle.connection.now() - self._armed_at
+            # An impact is detected only some time after it, because the vehicle must then lie still.
+            impact_at = self._vehicle.connection.now() if self._fast_sink_at is None else self._fast_sink_at
+            self._impact_s = self._armed_s + impact_at - self._armed_at
 
     def print_summary(self, recorded_in: str | None = None) -> None:
         """Print the statistics of the flight, the link and the batteries."""
@@ -382,6 +388,10 @@ class FlightReport:
                 self.print_line(f"  {arms_but(vehicle)}: {'; '.join(found.against_flight)}")
             else:
                 self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
+
+    def _on_velocity(self, _: Velocity | None, velocity: Velocity) -> None:
+        if velocity.down_m_s >= IMPACT_M_S:
+            self._fast_sink_at = self._vehicle.velocity.updated_at
 
     def _on_position(self, _: Position | None, position: Position) -> None:
         """Measure the track while the vehicle is armed. Like reports on recordings, ignore steps below a metre."""

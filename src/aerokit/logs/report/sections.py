@@ -73,7 +73,10 @@ def _heights(flight: FlightLog) -> Section:
 def _modes(flight: FlightLog) -> Section:
     if not flight.modes:
         return Section("Modes", missing="The log contains no modes.")
-    armed = [(clock(begin), clock(end), span(end - begin)) for begin, end in flight.armed]
+    armed = [
+        (clock(begin), clock(end) if end < flight.duration_s else "not before the end", span(end - begin))
+        for begin, end in flight.armed
+    ]
     times = Table(("armed", "disarmed", "duration"), armed, f"armed {len(armed)} times")
     return Section("Modes", [mode_table(flight), times if armed else Paragraphs(["never armed"])])
 

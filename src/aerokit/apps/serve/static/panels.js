@@ -111,7 +111,7 @@ export class ParameterPanel {
     this.draw();
     try {
       const found = await ask("GET", `api/vehicles/${id}/parameters${refresh ? "?refresh=true" : ""}`);
-      this.tables.set(id, { rows: found.parameters });
+      this.tables.set(id, { rows: found.parameters, receivedAt: Date.now() / 1000 });
     } catch (error) {
       this.tables.set(id, { rows: [], note: `reading failed: ${error.message}` });
     }
@@ -156,9 +156,9 @@ export class ParameterPanel {
       node.hidden = !words.every((word) => text.includes(word));
       count += !node.hidden;
     }
-    const note = (this.tables.get(this.vehicle) || {}).note;
+    const { note, receivedAt } = this.tables.get(this.vehicle) || {};
     const near = !count && words.length === 1 ? nearName(words[0], this.rows.map((each) => each.name)) : "";
-    show(this.note, note ?? `${count} of ${this.rows.length} parameters${near ? `: did you mean ${near}?` : count && this.isSettable() ? " · click one to set it" : ""}`);
+    show(this.note, note ?? `${count} of ${this.rows.length} parameters, received at ${clock(receivedAt)}${near ? `: did you mean ${near}?` : count && this.isSettable() ? " · click one to set it" : ""}`);
   }
 }
 
@@ -301,7 +301,7 @@ const EVENT_TEXTS = {
   VehicleRebooted: () => "The vehicle has rebooted",
   MissionItemReached: (e) => `Reached item ${e.item} of its mission`,
   MissionCurrentChanged: (e) => (e.after === null ? "No current mission item" : `Flies to item ${e.after} of its mission`),
-  MissionFinished: () => "Mission finished",
+  MissionFinished: () => "All items of the mission are done",
   ParameterChanged: (e) => `${e.name} changed from ${short(e.before)} to ${short(e.after)}`,
   StreamSlow: (e) => `Arrives at less than half the requested rate: ${e.message}`,
   LoopBlocked: (e) => `The server was busy for ${seconds(e.seconds)}`,
@@ -354,7 +354,7 @@ export class OrderPanel {
 
   // An order and its state, in words.
   outcome(record) {
-    if (record.finishedAt) return `${outcome(record)}, finished at ${clock(record.finishedAt)}`;
+    if (record.finishedAt) return `${outcome(record)}, all items done at ${clock(record.finishedAt)}`;
     if (!record.replaced_by) return outcome(record);
     const newer = this.records.get(record.replaced_by);
     return `${orderText(record)}: replaced by ${newer ? orderTitle(newer) : "a newer order"}`;

@@ -85,7 +85,8 @@ export class StateTable {
     if (!cells) {
       cells = [element("td", { class: "name" }, unitOf(name).label), element("td", { class: "value" }), element("td", { class: "age" })];
       this.rows.set(name, cells);
-      this.body.append(element("tr", {}, ...cells));
+      const isLater = (each) => each.cells[0].textContent.localeCompare(cells[0].textContent) > 0;
+      this.body.insertBefore(element("tr", {}, ...cells), [...this.body.rows].find(isLater) ?? null);
     }
     const old = ageOf(entry, receivedAt), kind = REPORTED_ONCE.has(name) ? "" : staleness(old);
     show(cells[1], inWords(name, entry.value), "value");
