@@ -1,7 +1,4 @@
-"""``Actions``: vehicle actions executed by several members at once, and barriers.
-
-https://mavlink.io/en/messages/common.html#GPS_RTCM_DATA
-"""
+"""``Actions``: vehicle actions executed by several members at once, and barriers."""
 
 from __future__ import annotations
 
@@ -177,7 +174,7 @@ class Actions(SelectionBase):
                         )
                     await change_signal.next(POLL_INTERVAL_S)
 
-        deadline = self._context.now() + timeout
+        deadline = self._context.now() + timeout  # one deadline for all members
         result = await self._run(description, wait_for_condition)
         result.raise_for_errors()
         return result

@@ -97,7 +97,7 @@ class DistanceMonitor:
     """
 
     def __init__(self, context: FleetContext, min_distance_m: float, *, holds: bool) -> None:
-        self._context, self._min_distance_m, self._holds = context, min_distance_m, holds
+        self._context, self._min_distance_m, self._orders_hold = context, min_distance_m, holds
         self._reported: set[tuple[str, str]] = set()
 
     async def run(self) -> None:
@@ -132,7 +132,7 @@ class DistanceMonitor:
         pair = (first, second)
         for member in pair:
             member.refresh()
-        holding = [member for member in pair if self._holds and member.is_flown_by_program]
+        holding = [member for member in pair if self._orders_hold and member.is_flown_by_program]
         for member in holding:
             self._context.hold(member, f"aerokit too close {member.name}")
         self._context.publish(

@@ -163,7 +163,8 @@ class Following:
         max_speed_m_s: float,
     ) -> None:
         self._context, self._leader, self._followers, self._formation = context, leader, followers, formation
-        self._period_s, self._rate_hz, self._max_speed_m_s = 1 / rate_hz, rate_hz, max_speed_m_s
+        self._rate_hz, self._period_s = rate_hz, 1 / rate_hz
+        self._max_speed_m_s = max_speed_m_s
         self._tasks = BackgroundTasks(self._on_error)
         self._stopped = asyncio.Event()
         self._was_entered = self._has_raised = False
@@ -224,6 +225,7 @@ class Following:
         self._stop_if_no_followers()
 
     async def _fly_follower(self, member: Member) -> None:
+        """Fly a member towards its place until following stops."""
         try:
             async with member.vehicle.guided.velocity(rate_hz=self._rate_hz) as stream:
                 while not self._stop_if_leader_lost():
@@ -237,6 +239,7 @@ class Following:
             asyncio.get_running_loop().call_soon(self._stop_if_no_followers)
 
     def _stop_if_no_followers(self) -> None:
+        """Stop following if no member follows any more, and give the failures as the reason."""
         if not self._action.active and self._action.program_error is None:
             result = self._action.result_so_far()
             failed = {name: str(error) for name, error in result.failed.items()}
@@ -262,6 +265,7 @@ class Following:
         return self._stopped.is_set()
 
     def _setpoint(self, member: Member) -> VelocitySetpoint:
+        """Return the velocity of the leader, plus a correction towards the member's place."""
         velocity = self._leader.vehicle.velocity.latest
         leader_velocity = (0.0, 0.0, 0.0)  # while the velocity is unknown
         if velocity is not None:
@@ -290,11 +294,13 @@ class Following:
             }
         )
         offset = self._formation.offset_of(member.name, leader.heading_deg.latest)
-        north, east, up = (
-            points["leader"][i] - points["member"][i] + metres
-            for i, metres in enumerate((offset.north_m, offset.east_m, offset.up_m))
-        )
-        # Extrapolate both positions: the leader has moved on since its position was measured, and so has the member.
+        leader_north, leader_east, leader_up = points["leader"]
+        member_north, member_east, member_up = points["member"]
+        north = leader_north + offset.north_m - member_north
+        east = leader_east + offset.east_m - member_east
+        up = leader_up + offset.up_m - member_up
+        # Both vehicles have moved on after their positions were measured. The leader's movement makes the vector
+        # longer, the member's own movement makes it shorter.
         for moving_vehicle, sign in ((leader, 1.0), (vehicle, -1.0)):
             velocity = moving_vehicle.velocity.latest
             if velocity is not None:

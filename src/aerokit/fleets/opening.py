@@ -127,7 +127,14 @@ async def fleet(
         )
         members += [Member(f"{name}/{vehicle.system_id}", name, vehicle) for name, vehicle in connected]
         _check_names(members)
-        context = FleetContext(members, networks, rules, next(iter(networks.values())).now, _raise, min_distance_m)
+        context = FleetContext(
+            members,
+            networks,
+            rules,
+            now=next(iter(networks.values())).now,
+            on_error=_raise,
+            min_distance_m=min_distance_m,
+        )
         _assign(context, groups or {}, "group")
         _assign(context, roles or {}, "role")
         stack.push_async_callback(context.aclose)
@@ -159,8 +166,8 @@ def _members_of_vehicles(sources_by_name: Mapping[str, Source], networks: dict[s
     members: list[Member] = []
     for name, source in sources_by_name.items():
         if isinstance(source, Vehicle):
-            same_connection = (key for key, connection in networks.items() if connection is source.connection)
-            network = next(same_connection, None)
+            names_of_connection = (key for key, connection in networks.items() if connection is source.connection)
+            network = next(names_of_connection, None)
             if network is None:
                 network = name
                 networks[name] = source.connection
@@ -203,6 +210,7 @@ def _check_names(members: list[Member]) -> None:
 
 
 def _assign(context: FleetContext, patterns_by_name: Mapping[str, Iterable[str]], attribute: str) -> None:
+    """Set the attribute ``group`` or ``role`` of the members that match each name's patterns."""
     for name, one_or_more in patterns_by_name.items():
         patterns = [one_or_more] if isinstance(one_or_more, str) else one_or_more
         for member in context.matching(*patterns):
@@ -255,7 +263,7 @@ async def find_systems(
             return passed_count + sum(map(len, found.values())) >= count
         return all(found[name] for name in searched)
 
-    def progress() -> str:
+    def describe_progress() -> str:
         names = [f"{name}/{system_id}" for name, ids in found.items() for system_id in ids]
         listed = ", ".join(names)
         if count is not None:
@@ -268,29 +276,29 @@ async def find_systems(
         text = f"no vehicle was found on {silent_networks}"
         return f"{text}; found: {listed}" if names else text
 
-    detach = []
+    detachments = []
     try:
         for name in searched:
             connection = networks[name]
             connection.raise_if_ended()
-            detach.append(connection.bus.attach_event(VehicleFound, partial(on_found, name)))
+            detachments.append(connection.bus.attach_event(VehicleFound, partial(on_found, name)))
             for source, heartbeat in connection.heartbeats.items():
                 on_found(name, discovery_event(heartbeat, connection.now(), *source))
         with anyio.move_on_after(timeout):
-            with warn_while_waiting(timeout, progress):
+            with warn_while_waiting(timeout, describe_progress):
                 while not is_complete():
                     changed = anyio.Event()
                     await changed.wait()
             if searched and count is None:
                 await anyio.sleep(DISCOVERY_S)
     finally:
-        for function in detach:
-            function()
+        for detach in detachments:
+            detach()
     if not is_complete():
         reasons = "".join(
             f"\n  - network {name}: {explain_no_vehicle(networks[name], None)}" for name in searched if not found[name]
         )
-        raise ConnectFailed(f"within {timeout:g} s {progress()}{reasons}")
+        raise ConnectFailed(f"within {timeout:g} s {describe_progress()}{reasons}")
     return {name: sorted(ids) for name, ids in found.items()}
 
 
@@ -357,6 +365,7 @@ class MemberConnections:
         error: BaseException | None = None,
         traceback: TracebackType | None = None,
     ) -> None:
+        """Close all vehicles, and wait until they are closed. The arguments are the exception of the fleet's block."""
         self._has_block_failed = error is not None
         self._close.set()
         is_every_vehicle_connected = len(self._open) == self._running
@@ -369,6 +378,7 @@ class MemberConnections:
         await self._all_closed.wait()
 
     async def _run(self, index: int, network: str, connection: Connection, system_id: int) -> None:
+        """Connect one vehicle, and keep it connected until the fleet closes."""
         try:
             async with connect(connection, system_id=system_id, timeout=self._timeout, rates=self._rates) as vehicle:
                 self._open[index] = (network, vehicle)

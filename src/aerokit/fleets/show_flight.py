@@ -252,12 +252,12 @@ class TrackRecorder:
         Raises:
             StaleValueError: no position was received in the last two seconds.
         """
-        now = self._vehicle.connection.now()
-        if self._latest is None or now - self._latest[0] > POSITION_MAX_AGE_S:
-            raise StaleValueError(f"no GLOBAL_POSITION_INT was received in the last {POSITION_MAX_AGE_S:g} s")
-        measured_at, place, velocity = self._latest
-        age = now - measured_at
-        return place[0] + age * velocity[0], place[1] + age * velocity[1], place[2] + age * velocity[2]
+        if self._latest is not None:
+            measured_at, (north, east, up), (north_m_s, east_m_s, up_m_s) = self._latest
+            age = self._vehicle.connection.now() - measured_at
+            if age <= POSITION_MAX_AGE_S:
+                return north + age * north_m_s, east + age * east_m_s, up + age * up_m_s
+        raise StaleValueError(f"no GLOBAL_POSITION_INT was received in the last {POSITION_MAX_AGE_S:g} s")
 
     def _on_message(self, message: GlobalPositionInt) -> None:
         frame = message.received_frame
@@ -279,9 +279,10 @@ class TrackRecorder:
 def _metres_per_degree(origin: LocalOrigin, latitude: float, longitude: float) -> tuple[float, float]:
     """Return the metres per degree of latitude and per degree of longitude, for places within some hundred metres."""
     step = 1e-3
-    north = origin.to_local(Position(min(latitude + step, 90.0), longitude), 0.0)[0] / step
-    east = origin.to_local(Position(latitude, longitude + step), 0.0)[1] / step
-    return north or METRES_PER_DEGREE, east  # at the north pole, a step north has no length
+    north_m, _, _ = origin.to_local(Position(min(latitude + step, 90.0), longitude), 0.0)
+    _, east_m, _ = origin.to_local(Position(latitude, longitude + step), 0.0)
+    # At the north pole, a step north has no length.
+    return north_m / step or METRES_PER_DEGREE, east_m / step
 
 
 @checks_arguments
@@ -404,6 +405,7 @@ class Shows(Travel):
 async def _fly_track(
     member: Member, path: Path, recorder: TrackRecorder, begin_at: float, rate_hz: float, lead_s: float
 ) -> None:
+    """Fly a member along its path, from the current time until the end of the path."""
     vehicle, period_s = member.vehicle, 1 / rate_hz
     with vehicle._session.streaming("position"):
         async with vehicle.guided.velocity(rate_hz=rate_hz) as stream:

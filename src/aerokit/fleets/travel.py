@@ -214,6 +214,8 @@ class Travel(SelectionBase):
         stagger_s: float | None = None,
         corridors: Deconfliction | None = None,
     ) -> FleetResult:
+        """Fly members straight to their targets; in corridors, each member starts after its delay."""
+
         async def fly(member: Member) -> None:
             delay_s = corridors.delays_s.get(member.name, 0.0) if corridors else 0.0
             if delay_s:
@@ -413,10 +415,10 @@ class Missions(SelectionBase):
 
 
 def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path | None:
-    """Return the path of a mission, whose points have no times; None if no item has a position."""
-    points = [
-        PathPoint(0.0, *origin.to_local(position, altitude_amsl(member, position)))
-        for position in (item.position for item in mission)
-        if position is not None and not math.isnan(position.latitude_deg)
-    ]
+    """Return the path of a mission, with time 0 for all points; None if no item has a position."""
+    points: list[PathPoint] = []
+    for item in mission:
+        position = item.position
+        if position is not None and not math.isnan(position.latitude_deg):
+            points.append(PathPoint(0.0, *origin.to_local(position, altitude_amsl(member, position))))
     return Path(member.name, points) if points else None

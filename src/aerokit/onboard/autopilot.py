@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest
     from aerokit.onboard.services import ComponentServices
 
-FORCE, FORCE_ARM = 21196, 2989
-"""Values of param 2: the standard's value, which forces arming or disarming, and ArduPilot's, which only forces arming.
-"""
+FORCE = 21196
+"""Value of param 2 in the MAVLink standard, which forces arming and disarming."""
+FORCE_ARM = 2989
+"""Value of param 2 in ArduPilot, which forces arming only."""
 _REBOOT, _SHUTDOWN = 1, 2
 
 
@@ -87,8 +88,8 @@ def add_autopilot(
         report(None, custom_mode)
 
     async def take_off(request: CommandRequest) -> None:
-        altitude = request.params[6]
-        await call("take_off", None if math.isnan(altitude) else altitude)
+        *_, altitude_m = request.params
+        await call("take_off", None if math.isnan(altitude_m) else altitude_m)
 
     async def reboot(_: CommandRequest, action: int) -> None:
         if action not in (_REBOOT, _SHUTDOWN):

@@ -84,7 +84,7 @@ class WinchDriver:
         return WinchReport()
 
 
-_WINCH_CALLS: dict[int, str] = {
+_WINCH_METHODS: dict[int, str] = {
     WinchActions.RELAXED: "relax",
     WinchActions.RELATIVE_LENGTH_CONTROL: "pay_out",
     WinchActions.RATE_CONTROL: "set_rate",
@@ -106,7 +106,7 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
     async def do_winch(
         _: CommandRequest, instance: float | None, action: int, length: float | None, rate: float | None
     ) -> None:
-        method = _WINCH_CALLS.get(action, "")
+        method = _WINCH_METHODS.get(action, "")
         if not method or not overrides(winch, WinchDriver, method):
             raise NotSupported(f"this winch does not support action {action}")
         arguments: tuple[float | None, ...] = ()

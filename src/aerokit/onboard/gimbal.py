@@ -114,8 +114,8 @@ class GimbalAdapter(GimbalMount):
         if yaw == _FULL_TURN_DEG:
             self.capabilities |= DeviceCapFlags.SUPPORTS_INFINITE_YAW
         self._gimbal, self._host = gimbal, host
-        self._is_locked = False
-        self._followed = 0  # id of the system at which the gimbal points; 0 for none
+        self._is_yaw_locked = False
+        self._followed_system_id = 0  # the gimbal points at this system; 0: none
 
     @property
     def host(self) -> ServerHost:
@@ -127,7 +127,7 @@ class GimbalAdapter(GimbalMount):
 
     @property
     def is_yaw_locked(self) -> bool:
-        return self._is_locked
+        return self._is_yaw_locked
 
     def angles(self) -> Angles:
         roll, pitch, yaw = map(math.radians, self._gimbal.attitude())
@@ -152,7 +152,7 @@ class GimbalAdapter(GimbalMount):
 
     def _apply(self, target: GimbalTarget, flags: int) -> None:
         self._gimbal.point(target)
-        self.flags, self._is_locked = flags, target.yaw_locked
+        self.flags, self._is_yaw_locked = flags, target.yaw_locked
 
     def look_at(self, place: Place | None) -> None:
         if place is None:
@@ -162,16 +162,18 @@ class GimbalAdapter(GimbalMount):
             position = Position(latitude_e7 / 1e7, longitude_e7 / 1e7, altitude_amsl_m=altitude_amsl_m)
         self._gimbal.look_at(position)
         self.flags: int = 0
-        self._is_locked = position is not None  # While the gimbal looks at a position, the vehicle does not turn it.
-        self._followed = 0
+        self._is_yaw_locked = (
+            position is not None
+        )  # While the gimbal looks at a position, the vehicle does not turn it.
+        self._followed_system_id = 0
 
     def follow(self, system_id: int) -> None:
-        self._followed = system_id
+        self._followed_system_id = system_id
 
     def update_followed(self, system_id: int, place: Place) -> None:
-        if system_id == self._followed:
+        if system_id == self._followed_system_id:
             self.look_at(place)
-            self._followed = system_id  # `look_at` has reset it.
+            self._followed_system_id = system_id  # `look_at` has reset it.
 
 
 _ROLL = DeviceCapFlags.HAS_ROLL_AXIS | DeviceCapFlags.HAS_ROLL_LOCK | DeviceCapFlags.HAS_ROLL_FOLLOW

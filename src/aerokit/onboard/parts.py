@@ -57,12 +57,12 @@ def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapt
     for command, handler in camera_commands(adapter).items():
         if command == MavCmd.STORAGE_FORMAT and not overrides(camera, CameraDriver, "format_storage"):
             continue  # The command stays UNSUPPORTED.
-        services.commands.add_raw(command, partial(_run, handler))
+        services.commands.add_raw(command, partial(_run_if_implemented, handler))
     services.commands.handlers.update(legacy_requests(streams))
     return adapter
 
 
-async def _run(handler: AsyncHandler, command: ReceivedCommand) -> int:
+async def _run_if_implemented(handler: AsyncHandler, command: ReceivedCommand) -> int:
     try:
         return await handler(command)
     except NotImplementedError:  # The program's class does not override the method.
