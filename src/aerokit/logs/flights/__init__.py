@@ -99,22 +99,27 @@ def read_flight(
 
 def _complete(flight: FlightLog) -> None:
     """Complete the flight once the whole log is read: end open time spans, and compute home, heights and failsafes."""
-    is_armed_at_end = bool(flight.armed) and math.isinf(flight.armed[-1][1])
-    if is_armed_at_end:
-        flight.armed[-1] = (flight.armed[-1][0], flight.duration_s)
+    is_armed_at_end = False
+    if flight.armed:
+        armed_s, disarmed_s = flight.armed[-1]
+        is_armed_at_end = math.isinf(disarmed_s)
+        if is_armed_at_end:
+            flight.armed[-1] = (armed_s, flight.duration_s)
     if flight.home is None and len(flight.track):  # use the position at the first arming, or else the first position
-        first_armed_row = max(flight.track.index_at(flight.armed[0][0]), 0) if flight.armed else 0
+        row = 0
+        if flight.armed:
+            first_armed_s, _ = flight.armed[0]
+            row = max(flight.track.index_at(first_armed_s), 0)
         columns = ("latitude_deg", "longitude_deg", "altitude_amsl_m")
-        position = (flight.track[name][first_armed_row] for name in columns)
-        flight.set_home(flight.track.times[first_armed_row], *position)
+        flight.set_home(flight.track.times[row], *(flight.track[name][row] for name in columns))
     _complete_altitudes(flight)
     if is_armed_at_end:
-        flight.notes.append(_armed_at_end(flight))
+        flight.notes.append(_armed_at_end_note(flight))
     flight.failsafe_evidence += evidence_in_texts(flight.texts) + evidence_in_fixes(flight)
     flight.failsafe_evidence.sort(key=lambda evidence: evidence.time_s)
 
 
-def _armed_at_end(flight: FlightLog) -> str:
+def _armed_at_end_note(flight: FlightLog) -> str:
     """Return a note that the log ends while the vehicle is armed, and on what is unknown for that reason."""
     note = "the log ends while the vehicle is armed"
     height_m = flight.track.at("altitude_relative_m", flight.duration_s, not_older_s=math.inf)
@@ -126,8 +131,8 @@ def _armed_at_end(flight: FlightLog) -> str:
     mode = flight.mode_at(flight.duration_s)
     in_mode = f" in {mode}" if mode else ""
     is_silent = bool(flight.silences) and flight.silences[-1].ends_s >= flight.duration_s
-    age = f", {flight.duration_s - flight.silences[-1].begins_s:.0f} s before its end" if is_silent else ""
-    state = f"{where}{in_mode}{motion}{age}"
+    when = f", {flight.duration_s - flight.silences[-1].begins_s:.0f} s before its end" if is_silent else ""
+    state = f"{where}{in_mode}{motion}{when}"
     return f"{note}{state}: the rest of the flight, and with it a landing or a crash, was not recorded"
 
 
@@ -139,8 +144,8 @@ def _complete_altitudes(flight: FlightLog) -> None:
     home_amsl_m = flight.home.altitude_amsl_m if flight.home is not None else None
     if home_amsl_m is None:
         return
-    for columns in (flight.track, flight.position_target):
-        amsl, relative = columns["altitude_amsl_m"], columns["altitude_relative_m"]
+    for series in (flight.track, flight.position_target):
+        amsl, relative = series["altitude_amsl_m"], series["altitude_relative_m"]
         for row, relative_m in enumerate(relative):
             amsl_m = amsl[row]
             if math.isnan(relative_m):

@@ -24,6 +24,10 @@ _GENERAL_GAP_S = 3.0
 # seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
 _DELAYED_REACTION_GAP_S = 10.0
 _REACTION_TIMEOUT_S = 12.0
+# The reaction may be logged this long before the first evidence of the failsafe.
+_EARLY_MODE_CHANGE_S, _EARLY_DISARMING_S = 2.5, 0.5
+# Evidence counts from this long before arming until this long after disarming.
+_BEFORE_ARMING_S, _AFTER_DISARMING_S = 1.0, 2.0
 # A failsafe is shown with values that were measured in this time before it.
 _BEFORE_S = 10.0
 # A mode change within this time after a failsafe is attributed to the autopilot, even if the log has no cause.
@@ -156,9 +160,11 @@ def evidence_in_fixes(flight: FlightLog) -> list[FailsafeEvidence]:
         for time_s, fix_type, satellites in zip(gps.times, gps["fix_type"], gps["satellites"], strict=True):
             has_fix = fix_type >= GpsFixType.TYPE_3D_FIX
             if had_fix and fix_type < GpsFixType.TYPE_3D_FIX:
-                counts = "" if math.isnan(satellites) else f", {satellites:.0f} satellites"
-                counts += "" if math.isnan(had_satellites) or not counts else f" instead of {had_satellites:.0f}"
-                text = f"receiver {number + 1} has no 3D fix any more{counts}"
+                text = f"receiver {number + 1} has no 3D fix any more"
+                if not math.isnan(satellites):
+                    text += f", {satellites:.0f} satellites"
+                    if not math.isnan(had_satellites):
+                        text += f" instead of {had_satellites:.0f}"
                 evidence.append(FailsafeEvidence(time_s, "gps", text))
             if not math.isnan(fix_type):
                 had_fix, had_satellites = has_fix, satellites
@@ -170,7 +176,9 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
     groups: list[list[FailsafeEvidence]] = []
     recent_groups: list[list[FailsafeEvidence]] = []
     for evidence in flight.failsafe_evidence:
-        was_armed = any(begin - 1 <= evidence.time_s <= end + 2 for begin, end in flight.armed)
+        was_armed = any(
+            begin - _BEFORE_ARMING_S <= evidence.time_s <= end + _AFTER_DISARMING_S for begin, end in flight.armed
+        )
         if not was_armed:
             continue
         recent_groups = [
@@ -190,6 +198,7 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
 
 
 def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -> bool:
+    """Return True if evidence belongs to the same failsafe as an earlier group of evidence."""
     kind, gap_s = _kind_of(group), evidence.time_s - group[-1].time_s
     if "general" in (kind, evidence.kind):
         is_reaction_delayed = kind == "gps" or "entering Hold" in group[-1].text
@@ -200,6 +209,7 @@ def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -
 
 
 def _kind_of(group: Sequence[FailsafeEvidence]) -> str:
+    """Return the first specific kind in a group of evidence; "general" if there is none."""
     return next((evidence.kind for evidence in group if evidence.kind != "general"), "general")
 
 
@@ -207,8 +217,12 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_o
     kind, time_s = _kind_of(group), group[0].time_s
     reaction, is_sure = _reaction(flight, time_s, group)
     acted = is_sure or any(evidence.is_action for evidence in group)
-    facts = [*_location(flight, time_s), *_CONTEXTS.get(kind, _general_context)(flight, time_s)]
-    facts += _limit_parameters(flight, kind, time_s) or (_missing_parameters(flight, kind) if is_first_of_kind else [])
+    context_of_kind = _CONTEXTS.get(kind, _general_context)
+    facts = [*_location(flight, time_s), *context_of_kind(flight, time_s)]
+    parameters = _limit_parameters(flight, kind, time_s)
+    if not parameters and is_first_of_kind:
+        parameters = _missing_parameters(flight, kind)
+    facts += parameters
     facts += _texts_before(flight, time_s)
     return Failsafe(time_s, kind, acted, tuple(group), reaction or "no mode change followed", tuple(facts))
 
@@ -221,7 +235,7 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
     """
     last_s = group[-1].time_s
     for change in flight.modes:
-        is_near = time_s - 2.5 <= change.time_s <= last_s + _REACTION_TIMEOUT_S
+        is_near = time_s - _EARLY_MODE_CHANGE_S <= change.time_s <= last_s + _REACTION_TIMEOUT_S
         # Some autopilots change the mode after disarming, which is no reaction to a failsafe.
         was_armed = any(begin <= change.time_s < end for begin, end in flight.armed)
         if is_near and was_armed and change.by_autopilot is not False:
@@ -230,7 +244,7 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
                 is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
                 cause = "" if is_sure else "; cause not logged"
                 return _mode_change_text(change, previous_mode, time_s) + cause, is_sure
-    disarmed_s = next((end for _, end in flight.armed if time_s - 0.5 <= end <= last_s + 3), None)
+    disarmed_s = next((end for _, end in flight.armed if time_s - _EARLY_DISARMING_S <= end <= last_s + 3), None)
     if disarmed_s is not None and disarmed_s < flight.duration_s:
         is_sure = _kind_of(group) in CRASH_KINDS
         cause = "" if is_sure else "; cause not logged"
@@ -415,8 +429,12 @@ def _missing_parameters(flight: FlightLog, kind: str) -> list[str]:
 
 def configured_by(flight: FlightLog, kind: str) -> list[str]:
     """Return the names of the autopilot's parameters for this kind of failsafe; empty if none are known."""
-    is_px4 = {"PX4": True, "ArduPilot": False}.get(flight.autopilot)
-    return [name for name in _LIMIT_PARAMETERS.get(kind, ()) if is_px4 in (None, name.startswith(_PX4_PREFIXES))]
+    names = _LIMIT_PARAMETERS.get(kind, ())
+    if flight.autopilot == "PX4":
+        return [name for name in names if name.startswith(_PX4_PREFIXES)]
+    if flight.autopilot == "ArduPilot":
+        return [name for name in names if not name.startswith(_PX4_PREFIXES)]
+    return list(names)
 
 
 def _texts_before(flight: FlightLog, time_s: float) -> list[str]:

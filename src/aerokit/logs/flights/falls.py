@@ -23,6 +23,10 @@ _FALL_SINK_M_S = 6.0
 _IMPACT_S = 0.6
 _SAME_HEIGHT_M = 1.5
 _DISARM_TIMEOUT_S = 30.0
+# Disarming and texts up to this long before a descent may explain it, and texts up to this long after its end.
+_REASON_BEFORE_S, _TEXT_AFTER_S = 3.0, 5.0
+# Disarming later than this before the end of a descent may be caused by the impact.
+_IMPACT_DISARM_S = 0.3
 _NEAR_HOME_HEIGHT_M = 3.0  # above this height, an armed vehicle that keeps its height may be hovering
 
 
@@ -38,8 +42,7 @@ class Fall(Snapshot):
     sink_m_s: float
     """Sink rate at the end of the descent."""
     is_hard_landing: bool
-    """True for a hard landing: the sink rate was below 6 m/s, and there are no ``reasons``.
-    """
+    """True for a hard landing: the sink rate was below 6 m/s, and there are no ``reasons``."""
     has_impact: bool
     """False if the log ends during the descent."""
     reasons: tuple[str, ...]
@@ -116,13 +119,12 @@ def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
 
 def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
     """Return the log's evidence of a fall: disarming in the air, and texts."""
-    # Disarming is a reason only if it may have caused the descent. Just before the end of the descent or later, the
-    # impact may have caused the disarming.
+    earliest_s = begin_s - _REASON_BEFORE_S
     reasons = [
         "disarmed in the air"
         for armed_s, disarmed_s in flight.armed
-        if armed_s < begin_s and begin_s - 3 <= disarmed_s <= end_s - 0.3
+        if armed_s < begin_s and earliest_s <= disarmed_s <= end_s - _IMPACT_DISARM_S
     ]
-    texts = [text for text in flight.texts if begin_s - 3 <= text.time_s <= end_s + 5]
+    texts = [text for text in flight.texts if earliest_s <= text.time_s <= end_s + _TEXT_AFTER_S]
     crash_texts = dict.fromkeys(item.text for item in evidence_in_texts(texts) if item.kind in CRASH_KINDS)
     return reasons + list(crash_texts)[:3]  # three texts are enough

@@ -258,7 +258,7 @@ class FlightLog:
     mission: list[Waypoint] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     """Problems of the log, and known reasons for missing data."""
-    _latest: dict[str, float] = field(default_factory=dict, repr=False)
+    _latest_parameters: dict[str, float] = field(default_factory=dict, repr=False)
 
     @property
     def duration_s(self) -> float:
@@ -310,11 +310,12 @@ class FlightLog:
 
     def set_armed(self, time_s: float, armed: bool) -> None:
         """Record the arming state. A span ends at infinity until the vehicle is disarmed."""
-        is_open = bool(self.armed) and math.isinf(self.armed[-1][1])
+        begin_s, end_s = self.armed[-1] if self.armed else (0.0, 0.0)
+        is_open = math.isinf(end_s)
         if armed and not is_open:
             self.armed.append((time_s, math.inf))
         elif not armed and is_open:
-            self.armed[-1] = (self.armed[-1][0], time_s)
+            self.armed[-1] = (begin_s, time_s)
 
     def set_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
         """Record home until shortly after the first arming. ArduPilot moves home with a disarmed vehicle."""
@@ -327,8 +328,8 @@ class FlightLog:
 
     def set_parameter(self, time_s: float, name: str, value: float) -> None:
         """Record a parameter's value: its first value, or a change."""
-        before = self._latest.get(name)
-        self._latest[name] = value
+        before = self._latest_parameters.get(name)
+        self._latest_parameters[name] = value
         if name not in self.parameters:
             self.parameters[name] = value
             return

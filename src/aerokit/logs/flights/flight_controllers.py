@@ -73,6 +73,8 @@ States = tuple[tuple[str, Any], ...]
 class _RowReader(LogReader):
     """Base class of readers whose records have named fields."""
 
+    _skipped = 0  # the number of damaged rows
+
     def columns(self, entry: LogRecord) -> list[TableColumn]:
         """Return the columns of a table from its first record, with units if the log has them."""
         return [
@@ -83,12 +85,11 @@ class _RowReader(LogReader):
     def _unit(self, table: str, field: str) -> str:
         return ""
 
-    _skipped = 0
-
     def _is_plausible_time(self, unix_s: float) -> bool:
         """Return True if a row's time is possible. If it is not, count the row as damaged."""
         is_plausible = 0 <= unix_s < _MAX_UNIX_S
-        self._skipped += not is_plausible
+        if not is_plausible:
+            self._skipped += 1
         return is_plausible
 
     def _note_skipped(self) -> None:
@@ -214,6 +215,8 @@ class _BinText(Snapshot):
 
 
 class _Mode:
+    """A flight mode of a ``.bin``, as the state ``mode``."""
+
     def __init__(self, name: str, number: int) -> None:
         self.name, self.custom_mode = str(name), int(number)
 
@@ -272,6 +275,8 @@ def _texts(log: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
 
 
 class _Px4States:
+    """Derives aerokit's states from the rows of PX4's topics."""
+
     def __init__(self) -> None:
         self._home_amsl_m: float | None = None
 

@@ -35,7 +35,7 @@ _FIRMWARES = {
 }
 _ARMED, _DISARMED = 10, 11  # events (EV) that old logs have instead of ARM
 _HOME = 1
-# A position closer to 0° N 0° E means that the estimator has no position yet.
+# A position within this distance of 0° N 0° E is not real: the estimator has no position yet.
 _NULL_ISLAND_DEG = 0.01
 _INDEXING_SHARE = 0.3  # part of the progress that indexing the rows counts for
 
@@ -119,7 +119,8 @@ class _Tables:
 
     def _first_time(self) -> int:
         """Return the time of the first row in the file, which may be in any table."""
-        reader, first_rows = self._reader, []  # offset and time of the first row of each table
+        reader = self._reader
+        first_rows = []  # offset and time of the first row of each table
         for number in reader.name_to_id.values():
             offsets = reader.offsets[number]
             if not len(offsets) or "TimeUS" not in reader.formats[number].columns:
@@ -171,6 +172,8 @@ def _wrapped(angles: Sequence[float]) -> list[float]:
 
 
 class _Reader:
+    """Fills a flight with the content of the tables."""
+
     def __init__(self, flight: FlightLog, tables: _Tables) -> None:
         self._flight, self._tables = flight, tables
 
@@ -260,7 +263,7 @@ class _Reader:
         table = next((table for table in ("XKF1", "NKF1") if self._tables.has(table, "VN", "VE", "VD")), "XKF1")
         core_columns = ("C",) if self._tables.has(table, "C") else ()
         for time_s, north, east, down, *core in self._tables.rows(table, "VN", "VE", "VD", *core_columns):
-            if not core or core[0] == 0:  # the first of several estimators
+            if core in ([], [0]):  # one estimator, or the first of several
                 self._flight.velocity.add(time_s, north, east, down)
 
     def _attitude(self) -> None:
@@ -276,7 +279,8 @@ class _Reader:
         if origin is not None:
             plane = TangentPlane(*origin)
             for (time, north_m, north_m_s), (_, east_m, east_m_s) in zip(north_rows, east_rows):  # noqa: B905 - one may be cut off at the end
-                self._flight.position_target.add(time, *plane.degrees(north_m, east_m), NAN, NAN)
+                latitude, longitude = plane.degrees(north_m, east_m)
+                self._flight.position_target.add(time, latitude, longitude, NAN, NAN)  # _add_heights() adds altitudes
                 self._flight.velocity_target.add(time, north_m_s, east_m_s, NAN)
         self._add_heights(self._tables.rows("CTUN", "DAlt"))
 
@@ -325,14 +329,16 @@ class _Reader:
                 self._flight.vibration.add(time, x, y, z, clips)
 
     def _estimator(self) -> None:
-        has_cores = self._tables.has("XKF4", "C", "PI")
         columns = ("SV", "SP", "SH", "SM", "SVT")
         table = "XKF4" if self._tables.has("XKF4", "SV") else "NKF4"
-        for time_s, *values in self._tables.rows(table, *columns, *(("C", "PI") if has_cores else ())):
-            ratios, core_and_primary = values[:5], values[5:]
-            # With several estimators, each row belongs to one of them (C), and PI is the number of the primary
-            # estimator. Only rows of the primary estimator are used. A negative PI stands for 0.
-            if not has_cores or core_and_primary[0] == max(core_and_primary[1], 0):
+        if not self._tables.has("XKF4", "C", "PI"):
+            for time_s, *ratios in self._tables.rows(table, *columns):
+                self._flight.estimator.add(time_s, *ratios)
+            return
+        # Each row belongs to one of several estimators (C), and PI is the number of the primary estimator. Only rows of
+        # the primary estimator are used. A negative PI stands for 0.
+        for time_s, *ratios, core, primary in self._tables.rows(table, *columns, "C", "PI"):
+            if core == max(primary, 0):
                 self._flight.estimator.add(time_s, *ratios)
 
     def _radio(self) -> None:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 NAN = math.nan
 _U16, _E7, _METRES_PER_DEGREE = 0xFFFF, 1e7, 111_319.5
-# A position closer to 0° N 0° E means that the estimator has no position yet.
+# A position within this distance of 0° N 0° E is not real: the estimator has no position yet.
 _NULL_ISLAND_E7 = 100_000
 _HEARTBEAT_ID = b"\0\0\0"
 # Bits of a set-point's type mask. If they are set, the position, velocity or attitude is ignored.
@@ -51,6 +51,7 @@ def read_tlog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
 
 
 def _first_autopilot(flight: FlightLog, system_id: int | None) -> tuple[m.Heartbeat, Frame]:
+    """Return the first valid heartbeat of an autopilot (with this system id, unless it is None), and its frame."""
     records = 0
     for _, raw in read_tlog(flight.path):
         records += 1
@@ -74,6 +75,8 @@ def _is_valid(raw: bytes) -> bool:
 
 
 class _Reader:
+    """Fills a flight with the messages of one vehicle."""
+
     def __init__(self, flight: FlightLog, component_id: int, heartbeat: m.Heartbeat) -> None:
         self._flight = flight
         self._source = bytes((flight.system_id, component_id))
@@ -94,8 +97,8 @@ class _Reader:
         self._destinations = TimeSeries(*flight.position_target.names)
         self._link = LinkCounter(flight)
         self._mission = RecordedMission(flight)
-        # `commands` are not handled if the vehicle has sent them, because it sends them to its components. For example,
-        # PX4 informs its components when it has itself decided to return.
+        # Commands that the vehicle itself has sent are not handled, because it sends them to its components. For
+        # example, PX4 informs its components when it has decided to return.
         commands: dict[type[Message], Callable[[float, Any], None]] = {
             m.CommandLong: self._mode_commands.on_command,
             m.CommandInt: self._mode_commands.on_command,
@@ -114,7 +117,8 @@ class _Reader:
         self._handlers_of_vehicle = {_message_id_bytes(kind): handler for kind, handler in handlers.items()}
 
     def read(self, on_bytes: Callable[[int], object]) -> None:
-        # This loop is optimised, because a log has millions of messages. Most of them are not decoded.
+        # This loop is optimised, because a log has millions of messages. Most of them are not decoded: only the fields
+        # of the header are read.
         flight, source, link = self._flight, self._source, self._link
         handlers_of_vehicle, handlers_of_any_sender = self._handlers_of_vehicle, self._handlers_of_any_sender
         damaged = count = received = 0  # `received`: frames since the last call of link.count()

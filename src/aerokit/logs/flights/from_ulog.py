@@ -146,6 +146,8 @@ class _Topic:
 
 
 class _Reader:
+    """Fills a flight with the content of a log that pyulog has loaded."""
+
     def __init__(self, flight: FlightLog, log: Any) -> None:
         self._flight, self._log = flight, log
         self._data = [data for data in log.data_list if len(data.data.get("timestamp", ()))]

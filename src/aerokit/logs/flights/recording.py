@@ -49,7 +49,7 @@ class LinkCounter:
 
     def __init__(self, flight: FlightLog) -> None:
         self._series, self._silences = flight.link, flight.silences
-        self._second = 0
+        self._second = 0  # the second that is being counted
         self._received = self._lost = 0
 
     def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
@@ -71,22 +71,26 @@ class LinkCounter:
         self._lost += missing
         return self._second + 1
 
-    def add_silence(self, begins_s: float, ends_s: float, others: int) -> None:
-        """Record a silence of the vehicle. ``others`` is the number of messages of other systems during the silence."""
-        self._silences.append(Silence(begins_s, ends_s, others > 0))
+    def add_silence(self, begins_s: float, ends_s: float, other_messages: int) -> None:
+        """Record a silence of the vehicle, in which this many messages of other systems were received."""
+        self._silences.append(Silence(begins_s, ends_s, is_recorded=other_messages > 0))
 
-    def end(self, received: int, received_s: float, ends_s: float, others: int) -> None:
-        """Count the last frames of the log. A silence until the end of the log is also recorded as 100 % loss."""
+    def end(self, received: int, received_s: float, ends_s: float, other_messages: int) -> None:
+        """Count the last frames of the log, the last of which arrived at ``received_s``.
+
+        A silence until the end of the log is also recorded as 100 % loss.
+        """
         self._received += received
         if ends_s - received_s < MIN_SILENCE_S:
             self._add_row(self._second + 1)
             return
-        self.add_silence(received_s, ends_s, others)
+        self.add_silence(received_s, ends_s, other_messages)
         self._add_row(int(ends_s))
         if ends_s > self._second:
             self._series.add(ends_s, 100.0, 0)
 
     def _add_row(self, second: int) -> None:
+        """Add the row of the counted second, and count ``second`` from now on. No frames arrived between the two."""
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
         if second - self._second > 1:  # the first and the last second without frames

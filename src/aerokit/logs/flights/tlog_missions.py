@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 MissionMessage: TypeAlias = "m.MissionItemInt | m.MissionItem | m.MissionCount | m.FileTransferProtocol"
 
 _DEGREES_E7 = 1e7
-_PATH = PACKED_PATHS[MavMissionType.MISSION].encode()
+_MISSION_PATH = PACKED_PATHS[MavMissionType.MISSION].encode()
 _OPENING = (MavFtpOpcode.OPENFILERO, MavFtpOpcode.OPENFILEWO, MavFtpOpcode.CREATEFILE)
 _READING = (MavFtpOpcode.READFILE, MavFtpOpcode.BURSTREADFILE)
 
@@ -53,7 +53,7 @@ class RecordedMission:
             return
         ftp = FtpMessage.decode(message.payload)
         if ftp.opcode in _OPENING:
-            self._is_file_open = ftp.data.rstrip(b"\0") == _PATH
+            self._is_file_open = ftp.data.rstrip(b"\0") == _MISSION_PATH
             self._file.clear()
             self._later_blocks.clear()
         elif self._is_file_open and ftp.data and ftp.offset >= len(self._file):

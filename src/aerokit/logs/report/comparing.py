@@ -115,7 +115,8 @@ def _maps(flights: Sequence[FlightLog]) -> Section:
         rows, deviation_m = drawn_track(places)
         deviations.append(deviation_m)
         if rows:
-            north, east = ([rounded(places[row][axis]) for row in rows] for axis in (0, 1))
+            north = [rounded(north_m) for north_m, _ in (places[row] for row in rows)]
+            east = [rounded(east_m) for _, east_m in (places[row] for row in rows)]
             traces.append({"x": east, "y": north, **_line_style(number)})
     title, missing = "Tracks", "Neither log has positions."
     if not traces:
