@@ -100,7 +100,7 @@ class FaultyPath:
         self._started_at = now
 
     def carry(self, data: bytes, now: float) -> list[tuple[float, bytes]]:
-        """Return when which bytes of a write or datagram arrive, as (time, bytes), in the order of sending."""
+        """Return the frames of a write or datagram that arrive, as pairs (time, bytes), in the order of sending."""
         if self._started_at is None:
             self.start(now)
         arrivals: list[tuple[float, bytes]] = []

@@ -96,7 +96,8 @@ class Track(Sequence[TrackPoint]):
     @property
     def max_distance_m(self) -> float:
         """Maximum distance from home in metres, along the ground."""
-        return self._farthest(self.home)[0]
+        distance_m, _ = self._farthest(self.home)
+        return distance_m
 
     @property
     def modes(self) -> list[str]:
@@ -147,7 +148,8 @@ class Track(Sequence[TrackPoint]):
 
         The distance is in space if the position has an ``altitude_relative_m``, otherwise along the ground.
         """
-        return self._nearest(place)[0]
+        distance_m, _ = self._nearest(place)
+        return distance_m
 
     def assert_reached_altitude(self, altitude_m: float, *, within_m: float = 1.0) -> None:
         """Assert that the vehicle was at least ``altitude_m - within_m`` metres above home at some time."""
