@@ -182,7 +182,8 @@ class IteratorTwin(TwinOf[IteratorT], Generic[IteratorT, ItemT]):
         item_or_nothing = self._loop.run(read)
         if not item_or_nothing:
             raise StopIteration
-        return item_or_nothing[0]
+        (item,) = item_or_nothing
+        return item
 
 
 class ChangesTwin(IteratorTwin["Changes[T]", T], Generic[T]):

@@ -173,8 +173,8 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
     def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
         """Decorator: ``function(index)`` continues the mission at an item.
 
-        Requests to change the current item are refused if the function returns False or raises, or if there is no such
-        function.
+        A request to change the current item is refused if the function returns False or raises an exception. Without a
+        function, all requests are refused.
         """
         return self._loop.call(self.aio.on_set_current, function)
 

@@ -92,12 +92,14 @@ def arguments_of(arguments: ast.arguments) -> list[str]:
     positional = [*arguments.posonlyargs, *arguments.args]
     no_defaults: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults))
     # Only the last positional arguments have defaults.
-    texts = [_argument(*pair) for pair in zip(positional, [*no_defaults, *arguments.defaults])]  # noqa: B905
+    defaults = [*no_defaults, *arguments.defaults]
+    texts = [_argument(argument, default) for argument, default in zip(positional, defaults, strict=True)]
     if arguments.vararg is not None:
         texts.append("*" + _argument(arguments.vararg, None))
     elif arguments.kwonlyargs:
         texts.append("*")
-    texts += [_argument(*pair) for pair in zip(arguments.kwonlyargs, arguments.kw_defaults)]  # noqa: B905
+    for argument, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True):
+        texts.append(_argument(argument, default))
     if arguments.kwarg is not None:
         texts.append("**" + _argument(arguments.kwarg, None))
     return texts
@@ -202,9 +204,9 @@ class Page:
             return
         imports = (imports_of(module) for module in modules)
         origin = next((imported[name] for imported in imports if name in imported), (modules[0], name))
-        # If several modules export a name, it is always imported from the module that was found first. `origin[1]` is
-        # empty if the name is that of a module, which is imported itself.
-        origin = self._import_sources.setdefault(origin[1] or name, origin)
+        _, original_name = origin  # an empty string for a module, which is imported itself
+        # If several modules export a name, it is always imported from the module that was found first.
+        origin = self._import_sources.setdefault(original_name or name, origin)
         if at_run_time:
             self.at_run_time.add(origin)
         else:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 DEFAULT_SIM_ADDRESS = "tcpin:127.0.0.1:{5760+10n}"
 """Default address template of ``aerokit sim``. Its ports are those of SITL instances: 5760, 5770, 5780 …"""
+_MAX_WIND_M_S = 50.0
 _TEMPLATE_FIELD = re.compile(r"\{(?:(\d{1,5})\+)?(\d{0,3})(n|id)\}")
 
 
@@ -129,10 +130,12 @@ def wind(text: str) -> tuple[float, ...]:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = ()
-    are_gusts_positive = min(values[2:], default=0) >= 0
-    is_in_range = all(abs(value) <= 50 for value in values) and are_gusts_positive
+    gusts = values[2:]  # empty, or one value
+    is_in_range = all(abs(value) <= _MAX_WIND_M_S for value in values) and all(gust >= 0 for gust in gusts)
     if len(values) not in (2, 3) or not is_in_range:
-        raise ArgumentTypeError(f"{text!r} is not NORTH,EAST or NORTH,EAST,GUSTS with numbers in m/s up to 50")
+        raise ArgumentTypeError(
+            f"{text!r} is not NORTH,EAST or NORTH,EAST,GUSTS with numbers in m/s up to {_MAX_WIND_M_S:g}"
+        )
     return values
 
 

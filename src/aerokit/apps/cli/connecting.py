@@ -295,11 +295,11 @@ async def await_vehicle(connection: Connection, options: argparse.Namespace, pat
 
 
 def _simulator_hint(connection: Connection) -> str:
-    """Return a hint on how to start a simulated vehicle for a link that listens and received nothing, else ""."""
-    place = connection.link.address.replace("0.0.0.0", "127.0.0.1")
-    if not place.startswith("udpin:127.0.0.1:") or any(peer.bytes for peer in connection.statistics()):
+    """Return a hint on how to simulate a vehicle, if the link is a UDP port that has received nothing, else ""."""
+    link_address = connection.link.address.replace("0.0.0.0", "127.0.0.1")
+    if not link_address.startswith("udpin:127.0.0.1:") or any(peer.bytes for peer in connection.statistics()):
         return ""
-    return f" (to simulate one, in another terminal: aerokit sim {place.replace('udpin', 'udpout')})"
+    return f" (to simulate one, in another terminal: aerokit sim {link_address.replace('udpin', 'udpout')})"
 
 
 async def await_end(connection: Connection, seconds: float | None, work: asyncio.Task[None] | None = None) -> bool:

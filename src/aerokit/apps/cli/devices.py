@@ -118,7 +118,8 @@ async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -
     record = {name: value for name, value in capture.to_dict().items() if name != "received_at"}
     emit(options, "picture", record, text)
     if folder is None or not capture.success:
-        return capture.success is not False  # None counts as success: the camera has not reported the result
+        has_failed = capture.success is False  # None: the camera has not reported the result
+        return not has_failed
     name = _file_name(capture)
     if name is None:
         not_fetched = {"index": capture.index, "file": None, "bytes": None}
@@ -264,5 +265,6 @@ def _information_lines(information: GimbalInformation) -> list[str]:
     for axis in ("roll", "pitch", "yaw"):
         limits = getattr(information, f"{axis}_deg")
         if limits is not None:
-            lines.append(f"{axis:>6}  {limits[0]:.0f} to {limits[1]:.0f} degrees")
+            low, high = limits
+            lines.append(f"{axis:>6}  {low:.0f} to {high:.0f} degrees")
     return lines

@@ -219,7 +219,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
         raise InvalidArgument("aerokit monitor needs a terminal, but stdin or stdout is redirected")
     with ExitStack() as stack:
 
-        def exit_soon(signal_number: int) -> None:
+        def force_exit_later(signal_number: int) -> None:
             if signal_number == getattr(signal, "SIGHUP", None):
                 _detach_terminal()
             timer = threading.Timer(EXIT_TIMEOUT_S, os._exit, (INTERRUPTED,))
@@ -228,18 +228,18 @@ async def run_monitor(options: argparse.Namespace) -> int:
             stack.callback(timer.cancel)
 
         stack.enter_context(new_recording(options.record))
-        stack.enter_context(_kept_is_printed(options.record))
+        stack.enter_context(_printing_kept_name(options.record))
         return await run(
             options.address,
             baud=options.baud,
             signing=signing_of(options),
             record=options.record,
-            on_start=lambda app: stack.enter_context(on_interrupt(app.exit, exit_soon)),
+            on_start=lambda app: stack.enter_context(on_interrupt(app.exit, force_exit_later)),
         )
 
 
 @contextmanager
-def _kept_is_printed(path: str | None) -> Iterator[None]:
+def _printing_kept_name(path: str | None) -> Iterator[None]:
     """After the block, print the new name of an earlier recording. In the block, Textual hides log messages."""
     if path is None or not os.path.isfile(path):
         yield

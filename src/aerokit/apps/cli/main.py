@@ -178,7 +178,7 @@ class Parser(argparse.ArgumentParser):
                 self.error(problem)
         namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            self._fail_unrecognized(unknown)
+            self._exit_unrecognized(unknown)
         return namespace, unknown
 
     def _check_option_names(self, args: Sequence[str]) -> None:
@@ -188,9 +188,9 @@ class Parser(argparse.ArgumentParser):
         names = [option.partition("=")[0] for option in options if option.startswith("--")]
         for name in names:
             if name != "--connect" and not any(known.startswith(name) for known in self._option_string_actions):
-                self._fail_unrecognized([name])
+                self._exit_unrecognized([name])
 
-    def _fail_unrecognized(self, unknown: Sequence[str]) -> NoReturn:
+    def _exit_unrecognized(self, unknown: Sequence[str]) -> NoReturn:
         options = [argument for argument in unknown if argument.startswith("-")]
         hint = suggestion(options[0].partition("=")[0], self._option_string_actions) if options else ""
         self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")

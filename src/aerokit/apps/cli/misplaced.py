@@ -74,7 +74,7 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
 
 def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) -> str:
     """Return the error text if an address is before the action, as in ``aerokit params udpin:… list``."""
-    address, action, *arguments = [*words, "ACTION"] if len(words) == 1 else words
+    address, action, *arguments = words if len(words) > 1 else [*words, "ACTION"]
     actions = next(item.choices for item in parser._actions if isinstance(item, argparse._SubParsersAction))
     action_parser = actions.get(action) or next(iter(actions.values()))
     has_connect = "--connect" in action_parser._option_string_actions

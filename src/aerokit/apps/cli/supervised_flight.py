@@ -252,7 +252,7 @@ class FlightReport:
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
         """Within the block, print the vehicle's texts, mode changes and status lines."""
-        detach_all = [
+        detachments = [
             self._vehicle.position.observe(self._on_position),
             self._vehicle.armed.observe(self._on_armed),
         ]
@@ -263,7 +263,7 @@ class FlightReport:
         try:
             yield
         finally:
-            for detach in detach_all:
+            for detach in detachments:
                 detach()
             for task in tasks:
                 task.cancel()
@@ -324,7 +324,7 @@ class FlightReport:
         self._emit("flight_summary", record, "\n".join(lines))
 
     def _describe_armed(self, speed: float) -> str:
-        """Return a clause such as "armed for 47 s", with the time until an impact, and with that of a simulation."""
+        """Return a clause such as "armed for 47 s". Notes give the time until an impact, and that of a simulation."""
         notes = []
         if self._impact_s is not None:
             notes.append(f"{_duration(speed * self._impact_s)} until the impact")
@@ -369,17 +369,18 @@ class FlightReport:
             if not self.prints_status or vehicle.connection.now() - self._last_line_at < _STATUS_INTERVAL_S:
                 continue
             if vehicle.heartbeat_age > SILENT_AFTER_S:
-                height = vehicle.position.latest and vehicle.position.latest.altitude_relative_m
+                here = vehicle.position.latest
+                height = None if here is None else here.altitude_relative_m
                 last = "" if height is None else f" at {height:.1f} m"
                 seconds = self.speedup * vehicle.heartbeat_age
                 self.print_line(f"  silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}")
                 continue
-            found = Readiness((), ()) if vehicle.is_armed else readiness(vehicle)
-            if found.against_arming:
-                yet = " yet" if found.is_known else ""
-                self.print_line(f"  {found.prefix}{yet}: {'; '.join([*found.against_arming, *found.against_flight])}")
-            elif found.against_flight:
-                self.print_line(f"  {arms_but(vehicle)}: {'; '.join(found.against_flight)}")
+            state = Readiness((), ()) if vehicle.is_armed else readiness(vehicle)
+            if state.against_arming:
+                yet = " yet" if state.is_known else ""
+                self.print_line(f"  {state.prefix}{yet}: {'; '.join([*state.against_arming, *state.against_flight])}")
+            elif state.against_flight:
+                self.print_line(f"  {arms_but(vehicle)}: {'; '.join(state.against_flight)}")
             else:
                 self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
 
@@ -390,7 +391,8 @@ class FlightReport:
             return
         step_m = 0.0 if self._previous_position is None else position.distance_to(self._previous_position)
         if self._previous_position is None or step_m >= _MIN_STEP_M:
-            self._flown_m, self._previous_position = self._flown_m + step_m, position
+            self._flown_m += step_m
+            self._previous_position = position
         self._highest_m = max(self._highest_m, position.altitude_relative_m or 0.0)
         self._fastest_m_s = max(self._fastest_m_s, self._vehicle.ground_speed_m_s.latest or 0.0)
 
