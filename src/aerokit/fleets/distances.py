@@ -137,11 +137,11 @@ class DistanceMonitor:
             self._context.hold(member, f"aerokit too close {member.name}")
         self._context.publish(
             TooClose(
-                self._context.now(),
-                first.vehicle.system_id,
-                first.name,
-                second.name,
-                distance_m,
-                tuple(member.name for member in holding),
+                at=self._context.now(),
+                system_id=first.vehicle.system_id,
+                member=first.name,
+                other=second.name,
+                distance_m=distance_m,
+                ordered=tuple(member.name for member in holding),
             )
         )

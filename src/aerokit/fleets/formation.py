@@ -316,15 +316,21 @@ class Following:
             raise OperationRejected(f"the leader {self._leader.name} is {self._leader.status}")
 
     def _stop(self, reason: str, orders: Mapping[str, str], skipped: Mapping[str, str]) -> None:
+        """Record that following has stopped early, and publish it. Later calls do nothing."""
         if self._stopped.is_set():
             return
         self._reason = reason
         self._stopped.set()
-        leader = self._leader
-        event = FollowingStopped(
-            self._context.now(), leader.vehicle.system_id, leader.name, reason, dict(orders), dict(skipped)
+        self._context.publish(
+            FollowingStopped(
+                at=self._context.now(),
+                system_id=self._leader.vehicle.system_id,
+                member=self._leader.name,
+                reason=reason,
+                orders=dict(orders),
+                skipped=dict(skipped),
+            )
         )
-        self._context.publish(event)
 
     def _on_error(self, error: Exception) -> None:
         holding = dict.fromkeys((member.name for member in self._followers if member.is_available), "hold")

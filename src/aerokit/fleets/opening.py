@@ -249,7 +249,8 @@ async def find_systems(
         ConnectFailed: not enough vehicles were found in time.
     """
     searched = [name for name in networks if requested[name] is None]
-    # Maps each network to its system ids. The inner dicts serve as ordered sets.
+    # The system ids of each network: those that were requested, and those that are found. The inner dicts serve as
+    # ordered sets.
     found: dict[str, dict[int, None]] = {name: dict.fromkeys(requested[name] or ()) for name in networks}
     changed = anyio.Event()
 

@@ -202,17 +202,14 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
         if slack_s < math.inf:
             corners = _clip(corners, lambda s, t: time_difference(s, t) - slack_s)
             corners = _clip(corners, lambda s, t: -time_difference(s, t) - slack_s)
-    best: tuple[float, float, float] | None = None  # the smallest distance so far, with its s and t
+    best: Approach | None = None
     for index, corner in enumerate(corners):
         previous = corners[index - 1]  # the last corner is before the first one
         s, t = _closest_on_edge(corner, previous, difference(*corner), difference(*previous))
         distance = math.hypot(*difference(s, t))
-        if best is None or distance < best[0]:
-            best = distance, s, t
-    if best is None:
-        return None
-    distance, s, t = best
-    return Approach(distance, begin.t_s + s * duration_s, other_begin.t_s + t * other_duration_s)
+        if best is None or distance < best.distance_m:
+            best = Approach(distance, begin.t_s + s * duration_s, other_begin.t_s + t * other_duration_s)
+    return best
 
 
 def _closest_inside(

@@ -134,7 +134,7 @@ def separate_by_altitude(
         reason = f"the paths cross, and the layers would reach {highest:.0f} m, above {max_altitude_m:.0f} m"
         return Deconfliction("refused", reason, min_distance_m, conflicts)
     reason = f"{_describe_pairs(conflicts)} come too close; they cross in {len(set(layers.values()))} layers"
-    return Deconfliction("layers", reason, min_distance_m, conflicts, heights)
+    return Deconfliction("layers", reason, min_distance_m, conflicts, heights_m=heights)
 
 
 def separate_by_time(
@@ -169,7 +169,7 @@ def separate_by_time(
             delays = {route.name: delays[route.name] for route in routes}  # in the sequence of `routes` again
             max_s = max(delays.values())
             reason = f"{_describe_pairs(conflicts)} come too close; starts are delayed by up to {max_s:g} s"
-            return Deconfliction("corridors", reason, min_distance_m, conflicts, {}, delays, slack_s)
+            return Deconfliction("corridors", reason, min_distance_m, conflicts, delays_s=delays, slack_s=slack_s)
         refusal = f"{blocked_route.name} would have to wait for {blocker} longer than {max_delay_s:g} s"
         # A route waits only for routes before it in the sequence, so the next try begins with the blocked route.
         sequence = [blocked_route, *(route for route in sequence if route is not blocked_route)]

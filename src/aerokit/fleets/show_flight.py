@@ -192,11 +192,16 @@ def max_relative_error(
             point = _interpolate(samples.get(name, ()), at_s)
             if point is not None:
                 planned, _ = state_at(path, at_s)
-                errors.append((planned[0] - point[0], planned[1] - point[1], planned[2] - point[2]))
+                errors.append(_difference(planned, point))
         if len(errors) > 1:
             relative_errors = (math.dist(first, second) for first, second in combinations(errors, 2))
             largest_m = max(largest_m or 0.0, *relative_errors)
     return largest_m
+
+
+def _difference(point: LocalPoint, other: LocalPoint) -> LocalPoint:
+    """Return the vector to a point from another point."""
+    return point[0] - other[0], point[1] - other[1], point[2] - other[2]
 
 
 def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> LocalPoint | None:
@@ -260,6 +265,7 @@ class TrackRecorder:
         raise StaleValueError(f"no GLOBAL_POSITION_INT was received in the last {POSITION_MAX_AGE_S:g} s")
 
     def _on_message(self, message: GlobalPositionInt) -> None:
+        """Record a position, unless it was measured before the start of the show."""
         frame = message.received_frame
         if frame is None or frame.component_id != self._vehicle.component_id:
             return
@@ -386,6 +392,7 @@ class Shows(Travel):
         }
 
     def _check_show(self, show: Show) -> None:
+        """Raise OperationRejected if a member is unavailable, or if tracks come too close."""
         for name in show.tracks:
             member = self.members[name]
             member.refresh()
@@ -423,7 +430,7 @@ def _setpoint(path: Path, at_s: float, lead_s: float, position: LocalPoint) -> V
     _, velocity = state_at(path, at_s + lead_s)
     speed = math.hypot(*velocity)
     north, east, up = follow_velocity(
-        (planned[0] - position[0], planned[1] - position[1], planned[2] - position[2]),
+        _difference(planned, position),
         velocity,
         gain=TRACK_GAIN,
         max_speed_m_s=max(CATCH_UP_FACTOR * speed, CATCH_UP_M_S) + CATCH_UP_M_S,

@@ -81,8 +81,8 @@ class Travel(SelectionBase):
             positions,
             speed_m_s,
             timeout,
-            stagger_s,
-            separation,
+            stagger_s=stagger_s,
+            separation=separation,
             names=names,
             max_distance_m=max_distance_m,
         )
@@ -128,7 +128,9 @@ class Travel(SelectionBase):
             deconfliction = separate_by_altitude(routes, stationary, min_m, max_altitude_m=max_m)
             if by == "refuse" and deconfliction.decision == "layers":  # the paths cross
                 deconfliction = deconfliction.replace(decision="refused", heights_m={})
-        self._context.publish(PathsCompared(self._context.now(), 0, "", deconfliction))
+        self._context.publish(
+            PathsCompared(at=self._context.now(), system_id=0, member="", deconfliction=deconfliction)
+        )
         return deconfliction
 
     # --------------------------------------------------------------------------------------- private
@@ -396,7 +398,9 @@ class Missions(SelectionBase):
         )
         reason = f"{pairs} come too close" if conflicts else "no paths come too close"
         deconfliction = Deconfliction("refused" if conflicts else "clear", reason, min_m, conflicts)
-        self._context.publish(PathsCompared(self._context.now(), 0, "", deconfliction))
+        self._context.publish(
+            PathsCompared(at=self._context.now(), system_id=0, member="", deconfliction=deconfliction)
+        )
         return deconfliction
 
     def _require_available(self, missions: Mapping[str, Any]) -> dict[str, Member]:

@@ -322,7 +322,8 @@ class CameraAdapter(CameraDevice):
         move to a percentage.
         """
         if kind == CameraZoomType.STEP and math.isfinite(current_percent):
-            kind, value = CameraZoomType.RANGE, max(0.0, min(100.0, current_percent + value * _STEP_PERCENT))
+            kind = CameraZoomType.RANGE
+            value = max(0.0, min(100.0, current_percent + value * _STEP_PERCENT))
         if kind == CameraZoomType.RANGE and 0.0 <= value <= 100.0:
             move = move_to
         elif kind == CameraZoomType.CONTINUOUS and -1.0 <= value <= 1.0:

@@ -87,7 +87,8 @@ class CommandRequest:
         self._report(percent)
 
     def __repr__(self) -> str:
-        return f"<CommandRequest {command_name(self.command)} from {self.sender[0]}/{self.sender[1]}>"
+        system_id, component_id = self.sender
+        return f"<CommandRequest {command_name(self.command)} from {system_id}/{component_id}>"
 
 
 def outcome_of(value: object) -> Outcome:

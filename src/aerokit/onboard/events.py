@@ -66,6 +66,7 @@ class EventSender:
         self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
 
     def _on_request(self, request: m.RequestEvent, channel: Channel) -> None:
+        """Send requested events again; answer with an error if none of them is stored any more."""
         # Sequence numbers have 16 bits and wrap around, so `last_sequence` may be below `first_sequence`.
         count = ((request.last_sequence - request.first_sequence) & 0xFFFF) + 1
         requested = {(request.first_sequence + i) & 0xFFFF for i in range(min(count, MAX_STORED_EVENTS))}

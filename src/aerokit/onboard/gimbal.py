@@ -137,12 +137,12 @@ class GimbalAdapter(GimbalMount):
         return math.radians(self._gimbal.heading())
 
     def point(self, angles: Angles, flags: int, *, locked: bool) -> None:
-        limited = [max(low, min(high, angle)) for angle, (low, high) in zip(angles, self.limits, strict=True)]
-        if locked:
-            limited[2] = angles[2]  # A locked yaw is relative to north, but the yaw limits are relative to the nose.
-        roll, pitch, yaw = map(math.degrees, limited)
+        roll, pitch, yaw = (max(low, min(high, angle)) for angle, (low, high) in zip(angles, self.limits, strict=True))
+        if locked:  # A locked yaw is relative to north, but the yaw limits are relative to the nose.
+            _, _, yaw = angles
+        angles_deg = (math.degrees(roll), math.degrees(pitch), math.degrees(yaw))
         is_retracted = bool(flags & ManagerFlags.RETRACT)
-        target = GimbalTarget((roll, pitch, yaw), rates=None, yaw_locked=locked, is_retracted=is_retracted)
+        target = GimbalTarget(angles_deg, rates=None, yaw_locked=locked, is_retracted=is_retracted)
         self._apply(target, flags)
 
     def turn(self, rates: Angles, flags: int, *, locked: bool) -> None:

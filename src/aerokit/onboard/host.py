@@ -75,12 +75,15 @@ class ComponentHost:
         self._detachments.append(self.connection.bus.attach(message_class, on_message))
 
     def _is_addressed(self, message: Message, sender: tuple[int, int]) -> bool:
+        """Return True if this component must process a message from this sender."""
+        sender_system, _ = sender
+        if sender == (self.system_id, self.component_id) or sender_system == 0:  # System id 0 is not a valid sender.
+            return False
+        if self._accepts is not None and sender_system not in self._accepts:
+            return False
         # A message without target fields is for all systems and components (0).
-        target_system, target_component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
-        if sender == (self.system_id, self.component_id) or sender[0] == 0:  # System id 0 is not a valid sender.
-            return False
-        if self._accepts is not None and sender[0] not in self._accepts:
-            return False
+        target_system = getattr(message, "target_system", 0)
+        target_component = getattr(message, "target_component", 0)
         if target_system not in (0, self.system_id) or target_component not in (0, self.component_id):
             return False
         # A command to all components is ignored if this component does not know it: another component may execute it.
@@ -101,7 +104,9 @@ class ComponentHost:
         """Send a message to one system, or to all if ``channel`` is None. Does nothing after the connection ended."""
         if self._is_closed or not self.connection.is_open:
             return
-        to = None if channel is None else channel[0]
+        to = None
+        if channel is not None:
+            to, _ = channel
         if self._encoder is None:
             self.connection.send(message, to=to)
         else:

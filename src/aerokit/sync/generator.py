@@ -197,6 +197,7 @@ class Page:
                 self._import_name(text, modules, at_run_time)
 
     def _import_name(self, name: str, modules: tuple[str, ...], at_run_time: bool) -> None:
+        """Add the import of one name, unless the file defines it or it is built in."""
         if name in self._page_of_other_twins and self._page_of_other_twins[name] == "twins":
             self.at_run_time.add(("aerokit.sync.twins", name))
             return
@@ -376,6 +377,7 @@ def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
 
 
 def _from_lines(module: str, names: set[tuple[str, str]], indent: str) -> str:
+    """Return the ``from … import`` statements for the names of one module."""
     imported = sorted((name for name_module, name in names if name_module == module and name), key=_by_kind)
     plain_names = [name for name in imported if " as " not in name]
     # Statements are sorted by their first imported name, which is the key in `statements`. As in ruff's format, each

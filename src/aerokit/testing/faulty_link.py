@@ -278,6 +278,7 @@ class FaultyLink(Link):
         self._expired_writes += writes
 
     def _on_stalled(self, is_stalled: bool) -> None:
+        """Report to the receiver that the link stalls or is drained."""
         now, stalled_at = asyncio.get_running_loop().time(), self._stalled_at
         was_stalled = stalled_at is not None
         if self._incoming_path is None or is_stalled == was_stalled:  # Report only a change, and only while open.
@@ -391,7 +392,8 @@ class _DeliveryQueue:
             if self._timer_at <= due:
                 return
             self._timer.cancel()
-        self._timer, self._timer_at = self.loop.call_at(due, self._run), due
+        self._timer = self.loop.call_at(due, self._run)
+        self._timer_at = due
 
     def _run(self) -> None:
         self._timer = None

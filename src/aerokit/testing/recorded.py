@@ -314,6 +314,7 @@ class RecordedVehicle(SimulatedVehicle):
             self._is_on = False
 
     def _on_command(self, command: ReceivedCommand) -> int | None:
+        """Send the recorded acknowledgements of a command with their delays; return UNSUPPORTED if there are none."""
         answer = self._answer_to(command)
         if answer is None:
             return MavResult.UNSUPPORTED

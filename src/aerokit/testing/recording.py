@@ -122,6 +122,7 @@ class RecordedFlight:
         self.answers = {command: answers for command, answers in acknowledged.items() if answers}
 
     def _read_request(self, message: Message, now: float) -> None:
+        """Record a request of a client, which later answers of the vehicle refer to."""
         if isinstance(message, _COMMANDS):
             is_repetition = isinstance(message, m.CommandLong) and message.confirmation > 0
             answers = self.answers.setdefault(message.command, [])
@@ -138,6 +139,7 @@ class RecordedFlight:
             self._clearing.add(message.mission_type)
 
     def _read_answer(self, message: Message, now: float) -> None:
+        """Record a message of the vehicle that answers a request."""
         readers: dict[type[Message], Callable[..., None]] = {
             m.CommandAck: self._read_ack,
             m.ParamValue: self._read_value,

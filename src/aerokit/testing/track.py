@@ -292,14 +292,14 @@ def true_point(vehicle: SimulatedVehicle) -> TrackPoint:
     place = true_place(vehicle)
     autopilot = cast("Any", vehicle)  # A vehicle with a true position also has the attributes that are read here.
     return TrackPoint(
-        vehicle.now,
-        place.latitude_e7 * 1e-7,
-        place.longitude_e7 * 1e-7,
-        place.altitude_m - autopilot.frame.origin.altitude_m,
-        autopilot.is_armed,
-        _mode_name(vehicle),
-        math.hypot(autopilot.motion.velocity_north, autopilot.motion.velocity_east),
-        autopilot.battery.percent,
+        time_s=vehicle.now,
+        latitude_deg=place.latitude_e7 * 1e-7,
+        longitude_deg=place.longitude_e7 * 1e-7,
+        altitude_m=place.altitude_m - autopilot.frame.origin.altitude_m,
+        armed=autopilot.is_armed,
+        mode=_mode_name(vehicle),
+        speed_m_s=math.hypot(autopilot.motion.velocity_north, autopilot.motion.velocity_east),
+        battery_percent=autopilot.battery.percent,
     )
 
 

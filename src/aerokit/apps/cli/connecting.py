@@ -48,8 +48,8 @@ async def _check_only_vehicle(vehicle: Vehicle, options: argparse.Namespace) -> 
         return
     system_ids = {vehicle.system_id}
     with anyio.move_on_after(_OTHER_VEHICLES_TIMEOUT_S):
-        async for found in vehicle.connection.vehicles():
-            system_ids.add(found.system_id)
+        async for discovery in vehicle.connection.vehicles():
+            system_ids.add(discovery.system_id)
             if len(system_ids) > 1:
                 listed = ", ".join(map(str, sorted(system_ids)))
                 raise InvalidArgument(

@@ -275,8 +275,8 @@ class LinkExamination:
         for statistics in self._connection.statistics():
             unknown_messages.update(statistics.unknown_messages)
         if unknown_messages:
-            first = sorted(unknown_messages.items())[:10]
-            listed = ", ".join(f"{message_id} ({count})" for message_id, count in first)
+            first_messages = sorted(unknown_messages.items())[:10]
+            listed = ", ".join(f"{message_id} ({count})" for message_id, count in first_messages)
             yield Finding(
                 "note",
                 "dialect",

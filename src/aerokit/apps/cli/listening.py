@@ -156,6 +156,7 @@ async def run_events(options: argparse.Namespace) -> int:
 
 
 async def _print_all(connection: Connection, options: argparse.Namespace) -> None:
+    """Print the events of a connection until it ends, with a countdown before the first event."""
     unix_time_at_0 = connection.unix_time() - connection.now()
     async with AsyncExitStack() as stack:
         events = stack.enter_context(connection.subscribe(Event, capacity=_MAX_WAITING_EVENTS))

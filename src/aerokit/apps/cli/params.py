@@ -188,7 +188,8 @@ async def _set(options: argparse.Namespace) -> int:
 async def _load(options: argparse.Namespace) -> int:
     from aerokit.parameters import read_parameter_file
 
-    file_values, file_metadata = read_parameter_file(options.file), load_metadata_option(options)
+    file_values = read_parameter_file(options.file)
+    file_metadata = load_metadata_option(options)
     async with connected(options, changes=True) as vehicle:
         _check_file(file_values, await _download(vehicle, options), vehicle)
         metadata = await metadata_for_check(vehicle, file_metadata, options)

@@ -92,6 +92,7 @@ async def _serve_vehicles(uvicorn: Any, serve: Any, options: argparse.Namespace,
 
 @asynccontextmanager
 async def _connection(options: argparse.Namespace) -> AsyncIterator[Connection]:
+    """Open the connection to the vehicles or, with ``--sim``, to simulated ones."""
     from aerokit.connection.opening import open_connection
 
     async with AsyncExitStack() as stack:

@@ -328,6 +328,7 @@ def _server(vehicles: Sequence[SimulatedVehicle], addresses: Sequence[str], spee
 
 
 def _emit(server: SimulatorServer, options: argparse.Namespace) -> None:
+    """Print the addresses of the vehicles, and commands to try."""
     for address, vehicles in zip(server.addresses, server.vehicles_on, strict=True):
         record = {
             "system_ids": [vehicle.system_id for vehicle in vehicles],

@@ -113,6 +113,7 @@ class SupervisedFlight(ABC):
             raise OperationRejected(f"the vehicle was armed by another party ({now}); nothing was started")
 
     async def _arm(self) -> None:
+        """Arm the vehicle, and record this before the command is sent, because its result may remain unknown."""
         self._check_disarmed()
         self.armed_by_us = self._may_arm_late = True
         self._modes_armed_in.add(self._vehicle.mode_name)

@@ -134,6 +134,7 @@ class MqttLink(BaseLink):
         return link_open_error(self.address, error, hint)
 
     async def _connect(self) -> None:
+        """Open the socket in a thread, then wait until the broker accepts or refuses the connection."""
         mqtt = import_optional(self.address, "paho.mqtt.client", "paho-mqtt", "mqtt")
         broker, loop = self._broker, asyncio.get_running_loop()
         client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, reconnect_on_failure=False)

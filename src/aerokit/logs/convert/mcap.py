@@ -34,6 +34,7 @@ class McapWriter:
         self.written: int = 0
 
     def write(self, record: LogRecord) -> None:
+        """Write a record, and the states that it changes."""
         message, system_id = record.message, record.system_id
         if message is not None:
             message_class = STANDARD[message.ID]
@@ -58,6 +59,7 @@ class McapWriter:
         self._file.close()
 
     def _write_states(self, record: LogRecord) -> None:
+        """Write the changed states, and Foxglove's topics that depend on them: texts, location and pose."""
         system_id, unix_s = record.system_id, record.unix_s
         latest = self._latest.setdefault(system_id, {})
         for state, value in record.states:

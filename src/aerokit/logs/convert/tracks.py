@@ -37,6 +37,8 @@ def _altitude_amsl_m(waypoint: Waypoint, home_amsl_m: float | None) -> float | N
 
 
 class _Track:
+    """The positions and the mission of one vehicle."""
+
     def __init__(self) -> None:
         self.points: list[tuple[datetime, Position]] = []
         self.waypoints: dict[int, Waypoint] = {}
@@ -74,6 +76,7 @@ class _TrackWriter:
         self._path.write_text(self._text(), encoding="utf-8")
 
     def _add_item(self, record: LogRecord) -> None:
+        """Add a mission item that has a position to the vehicle that received or sent it."""
         item: Any = record.message
         if item is None or item.mission_type or item.frame not in _AMSL_FRAMES | _RELATIVE_FRAMES | _TERRAIN_FRAMES:
             return
@@ -89,10 +92,16 @@ class _TrackWriter:
         is_valid = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
         if is_valid and math.isfinite(item.z):
             self._tracks[system_id].waypoints[item.seq] = Waypoint(
-                item.seq, item.command, latitude, longitude, item.z, item.frame
+                number=item.seq,
+                command=item.command,
+                latitude_deg=latitude,
+                longitude_deg=longitude,
+                altitude_m=item.z,
+                frame=item.frame,
             )
 
     def _text(self) -> str:
+        """Return the content of the file."""
         raise NotImplementedError
 
 

@@ -214,6 +214,7 @@ def _kind_of(group: Sequence[FailsafeEvidence]) -> str:
 
 
 def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_of_kind: bool) -> Failsafe:
+    """Return the failsafe for a group of evidence, with the reaction and the facts that explain it."""
     kind, time_s = _kind_of(group), group[0].time_s
     reaction, is_sure = _reaction(flight, time_s, group)
     acted = is_sure or any(evidence.is_action for evidence in group)
@@ -224,7 +225,14 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_o
         parameters = _missing_parameters(flight, kind)
     facts += parameters
     facts += _texts_before(flight, time_s)
-    return Failsafe(time_s, kind, acted, tuple(group), reaction or "no mode change followed", tuple(facts))
+    return Failsafe(
+        time_s,
+        kind,
+        acted=acted,
+        evidence=tuple(group),
+        reaction=reaction or "no mode change followed",
+        context=tuple(facts),
+    )
 
 
 def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence]) -> tuple[str, bool]:
@@ -283,15 +291,19 @@ def distance_from_home_m(flight: FlightLog, time_s: float) -> float | None:
     return math.hypot(*plane.metres(latitude, longitude))
 
 
+# Each of the following functions describes the values that may explain a failsafe at `time_s`.
+
+
 def _battery_context(flight: FlightLog, time_s: float) -> list[str]:
     facts = []
     for number, battery in sorted(flight.batteries.items()):
-        voltage, earlier = battery.at("voltage_v", time_s), battery.at("voltage_v", time_s - 60, not_older_s=30)
+        voltage = battery.at("voltage_v", time_s)
         if math.isnan(voltage):
             continue
         text = f"{battery_name(number)}: {voltage:.2f} V"
-        if not math.isnan(earlier):
-            text += f", {earlier:.2f} V one minute before"
+        earlier_voltage = battery.at("voltage_v", time_s - 60, not_older_s=30)
+        if not math.isnan(earlier_voltage):
+            text += f", {earlier_voltage:.2f} V one minute before"
         for name, template in (
             ("current_a", "{:.1f} A"),
             ("remaining_percent", "{:.0f} % left"),
@@ -327,11 +339,12 @@ def _gps_context(flight: FlightLog, time_s: float) -> list[str]:
         if math.isnan(satellites) and math.isnan(fix_type):
             continue
         text = f"receiver {number + 1}: {satellites:.0f} satellites, fix type {fix_type:.0f}"
-        hdop, earlier = gps.at("hdop", time_s), gps.at("satellites", time_s - _BEFORE_S)
+        hdop = gps.at("hdop", time_s)
         if not math.isnan(hdop):
             text += f", HDOP {hdop:.1f}"
-        if not math.isnan(earlier):
-            text += f"; {earlier:.0f} satellites {_BEFORE_S:.0f} s before"
+        earlier_satellites = gps.at("satellites", time_s - _BEFORE_S)
+        if not math.isnan(earlier_satellites):
+            text += f"; {earlier_satellites:.0f} satellites {_BEFORE_S:.0f} s before"
         facts.append(text)
     return facts
 

@@ -78,7 +78,8 @@ def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
             continue
         if down_m_s >= _MIN_SINK_M_S:
             is_recent = time_s - last_fast_s <= _IMPACT_S
-            last_fast_s, sink_m_s = time_s, max(down_m_s, sink_m_s if is_recent else 0.0)
+            sink_m_s = max(sink_m_s, down_m_s) if is_recent else down_m_s
+            last_fast_s = time_s
         elif down_m_s < _STOPPED_M_S:
             max_stop_s = max(_IMPACT_S, 1.5 * (time_s - previous_s))  # longer if the log has few values
             if last_fast_s > begin_s and time_s - last_fast_s <= max_stop_s:
@@ -103,7 +104,15 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
     if not (is_on_ground or reasons):
         return None
     is_hard_landing = sink_m_s < _FALL_SINK_M_S and not reasons
-    return Fall(end_s, begin_s, lost_height_m, sink_m_s, is_hard_landing, has_impact, tuple(reasons))
+    return Fall(
+        time_s=end_s,
+        begins_s=begin_s,
+        height_m=lost_height_m,
+        sink_m_s=sink_m_s,
+        is_hard_landing=is_hard_landing,
+        has_impact=has_impact,
+        reasons=tuple(reasons),
+    )
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:

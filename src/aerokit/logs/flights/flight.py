@@ -323,7 +323,8 @@ class FlightLog:
         if not is_valid:  # NaN is not valid, because it fails the comparisons
             return
         home = Position(latitude_deg, longitude_deg, amsl_m if math.isfinite(amsl_m) else None)
-        if self.home is None or not self.armed or time_s <= self.armed[0][0] + _HOME_AFTER_ARMING_S:
+        first_armed_s, _ = self.armed[0] if self.armed else (math.inf, math.inf)
+        if self.home is None or time_s <= first_armed_s + _HOME_AFTER_ARMING_S:
             self.home = home
 
     def set_parameter(self, time_s: float, name: str, value: float) -> None:

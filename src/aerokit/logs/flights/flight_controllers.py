@@ -144,8 +144,11 @@ class BinReader(_RowReader):
             fields.pop("mavpackettype", None)
             if table not in ("FMT", "FMTU") and self._is_plausible_time(message._timestamp):
                 self._note_time(message._timestamp)
+                states = _ardupilot_states(table, fields, reader)
                 # A .bin contains no system and component id, so both are 1.
-                yield LogRecord(message._timestamp, 1, 1, table, fields, _ardupilot_states(table, fields, reader))
+                yield LogRecord(
+                    message._timestamp, system_id=1, component_id=1, table=table, fields=fields, states=states
+                )
         if not count:
             raise FileFormatError(f"{self.path} is not an ArduPilot log: it contains no message")
         if reader.data_len - reader.offset > _MAX_UNREADABLE_TAIL:
@@ -169,6 +172,7 @@ class BinReader(_RowReader):
 
 
 def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> States:
+    """Return the names and values of the states that a row changes."""
     decode = _ARDUPILOT.get(table)
     try:
         return () if decode is None else decode(fields, reader)
@@ -246,16 +250,23 @@ class UlogReader(_RowReader):
         self._note_time(begins_s)
         system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
         decoder = _Px4States()
-        rows = heapq.merge(*(_rows(data) for data in log.data_list), _texts(log), key=lambda row: row[0])
-        size, total = self.path.stat().st_size, sum(len(data.data["timestamp"]) for data in log.data_list)
+        rows = heapq.merge(*(_rows(data) for data in log.data_list), _texts(log), key=_time_of)
+        size = self.path.stat().st_size
+        total = sum(len(data.data["timestamp"]) for data in log.data_list)
         for count, (time_us, table, fields) in enumerate(rows):
             if count % 1024 == 0:
                 on_bytes(size * count // max(total, 1))
             unix_s = begins_s + time_us / 1e6
             if self._is_plausible_time(unix_s):
-                yield LogRecord(unix_s, system_id, 1, table, fields, decoder.states(table, fields))
+                states = decoder.states(table, fields)
+                yield LogRecord(unix_s, system_id, component_id=1, table=table, fields=fields, states=states)
         self._note_skipped()
         on_bytes(size)
+
+
+def _time_of(row: tuple[int, str, dict[str, Any]]) -> int:
+    time_us, _, _ = row
+    return time_us
 
 
 def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
@@ -268,6 +279,7 @@ def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
 
 
 def _texts(log: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    """Yield the logged texts as rows of a table, like `_rows`."""
     for text in log.logged_messages:
         # `log_level` is the character of a level of the Linux kernel ("6" is info), whose numbers are MAV_SEVERITY's.
         severity = max(0, min(7, int(text.log_level) - ord("0")))
@@ -281,6 +293,7 @@ class _Px4States:
         self._home_amsl_m: float | None = None
 
     def states(self, table: str, row: Mapping[str, Any]) -> States:
+        """Return the names and values of the states that a row changes."""
         try:
             return self._states(table, row)
         except KeyError:  # the field has another name in this version of PX4
@@ -305,7 +318,8 @@ class _Px4States:
             percent = round(remaining * 100) if math.isfinite(remaining) and remaining >= 0 else None
             current_a = _finite_or_none(row["current_a"]) if row["current_a"] >= 0 else None  # -1: unknown
             voltage_v = _finite_or_none(row["voltage_v"]) if row["voltage_v"] > 0 else None  # 0: unknown
-            return (("batteries", (Battery(0, voltage_v, current_a, percent),)),)
+            battery = Battery(id=0, voltage_v=voltage_v, current_a=current_a, remaining_percent=percent)
+            return (("batteries", (battery,)),)
         elif table == "logged_messages":
             return (("status_text", StatusText(row["severity"], clean_text(row["message"]))),)
         return ()

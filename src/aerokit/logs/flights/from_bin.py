@@ -178,6 +178,7 @@ class _Reader:
         self._flight, self._tables = flight, tables
 
     def read(self, on_share: Callable[[float], object]) -> None:
+        """Read all tables. ``on_share`` is called with the share of the work that is done, from 0 to 1."""
         flight, tables = self._flight, self._tables
         flight.autopilot = "ArduPilot"
         flight.begins_at = tables.unix_at_0 + tables.began_us / 1e6
@@ -211,7 +212,7 @@ class _Reader:
         has_reason = self._tables.has("MODE", "ModeNum", "Rsn")
         columns = ("ModeNum", "Rsn") if has_reason else ("ModeNum",)
         for time_s, mode_number, *reason_number in self._tables.rows("MODE", *columns):
-            key = reason_number[0] if has_reason else None
+            (key,) = reason_number or (None,)
             reason, failsafe, by_autopilot = MODE_REASONS.get(key, ("", None, None))
             name = modes.name_of(mode_number)
             if self._flight.add_mode(time_s, name, reason, by_autopilot) and failsafe:
@@ -238,7 +239,14 @@ class _Reader:
             _, number, command, latitude, longitude, altitude, frame = row
             if not latitude and not longitude:
                 latitude = longitude = NAN  # the item has no position
-            items[number] = Waypoint(number, command, latitude, longitude, altitude, frame)
+            items[number] = Waypoint(
+                number,
+                command,
+                latitude_deg=latitude,
+                longitude_deg=longitude,
+                altitude_m=altitude,
+                frame=frame,
+            )
         self._flight.mission = [items[number] for number in sorted(items)]
 
     def _home(self) -> None:
@@ -273,6 +281,7 @@ class _Reader:
         self._flight.attitude_target.extend(times, roll_deg=roll, pitch_deg=pitch, yaw_deg=_wrapped(yaw))
 
     def _targets(self) -> None:
+        """Read the set-points of position and velocity. The log has them relative to the estimator's origin."""
         origin = self._origin()
         north_rows = list(self._tables.rows("PSCN", "TPN", "TVN"))
         east_rows = list(self._tables.rows("PSCE", "TPE", "TVE"))
@@ -311,8 +320,10 @@ class _Reader:
         percent_columns = ("RemPct",) if self._tables.has("BAT", "RemPct") else ()
         rows = self._tables.rows("BAT", instance, "Volt", "Curr", "CurrTot", *percent_columns)
         for time_s, number, voltage, current, used, *percent in rows:
-            is_known = percent and percent[0] != _NO_PERCENT
-            self._flight.battery(number).add(time_s, voltage, current, used, percent[0] if is_known else NAN)
+            (remaining,) = percent or (_NO_PERCENT,)
+            self._flight.battery(number).add(
+                time_s, voltage, current, used, NAN if remaining == _NO_PERCENT else remaining
+            )
 
     def _gps(self) -> None:
         # GPA has the accuracy for each row of GPS. Rows belong together if time and receiver are the same.

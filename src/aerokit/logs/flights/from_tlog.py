@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots import Autopilot, autopilot_for, is_armed
@@ -117,6 +118,7 @@ class _Reader:
         self._handlers_of_vehicle = {_message_id_bytes(kind): handler for kind, handler in handlers.items()}
 
     def read(self, on_bytes: Callable[[int], object]) -> None:
+        """Read all messages of the log. ``on_bytes`` is called with the number of bytes read so far."""
         # This loop is optimised, because a log has millions of messages. Most of them are not decoded: only the fields
         # of the header are read.
         flight, source, link = self._flight, self._source, self._link
@@ -167,6 +169,7 @@ class _Reader:
         self._finish(damaged)
 
     def _finish(self, damaged: int) -> None:
+        """Complete the flight after the last message. ``damaged`` is the number of damaged messages."""
         flight = self._flight
         self._add_texts(flight.duration_s, self._texts.expire(math.inf))
         self._add_destinations()
@@ -197,10 +200,11 @@ class _Reader:
             heights = (NAN, NAN) if has_heights else (amsl, relative)
             rows.append((time, latitude, longitude, *heights))
         self._flight.position_target = merged = TimeSeries(*setpoints.names)
-        for row in sorted(rows, key=lambda row: row[0]):
+        for row in sorted(rows, key=itemgetter(0)):  # by time
             merged.add(*row)
 
     def _vehicle_handlers(self) -> dict[type[Message], Callable[[float, Any], None]]:
+        """Return the handlers of messages that count only if the vehicle itself has sent them."""
         return {
             m.Heartbeat: self._on_heartbeat,
             m.GlobalPositionInt: self._on_global_position,

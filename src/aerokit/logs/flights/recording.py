@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 NAN = math.nan
 _MAX_SEQUENCE_GAP = 200
+_ALL_LOST = (100.0, 0)  # a row of the link's time series: the percentage of lost messages, and the received ones
 MIN_SILENCE_S = 3.0
 """Minimum seconds without a message that count as a silence. Autopilots send HEARTBEAT once a second."""
 
@@ -87,15 +88,15 @@ class LinkCounter:
         self.add_silence(received_s, ends_s, other_messages)
         self._add_row(int(ends_s))
         if ends_s > self._second:
-            self._series.add(ends_s, 100.0, 0)
+            self._series.add(ends_s, *_ALL_LOST)
 
     def _add_row(self, second: int) -> None:
         """Add the row of the counted second, and count ``second`` from now on. No frames arrived between the two."""
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
         if second - self._second > 1:  # the first and the last second without frames
-            self._series.add(self._second + 1, 100.0, 0)
-            self._series.add(second - 1, 100.0, 0)
+            self._series.add(self._second + 1, *_ALL_LOST)
+            self._series.add(second - 1, *_ALL_LOST)
         self._second, self._received, self._lost = second, 0, 0
 
 
@@ -134,10 +135,10 @@ def use_simulated_time(flight: FlightLog, speed: float) -> None:
 
 
 def _all_series(flight: FlightLog) -> list[TimeSeries]:
-    parts = [getattr(flight, part.name) for part in fields(flight)]
-    return [
-        series
-        for part in parts
-        for series in (part.values() if isinstance(part, dict) else (part,))
-        if isinstance(series, TimeSeries)
-    ]
+    """Return all time series of a flight, including those of each battery and receiver."""
+    all_series: list[TimeSeries] = []
+    for field in fields(flight):
+        value = getattr(flight, field.name)
+        values = value.values() if isinstance(value, dict) else (value,)
+        all_series += [series for series in values if isinstance(series, TimeSeries)]
+    return all_series

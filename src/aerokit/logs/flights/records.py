@@ -194,6 +194,7 @@ class _VehicleStates:
             telemetry.receive(message)
         if now - self._expired_at > 1.0:
             telemetry.expire(now)  # publishes status texts whose last parts are missing
-            self._expired_at, names = now, (*names, "status_text")
+            self._expired_at = now
+            names = (*names, "status_text")
         cells = telemetry.cells
         return tuple((name, cells[name].latest) for name in names if cells[name].updated_at == now)

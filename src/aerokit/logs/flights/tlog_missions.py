@@ -86,12 +86,12 @@ class RecordedMission:
         scale = _DEGREES_E7 if isinstance(message, m.MissionItemInt) else 1.0
         has_position = bool(message.x or message.y)
         self._items[message.seq] = Waypoint(
-            message.seq,
-            message.command,
-            message.x / scale if has_position else math.nan,
-            message.y / scale if has_position else math.nan,
-            message.z,
-            message.frame,
+            number=message.seq,
+            command=message.command,
+            latitude_deg=message.x / scale if has_position else math.nan,
+            longitude_deg=message.y / scale if has_position else math.nan,
+            altitude_m=message.z,
+            frame=message.frame,
         )
 
     def _is_of_vehicle(self, message: MissionMessage) -> bool:

@@ -283,6 +283,7 @@ def rounded(value: float) -> float | None:
 
 
 def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
+    """Return a dotted line through the position set-points; an empty list if there are none."""
     target = flight.position_target
     places = [
         plane.metres(latitude, longitude)
@@ -304,6 +305,7 @@ def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any
 
 
 def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
+    """Return a dashed line through the mission items without home; an empty list if there are none."""
     items = [item for item in flight.mission if not math.isnan(item.latitude_deg) and flight.item_label(item) != "home"]
     if not items:
         return []
@@ -341,6 +343,7 @@ def _circular_fence(flight: FlightLog) -> list[dict[str, Any]]:
 
 
 def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
+    """Return markers where the vehicle was at the times of failsafes and falls."""
     events_by_legend: tuple[tuple[str, str, Sequence[Failsafe | Fall]], ...] = (
         ("failsafe", "x", failsafes(flight)),
         ("fall", "triangle-down", falls(flight)),
@@ -350,7 +353,7 @@ def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) 
         event_places, names = [], []
         for event in events:
             row = flight.track.index_at(event.time_s)
-            if row >= 0 and not math.isnan(places[row][0]):
+            if row >= 0 and not math.isnan(math.hypot(*places[row])):
                 event_places.append(places[row])
                 names.append(f"{event.title}, {clock(event.time_s)}")
         if event_places:
@@ -366,6 +369,7 @@ def _marker(
     size: int,
     texts: Sequence[str] = (),
 ) -> dict[str, Any]:
+    """Return a trace of markers. ``texts`` has a text for each place to show on hovering; by default, the name."""
     return {
         **_coordinates(places),
         "mode": "markers",

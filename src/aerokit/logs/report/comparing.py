@@ -90,7 +90,9 @@ def _first(by_number: dict[int, TimeSeries]) -> TimeSeries | None:
 
 
 def _armed_at(flight: FlightLog) -> float:
-    return flight.armed[0][0] if flight.armed else 0.0
+    """Return the time of the first arming; 0 if the vehicle was never armed."""
+    armed_s, _ = flight.armed[0] if flight.armed else (0.0, 0.0)
+    return armed_s
 
 
 def _differences(statistics: tuple[FlightStatistics, FlightStatistics]) -> Section:
