@@ -142,10 +142,5 @@ def _heartbeat(type_: int, autopilot: int) -> Heartbeat:
         if not 0 <= value <= 255:
             raise InvalidArgument(f"{name} = {value} is not allowed: it must be 0 to 255")
     return Heartbeat(
-        type_,
-        autopilot,
-        base_mode=0,
-        custom_mode=0,
-        system_status=MavState.ACTIVE,
-        mavlink_version=MAVLINK_VERSION,
+        type_, autopilot, base_mode=0, custom_mode=0, system_status=MavState.ACTIVE, mavlink_version=MAVLINK_VERSION
     )

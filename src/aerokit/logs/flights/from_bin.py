@@ -240,12 +240,7 @@ class _Reader:
             if not latitude and not longitude:
                 latitude = longitude = NAN  # the item has no position
             items[number] = Waypoint(
-                number,
-                command,
-                latitude_deg=latitude,
-                longitude_deg=longitude,
-                altitude_m=altitude,
-                frame=frame,
+                number, command, latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude, frame=frame
             )
         self._flight.mission = [items[number] for number in sorted(items)]
 
