@@ -28,7 +28,7 @@ async def print_attitudes(vehicle: aerokit.Vehicle) -> None:
 
 
 async def print_events(vehicle: aerokit.Vehicle) -> None:
-    """Print every event: modes, arming, texts, silence, reboots, slow streams, a blocked event loop."""
+    """Print every event: modes, arming, status texts, silence, reboots, slow streams, a blocked event loop."""
     with vehicle.subscribe(events.Event, capacity=100) as subscription:
         async for event in subscription:
             print(event)

@@ -185,7 +185,7 @@ class _TopicChannels:
 
     def send_again(self, topic: str) -> None:
         """Send the current value of a topic again, because a new viewer has subscribed."""
-        if not topic.endswith("/log"):  # otherwise the other viewers would get all texts again
+        if not topic.endswith("/log"):  # otherwise the other viewers would get all status texts again
             self._sent_at.pop(topic, None)  # so that `publish` sends the current value
 
     def on_message(self, message: Message) -> None:

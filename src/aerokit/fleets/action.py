@@ -120,8 +120,7 @@ class FleetAction:
         try:
             for index, member in enumerate(self._members):
                 tasks.start(
-                    partial(self._run_member, member, index * self._stagger_s),
-                    f"aerokit {self.name} {member.name}",
+                    partial(self._run_member, member, index * self._stagger_s), f"aerokit {self.name} {member.name}"
                 )
             await self._finished.wait()
         except BaseException:
@@ -147,7 +146,7 @@ class FleetAction:
         return tuple(
             member.name
             for member in self._members
-            if member.name in self._tasks and member.name not in (*self._failed, *self._stopped)
+            if member.name in self._tasks and not self._has_failed_or_stopped(member)
         )
 
     def result_so_far(self) -> FleetResult:
@@ -159,7 +158,7 @@ class FleetAction:
 
     def on_member_unavailable(self, member: Member) -> None:
         """Record that the member has failed because it was lost or taken over."""
-        if member not in self._members or member.name in (*self._failed, *self._stopped):
+        if member not in self._members or self._has_failed_or_stopped(member):
             return
         error_class = HeartbeatTimeout if member.state is MemberState.LOST else OperationRejected
         self._record_failure(member, error_class(f"{self.name}: {member.name} is {member.status}"))
@@ -177,8 +176,8 @@ class FleetAction:
             wait_s = delay_s
             while wait_s > START_TOLERANCE_S:
                 await wait_to_start(member, wait_s, self.name)
-                # After a blocked event loop, the delays of several members may end at once. Keep the distance to the
-                # last start nevertheless.
+                # After a blocked event loop, the delays of several members may end at once. Each of them then waits
+                # until `stagger_s` after the last start.
                 wait_s = self._last_start_at + self._stagger_s - self._context.now()
             self._last_start_at = self._context.now()
             if not member.is_available:
@@ -189,15 +188,18 @@ class FleetAction:
                 self._record_failure(member, error)
         except asyncio.CancelledError:
             # This class cancels the tasks of failed and stopped members. Other cancellations come from outside.
-            if member.name not in self._stopped and member.name not in self._failed:
+            if not self._has_failed_or_stopped(member):
                 raise
         else:
-            if member.name not in self._stopped and member.name not in self._failed:
+            if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
                 member.record_success()
         finally:
             del self._tasks[member.name]
             self._check_finished()
+
+    def _has_failed_or_stopped(self, member: Member) -> bool:
+        return member.name in self._failed or member.name in self._stopped
 
     async def _execute_in_time(self, member: Member) -> Any:
         if self._timeout is None:
@@ -261,8 +263,7 @@ class FleetAction:
         for member in available:
             if member.name in self._orders:
                 self._context.background.start(
-                    partial(self._send_order, member, self._orders[member.name]),
-                    f"aerokit policy {member.name}",
+                    partial(self._send_order, member, self._orders[member.name]), f"aerokit policy {member.name}"
                 )
         # The running actions are cancelled one loop iteration later, after the policy's orders have begun. By then, the
         # policy's orders have superseded the orders of the actions, so that the cancelled actions do not send a hold.
@@ -311,11 +312,8 @@ class FleetAction:
         # Only members that have finished the action get an order to hold. The others still execute the action, and its
         # cancellation makes them hold.
         for member in self._members:
-            if (
-                member.is_flown_by_program
-                and member.name in self._outcomes
-                and member.name not in (*self._failed, *self._stopped)
-            ):
+            has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
+            if has_finished and member.is_flown_by_program:
                 self._context.hold(member, f"aerokit hold {member.name}")
 
     def _check_finished(self) -> None:

@@ -98,9 +98,7 @@ class Actions(SelectionBase):
         """
         check_range("altitude_m", altitude_m, 0, 10_000, above=True)
         return await self._run(
-            "take_off",
-            lambda member: member.vehicle.take_off(altitude_m, timeout=timeout),
-            stagger_s=stagger_s,
+            "take_off", lambda member: member.vehicle.take_off(altitude_m, timeout=timeout), stagger_s=stagger_s
         )
 
     async def land(self, *, timeout: float | None = 300.0, stagger_s: float | None = None) -> FleetResult:
@@ -120,9 +118,7 @@ class Actions(SelectionBase):
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
         """
         return await self._run(
-            "return_to_launch",
-            lambda member: member.vehicle.return_to_launch(timeout=timeout),
-            stagger_s=stagger_s,
+            "return_to_launch", lambda member: member.vehicle.return_to_launch(timeout=timeout), stagger_s=stagger_s
         )
 
     async def hold(self) -> FleetResult:

@@ -67,10 +67,7 @@ class LocalOrigin:
 
     def to_local(self, position: Position, altitude_amsl_m: float) -> LocalPoint:
         north, east = geo.north_east_m(
-            self._origin.latitude_deg,
-            self._origin.longitude_deg,
-            position.latitude_deg,
-            position.longitude_deg,
+            self._origin.latitude_deg, self._origin.longitude_deg, position.latitude_deg, position.longitude_deg
         )
         return north, east, altitude_amsl_m
 

@@ -321,16 +321,8 @@ class Following:
             return
         self._reason = reason
         self._stopped.set()
-        self._context.publish(
-            FollowingStopped(
-                at=self._context.now(),
-                system_id=self._leader.vehicle.system_id,
-                member=self._leader.name,
-                reason=reason,
-                orders=dict(orders),
-                skipped=dict(skipped),
-            )
-        )
+        now, system_id, name = self._context.now(), self._leader.vehicle.system_id, self._leader.name
+        self._context.publish(FollowingStopped(now, system_id, name, reason, dict(orders), dict(skipped)))
 
     def _on_error(self, error: Exception) -> None:
         holding = dict.fromkeys((member.name for member in self._followers if member.is_available), "hold")
@@ -362,15 +354,15 @@ class Formations(Travel):
             OperationRejected: the leader is unavailable, or paths come too close. Nothing was sent.
             ValueUnknownError: the position of the leader or of a follower is unknown.
         """
-        member, followers = self._leader_and_followers(formation, leader)
-        leader_position, heading = position_of(member), member.vehicle.heading_deg.latest
+        leader_member, followers = self._leader_and_followers(formation, leader)
+        leader_position = position_of(leader_member)
+        heading = leader_member.vehicle.heading_deg.latest
         targets: dict[str, Position] = {}
         for follower in followers:
             offset = formation.offset_of(follower.name, heading)
             target = leader_position.offset(north_m=offset.north_m, east_m=offset.east_m, up_m=offset.up_m)
             if target.altitude_amsl_m is not None:
-                # The target gets no altitude above the leader's home, because the followers' homes may be at other
-                # altitudes.
+                # An altitude above the leader's home is dropped, because a follower's home may be at another altitude.
                 target = Position(target.latitude_deg, target.longitude_deg, altitude_amsl_m=target.altitude_amsl_m)
             targets[follower.name] = target
         if speed_m_s is not None:

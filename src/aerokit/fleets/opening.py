@@ -249,8 +249,8 @@ async def find_systems(
         ConnectFailed: not enough vehicles were found in time.
     """
     searched = [name for name in networks if requested[name] is None]
-    # The system ids of each network: those that were requested, and those that are found. The inner dicts serve as
-    # ordered sets.
+    # The system ids of each network: first those that were requested, then those that are found. The inner dicts serve
+    # as ordered sets.
     found: dict[str, dict[int, None]] = {name: dict.fromkeys(requested[name] or ()) for name in networks}
     changed = anyio.Event()
 
@@ -318,7 +318,7 @@ def warn_while_waiting(timeout: float, describe: Callable[[], str]) -> Iterator[
 
 
 class _BlockFailed(Exception):
-    """Raised in the ``async with`` block of each vehicle when the fleet's block has raised an exception."""
+    """Raised in each vehicle's block if the fleet's block has failed. A vehicle left flying then logs a warning."""
 
 
 class MemberConnections:

@@ -255,12 +255,10 @@ def _closest_on_edge(
     ``difference`` and ``other_difference`` are the difference vectors at the corners of the edge.
     """
     step = [q - p for p, q in zip(difference, other_difference, strict=True)]
-    length = _dot(step, step)
-    fraction = 0.0 if length == 0 else min(1.0, max(0.0, -_dot(difference, step) / length))
-    return (
-        corner[0] + fraction * (other_corner[0] - corner[0]),
-        corner[1] + fraction * (other_corner[1] - corner[1]),
-    )
+    squared_length = _dot(step, step)
+    fraction = 0.0 if squared_length == 0 else min(1.0, max(0.0, -_dot(difference, step) / squared_length))
+    (s, t), (other_s, other_t) = corner, other_corner
+    return s + fraction * (other_s - s), t + fraction * (other_t - t)
 
 
 def _dot(vector: Sequence[float], other: Sequence[float]) -> float:

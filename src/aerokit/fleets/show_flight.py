@@ -171,7 +171,7 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
             error_times_velocity += sum(e * v for e, v in zip(error, velocity, strict=True))
             velocity_squared += sum(v * v for v in velocity)
     if not errors:
-        return TrackDeviation(math.nan, math.nan, None, 0)
+        return TrackDeviation(max_m=math.nan, rms_m=math.nan, lag_s=None, samples=0)
     rms = math.sqrt(sum(error * error for error in errors) / len(errors))
     lag_s = error_times_velocity / velocity_squared if velocity_squared else None
     return TrackDeviation(max(errors), rms, lag_s, len(errors))

@@ -1,4 +1,4 @@
-"""``Travel`` and ``Missions``: flights to targets and flights of missions, whose paths are compared before."""
+"""``Travel`` and ``Missions``: flights to targets and of missions. Their paths are compared before the flight."""
 
 from __future__ import annotations
 
@@ -243,13 +243,11 @@ class Travel(SelectionBase):
     ) -> FleetResult:
         """Fly up to the layers, across, and down. A leg begins when all members have finished the leg before."""
         starts = {name: position_of(self._context.members[name], math.inf) for name in heights_m}
-        legs: tuple[dict[str, Position], ...] = (
-            {name: _at_altitude(starts[name], height) for name, height in heights_m.items()},
-            {name: _at_altitude(targets[name], height) for name, height in heights_m.items()},
-            {name: targets[name] for name in heights_m},
-        )
+        climb = {name: _at_altitude(starts[name], height) for name, height in heights_m.items()}
+        crossing = {name: _at_altitude(targets[name], height) for name, height in heights_m.items()}
+        descent = {name: targets[name] for name in heights_m}
         result: FleetResult | None = None
-        for leg in legs:
+        for leg in (climb, crossing, descent):
             missing = [name for name in leg if not self.members[name].is_available]
             if missing:  # an unavailable member may be in the way of the others, so the flight ends
                 raise OperationRejected(
@@ -362,9 +360,7 @@ class Missions(SelectionBase):
         """
         names = tuple(name for name in self._context.missions if name in self.members)
         return await self._run(
-            "mission.wait_finished",
-            lambda member: member.vehicle.mission.wait_finished(timeout=timeout),
-            names=names,
+            "mission.wait_finished", lambda member: member.vehicle.mission.wait_finished(timeout=timeout), names=names
         )
 
     def compare_missions(

@@ -159,10 +159,7 @@ class ComponentCommands:
         self.handlers.update({command: guard(handler) for command, handler in handlers.items()})
 
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function or coroutine function of the program, and wait for its result.
-
-        With ``uses_threads``, a plain function runs in a thread.
-        """
+        """Call a function of the program, in a thread if it may block (`uses_threads`), and wait for its result."""
         result = self.begin(function, *arguments)
         return await result if inspect.isawaitable(result) else result
 

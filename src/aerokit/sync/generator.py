@@ -5,9 +5,9 @@ Fleets are in ``sync/fleet_twins.py`` and components in ``sync/component_twins.p
     python -m aerokit.sync.generator            # write the files
     python -m aerokit.sync.generator --check    # compare; exit code 1 if they differ
 
-The twin of a coroutine method runs it on the loop; the twin of another method calls it there. A return value whose
-class has a twin is wrapped in it. ``originals.py`` lists the classes. Arguments, defaults and docstrings are copied;
-annotations are imported from the modules that the original class imports them from.
+The twin of a coroutine method awaits it on the loop; the twin of a plain method calls it there. If the class of a
+return value has a twin, the value is wrapped in it. ``originals.py`` lists the classes. Arguments, defaults and
+docstrings are copied; annotations are imported from the modules that the original class imports them from.
 """
 
 from __future__ import annotations
@@ -399,7 +399,8 @@ def _by_kind(name: str) -> tuple[bool, bool, str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m aerokit.sync.generator")
     parser.add_argument("--check", action="store_true", help="compare with the committed file, write nothing")
-    is_check, exit_code = parser.parse_args(arguments).check, 0
+    is_check = parser.parse_args(arguments).check
+    exit_code = 0
     for name, file in FILES.items():
         text = generate(name)
         if not is_check:

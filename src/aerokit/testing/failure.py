@@ -1,4 +1,4 @@
-"""Report on a failed test: its flights, their texts, and the paths of pictures and recordings."""
+"""Report on a failed test: its flights, their status texts, and the paths of pictures and recordings."""
 
 from __future__ import annotations
 

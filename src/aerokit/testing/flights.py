@@ -51,7 +51,7 @@ class Flight:
         self.track: Track = fleet._scheduler.tracks[number]
         """True track of the vehicle."""
         self.journal: Journal = fleet._scheduler.journals[number]
-        """Texts that the vehicle sent and messages that it received."""
+        """Status texts that the vehicle sent, and messages that it received."""
         self.faults: FaultInjector = FaultInjector(self.simulated, fleet._schedule_with)
         """Injects faults."""
         self._vehicle: aerokit.Vehicle | None = None

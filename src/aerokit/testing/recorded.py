@@ -184,24 +184,9 @@ def _item_message(item: AnyItem, seq: int, client: tuple[int, int], as_float: bo
         place = (item.x, item.y) if is_float else (item.x / scale, item.y / scale)
         return item_message_float(item_from(item), place, seq, client, item.mission_type, item.current)
     x, y = (round(item.x * scale), round(item.y * scale)) if is_float else (int(item.x), int(item.y))
-    target_system, target_component = client
-    return m.MissionItemInt(
-        target_system,
-        target_component,
-        seq,
-        item.frame,
-        item.command,
-        item.current,
-        item.autocontinue,
-        param1=item.param1,
-        param2=item.param2,
-        param3=item.param3,
-        param4=item.param4,
-        x=x,
-        y=y,
-        z=item.z,
-        mission_type=item.mission_type,
-    )
+    header = (*client, seq, item.frame, item.command, item.current, item.autocontinue)
+    params = (item.param1, item.param2, item.param3, item.param4)
+    return m.MissionItemInt(*header, *params, x, y, item.z, item.mission_type)
 
 
 _MESSAGE_REQUESTS = (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE)
@@ -329,9 +314,9 @@ class RecordedVehicle(SimulatedVehicle):
         """Return the recorded answer to a command. Equal commands get successive answers. The last answer repeats."""
         answers = self.recording.answers.get(command.command, [])
         params = (command.param1, command.param2, command.param3, command.param4)
-        # The params are compared as texts, because NaN is not equal to NaN.
+        # The params are compared by repr(), because NaN is not equal to NaN.
         candidates = [answer for answer in answers if repr(answer.params) == repr(params)]
-        # A message request matches an answer for the same message, whose id is param 1.
+        # A request for a message matches any answer for that message. Param 1 is the id of the message.
         if not candidates and command.command in _MESSAGE_REQUESTS:
             candidates = [answer for answer in answers if answer.params[:1] == params[:1]]
         elif not candidates:  # Use the answers to the same command with other params.

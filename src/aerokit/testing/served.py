@@ -41,7 +41,7 @@ class ServedFlight:
         self.track: Track = scheduler.tracks[0]
         """True track of the vehicle."""
         self.journal: Journal = scheduler.journals[0]
-        """Texts that the vehicle sent and messages that it received."""
+        """Status texts that the vehicle sent, and messages that it received."""
         self.faults: FaultInjector = FaultInjector(vehicle, lambda plan: portal.call(self._schedule_with, plan))
         """Injects faults."""
         self.recording: FlightRecording | None = recording

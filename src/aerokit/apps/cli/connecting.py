@@ -231,13 +231,7 @@ async def connect_to(
     async with AsyncExitStack() as stack:
         async with waiting(options, address, _CONNECT_TIMEOUT_S):
             vehicle = await stack.enter_async_context(
-                connect(
-                    link,
-                    system_id=options.system_id,
-                    timeout=_CONNECT_TIMEOUT_S,
-                    baud=options.baud,
-                    **connecting,
-                )
+                connect(link, system_id=options.system_id, timeout=_CONNECT_TIMEOUT_S, baud=options.baud, **connecting)
             )
         if changes:
             await _check_only_vehicle(vehicle, options)

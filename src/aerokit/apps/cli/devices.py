@@ -189,10 +189,7 @@ def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
     run = command_action("gimbal point", "pointing at pitch {pitch:g}°, yaw {yaw:g}°", _point, _gimbal)
     point = add_action(actions, "point", run, "Point the gimbal, and hold the direction.")
     point.add_argument(
-        "pitch",
-        type=number(-360, 360),
-        metavar="PITCH",
-        help="degrees from the horizon: -90 is straight down",
+        "pitch", type=number(-360, 360), metavar="PITCH", help="degrees from the horizon: -90 is straight down"
     )
     point.add_argument(
         "yaw", type=number(-360, 360), nargs="?", default=0.0, metavar="YAW", help="degrees to the right (default: 0)"

@@ -224,10 +224,7 @@ class LinkExamination:
             )
         if any(system == 0 for system, _ in self._frames):
             yield Finding(
-                "problem",
-                "ids",
-                "a sender uses system id 0, which means broadcast",
-                "give it an id from 1 to 255",
+                "problem", "ids", "a sender uses system id 0, which means broadcast", "give it an id from 1 to 255"
             )
 
     def _senders(self) -> Iterator[Finding]:

@@ -60,9 +60,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("file", type=log_file, metavar="FILE", help="flight.tlog; directly after ADDRESS")
     add_seconds(command, "stop after S seconds (at Ctrl-C)")
     command.add_argument(
-        "--as-is",
-        action="store_true",
-        help="request nothing; by default, request aerokit's usual message rates",
+        "--as-is", action="store_true", help="request nothing; by default, request aerokit's usual message rates"
     )
 
 
@@ -189,12 +187,7 @@ def _emit_event(event: Event, unix_s: float, options: argparse.Namespace) -> Non
     }
     time = datetime.fromtimestamp(unix_s, timezone.utc).astimezone()
     system = "  -" if event.system_id == 0 else f"{event.system_id:>3}"
-    emit(
-        options,
-        "event",
-        record,
-        f"{time:%H:%M:%S}.{time.microsecond // 1000:03}  {system}  {_event_text(event)}",
-    )
+    emit(options, "event", record, f"{time:%H:%M:%S}.{time.microsecond // 1000:03}  {system}  {_event_text(event)}")
 
 
 def _event_text(event: Event) -> str:

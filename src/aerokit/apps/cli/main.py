@@ -124,11 +124,7 @@ COMMANDS = (
         "Serve vehicles to the browser. The page shows map, state, missions and parameters, and sends"
         " orders; there is also an HTTP and WebSocket API. Orders need the token that is printed.",
     ),
-    CliCommand(
-        "gimbal",
-        "devices:add_gimbal_arguments",
-        "Show where a vehicle's gimbal points, and point it.",
-    ),
+    CliCommand("gimbal", "devices:add_gimbal_arguments", "Show where a vehicle's gimbal points, and point it."),
     CliCommand("bridge", "bridge", "Publish the vehicles on a link to Foxglove, zenoh or MQTT."),
     CliCommand(
         "report",
@@ -141,11 +137,7 @@ COMMANDS = (
         "flight_logs",
         "Convert a flight log (.tlog, .bin, .ulg) to MCAP for Foxglove, CSV, Parquet, GPX or KML.",
     ),
-    CliCommand(
-        "completion",
-        "completion",
-        "Print a script that completes commands, options and names in your shell.",
-    ),
+    CliCommand("completion", "completion", "Print a script that completes commands, options and names in your shell."),
 )
 
 

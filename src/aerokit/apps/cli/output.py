@@ -31,9 +31,7 @@ if TYPE_CHECKING:
 
 def add_json(command: argparse._ActionsContainer) -> None:
     command.add_argument(
-        "--json",
-        action="store_true",
-        help="print JSON, one object a line, instead of text (docs/command-line.md)",
+        "--json", action="store_true", help="print JSON, one object a line, instead of text (docs/command-line.md)"
     )
 
 

@@ -171,7 +171,7 @@ async def _set(options: argparse.Namespace) -> int:
         check_allowed(metadata, dict(options.values))  # with a file of metadata, already before connecting
     async with connected(options, changes=True) as vehicle:
         if metadata is None:
-            metadata = await metadata_for_check(vehicle, None, options)
+            metadata = await metadata_for_check(vehicle, from_file=None, options=options)
             check_allowed(metadata, dict(options.values))
         results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
         known = await _names_for_hints(vehicle, results.values())

@@ -179,10 +179,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     _add_devices(command)
     add_conditions(command)
     command.add_argument(
-        "--boot-time",
-        type=number(0, 600),
-        metavar="S",
-        help="simulated seconds until the vehicle is ready to arm",
+        "--boot-time", type=number(0, 600), metavar="S", help="simulated seconds until the vehicle is ready to arm"
     )
     add_signing_key(command, "signing key of the vehicles; ArduPilot's first port accepts unsigned messages too")
     command.add_argument(

@@ -60,7 +60,7 @@ _MIN_STEP_M = 1.0
 class SupervisedFlight(ABC):
     """Arms and flies a vehicle, and brings it to a safe state after a failure or Ctrl-C.
 
-    Never commands a vehicle that was already armed before, or whose mode another party has changed.
+    It never commands a vehicle that was armed before the flight, or that another party has put into another mode.
     """
 
     _prints_reasons = True  # False if the command prints the error with its reasons when it ends
@@ -71,7 +71,7 @@ class SupervisedFlight(ABC):
         self._on_interrupt = on_interrupt
         self.armed_by_us: bool = False
         """True once this program has sent an arm command."""
-        self._may_arm_late = False  # True if an arm command was sent whose result is unknown
+        self._may_arm_late = False  # True while the result of a sent arm command is unknown
         self._modes_armed_in: set[str] = set()
         self._has_started = False  # True once a command of this program has changed the mode after arming
 
@@ -220,7 +220,7 @@ class SupervisedFlight(ABC):
 
 
 class FlightReport:
-    """Prints the progress of a flight and the vehicle's texts, and measures the track.
+    """Prints the progress of a flight and the vehicle's status texts, and measures the track.
 
     ``speedup`` is the speed of the simulation, 1.0 for a real vehicle. Durations are in simulated time.
     """
@@ -252,7 +252,7 @@ class FlightReport:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Within the block, print the vehicle's texts, mode changes and status lines."""
+        """Within the block, print the vehicle's status texts, mode changes and status lines."""
         detachments = [
             self._vehicle.position.observe(self._on_position),
             self._vehicle.armed.observe(self._on_armed),
@@ -284,7 +284,7 @@ class FlightReport:
         is_unknown_simulation = self.speedup == 1.0 and not is_real_time(measured)
         speed = measured if is_unknown_simulation else self.speedup
         seconds = speed * (vehicle.connection.now() - self._started_at)
-        self._on_armed(None, False)  # if the vehicle is still armed, adds the time since arming
+        self._on_armed(None, is_armed=False)  # if the vehicle is still armed, adds the time since arming
         version = vehicle.version.latest
         batteries = vehicle.batteries.latest or ()
         record = {

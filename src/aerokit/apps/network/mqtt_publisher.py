@@ -177,7 +177,7 @@ class MqttLink(BaseLink):
     def _send_unsent(self) -> None:
         """Publish the buffered values until the socket accepts no more data; continue when it does."""
         client = self._client
-        # publish() may detect a lost connection, whose callback sets self._client to None.
+        # publish() may detect that the connection is lost, and call _on_disconnect(), which resets self._client.
         while self._client is not None and self._unsent and not client.want_write():
             name = next(iter(self._unsent))
             client.publish(self._broker.key_space.state(name), self._unsent.pop(name))
@@ -198,7 +198,7 @@ class MqttLink(BaseLink):
                 client.loop_read()
         except Exception as error:  # paho 2.1 raises arbitrary errors for malformed packets
             _close_socket(client)
-            self._on_disconnect(client, None, None, f"malformed MQTT packet: {error}", None)
+            self._on_connection_end(f"malformed MQTT packet: {error}")
 
     def _poll(self, client: Any) -> None:
         """Let paho send pings and detect missing answers, now and at intervals."""
@@ -210,6 +210,9 @@ class MqttLink(BaseLink):
         self._finish_connecting(f"the broker refuses: {reason}" if reason.is_failure else "")
 
     def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        self._on_connection_end(reason)
+
+    def _on_connection_end(self, reason: object) -> None:
         self._finish_connecting("the broker closed the connection")
         if self._is_accepted:
             self._lose(f"the connection to the broker has ended ({reason})")

@@ -43,10 +43,7 @@ _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=Fa
 
 
 def publisher_for(address: str) -> AbstractAsyncContextManager[Publisher]:
-    """Return the publisher for an address, to be opened by ``async with``.
-
-    For an unknown scheme, zenoh's publisher is returned, which raises an error when it is opened.
-    """
+    """Return the publisher for an address, to be entered by ``async with``. zenoh's publisher rejects other schemes."""
     scheme = address.partition(":")[0].strip().lower()
     return PUBLISHERS.get(scheme, zenoh_publisher)(address)
 

@@ -138,7 +138,7 @@ def _enum_schema(name: str) -> dict[str, Any] | None:
 
 
 def _snapshot_schema(value_type: type[Snapshot], definitions: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return the schema of a class of values, whose fields may be inherited."""
+    """Return the schema of a class of values, including its inherited fields."""
     annotations: dict[str, Any] = {}
     for base in reversed(value_type.__mro__):
         if issubclass(base, Snapshot) and base is not Snapshot:

@@ -105,7 +105,7 @@ async def discover(
     """
     check_name("fleet", fleet)
     keys: set[str] = set()
-    subscribers: list[Any] = []  # a reference, because zenoh ends a subscription whose subscriber is garbage collected
+    subscribers: list[Any] = []  # keeps the subscriber alive, because zenoh ends a garbage-collected subscription
 
     def subscribe(zenoh: Any, session: Any) -> None:
         def on_sample(sample: Any) -> None:  # runs on a zenoh thread; set.add and set.discard are atomic

@@ -126,15 +126,7 @@ def convert(
         writer = make_writer(incomplete, log_reader)
         entries, begins_at, ends_at, written = _write_records(log_reader, writer, on_bytes)
         size = _move(incomplete, target_path)
-    return Conversion(
-        target_path,
-        entries=entries,
-        written=written,
-        bytes=size,
-        begins_at=begins_at,
-        ends_at=ends_at,
-        notes=tuple(log_reader.notes),
-    )
+    return Conversion(target_path, entries, written, size, begins_at, ends_at, tuple(log_reader.notes))
 
 
 def _writer_for(target: Path, tables: str) -> Callable[[Path, LogReader], _Writer]:
@@ -149,9 +141,7 @@ def _writer_for(target: Path, tables: str) -> Callable[[Path, LogReader], _Write
 
 
 def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], object]) -> tuple[int, float, float, int]:
-    """Write all records of a log. Return their number, their first and last time, and the number of written messages,
-    rows or points.
-    """
+    """Write all records of a log. Return their number, their first and last time, and the writer's ``written``."""
     entries, begins_at, ends_at = 0, 0.0, 0.0
     try:
         for entry in log.entries(on_bytes):

@@ -92,12 +92,7 @@ class _TrackWriter:
         is_valid = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
         if is_valid and math.isfinite(item.z):
             self._tracks[system_id].waypoints[item.seq] = Waypoint(
-                number=item.seq,
-                command=item.command,
-                latitude_deg=latitude,
-                longitude_deg=longitude,
-                altitude_m=item.z,
-                frame=item.frame,
+                item.seq, item.command, latitude, longitude, altitude_m=item.z, frame=item.frame
             )
 
     def _text(self) -> str:

@@ -99,17 +99,12 @@ def read_flight(
 
 def _complete(flight: FlightLog) -> None:
     """Complete the flight once the whole log is read: end open time spans, and compute home, heights and failsafes."""
-    is_armed_at_end = False
-    if flight.armed:
-        armed_s, disarmed_s = flight.armed[-1]
-        is_armed_at_end = math.isinf(disarmed_s)
-        if is_armed_at_end:
-            flight.armed[-1] = (armed_s, flight.duration_s)
+    _, last_disarmed_s = flight.armed[-1] if flight.armed else (0.0, 0.0)
+    is_armed_at_end = math.isinf(last_disarmed_s)
+    flight.set_armed(flight.duration_s, armed=False)  # ends an open span
     if flight.home is None and len(flight.track):  # use the position at the first arming, or else the first position
-        row = 0
-        if flight.armed:
-            first_armed_s, _ = flight.armed[0]
-            row = max(flight.track.index_at(first_armed_s), 0)
+        first_armed_s, _ = flight.armed[0] if flight.armed else (-math.inf, -math.inf)
+        row = max(flight.track.index_at(first_armed_s), 0)
         columns = ("latitude_deg", "longitude_deg", "altitude_amsl_m")
         flight.set_home(flight.track.times[row], *(flight.track[name][row] for name in columns))
     _complete_altitudes(flight)

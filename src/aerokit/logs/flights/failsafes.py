@@ -1,4 +1,4 @@
-"""Detects failsafes of a flight from texts, modes, errors and flags, and collects the values before each of them."""
+"""Detects failsafes of a flight by status texts, modes, errors and flags, and collects the values before each."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ _GENERAL_GAP_S = 3.0
 # The same for failsafes with a delayed reaction. Without satellites, autopilots continue with dead reckoning for some
 # seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
 _DELAYED_REACTION_GAP_S = 10.0
-_REACTION_TIMEOUT_S = 12.0
+# A reaction is a mode change or disarming within these times after the last evidence.
+_REACTION_TIMEOUT_S, _DISARMING_TIMEOUT_S = 12.0, 3.0
 # The reaction may be logged this long before the first evidence of the failsafe.
 _EARLY_MODE_CHANGE_S, _EARLY_DISARMING_S = 2.5, 0.5
 # Evidence counts from this long before arming until this long after disarming.
@@ -141,7 +142,7 @@ _LIMIT_PARAMETERS: dict[str, tuple[str, ...]] = {
 
 
 def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
-    """Return the evidence of failsafes that the vehicle's texts contain."""
+    """Return the evidence of failsafes that status texts contain."""
     evidence = []
     for text in texts:
         if _NO_EVIDENCE_PATTERN.search(text.text) is None:
@@ -225,14 +226,7 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_o
         parameters = _missing_parameters(flight, kind)
     facts += parameters
     facts += _texts_before(flight, time_s)
-    return Failsafe(
-        time_s,
-        kind,
-        acted=acted,
-        evidence=tuple(group),
-        reaction=reaction or "no mode change followed",
-        context=tuple(facts),
-    )
+    return Failsafe(time_s, kind, acted, tuple(group), reaction or "no mode change followed", tuple(facts))
 
 
 def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence]) -> tuple[str, bool]:
@@ -252,7 +246,8 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
                 is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
                 cause = "" if is_sure else "; cause not logged"
                 return _mode_change_text(change, previous_mode, time_s) + cause, is_sure
-    disarmed_s = next((end for _, end in flight.armed if time_s - _EARLY_DISARMING_S <= end <= last_s + 3), None)
+    until_s = last_s + _DISARMING_TIMEOUT_S
+    disarmed_s = next((end for _, end in flight.armed if time_s - _EARLY_DISARMING_S <= end <= until_s), None)
     if disarmed_s is not None and disarmed_s < flight.duration_s:
         is_sure = _kind_of(group) in CRASH_KINDS
         cause = "" if is_sure else "; cause not logged"

@@ -1,4 +1,4 @@
-"""Detects the falls and hard landings of a flight from heights, sink rates and the autopilot's texts."""
+"""Detects the falls and hard landings of a flight by heights, sink rates and status texts."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Fall(Snapshot):
     has_impact: bool
     """False if the log ends during the descent."""
     reasons: tuple[str, ...]
-    """Evidence of a fall: disarming in the air, and texts that report a crash, a motor failure or a termination."""
+    """Evidence of a fall: disarming in the air, and status texts about a crash, a motor failure or a termination."""
 
     @property
     def title(self) -> str:
@@ -104,15 +104,7 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
     if not (is_on_ground or reasons):
         return None
     is_hard_landing = sink_m_s < _FALL_SINK_M_S and not reasons
-    return Fall(
-        time_s=end_s,
-        begins_s=begin_s,
-        height_m=lost_height_m,
-        sink_m_s=sink_m_s,
-        is_hard_landing=is_hard_landing,
-        has_impact=has_impact,
-        reasons=tuple(reasons),
-    )
+    return Fall(end_s, begin_s, lost_height_m, sink_m_s, is_hard_landing, has_impact, tuple(reasons))
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
@@ -127,7 +119,7 @@ def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
 
 
 def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
-    """Return the log's evidence of a fall: disarming in the air, and texts."""
+    """Return the log's evidence of a fall: disarming in the air, and status texts."""
     earliest_s = begin_s - _REASON_BEFORE_S
     reasons = [
         "disarmed in the air"

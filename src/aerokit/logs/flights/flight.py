@@ -117,7 +117,7 @@ class TangentPlane:
 
 
 def battery_name(number: int) -> str:
-    """Return the name of a battery to display. Names count from 1, as ArduPilot's texts and parameters do."""
+    """Return the name of a battery to display. Names count from 1, as ArduPilot's status texts and parameters do."""
     return f"battery {number + 1}"
 
 
@@ -192,7 +192,7 @@ class FailsafeEvidence(Snapshot):
 class FlightLog:
     """One flight: time series and lists. Times are seconds since ``begins_at``.
 
-    Series, lists and texts that the log does not contain are empty.
+    What the log does not contain is an empty series, list or string.
     """
 
     path: Path
@@ -202,8 +202,8 @@ class FlightLog:
     ends_at: float = 0.0
     """UTC of the last entry, in seconds since 1970."""
     speed: float = 1.0
-    """Simulated seconds for each recorded second: not 1 only in a ``.tlog`` of a simulation that is not in real time.
-    All times of the flight are then in simulated seconds.
+    """Simulated seconds for each recorded second. It differs from 1 only in a ``.tlog`` of a simulation that did not
+    run in real time. All times of the flight are then in simulated seconds.
     """
     vehicle: str = ""
     """Firmware and its version, if known: ``"ArduCopter V4.5.7"``."""

@@ -281,7 +281,7 @@ def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
 def _texts(log: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
     """Yield the logged texts as rows of a table, like `_rows`."""
     for text in log.logged_messages:
-        # `log_level` is the character of a level of the Linux kernel ("6" is info), whose numbers are MAV_SEVERITY's.
+        # `log_level` is a digit: "6" is info. The Linux kernel's levels and MAV_SEVERITY have the same numbers.
         severity = max(0, min(7, int(text.log_level) - ord("0")))
         yield text.timestamp, "logged_messages", {"severity": severity, "message": text.message}
 

@@ -201,7 +201,7 @@ class _Reader:
     def _texts(self) -> None:
         flight = self._flight
         rows = self._tables.rows("MSG", "Message")
-        flight.texts = [LoggedText(time, None, clean_text(text)) for time, text in rows]
+        flight.texts = [LoggedText(time, severity=None, text=clean_text(text)) for time, text in rows]
         banners = (text.text for text in flight.texts if text.text.split(" ")[0] in _FIRMWARES)
         banner = next(banners, "")  # such as "ArduCopter V4.5.7 (2a3dc4b7)"
         flight.vehicle = " ".join(banner.split(" ")[:2]) or "ArduPilot"
@@ -216,9 +216,8 @@ class _Reader:
             reason, failsafe, by_autopilot = MODE_REASONS.get(key, ("", None, None))
             name = modes.name_of(mode_number)
             if self._flight.add_mode(time_s, name, reason, by_autopilot) and failsafe:
-                self._flight.failsafe_evidence.append(
-                    FailsafeEvidence(time_s, failsafe, f"mode {name}, reason: {reason} (MODE)", True)
-                )
+                text = f"mode {name}, reason: {reason} (MODE)"
+                self._flight.failsafe_evidence.append(FailsafeEvidence(time_s, failsafe, text, is_action=True))
 
     def _armed(self) -> None:
         if self._tables.has("ARM", "ArmState"):

@@ -158,14 +158,14 @@ class _Reader:
         flight, log = self._flight, self._log
         flight.autopilot = "PX4"
         flight.vehicle = _version(log)
-        utc = utc_at_boot(log)
-        flight.begins_at = utc + self._began_us / 1e6
-        flight.ends_at = utc + log.last_timestamp / 1e6
-        if not utc:
+        booted_at = utc_at_boot(log)
+        flight.begins_at = booted_at + self._began_us / 1e6
+        flight.ends_at = booted_at + log.last_timestamp / 1e6
+        if not booted_at:
             flight.notes.append("no GNSS time in the log: times count from power-on")
         flight.system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
         for text in log.logged_messages:
-            # `log_level` is the character of a level of the Linux kernel, whose numbers are those of MAV_SEVERITY.
+            # `log_level` is a digit: "6" is info. The Linux kernel's levels and MAV_SEVERITY have the same numbers.
             severity = max(0, min(7, int(text.log_level) - ord("0")))
             flight.texts.append(LoggedText(self._time(text.timestamp), severity, clean_text(str(text.message))))
         initial = [(log.start_timestamp, *item) for item in log.initial_parameters.items()]
@@ -200,7 +200,7 @@ class _Reader:
             for time_s, failsafe in status.changes("failsafe"):
                 if failsafe == 1:
                     flight.failsafe_evidence.append(
-                        FailsafeEvidence(time_s, "general", "failsafe active (vehicle_status.failsafe)", True)
+                        FailsafeEvidence(time_s, "general", "failsafe active (vehicle_status.failsafe)", is_action=True)
                     )
         self._failsafe_flags()
 
@@ -249,13 +249,7 @@ class _Reader:
             if "lat_lon_valid" in position:
                 latitude[position.array("lat_lon_valid") == 0] = NAN
                 longitude[position.array("lat_lon_valid") == 0] = NAN
-            _extend(
-                flight.track,
-                position.times,
-                latitude_deg=latitude,
-                longitude_deg=longitude,
-                altitude_amsl_m=amsl,
-            )
+            _extend(flight.track, position.times, latitude_deg=latitude, longitude_deg=longitude, altitude_amsl_m=amsl)
         else:
             self._track_of_receiver()
         local = self._topic("vehicle_local_position")

@@ -77,10 +77,7 @@ class LinkCounter:
         self._silences.append(Silence(begins_s, ends_s, is_recorded=other_messages > 0))
 
     def end(self, received: int, received_s: float, ends_s: float, other_messages: int) -> None:
-        """Count the last frames of the log, the last of which arrived at ``received_s``.
-
-        A silence until the end of the log is also recorded as 100 % loss.
-        """
+        """Count the frames up to ``received_s``. A silence from then until the end of the log counts as 100 % loss."""
         self._received += received
         if ends_s - received_s < MIN_SILENCE_S:
             self._add_row(self._second + 1)

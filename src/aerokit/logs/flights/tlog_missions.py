@@ -73,7 +73,7 @@ class RecordedMission:
             if len(self._file) < header.length:
                 return
             items = unpack_items(bytes(self._file[: header.length]), MavMissionType.MISSION)
-        except RemoteProtocolError:  # The file contains something else than a mission.
+        except RemoteProtocolError:  # The file does not contain a mission.
             self._is_file_open = False
             return
         self._is_file_open = False

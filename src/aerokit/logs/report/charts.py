@@ -243,10 +243,11 @@ def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tu
     """Return a line for each mode, and the largest distance of a point of the track from these lines."""
     times, heights = flight.track.times, flight.track["altitude_relative_m"]
     changes = flight.modes or [ModeChange(0.0, "")]
-    starts = [0, *(bisect_left(times, change.time_s) for change in changes[1:]), len(places)]
-    rows, deviation_m = drawn_track(places, keep=(row for row in starts if row < len(places)))
+    # The rows at which the modes begin, and the end of the last mode.
+    boundaries = [0, *(bisect_left(times, change.time_s) for change in changes[1:]), len(places)]
+    rows, deviation_m = drawn_track(places, keep=(row for row in boundaries if row < len(places)))
     rows_by_mode: dict[str, list[int | None]] = {}  # None interrupts the line
-    for (start, end), change in zip(pairwise(starts), changes, strict=True):
+    for (start, end), change in zip(pairwise(boundaries), changes, strict=True):
         # The line of a mode ends at the first position of the next mode, so that the track has no gaps.
         part = rows[bisect_left(rows, start) : bisect_left(rows, end) + 1] if start < end else []
         if part:
