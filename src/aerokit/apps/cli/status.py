@@ -44,7 +44,7 @@ _RELEASE_TIME_S = 0.5
 _MESSAGE_TIMEOUT_S = 0.3
 
 
-def _vehicle_record(vehicle: Vehicle, state: Readiness) -> dict[str, Any]:
+def _vehicle_record(vehicle: Vehicle, found: Readiness) -> dict[str, Any]:
     version = vehicle.version.latest
     return {
         **overview(vehicle),
@@ -52,13 +52,13 @@ def _vehicle_record(vehicle: Vehicle, state: Readiness) -> dict[str, Any]:
         "version": None if version is None else str(version),
         "mode": vehicle.mode_name,
         "armed": vehicle.armed.latest,
-        "missing": [*state.against_arming, *state.against_flight],
-        "against_arming": list(state.against_arming),
+        "missing": [*found.against_arming, *found.against_flight],
+        "against_arming": list(found.against_arming),
         **_frame_of(vehicle.connection.heartbeats.get((vehicle.system_id, vehicle.component_id))),
     }
 
 
-def _vehicle_lines(vehicle: Vehicle, state: Readiness) -> list[str]:
+def _vehicle_lines(vehicle: Vehicle, found: Readiness) -> list[str]:
     version = vehicle.version.latest
     heartbeat = vehicle.connection.heartbeats.get((vehicle.system_id, vehicle.component_id))
     frame = _frame_of(heartbeat)
@@ -75,14 +75,14 @@ def _vehicle_lines(vehicle: Vehicle, state: Readiness) -> list[str]:
         f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or _UNKNOWN}",
         f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or _UNKNOWN}",
         f"  link     {_link(vehicle, frame)}",
-        *_readiness(vehicle, state),
+        *_readiness(vehicle, found),
     ]
 
 
-def _readiness(vehicle: Vehicle, state: Readiness) -> list[str]:
-    lines = readiness_lines(vehicle, state)
+def _readiness(vehicle: Vehicle, found: Readiness) -> list[str]:
+    lines = readiness_lines(vehicle, found)
     if lines and vehicle.armed.latest:  # the checks before arming do not matter in flight
-        return _aligned("missing", [*state.against_arming, *state.against_flight])
+        return _aligned("missing", [*found.against_arming, *found.against_flight])
     if lines:
         return _aligned("arming", [text.replace("arm() changes to", "aerokit changes to") for text in lines])
     if vehicle.armed.latest:
@@ -216,16 +216,16 @@ async def run_status(options: argparse.Namespace) -> int:
         started_at = connection.now()
         await anyio.sleep(options.seconds)
         vehicles_found = dict(vehicles)  # a copy, because more vehicles may be found while reasons are requested
-        states = await asyncio.gather(*map(_readiness_of, vehicles_found.values()))
+        reasons = await asyncio.gather(*map(_readiness_of, vehicles_found.values()))
         _emit_link(connection, options, connection.now() - started_at)
-        for vehicle, state in zip(vehicles_found.values(), states, strict=True):
-            record = _vehicle_record(vehicle, state)
-            emit(options, "status", record, "\n".join(_vehicle_lines(vehicle, state)))
+        for vehicle, found in zip(vehicles_found.values(), reasons, strict=True):
+            record = _vehicle_record(vehicle, found)
+            emit(options, "status", record, "\n".join(_vehicle_lines(vehicle, found)))
         _emit_components(connection, options, vehicles_found)
         await anyio.sleep(_RELEASE_TIME_S)
     cannot_arm = any(
-        state.against_arming and state.is_known and not vehicle.is_armed
-        for vehicle, state in zip(vehicles_found.values(), states, strict=True)
+        found.against_arming and found.is_known and not vehicle.is_armed
+        for vehicle, found in zip(vehicles_found.values(), reasons, strict=True)
     )
     return FAILED if cannot_arm else DONE
 

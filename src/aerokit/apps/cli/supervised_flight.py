@@ -376,12 +376,12 @@ class FlightReport:
                 seconds = self.speedup * vehicle.heartbeat_age
                 self.print_line(f"  silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}")
                 continue
-            state = Readiness((), ()) if vehicle.is_armed else readiness(vehicle)
-            if state.against_arming:
-                yet = " yet" if state.is_known else ""
-                self.print_line(f"  {state.prefix}{yet}: {'; '.join([*state.against_arming, *state.against_flight])}")
-            elif state.against_flight:
-                self.print_line(f"  {arms_but(vehicle)}: {'; '.join(state.against_flight)}")
+            found = Readiness((), ()) if vehicle.is_armed else readiness(vehicle)
+            if found.against_arming:
+                yet = " yet" if found.is_known else ""
+                self.print_line(f"  {found.prefix}{yet}: {'; '.join([*found.against_arming, *found.against_flight])}")
+            elif found.against_flight:
+                self.print_line(f"  {arms_but(vehicle)}: {'; '.join(found.against_flight)}")
             else:
                 self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
 
