@@ -108,7 +108,7 @@ class FleetAction:
         self._last_start_at = -math.inf  # when the last member started
         self._is_applying_policy = False
         self._finished = asyncio.Event()
-        # An error that is not of aerokit, raised by a function of the program; `run` raises it at the end.
+        # An error in a function of the program, which is not an AerokitError. `run` raises it at the end.
         self.program_error: Exception | None = None
 
     async def run(self) -> FleetResult:
@@ -233,16 +233,11 @@ class FleetAction:
         others = [member for member in self._members if member.name not in self._failed]
         available = [member for member in others if member.is_available]
         failure = MemberFailure(failed.name, failed.group, self.name, error, tuple(member.name for member in available))
-        orders: dict[str, PolicyOrder]
-        try:
-            orders = self._context.rules.decide(failure)
-        except Exception as program_error:  # the program's policy function raised it; the other members hold for safety
-            self.program_error = self.program_error or program_error
-            orders = dict.fromkeys(failure.others, "hold")
+        orders = self._decide(failure)
         if not orders:
             return
         self._policy_trigger = (failed.vehicle.system_id, failed.name)
-        self._cancel([failed])
+        self._cancel_tasks_of([failed])
         skipped = {member.name: member.reason for member in others if not member.is_available}
         for member in available:
             order = orders.get(member.name)
@@ -267,16 +262,25 @@ class FleetAction:
                 )
         # The running actions are cancelled one loop iteration later, after the policy's orders have begun. By then, the
         # policy's orders have superseded the orders of the actions, so that the cancelled actions do not send a hold.
-        asyncio.get_running_loop().call_soon(self._cancel, [member for member in available if member.name in orders])
+        ordered = [member for member in available if member.name in orders]
+        asyncio.get_running_loop().call_soon(self._cancel_tasks_of, ordered)
         if not self._orders:
             self._publish_completed()
+
+    def _decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
+        """Return the policy's orders. If the program's policy function raises an error, the others hold for safety."""
+        try:
+            return self._context.rules.decide(failure)
+        except Exception as error:
+            self.program_error = self.program_error or error
+            return dict.fromkeys(failure.others, "hold")
 
     def _set_stopped(self, member: Member, failed: Member, order: PolicyOrder | None) -> None:
         order_text = f"; the policy ordered {member.name} to {order}" if order else ""
         error = OperationRejected(f"{self.name}: stopped because {failed.name} failed{order_text}")
         self._stopped[member.name] = self._outcomes[member.name] = error
 
-    def _cancel(self, members: Iterable[Member]) -> None:
+    def _cancel_tasks_of(self, members: Iterable[Member]) -> None:
         for member in members:
             task = self._tasks.get(member.name)
             if task is not None and task is not asyncio.current_task():

@@ -197,6 +197,7 @@ class ComponentCommands:
         is_cancelled = False
 
         def cancel() -> None:
+            """Cancel the handler because its sender or the end of the component requires it."""
             nonlocal is_cancelled
             if task in self._tasks_in_threads:
                 return  # The command cannot be cancelled. Its sender gets the result.
@@ -204,8 +205,8 @@ class ComponentCommands:
                 task.cancel()
             elif not is_cancelled:  # The task has not started yet.
                 is_cancelled = True
-                if inspect.iscoroutine(answer):
-                    answer.close()
+                if inspect.iscoroutine(returned):
+                    returned.close()
                 self._running.finish(started, Outcome(MavResult.CANCELLED))
 
         running = self._running.start(command, cancel)
@@ -223,12 +224,12 @@ class ComponentCommands:
         request = CommandRequest(command, report)
         try:
             values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]
-            answer = self.begin(function, request, *values)
+            returned = self.begin(function, request, *values)
         except Exception as error:
             self._finish_with_error(running, function, error)
             return
-        if not inspect.isawaitable(answer):
-            self._running.finish(running, outcome_of(answer))
+        if not inspect.isawaitable(returned):
+            self._running.finish(running, outcome_of(returned))
             return
 
         async def run() -> None:
@@ -236,16 +237,16 @@ class ComponentCommands:
             if is_cancelled:
                 return
             task = asyncio.current_task()
-            await self._finish_when_done(running, function, answer)
+            await self._finish_when_done(running, function, returned)
 
         self._tasks.start(run, f"aerokit {command_name(command.command)}")
 
     async def _finish_when_done(
-        self, running: RunningCommand, function: Callable[..., Any], answer: Awaitable[Any]
+        self, running: RunningCommand, function: Callable[..., Any], returned: Awaitable[Any]
     ) -> None:
         """Wait for the result of a handler, and acknowledge the command."""
         try:
-            outcome = outcome_of(await answer)
+            outcome = outcome_of(await returned)
         except asyncio.CancelledError:
             self._running.finish(running, Outcome(MavResult.CANCELLED))
             raise

@@ -179,7 +179,7 @@ class RecordedFlight:
             self._add_plan(item.mission_type, items, now)
 
     def _read_mission_ack(self, ack: m.MissionAck, now: float) -> None:
-        # If an upload is in progress, the acknowledgement ends the upload, and otherwise a deletion.
+        # The acknowledgement ends the upload that is in progress. Without an upload, it answers MISSION_CLEAR_ALL.
         if ack.mission_type in self._uploads:
             items = self._uploads.pop(ack.mission_type)
             self.uploads.setdefault(ack.mission_type, []).append(ack.type)

@@ -332,7 +332,7 @@ def _emit(server: SimulatorServer, options: argparse.Namespace) -> None:
             "address": address,
             "speedup": options.speedup,
         }
-        # As text, the addresses that serve the same vehicles are printed on one line.
+        # Without --json, the addresses that serve the same vehicles are printed together on one line.
         same = [other for other, others in zip(server.addresses, server.vehicles_on, strict=True) if others == vehicles]
         text = f"{_systems(vehicles)} on {' and '.join(same)}, speed {options.speedup:g}x"
         emit(options, "simulated", record, text if address == same[0] else None)

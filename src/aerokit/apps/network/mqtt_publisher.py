@@ -193,7 +193,7 @@ class MqttLink(BaseLink):
     def _read(self, client: Any, sock: Any) -> None:
         try:
             client.loop_read()
-            # TLS may hold more decrypted data, which the loop does not report, because it has left the socket.
+            # The event loop does not report data that TLS has decrypted already, because it has left the socket.
             while client.socket() is sock and isinstance(sock, ssl.SSLSocket) and sock.pending():
                 client.loop_read()
         except Exception as error:  # paho 2.1 raises arbitrary errors for malformed packets

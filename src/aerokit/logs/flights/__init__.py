@@ -145,11 +145,10 @@ def _complete_altitudes(flight: FlightLog) -> None:
             amsl_m = amsl[row]
             if math.isnan(relative_m):
                 relative[row] = amsl_m - home_amsl_m
-            # Home is not near sea level, so the altitudes above sea level and above home must differ. If they do not,
-            # the log has the same altitude in both columns.
+            # Unless home is near sea level, the two altitudes must differ. If they do not, the log has the same
+            # altitude in both columns.
             elif abs(home_amsl_m) > _SAME_ALTITUDE_M and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
-                # An altitude that is closer to home's altitude above sea level than to 0 is above sea level. Any other
-                # altitude is above home.
+                # A value near home's altitude above sea level is above sea level. A value near 0 is above home.
                 if abs(amsl_m - home_amsl_m) < abs(amsl_m):
                     relative[row] = amsl_m - home_amsl_m
                 else:
