@@ -61,8 +61,8 @@ POSITION_MAX_AGE_S = 2.0
 TIMESYNC_INTERVAL_S = 0.1
 TIMESYNC_TIMEOUT_S = 2.0
 
-# `time_boot_ms` is converted to the event loop's time with the result of TIMESYNC. If the converted time differs by more
-# than this from the time of arrival, the vehicle uses different clocks for `time_boot_ms` and TIMESYNC.
+# TIMESYNC gives the offset by which `time_boot_ms` is converted to the event loop's time. If the converted time differs
+# by more than this from the time of arrival, the vehicle uses different clocks for `time_boot_ms` and TIMESYNC.
 MAX_CLOCK_ERROR_S = 1.0
 
 
