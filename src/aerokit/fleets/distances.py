@@ -41,7 +41,7 @@ def position_of(member: Member, max_age_s: float = POSITION_MAX_AGE_S) -> Positi
 def altitude_amsl(member: Member, target: Position) -> float:
     """Return a target's altitude above sea level in metres, for this member.
 
-    A relative altitude counts from the member's home. Without an altitude, it is the member's present altitude.
+    A relative altitude counts from the member's home. A target without an altitude has the member's present altitude.
 
     Raises:
         ValueUnknownError, StaleValueError: the position of the member or of its home is unknown.

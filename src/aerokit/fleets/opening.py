@@ -127,14 +127,8 @@ async def fleet(
         )
         members += [Member(f"{name}/{vehicle.system_id}", name, vehicle) for name, vehicle in connected]
         _check_names(members)
-        context = FleetContext(
-            members,
-            networks,
-            rules,
-            now=next(iter(networks.values())).now,
-            on_error=_raise,
-            min_distance_m=min_distance_m,
-        )
+        now = next(iter(networks.values())).now
+        context = FleetContext(members, networks, rules, now=now, on_error=_raise, min_distance_m=min_distance_m)
         _assign(context, groups or {}, "group")
         _assign(context, roles or {}, "role")
         stack.push_async_callback(context.aclose)
@@ -162,7 +156,7 @@ def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[s
 
 
 def _members_of_vehicles(sources_by_name: Mapping[str, Source], networks: dict[str, Connection]) -> list[Member]:
-    """Return the members for vehicles among the sources, and add their connections to the networks."""
+    """Return a member for each vehicle object among the sources, and add the vehicles' connections to the networks."""
     members: list[Member] = []
     for name, source in sources_by_name.items():
         if isinstance(source, Vehicle):

@@ -150,7 +150,7 @@ def horizontal_distance(line: tuple[LocalPoint, LocalPoint], other: tuple[LocalP
 
 
 def _flat_leg(start: LocalPoint, end: LocalPoint) -> Leg:
-    """Return a leg between two points without their altitudes, and without times."""
+    """Return a leg between two points, with altitudes and times of 0."""
     north_m, east_m, _ = start
     end_north_m, end_east_m, _ = end
     return PathPoint(0.0, north_m, east_m, 0.0), PathPoint(0.0, end_north_m, end_east_m, 0.0)

@@ -145,7 +145,7 @@ class ShowReport(Snapshot):
     """Result of a show. Positions have times of the vehicles' own clocks, which ``clocks`` relate to each other.
 
     ``lag_spread_s`` is the difference between the largest and the smallest lag. ``max_relative_error_m`` is the largest
-    deviation between two members: of the vector from one to the other. Both are None if unknown.
+    error of a vector from one member to another. Both are None if unknown.
     """
 
     result: FleetResult
@@ -221,7 +221,7 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
 
 
 class TrackRecorder:
-    """Records the positions of a vehicle (GLOBAL_POSITION_INT) in its ``with`` block: seconds of the show, and metres.
+    """Records a vehicle's positions (GLOBAL_POSITION_INT) in its ``with`` block, in seconds and metres of the show.
 
     Times are from the vehicle's clock (``time_boot_ms``), or those of arrival if the measured offset does not fit it.
     """

@@ -48,14 +48,14 @@ class _Row:
 class ComponentParameters(Mapping[str, ParameterValue]):
     """Parameters of a component, a mapping of names to values. Other programs read and set them by MAVLink.
 
-    PARAM serves numbers, PARAM_EXT numbers and texts. A value that is out of range, of another type, or refused by
+    PARAM serves numbers, PARAM_EXT numbers and strings. A value that is out of range, of another type, or refused by
     ``on_set`` is not stored. PARAM_ERROR or PARAM_EXT_ACK then reports the reason to the sender.
     """
 
     def __init__(self, host: ComponentHost, path: Path | None, *, bytewise: bool) -> None:
         self._host, self._path = host, path
         self._rows: dict[str, _Row] = {}
-        self._small_names: list[str] = []  # names of the parameters that are not texts, which PARAM_VALUE can carry
+        self._small_names: list[str] = []  # names of the parameters that are not strings, which PARAM_VALUE can carry
         self._stored: dict[str, Any] = _read_stored(path)
         self._is_dirty = False
         self._save_task: asyncio.Task[None] | None = None

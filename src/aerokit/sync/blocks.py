@@ -113,7 +113,7 @@ TwinT = TypeVar("TwinT", bound="ConnectionTwin | VehicleTwin")
 
 
 class TwinOf(ReadOnly, Generic[AsyncT]):
-    """Blocking twin of an asynchronous object, whose methods it calls on the loop thread."""
+    """Blocking twin of an asynchronous object. It calls the object's methods on the loop thread."""
 
     def __init__(self, loop: LoopThread, aio: AsyncT) -> None:
         self._loop, self._aio = loop, aio

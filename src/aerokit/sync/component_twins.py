@@ -58,7 +58,7 @@ __all__ = [
 class ComponentParameters(TwinOf["AsyncComponentParameters"]):
     """Parameters of a component, a mapping of names to values. Other programs read and set them by MAVLink.
 
-    PARAM serves numbers, PARAM_EXT numbers and texts. A value that is out of range, of another type, or refused by
+    PARAM serves numbers, PARAM_EXT numbers and strings. A value that is out of range, of another type, or refused by
     ``on_set`` is not stored. PARAM_ERROR or PARAM_EXT_ACK then reports the reason to the sender.
     """
 

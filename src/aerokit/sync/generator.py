@@ -366,7 +366,7 @@ def _opener(page: Page, path: str) -> str:
 
 
 def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
-    """Return import statements in the order of ruff."""
+    """Return import statements in the order that ruff requires."""
     parts: list[str] = []
     for is_ours in (False, True):
         modules = {module for module, _ in names if module.startswith("aerokit") == is_ours}

@@ -48,7 +48,7 @@ class Interruption:
 
     @contextlib.contextmanager
     def on_error(self) -> Iterator[None]:
-        """Block on another thread than the main one: an exception that leaves it interrupts the main thread."""
+        """For a block on another thread: an exception that leaves the block interrupts the main thread."""
         try:
             yield
         except Exception:

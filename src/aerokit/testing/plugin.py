@@ -115,7 +115,7 @@ def dronekit_address(served_flight: ServedFlight) -> str:
 
 @pytest.fixture
 def dronekit() -> Iterator[ModuleType]:
-    """`aerokit.dronekit`, which ``import dronekit`` imports meanwhile, unless DroneKit itself was imported before."""
+    """`aerokit.dronekit`. In the test, ``import dronekit`` imports it, unless DroneKit itself was imported before."""
     import sys
 
     import aerokit.dronekit as package

@@ -49,7 +49,7 @@ class RecordedAnswer:
 
 @dataclass(frozen=True)
 class RecordedPlan:
-    """A mission, fence or list of rally points, and the time from which on the vehicle had it."""
+    """A mission, fence or list of rally points, and the time at which the vehicle got it."""
 
     since: float
     mission_type: int
@@ -57,7 +57,7 @@ class RecordedPlan:
 
 
 class RecordedFlight:
-    """Content of a recording about one vehicle. Times are seconds since the vehicle's first message, without long gaps.
+    """Content of a recording that concerns one vehicle. Times are seconds since its first message, without long gaps.
 
     If ``system_id`` is None, the vehicle is the first autopilot with a HEARTBEAT. Raises InvalidArgument if the
     recording contains no such vehicle, and OSError if the file cannot be read.

@@ -22,7 +22,7 @@ _POLL_INTERVAL_S = 0.1
 
 
 class FlightScheduler(SimulatedVehicle):
-    """Runs scheduled actions. For the server, the scheduler is a further vehicle on the links, which sends nothing.
+    """Runs scheduled actions. The server treats the scheduler as one more vehicle, which sends nothing.
 
     The actions survive a reboot of a vehicle, and are not delayed while a vehicle is frozen. Pass the scheduler to the
     server before the vehicles, because the scheduler advances the vehicles to the time of each action.

@@ -285,7 +285,7 @@ def add_conditions(command: argparse._ActionsContainer) -> None:
 
 
 def conditions(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the conditions as arguments of a simulated vehicle, which `add_conditions` has added."""
+    """Return the values of the options of `add_conditions`, as arguments of a simulated vehicle."""
     from aerokit.sim import SimulatedWind
 
     optional = {

@@ -249,7 +249,7 @@ def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[L
 
 
 def _cell(value: Any) -> Any:
-    """Convert a value for a table: bytes become hexadecimal digits, and a list becomes a text."""
+    """Convert a value for a table: bytes become hexadecimal digits, and a list becomes a string."""
     if isinstance(value, bytes):
         return value.hex()
     is_array = hasattr(value, "typecode")

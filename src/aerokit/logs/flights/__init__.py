@@ -115,7 +115,7 @@ def _complete(flight: FlightLog) -> None:
 
 
 def _armed_at_end_note(flight: FlightLog) -> str:
-    """Return a note that the log ends while the vehicle is armed, and on what is unknown for that reason."""
+    """Return a note that the log ends while the vehicle is armed, and what is therefore unknown."""
     note = "the log ends while the vehicle is armed"
     height_m = flight.track.at("altitude_relative_m", flight.duration_s, not_older_s=math.inf)
     if height_m < _FLYING_HEIGHT_M:  # False if the height is unknown (NaN)

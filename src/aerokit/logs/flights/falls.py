@@ -91,7 +91,7 @@ def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
 
 
 def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_impact: bool) -> Fall | None:
-    """Return the fall or hard landing that a descent is; None if the vehicle may have continued to fly."""
+    """Return the fall or hard landing in which a descent ends; None if the vehicle may have continued to fly."""
     begin_height_m = flight.track.at("altitude_relative_m", begin_s)
     end_height_m = flight.track.at("altitude_relative_m", end_s)
     lost_height_m = begin_height_m - end_height_m

@@ -127,7 +127,7 @@ class BinReader(_RowReader):
     _reader: Any = None
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield all records except the formats. Values are multiplied by the factors of their formats."""
+        """Yield all records except those that describe formats. Values are multiplied by the factors of the formats."""
         reader = self._reader = opened_bin(self.path)
         try:
             yield from self._rows(reader, on_bytes)

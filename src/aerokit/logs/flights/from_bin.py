@@ -57,7 +57,7 @@ def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable
 
 
 class _Tables:
-    """The tables of a log, by pymavlink's index of their rows."""
+    """Reads the tables of a log by means of pymavlink's index of their rows."""
 
     def __init__(self, reader: Any) -> None:
         self._reader = reader
@@ -155,7 +155,7 @@ def _struct_pattern(row_format: Any, indices: Sequence[int]) -> str:
 
 
 def _scaled(values: Sequence[Any], scale: float | None) -> list[Any]:
-    """Decode the texts of a column, or convert its numbers to the unit of the table."""
+    """Decode the strings of a column, or convert its numbers to the unit of the table."""
     if values and isinstance(values[0], bytes):
         return [value.split(b"\0", 1)[0].decode("utf-8", "replace") for value in values]
     if scale is None:
@@ -265,7 +265,7 @@ class _Reader:
         table = next((table for table in ("XKF1", "NKF1") if self._tables.has(table, "VN", "VE", "VD")), "XKF1")
         core_columns = ("C",) if self._tables.has(table, "C") else ()
         for time_s, north, east, down, *core in self._tables.rows(table, "VN", "VE", "VD", *core_columns):
-            if core in ([], [0]):  # one estimator, or the first of several
+            if not core or core == [0]:  # one estimator, or the first of several
                 self._flight.velocity.add(time_s, north, east, down)
 
     def _attitude(self) -> None:

@@ -156,7 +156,7 @@ class _Reader:
                     handle = handlers_of_any_sender[message_id]
                 else:
                     if message_id == _HEARTBEAT_ID:
-                        self._count_other_heartbeat(unix_s - begins_at, sender[0], raw)
+                        self._record_other_heartbeat(unix_s - begins_at, sender[0], raw)
                     continue
                 message = _decoded(raw, unix_s)
                 if message is None:
@@ -271,7 +271,7 @@ class _Reader:
             flight.failsafe_evidence.append(FailsafeEvidence(time_s, "general", text))
         self._system_status = status
 
-    def _count_other_heartbeat(self, time_s: float, system_id: int, raw: bytes) -> None:
+    def _record_other_heartbeat(self, time_s: float, system_id: int, raw: bytes) -> None:
         """Record a ground station's heartbeat, or that the log contains another vehicle."""
         vehicle_type = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]  # empty if the frame is too short
         if vehicle_type == bytes((MavType.GCS,)):

@@ -72,7 +72,7 @@ def _state(flight: FlightLog, time_s: float) -> str:
 
 
 def ground_station_failsafe(flight: FlightLog, time_s: float) -> str:
-    """Return a sentence about the vehicle's configured reaction to a lost ground station, also if it is unknown."""
+    """Return a sentence about the vehicle's configured reaction to a lost ground station, or that it is unknown."""
     firmware = next((name for name in GCS_FAILSAFE_ACTIONS if name in flight.vehicle), "")
     if not firmware:
         return "How the vehicle reacts to a lost ground station is unknown."
