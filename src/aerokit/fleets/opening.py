@@ -321,12 +321,12 @@ class MemberConnections:
     def __init__(self, timeout: float, rates: Mapping[type[Message], float] | None) -> None:
         self._timeout, self._rates = timeout, rates
         self._tasks = BackgroundTasks(self._on_error)
-        self._open: dict[int, tuple[str, Vehicle]] = {}  # by index in the list of systems
+        self._connected: dict[int, tuple[str, Vehicle]] = {}  # by index in the list of systems
         self._error: Exception | None = None
         self._changed = asyncio.Event()
         self._close = asyncio.Event()
         self._has_block_failed = False
-        self._running = 0
+        self._task_count = 0
         self._all_closed = asyncio.Event()
 
     async def open(self, systems: Sequence[tuple[str, Connection, int]]) -> list[tuple[str, Vehicle]]:
@@ -335,24 +335,21 @@ class MemberConnections:
         Returns the network and the vehicle of each system, in the same order.
         """
         for index, (network, connection, system_id) in enumerate(systems):
-            self._running += 1
+            self._task_count += 1
             self._tasks.start(partial(self._run, index, network, connection, system_id))
 
         def describe_missing() -> str:
-            names = (
-                f"{network}/{system_id}"
-                for index, (network, _, system_id) in enumerate(systems)
-                if index not in self._open
-            )
-            return f"no heartbeat of {', '.join(names)}"
+            names = [f"{network}/{system_id}" for network, _, system_id in systems]
+            missing = (name for index, name in enumerate(names) if index not in self._connected)
+            return f"no heartbeat of {', '.join(missing)}"
 
         with warn_while_waiting(self._timeout, describe_missing):
-            while len(self._open) < len(systems) and self._error is None:
+            while len(self._connected) < len(systems) and self._error is None:
                 self._changed.clear()
                 await self._changed.wait()
         if self._error is not None:
             raise self._error
-        return [self._open[index] for index in range(len(systems))]
+        return [self._connected[index] for index in range(len(systems))]
 
     async def aclose(
         self,
@@ -363,9 +360,9 @@ class MemberConnections:
         """Close all vehicles, and wait until they are closed. The arguments are the exception of the fleet's block."""
         self._has_block_failed = error is not None
         self._close.set()
-        is_every_vehicle_connected = len(self._open) == self._running
+        is_every_vehicle_connected = len(self._connected) == self._task_count
         # If a vehicle is not connected, opening has failed, and cancelling the tasks is enough.
-        if self._running and is_every_vehicle_connected:
+        if self._task_count and is_every_vehicle_connected:
             await run_shielded(self._wait_until_all_closed())
         await self._tasks.aclose()
 
@@ -376,7 +373,7 @@ class MemberConnections:
         """Connect one vehicle, and keep it connected until the fleet closes."""
         try:
             async with connect(connection, system_id=system_id, timeout=self._timeout, rates=self._rates) as vehicle:
-                self._open[index] = (network, vehicle)
+                self._connected[index] = (network, vehicle)
                 self._changed.set()
                 await self._close.wait()
                 if self._has_block_failed:
@@ -384,8 +381,8 @@ class MemberConnections:
         except _BlockFailed:
             pass
         finally:
-            self._running -= 1
-            if not self._running:
+            self._task_count -= 1
+            if not self._task_count:
                 self._all_closed.set()
 
     def _on_error(self, error: Exception) -> None:

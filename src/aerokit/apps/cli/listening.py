@@ -98,6 +98,7 @@ async def _record_link(options: argparse.Namespace) -> int:
 
 
 async def _record(connection: Connection, options: argparse.Namespace) -> bool:
+    """Wait for the end of the recording. Unless ``--as-is``, connect to the vehicles, which requests message rates."""
     if options.as_is:
         return await await_end(connection, options.seconds)
     from aerokit.vehicle.connect import vehicles_on

@@ -154,7 +154,7 @@ def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
 
 
 def evidence_in_fixes(flight: FlightLog) -> list[FailsafeEvidence]:
-    """Return the times at which a satellite receiver lost its 3D fix."""
+    """Return evidence for each time at which a satellite receiver lost its 3D fix."""
     evidence = []
     for number, gps in flight.gps.items():
         had_fix, had_satellites = False, math.nan

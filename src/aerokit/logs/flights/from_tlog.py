@@ -193,7 +193,7 @@ class _Reader:
         setpoints, destinations = self._flight.position_target, self._destinations
         if setpoints.has("latitude_deg"):
             return
-        has_heights = setpoints.has()
+        has_heights = setpoints.has()  # set-points without latitudes have only heights
         rows = list(zip(setpoints.times, *(setpoints[name] for name in setpoints), strict=True))
         columns = (destinations[name] for name in destinations)
         for time, latitude, longitude, amsl, relative in zip(destinations.times, *columns, strict=True):
@@ -327,9 +327,9 @@ class _Reader:
 
     def _on_nav_controller_output(self, time_s: float, message: m.NavControllerOutput) -> None:
         if self._autopilot.name == "ArduPilot":
-            bearing = message.nav_bearing  # meaningful for fixed wings only
+            # The yaw is NaN, because `nav_bearing` is no yaw of the vehicle, but the course of a fixed wing.
             self._flight.attitude_target.add(time_s, message.nav_roll, message.nav_pitch, NAN)
-            if -180 <= bearing <= 360 and not math.isnan(self._relative_m):
+            if -180 <= message.nav_bearing <= 360 and not math.isnan(self._relative_m):
                 self._flight.position_target.add(time_s, NAN, NAN, NAN, self._relative_m + message.alt_error)
 
     def _on_attitude_target(self, time_s: float, message: m.AttitudeTarget) -> None:

@@ -14,6 +14,7 @@ from aerokit.autopilots.px4 import Px4
 from aerokit.errors import FileFormatError
 from aerokit.logs.flights.codes import clean_text
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPlane
+from aerokit.mavlink.enums import GpsFixType
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -269,7 +270,7 @@ class _Reader:
             fields = ("lat", "lon", "alt") if has_integers else ("latitude_deg", "longitude_deg", "altitude_msl_m")
             per_degree, per_metre = (1e7, 1e3) if has_integers else (1, 1)
             for time_s, fix_type, latitude, longitude, amsl in receiver.rows("fix_type", *fields):
-                if fix_type >= 3:
+                if fix_type >= GpsFixType.TYPE_3D_FIX:
                     self._flight.track.add(time_s, latitude / per_degree, longitude / per_degree, amsl / per_metre, NAN)
 
     def _angles(self, columns: TimeSeries, topic: _Topic | None, field: str) -> None:

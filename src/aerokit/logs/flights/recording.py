@@ -57,7 +57,7 @@ class LinkCounter:
         """Count received and lost frames. Called after a gap in the sequence and at the start of a second.
 
         ``received`` frames arrived since the last call; the last of them has this time and sequence number. Returns the
-        start of the next second.
+        start of the next second. ``expected`` is negative for the first frame.
         """
         missing = (sequence - expected) & 0xFF if expected >= 0 else 0
         if missing > _MAX_SEQUENCE_GAP:  # not a loss, but a late frame or a frame of another link
