@@ -46,12 +46,8 @@ class ServedFlight:
         """Injects faults."""
         self.recording: FlightRecording | None = recording
         """Recording of the vehicle's link; None without ``record=True``."""
-        self._portal, self._server, self._scheduler, self._interruption = (
-            portal,
-            server,
-            scheduler,
-            interruption,
-        )
+        self._portal, self._server = portal, server
+        self._scheduler, self._interruption = scheduler, interruption
         self._is_raised = False
         scheduler.refresh_with(lambda: portal.call(self._refresh))
 

@@ -23,7 +23,7 @@ from aerokit.apps.cli.arguments import (
     system_id,
 )
 from aerokit.apps.cli.connecting import add_signing_key
-from aerokit.apps.cli.output import add_json, emit
+from aerokit.apps.cli.output import DONE, add_json, emit
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavComponent, MavType
@@ -251,7 +251,7 @@ async def run_sim(options: argparse.Namespace) -> int:
         save_picture(tracks, options.picture)
         record = {"file": options.picture, "what": "track", "count": len(tracks)}
         emit(options, "saved", record, f"track written to {options.picture}")
-    return 0
+    return DONE
 
 
 @asynccontextmanager

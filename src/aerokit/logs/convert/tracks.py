@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.flights.flight import Waypoint
-from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionType
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _AMSL_FRAMES = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
 _RELATIVE_FRAMES = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
-_TERRAIN_FRAMES = frozenset((MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT))
+_GLOBAL_FRAMES = _AMSL_FRAMES | _RELATIVE_FRAMES | {MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT}
 
 
 def _waypoint_name(waypoint: Waypoint) -> str:
@@ -78,7 +78,7 @@ class _TrackWriter:
     def _add_item(self, record: LogRecord) -> None:
         """Add a mission item that has a position to the vehicle that received or sent it."""
         item: Any = record.message
-        if item is None or item.mission_type or item.frame not in _AMSL_FRAMES | _RELATIVE_FRAMES | _TERRAIN_FRAMES:
+        if item is None or item.mission_type != MavMissionType.MISSION or item.frame not in _GLOBAL_FRAMES:
             return
         if item.target_system in self._tracks:  # sent to the vehicle
             system_id = item.target_system

@@ -234,10 +234,8 @@ class UlogReader(_RowReader):
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         """Yield all rows of all topics, ordered by time."""
         try:
-            with (
-                self.path.open("rb") as file,
-                redirect_stdout(sys.stderr),
-            ):  # pyulog prints to stdout, which may be for JSON
+            # pyulog prints to stdout, which may be for JSON.
+            with self.path.open("rb") as file, redirect_stdout(sys.stderr):
                 log = import_module("pyulog").ULog(file)
         except Exception as error:  # pyulog raises arbitrary errors for other files
             raise FileFormatError(f"{self.path} is not a PX4 log: {error}") from error
@@ -312,7 +310,7 @@ class _Px4States:
         elif table == "vehicle_local_position" and row.get("v_xy_valid", 1):
             return (("velocity", Velocity(row["vx"], row["vy"], row["vz"])),)
         elif table == "vehicle_status":
-            return (("armed", row["arming_state"] == 2),)
+            return (("armed", row["arming_state"] == 2),)  # ARMING_STATE_ARMED
         elif table == "battery_status":
             remaining = row["remaining"]
             percent = round(remaining * 100) if math.isfinite(remaining) and remaining >= 0 else None

@@ -183,10 +183,10 @@ class _Reader:
         flight.autopilot = "ArduPilot"
         flight.begins_at = tables.unix_at_0 + tables.began_us / 1e6
         steps = (
-            *(self._texts, self._modes, self._armed, self._parameters, self._mission, self._home),
-            *(self._track, self._velocity, self._attitude, self._targets, self._air, self._batteries),
-            *(self._gps, self._vibration, self._estimator, self._radio, self._errors),
-        )
+            self._texts, self._modes, self._armed, self._parameters, self._mission, self._home,
+            self._track, self._velocity, self._attitude, self._targets, self._air, self._batteries,
+            self._gps, self._vibration, self._estimator, self._radio, self._errors,
+        )  # fmt: skip
         for done, step in enumerate(steps, 1):
             step()
             on_share(done / len(steps))

@@ -86,10 +86,7 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
     pyulog = import_module("pyulog")
     try:
         # pyulog prints about damage to stdout, which may be for JSON.
-        with (
-            io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file,
-            redirect_stdout(sys.stderr),
-        ):
+        with io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file, redirect_stdout(sys.stderr):
             log = pyulog.ULog(file, list(_TOPICS))
     except Exception as error:  # pyulog raises arbitrary errors for other files
         raise FileFormatError(f"{flight.path} is not a PX4 log: {error}") from error
@@ -222,7 +219,8 @@ class _Reader:
         if flags is None:
             return
 
-        def is_armed(time_s: float) -> bool:  # flags on the ground are ignored, because many are set there
+        # Flags on the ground, until one second after arming, are ignored, because many are set there.
+        def is_armed(time_s: float) -> bool:
             return any(begin + 1 < time_s <= end for begin, end in flight.armed)
 
         for name, (kind, text) in _FAILSAFE_FLAGS.items():
