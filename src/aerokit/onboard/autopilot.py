@@ -83,7 +83,7 @@ def add_autopilot(
         await call("arm" if is_armed else "disarm", is_forced)
         report(is_armed, None)
 
-    async def set_mode(request: CommandRequest, base_mode: float | None, custom_mode: int) -> None:
+    async def set_mode(_: CommandRequest, base_mode: float | None, custom_mode: int) -> None:
         await call("set_mode", custom_mode)
         report(None, custom_mode)
 

@@ -94,6 +94,7 @@ class RecordedParameters(ParameterProtocolServer):
         self.send(name, self.names.index(name), None)
 
     def _refuse(self, request: m.ParamRequestRead | m.ParamSet, index: int, channel: Channel) -> None:
+        """Answer with PARAM_ERROR, if the recorded vehicle does so. Otherwise there is no answer."""
         if self._vehicle.recording.has_parameter_errors:
             self.send_error(sender_of(request), request.param_id, index, MavParamError.DOES_NOT_EXIST, channel)
 
@@ -145,7 +146,7 @@ class RecordedMissions(MissionServer):
         return _item_message(recorded, request.seq, sender_of(request), isinstance(request, m.MissionRequest))
 
     def _put(self, upload: ListUpload, message: AnyItem) -> int:
-        self._received[message.seq :] = [message]
+        self._received[message.seq :] = [message]  # A repeated item replaces the earlier one.
         return MavMissionResult.ACCEPTED
 
     def _finish(self, upload: ListUpload) -> None:
@@ -355,10 +356,10 @@ class RecordedVehicle(SimulatedVehicle):
         self.send(m.LogEntry(id=0, num_logs=0, last_log_num=0, time_utc=0, size=0), channel)
 
     def _on_timesync(self, message: m.Timesync, channel: Channel) -> None:
-        if message.tc1 == 0:
+        if message.tc1 == 0:  # A TIMESYNC with another value is an answer.
             nanoseconds = int(self.position_s * 1e9)
             self.send(m.Timesync(nanoseconds, message.ts1), channel)
 
     def _on_ping(self, message: m.Ping, channel: Channel) -> None:
-        if message.target_system == 0:
+        if message.target_system == 0:  # A PING with a target is an answer.
             self.send(m.Ping(message.time_usec, message.seq, *sender_of(message)), channel)

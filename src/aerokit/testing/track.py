@@ -240,7 +240,7 @@ class Track(Sequence[TrackPoint]):
     def assert_modes(self, *names: str) -> None:
         """Assert that the vehicle was in these modes in this order. Other modes in between are allowed."""
         __tracebackhide__ = True
-        modes = iter(self.modes)
+        modes = iter(self.modes)  # `in` consumes the modes up to the name, so the order of the names counts.
         for name in names:
             assert name in modes, f"{name} is missing in {' → '.join(names)}: the modes were {' → '.join(self.modes)}"
 

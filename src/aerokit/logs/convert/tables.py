@@ -99,7 +99,7 @@ class CsvTable:
         self._file.close()
 
     def _flush(self) -> None:
-        self._file.write("".join([line[:-2] + "\n" for line in self._lines]))
+        self._file.write("".join([line.removesuffix("\r\n") + "\n" for line in self._lines]))
         self._lines.clear()
 
 

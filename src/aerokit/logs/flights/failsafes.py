@@ -446,5 +446,6 @@ def configured_by(flight: FlightLog, kind: str) -> list[str]:
 
 
 def _texts_before(flight: FlightLog, time_s: float) -> list[str]:
+    """Return the last texts of the 15 s before a failsafe, without the text that reports the failsafe itself."""
     texts = [text for text in flight.texts if time_s - 15 <= text.time_s < time_s - 0.05]
     return [f"text {time_s - text.time_s:.1f} s before: {text.text}" for text in texts[-4:]]

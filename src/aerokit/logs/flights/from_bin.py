@@ -330,7 +330,7 @@ class _Reader:
     def _vibration(self) -> None:
         columns = ("VibeX", "VibeY", "VibeZ", "Clip", "IMU")
         for time, x, y, z, clips, number in self._tables.rows("VIBE", *columns):
-            if number == 0:
+            if number == 0:  # the first of several IMUs
                 self._flight.vibration.add(time, x, y, z, clips)
 
     def _estimator(self) -> None:

@@ -417,9 +417,9 @@ class _Reader:
         )
 
     def _on_servo_output(self, time_s: float, message: m.ServoOutputRaw) -> None:
-        if message.port == 0:
+        if message.port == 0:  # the main outputs
             pulses = (getattr(message, f"servo{number}_raw") for number in range(1, 9))
-            self._flight.outputs.add(time_s, *(pulse or NAN for pulse in pulses))
+            self._flight.outputs.add(time_s, *(pulse or NAN for pulse in pulses))  # 0: the output is not used
 
     def _on_radio(self, time_s: float, message: m.RadioStatus | m.Radio) -> None:
         self._flight.radio.add(time_s, message.rssi, message.remrssi, message.noise, message.remnoise)
