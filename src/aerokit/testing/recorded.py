@@ -146,7 +146,7 @@ class RecordedMissions(MissionServer):
         return _item_message(recorded, request.seq, sender_of(request), isinstance(request, m.MissionRequest))
 
     def _put(self, upload: ListUpload, message: AnyItem) -> int:
-        self._received[message.seq :] = [message]  # A repeated item replaces the earlier one.
+        self._received[message.seq :] = [message]
         return MavMissionResult.ACCEPTED
 
     def _finish(self, upload: ListUpload) -> None:
