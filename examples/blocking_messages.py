@@ -19,11 +19,11 @@ def main(address: str) -> None:
         vehicle.take_off(altitude_m=5)
         with (
             vehicle.guided.velocity() as stream,
-            vehicle.subscribe(messages.VfrHud, rate_hz=10) as huds,
+            vehicle.subscribe(messages.VfrHud, rate_hz=10) as received,
         ):
-            for count, hud in enumerate(huds):
+            for count, message in enumerate(received):
                 stream.set(VelocitySetpoint(east_m_s=3))
-                print(f"{hud.groundspeed:.1f} m/s at {hud.alt:.1f} m")
+                print(f"{message.groundspeed:.1f} m/s at {message.alt:.1f} m")
                 if count == 20:
                     break
         print(f"holding in {vehicle.mode_name}")

@@ -27,7 +27,11 @@ class VideoDevice(CameraDriver):
         super().__init__(vendor="aerokit", model="Video device", resolution=(640, 480))
         self._source, self._folder = source, folder
         folder.mkdir(exist_ok=True)
-        self._format = "lavfi" if source == PATTERN else "v4l2" if source.startswith("/dev/") else None
+        self._format: str | None = None  # FFmpeg recognises the format of files and streams
+        if source == PATTERN:
+            self._format = "lavfi"
+        elif source.startswith("/dev/"):
+            self._format = "v4l2"
 
     async def take_photo(self, index: int) -> Photo:
         """Read one frame in a thread, and write it as JPEG."""

@@ -18,9 +18,9 @@ def main(address: str, file: str = "") -> None:
             print("the vehicle has no logs")
             return
         newest = logs[-1]
-        to = file or f"log{newest.id:05}{vehicle.autopilot.log_suffix}"
-        vehicle.logs.download(newest, to, on_progress=lambda at: print(f"{at.done} of {at.total} bytes"))
-        print(f"log {newest.id} is in {to}")
+        target = file or f"log{newest.id:05}{vehicle.autopilot.log_suffix}"
+        vehicle.logs.download(newest, target, on_progress=lambda progress: print(progress.done, "bytes"))
+        print(f"log {newest.id} is in {target}")
 
 
 if __name__ == "__main__":

@@ -28,8 +28,10 @@ async def main(address: str, name: str = "LAND_SPEED", value: float = 40) -> Non
 
 
 if __name__ == "__main__":
-    address, name, value, *_ = [
-        *sys.argv[1:],
-        *["udpin:0.0.0.0:14550", "LAND_SPEED", "40"][len(sys.argv) - 1 :],
-    ]
-    asyncio.run(main(address, name, float(value)))
+    asyncio.run(
+        main(
+            sys.argv[1] if len(sys.argv) > 1 else "udpin:0.0.0.0:14550",
+            sys.argv[2] if len(sys.argv) > 2 else "LAND_SPEED",
+            float(sys.argv[3]) if len(sys.argv) > 3 else 40.0,
+        )
+    )

@@ -13,7 +13,7 @@ from aerokit import errors, messages
 
 
 async def count_attitudes(vehicle: aerokit.Vehicle) -> int:
-    """Count attitudes, of a live vehicle or of a recording."""
+    """Count the ATTITUDE messages of a live vehicle or of a recording."""
     count = 0
     with vehicle.subscribe(messages.Attitude, capacity=1000) as attitudes:
         try:

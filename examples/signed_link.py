@@ -20,7 +20,7 @@ STAMP = Path("signing-timestamp.txt")
 
 
 async def main(address: str, passphrase: str, stamp: Path = STAMP) -> None:
-    """Set up the key, use it, and remove it."""
+    """Give the vehicle the key, use it, and remove it."""
     signing = Signing(SigningKey.from_passphrase(passphrase), keep=stamp)
     async with aerokit.connect(address) as vehicle:
         await vehicle.wait_ready()

@@ -21,16 +21,16 @@ async def print_values(vehicle: aerokit.Vehicle) -> None:
 
 
 async def print_attitudes(vehicle: aerokit.Vehicle) -> None:
-    """Print raw messages at 20 Hz; a slow reader gets the latest and a count of missed ones."""
+    """Print raw messages at 20 Hz. If printing is slow, messages are dropped and counted in ``missed``."""
     with vehicle.subscribe(messages.Attitude, rate_hz=20) as attitudes:
         async for attitude in attitudes:
             print(f"roll {attitude.roll:+.3f} rad, {attitudes.missed} missed")
 
 
 async def print_events(vehicle: aerokit.Vehicle) -> None:
-    """Print every event: modes, arming, texts, silence, reboots, slow streams, a blocked event loop."""
-    with vehicle.subscribe(events.Event, capacity=100) as news:
-        async for event in news:
+    """Print every event: modes, arming, status texts, silence, reboots, slow streams, a blocked event loop."""
+    with vehicle.subscribe(events.Event, capacity=100) as subscription:
+        async for event in subscription:
             print(event)
 
 

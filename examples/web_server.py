@@ -39,7 +39,8 @@ async def main(address: str, port: int = 8080) -> None:
 
     async with aerokit.connect(address) as vehicle:
         server = await asyncio.start_server(answer, "127.0.0.1", port)
-        print(f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/", flush=True)
+        _, listening_port = server.sockets[0].getsockname()
+        print(f"http://127.0.0.1:{listening_port}/", flush=True)
         async with server:
             await server.serve_forever()
 

@@ -18,6 +18,7 @@ ABOVE_HOME = mavutil.mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
 
 
 def item(command: int, lat: float, lon: float, altitude: float) -> Command:
+    """Make a mission item with an altitude above home; the other arguments of Command are not needed here."""
     return Command(0, 0, 0, ABOVE_HOME, command, 0, 1, 0, 0, 0, 0, lat, lon, altitude)
 
 
@@ -33,8 +34,8 @@ def upload_square(vehicle: Vehicle, home: LocationGlobal, side: float, altitude:
     commands = vehicle.commands
     commands.clear()
     commands.add(item(TAKEOFF, 0, 0, altitude))
-    for up, right in ((1, -1), (1, 1), (-1, 1), (-1, -1)):
-        commands.add(item(WAYPOINT, home.lat + up * north, home.lon + right * east, altitude))
+    for north_sign, east_sign in ((1, -1), (1, 1), (-1, 1), (-1, -1)):
+        commands.add(item(WAYPOINT, home.lat + north_sign * north, home.lon + east_sign * east, altitude))
     commands.add(item(RETURN, 0, 0, 0))
     commands.upload()
 
@@ -59,7 +60,7 @@ def fly_mission(vehicle: Vehicle, mode: str, altitude: float) -> None:
     while vehicle.armed:
         if vehicle.commands.next != shown:
             shown = vehicle.commands.next
-            print(f"flies command {shown} of {len(vehicle.commands)}")
+            print(f"executing command {shown} of {len(vehicle.commands)}")
         time.sleep(POLL_S)
 
 

@@ -13,12 +13,14 @@ TIMEOUT_S = 5.0
 
 
 def wait_for_channels(vehicle: Vehicle, wanted: dict[str, int]) -> None:
-    """Wait until RC_CHANNELS reports these values: the receiver's or the overrides."""
+    """Wait until RC_CHANNELS reports these values, which are those of the receiver or overrides."""
 
-    def has_them() -> bool:
+    def are_as_wanted() -> bool:
         return all(vehicle.channels[number] == value for number, value in wanted.items())
 
-    vehicle.wait_for(has_them, timeout=TIMEOUT_S, interval=POLL_S, errmsg=f"the channels did not change to {wanted}")
+    vehicle.wait_for(
+        are_as_wanted, timeout=TIMEOUT_S, interval=POLL_S, errmsg=f"the channels did not change to {wanted}"
+    )
     print("channels:", vehicle.channels)
 
 

@@ -49,14 +49,14 @@ def main() -> None:
 
     vehicle = connect(options.connect, wait_ready=["mode", "vibration"], vehicle_class=ShakingVehicle)
     print("first:", vehicle.vibration)
-    left = options.count
+    remaining = options.count
     done = threading.Event()
 
     def print_it(vehicle: Vehicle, name: str, value: Vibration) -> None:
-        nonlocal left
+        nonlocal remaining
         print(f"{name}: {value}")
-        left -= 1
-        if left == 0:
+        remaining -= 1
+        if remaining == 0:
             vehicle.remove_attribute_listener(name, print_it)
             done.set()
 

@@ -59,9 +59,9 @@ def main() -> None:
     if not track:
         raise SystemExit("the recording has no flight")
     vehicle = connect(options.connect, wait_ready=True)
-    way = distance(here(vehicle), track[0])
-    if way > options.farthest:
-        raise SystemExit(f"the recorded flight starts {way:.0f} m away, more than --farthest")
+    distance_to_start = distance(here(vehicle), track[0])
+    if distance_to_start > options.farthest:
+        raise SystemExit(f"the recorded flight starts {distance_to_start:.0f} m away, more than --farthest")
     print(f"{len(track)} waypoints")
     upload(vehicle, track)
 

@@ -25,7 +25,7 @@ def main() -> None:
     vehicle = connect(options.connect, wait_ready=["mode", "location.global_relative_frame"])
     look(vehicle, options.seconds)
     if vehicle.gimbal.pitch is None:
-        print("no gimbal attitude received; sending orders anyway")
+        print("no gimbal attitude received; sending commands anyway")
     for pitch, yaw in ((-90, 0), (-45, 90), (0, 0)):
         print(f"pitch {pitch}, yaw {yaw}")
         vehicle.gimbal.rotate(pitch, 0, yaw)

@@ -10,15 +10,19 @@ from dronekit import Vehicle, VehicleMode, connect, mavutil
 
 POLL_S = 0.1
 LEGS = ((2, 0, 0), (0, 2, 0), (-2, -2, 0), (0, 0, 0.5), (0, 0, 0))
-"""Velocities in m/s north, east, down; the last one stops the vehicle."""
+"""Velocities in m/s north, east and down. The last velocity stops the vehicle."""
 ONLY_VELOCITY = 0b110111000111
 """type_mask: ignore position, acceleration, yaw and yaw rate."""
 
 
 def fly(vehicle: Vehicle, north: float, east: float, down: float, seconds: float) -> None:
     """Send a velocity in m/s repeatedly, because the vehicle stops when set-points stop."""
+    time_boot_ms = target_system = target_component = unused = 0
     message = vehicle.message_factory.set_position_target_local_ned_encode(
-        0, 0, 0, mavutil.mavlink.MAV_FRAME_LOCAL_NED, ONLY_VELOCITY, 0, 0, 0, north, east, down, 0, 0, 0, 0, 0
+        *(time_boot_ms, target_system, target_component, mavutil.mavlink.MAV_FRAME_LOCAL_NED, ONLY_VELOCITY),
+        *(unused, unused, unused),  # position
+        *(north, east, down),
+        *(unused, unused, unused, unused, unused),  # acceleration, yaw and yaw rate
     )
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -33,10 +37,12 @@ def turn(vehicle: Vehicle, heading: float, timeout: float = 20.0) -> None:
     )
     vehicle.send_mavlink(message)
 
-    def off() -> float:
+    def error_deg() -> float:
         return float(abs((vehicle.heading - heading + 180) % 360 - 180))
 
-    vehicle.wait_for(lambda: off() < 5, timeout=timeout, errmsg=f"the vehicle did not turn to {heading:g} degrees")
+    vehicle.wait_for(
+        lambda: error_deg() < 5, timeout=timeout, errmsg=f"the vehicle did not turn to {heading:g} degrees"
+    )
     print(f"heading {vehicle.heading}")
 
 

@@ -47,11 +47,11 @@ def go_to(vehicle: Vehicle, place: LocationGlobalRelative, speed: float) -> None
     """Return on arrival, or when the pilot has changed the mode."""
     vehicle.simple_goto(place, groundspeed=speed)
     while vehicle.mode.name in MODES:
-        left = distance(vehicle.location.global_relative_frame, place)
-        if left < 1.0:
+        remaining = distance(vehicle.location.global_relative_frame, place)
+        if remaining < 1.0:
             print("there")
             return
-        print(f"{left:.0f} m to go")
+        print(f"{remaining:.0f} m to go")
         time.sleep(POLL_S)
 
 

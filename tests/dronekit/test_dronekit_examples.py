@@ -48,7 +48,7 @@ EXPECTED: dict[str, tuple[float, list[str], list[str]]] = {
     "basic_mission": (
         20,
         ["--altitude", "5", "--side", "20"],
-        ["6: command 20", "flies command 6 of 6", "landed"],
+        ["6: command 20", "executing command 6 of 6", "landed"],
     ),
     "guided_velocity_and_yaw": (
         25,

@@ -99,7 +99,8 @@ async def foxglove_bridge(
     message_types = _message_types(connection, messages)
     channels = _TopicChannels(connection)
     server = _serve(channels, host, port)
-    tasks, detachers = BackgroundTasks(connection.fail), connection.attach(message_types, channels.on_message)
+    tasks = BackgroundTasks(connection.fail)
+    detachments = connection.attach(message_types, channels.on_message)
     try:
         async with vehicles_on(connection, rates=rates, on_found=on_found) as vehicles:
             tasks.start(lambda: _repeat(lambda: channels.publish(vehicles), 1 / rate_hz))
@@ -108,13 +109,14 @@ async def foxglove_bridge(
             finally:
                 await tasks.aclose()
     finally:
-        for detach in detachers:
+        for detach in detachments:
             detach()
         channels.close()
         await _stop(server, host)
 
 
 def _message_types(connection: Connection, patterns: Iterable[str]) -> list[type[Message]]:
+    """Return the messages of the connection's dialect whose names match a pattern, each once."""
     by_id: dict[int, type[Message]] = {}
     for pattern in patterns:
         matching = [message for message in connection.bus.dialect if fnmatchcase(message.NAME, pattern.upper())]
@@ -183,7 +185,7 @@ class _TopicChannels:
 
     def send_again(self, topic: str) -> None:
         """Send the current value of a topic again, because a new viewer has subscribed."""
-        if not topic.endswith("/log"):  # otherwise the other viewers would get all texts again
+        if not topic.endswith("/log"):  # otherwise the other viewers would get all status texts again
             self._sent_at.pop(topic, None)  # so that `publish` sends the current value
 
     def on_message(self, message: Message) -> None:
@@ -199,7 +201,8 @@ class _TopicChannels:
             self._publish_texts(system_id, vehicle)
         for (system_id, component_id, _), message in self._messages.items():
             assert message.received_frame is not None
-            received_at, message_type = message.received_frame.received_at, type(message)
+            received_at = message.received_frame.received_at
+            message_type = type(message)
             name = topics.raw_topic_name(system_id, component_id, message_type)
             make_topic = partial(topics.raw_topic, system_id, component_id, message_type)
             if self._needs_sending(name, received_at, make_topic):
@@ -239,11 +242,11 @@ class _TopicChannels:
             heading, velocity = vehicle.heading_deg.latest, vehicle.velocity.latest
             unix_s = self._to_unix_time(position_at)
             self._send(location, position_at, topics.location_fix(unix_s, system_id, position, heading, velocity))
-        metres, unix_s = self._map_frame.east_north_up_m(position), self._to_unix_time(pose_at)
+        map_position, unix_s = self._map_frame.east_north_up_m(position), self._to_unix_time(pose_at)
         if self._needs_sending(transform, pose_at, lambda: Topic(transform, topics.FRAME_TRANSFORM)):
-            self._send(transform, pose_at, topics.frame_transform(unix_s, system_id, metres, attitude))
+            self._send(transform, pose_at, topics.frame_transform(unix_s, system_id, map_position, attitude))
         if self._needs_sending(pose, pose_at, lambda: Topic(pose, topics.POSE_IN_FRAME)):
-            self._send(pose, pose_at, topics.pose_in_frame(unix_s, metres, attitude))
+            self._send(pose, pose_at, topics.pose_in_frame(unix_s, map_position, attitude))
 
     def _publish_texts(self, system_id: int, vehicle: Vehicle) -> None:
         name = topics.vehicle_topic(system_id, "log")

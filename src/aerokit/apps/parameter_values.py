@@ -21,7 +21,7 @@ def check_values(metadata: Metadata | None, values: Mapping[str, float], force: 
     """
     if metadata is None:
         return
-    problems = list(filter(None, (_problem(metadata, name, value) for name, value in values.items())))
+    problems = [problem for name, value in values.items() if (problem := _problem(metadata, name, value))]
     if problems:
         raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; {force} sets such values too")
 
@@ -35,10 +35,11 @@ def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: s
         return result
     if metadata is None:
         text = f"range not checked ({option} checks it)"
-    elif metadata_entry(metadata, result.name)[0] is None:
-        text = "range not checked (the metadata does not have this parameter)"
     else:
-        return result
+        entry, _ = metadata_entry(metadata, result.name)
+        if entry is not None:
+            return result
+        text = "range not checked (the metadata does not have this parameter)"
     return result.replace(note=f"{result.note}; {text}" if result.note else text)
 
 

@@ -41,9 +41,9 @@ START_TOLERANCE_S = 0.001
 
 
 async def wait_to_start(member: Member, delay_s: float, action: str) -> float:
-    """Wait before a member's order, and then for its next HEARTBEAT if the last one is not recent.
+    """Wait ``delay_s`` before a member's order, and then for its next HEARTBEAT if the last one is not recent.
 
-    Return how much longer than ``delay_s`` this took.
+    Return the seconds by which the whole wait exceeds ``delay_s``.
 
     Raises:
         OperationRejected: the computer slept meanwhile, so that the order would be late, or the member is unavailable.
@@ -101,14 +101,14 @@ class FleetAction:
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._orders: dict[str, PolicyOrder] = {}
-        # System id and name of the failed member for which the policy sent orders; None without such a failure.
-        self._failed_first: tuple[int, str] | None = None
+        # System id and name of the failed member for which the policy was applied; None if it was not applied.
+        self._policy_trigger: tuple[int, str] | None = None
         self._order_errors: dict[str, str] = {}
         self._pending_orders = 0
-        self._started_at = -math.inf  # when the last member started
+        self._last_start_at = -math.inf  # when the last member started
         self._is_applying_policy = False
         self._finished = asyncio.Event()
-        # An error that is not of aerokit, raised by a function of the program; `run` raises it at the end.
+        # An error in a function of the program, which is not an AerokitError. `run` raises it at the end.
         self.program_error: Exception | None = None
 
     async def run(self) -> FleetResult:
@@ -120,8 +120,7 @@ class FleetAction:
         try:
             for index, member in enumerate(self._members):
                 tasks.start(
-                    partial(self._run_member, member, index * self._stagger_s),
-                    f"aerokit {self.name} {member.name}",
+                    partial(self._run_member, member, index * self._stagger_s), f"aerokit {self.name} {member.name}"
                 )
             await self._finished.wait()
         except BaseException:
@@ -147,7 +146,7 @@ class FleetAction:
         return tuple(
             member.name
             for member in self._members
-            if member.name in self._tasks and member.name not in (*self._failed, *self._stopped)
+            if member.name in self._tasks and not self._has_failed_or_stopped(member)
         )
 
     def result_so_far(self) -> FleetResult:
@@ -159,10 +158,10 @@ class FleetAction:
 
     def on_member_unavailable(self, member: Member) -> None:
         """Record that the member has failed because it was lost or taken over."""
-        if member not in self._members or member.name in (*self._failed, *self._stopped):
+        if member not in self._members or self._has_failed_or_stopped(member):
             return
         error_class = HeartbeatTimeout if member.state is MemberState.LOST else OperationRejected
-        self._fail(member, error_class(f"{self.name}: {member.name} is {member.status}"))
+        self._record_failure(member, error_class(f"{self.name}: {member.name} is {member.status}"))
 
     # --------------------------------------------------------------------------------- one member
 
@@ -177,26 +176,30 @@ class FleetAction:
             wait_s = delay_s
             while wait_s > START_TOLERANCE_S:
                 await wait_to_start(member, wait_s, self.name)
-                # After a blocked event loop, the delays of several members may end at once.
-                wait_s = self._started_at + self._stagger_s - self._context.now()
-            self._started_at = self._context.now()
+                # After a blocked event loop, the delays of several members may end at once. Each of them then waits
+                # until `stagger_s` after the last start.
+                wait_s = self._last_start_at + self._stagger_s - self._context.now()
+            self._last_start_at = self._context.now()
             if not member.is_available:
                 raise OperationRejected(f"{self.name}: {member.name} is {member.status}")
             value = await self._execute_in_time(member)
         except AerokitError as error:
             if member.name not in self._stopped:
-                self._fail(member, error)
+                self._record_failure(member, error)
         except asyncio.CancelledError:
             # This class cancels the tasks of failed and stopped members. Other cancellations come from outside.
-            if member.name not in self._stopped and member.name not in self._failed:
+            if not self._has_failed_or_stopped(member):
                 raise
         else:
-            if member.name not in self._stopped and member.name not in self._failed:
+            if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
                 member.record_success()
         finally:
             del self._tasks[member.name]
             self._check_finished()
+
+    def _has_failed_or_stopped(self, member: Member) -> bool:
+        return member.name in self._failed or member.name in self._stopped
 
     async def _execute_in_time(self, member: Member) -> Any:
         if self._timeout is None:
@@ -205,16 +208,16 @@ class FleetAction:
             return await self._execute(member)
         raise OperationTimeout(f"{self.name}: {member.name} has not finished within {self._timeout:g} s")
 
-    def _fail(self, member: Member, error: Exception) -> None:
+    def _record_failure(self, member: Member, error: Exception) -> None:
+        """Record that a member failed. The first failure applies the policy."""
         if member.name in self._failed:
             return
         self._failed[member.name] = self._outcomes[member.name] = error
         member.record_failure(self.name, error)
-        is_policy_applied = self._failed_first is not None or self._is_applying_policy
+        is_policy_applied = self._policy_trigger is not None or self._is_applying_policy
         if self._is_safe or is_policy_applied or self._context.is_closed:
             return
-        # _apply_policy() refreshes the other members, which may call _fail() for them, too. Only the first failure
-        # applies the policy.
+        # _apply_policy() refreshes the other members, which may call _record_failure() for them, too.
         self._is_applying_policy = True
         try:
             self._apply_policy(member, error)
@@ -230,16 +233,11 @@ class FleetAction:
         others = [member for member in self._members if member.name not in self._failed]
         available = [member for member in others if member.is_available]
         failure = MemberFailure(failed.name, failed.group, self.name, error, tuple(member.name for member in available))
-        orders: dict[str, PolicyOrder]
-        try:
-            orders = self._context.rules.decide(failure)
-        except Exception as program_error:  # the program's policy function raised it; the other members hold for safety
-            self.program_error = self.program_error or program_error
-            orders = dict.fromkeys(failure.others, "hold")
+        orders = self._decide(failure)
         if not orders:
             return
-        self._failed_first = (failed.vehicle.system_id, failed.name)
-        self._cancel([failed])
+        self._policy_trigger = (failed.vehicle.system_id, failed.name)
+        self._cancel_tasks_of([failed])
         skipped = {member.name: member.reason for member in others if not member.is_available}
         for member in available:
             order = orders.get(member.name)
@@ -254,33 +252,42 @@ class FleetAction:
             if member.name in self._orders or member.name not in self._outcomes:
                 self._set_stopped(member, failed, self._orders.get(member.name))
         self._context.publish(
-            PolicyApplied(self._context.now(), *self._failed_first, self.name, dict(self._orders), skipped)
+            PolicyApplied(self._context.now(), *self._policy_trigger, self.name, dict(self._orders), skipped)
         )
         self._pending_orders = len(self._orders)
         for member in available:
             if member.name in self._orders:
                 self._context.background.start(
-                    partial(self._send_order, member, self._orders[member.name]),
-                    f"aerokit policy {member.name}",
+                    partial(self._send_order, member, self._orders[member.name]), f"aerokit policy {member.name}"
                 )
         # The running actions are cancelled one loop iteration later, after the policy's orders have begun. By then, the
         # policy's orders have superseded the orders of the actions, so that the cancelled actions do not send a hold.
-        asyncio.get_running_loop().call_soon(self._cancel, [member for member in available if member.name in orders])
+        ordered = [member for member in available if member.name in orders]
+        asyncio.get_running_loop().call_soon(self._cancel_tasks_of, ordered)
         if not self._orders:
             self._publish_completed()
+
+    def _decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
+        """Return the policy's orders. If the program's policy function raises an error, the others hold for safety."""
+        try:
+            return self._context.rules.decide(failure)
+        except Exception as error:
+            self.program_error = self.program_error or error
+            return dict.fromkeys(failure.others, "hold")
 
     def _set_stopped(self, member: Member, failed: Member, order: PolicyOrder | None) -> None:
         order_text = f"; the policy ordered {member.name} to {order}" if order else ""
         error = OperationRejected(f"{self.name}: stopped because {failed.name} failed{order_text}")
         self._stopped[member.name] = self._outcomes[member.name] = error
 
-    def _cancel(self, members: Iterable[Member]) -> None:
+    def _cancel_tasks_of(self, members: Iterable[Member]) -> None:
         for member in members:
             task = self._tasks.get(member.name)
             if task is not None and task is not asyncio.current_task():
                 task.cancel()
 
     async def _send_order(self, member: Member, order: PolicyOrder) -> None:
+        """Send an order of the policy to a member, and wait until the member has carried it out."""
         try:
             if order == "land":
                 await member.vehicle.land()
@@ -298,10 +305,10 @@ class FleetAction:
                 self._check_finished()
 
     def _publish_completed(self) -> None:
-        assert self._failed_first is not None
+        assert self._policy_trigger is not None
         self._context.publish(
             PolicyCompleted(
-                self._context.now(), *self._failed_first, self.name, dict(self._orders), dict(self._order_errors)
+                self._context.now(), *self._policy_trigger, self.name, dict(self._orders), dict(self._order_errors)
             )
         )
 
@@ -309,14 +316,12 @@ class FleetAction:
         # Only members that have finished the action get an order to hold. The others still execute the action, and its
         # cancellation makes them hold.
         for member in self._members:
-            if (
-                member.is_flown_by_program
-                and member.name in self._outcomes
-                and member.name not in (*self._failed, *self._stopped)
-            ):
+            has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
+            if has_finished and member.is_flown_by_program:
                 self._context.hold(member, f"aerokit hold {member.name}")
 
     def _check_finished(self) -> None:
+        """End `run` once every member has an outcome and all orders of the policy have ended."""
         if not self._tasks and not self._pending_orders and len(self._outcomes) == len(self._members):
             self._finished.set()
 
@@ -432,6 +437,7 @@ class SelectionBase:
         stagger_s: float | None = None,
         names: tuple[str, ...] | None = None,
     ) -> FleetResult:
+        """Execute an action with all members of the selection, or with those in ``names``."""
         members = [member for member in self if names is None or member.name in names]
         is_safe = name in FLIGHT_ENDING_ACTIONS
         return await FleetAction(

@@ -1,7 +1,4 @@
-"""``Actions``: vehicle actions executed by several members at once, and barriers.
-
-https://mavlink.io/en/messages/common.html#GPS_RTCM_DATA
-"""
+"""``Actions``: vehicle actions executed by several members at once, and barriers."""
 
 from __future__ import annotations
 
@@ -101,9 +98,7 @@ class Actions(SelectionBase):
         """
         check_range("altitude_m", altitude_m, 0, 10_000, above=True)
         return await self._run(
-            "take_off",
-            lambda member: member.vehicle.take_off(altitude_m, timeout=timeout),
-            stagger_s=stagger_s,
+            "take_off", lambda member: member.vehicle.take_off(altitude_m, timeout=timeout), stagger_s=stagger_s
         )
 
     async def land(self, *, timeout: float | None = 300.0, stagger_s: float | None = None) -> FleetResult:
@@ -123,9 +118,7 @@ class Actions(SelectionBase):
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
         """
         return await self._run(
-            "return_to_launch",
-            lambda member: member.vehicle.return_to_launch(timeout=timeout),
-            stagger_s=stagger_s,
+            "return_to_launch", lambda member: member.vehicle.return_to_launch(timeout=timeout), stagger_s=stagger_s
         )
 
     async def hold(self) -> FleetResult:
@@ -177,7 +170,7 @@ class Actions(SelectionBase):
                         )
                     await change_signal.next(POLL_INTERVAL_S)
 
-        deadline = self._context.now() + timeout
+        deadline = self._context.now() + timeout  # one deadline for all members
         result = await self._run(description, wait_for_condition)
         result.raise_for_errors()
         return result

@@ -41,7 +41,7 @@ def position_of(member: Member, max_age_s: float = POSITION_MAX_AGE_S) -> Positi
 def altitude_amsl(member: Member, target: Position) -> float:
     """Return a target's altitude above sea level in metres, for this member.
 
-    A relative altitude counts from the member's home. Without an altitude, it is the member's present altitude.
+    A relative altitude counts from the member's home. A target without an altitude has the member's present altitude.
 
     Raises:
         ValueUnknownError, StaleValueError: the position of the member or of its home is unknown.
@@ -67,10 +67,7 @@ class LocalOrigin:
 
     def to_local(self, position: Position, altitude_amsl_m: float) -> LocalPoint:
         north, east = geo.north_east_m(
-            self._origin.latitude_deg,
-            self._origin.longitude_deg,
-            position.latitude_deg,
-            position.longitude_deg,
+            self._origin.latitude_deg, self._origin.longitude_deg, position.latitude_deg, position.longitude_deg
         )
         return north, east, altitude_amsl_m
 
@@ -97,7 +94,7 @@ class DistanceMonitor:
     """
 
     def __init__(self, context: FleetContext, min_distance_m: float, *, holds: bool) -> None:
-        self._context, self._min_distance_m, self._holds = context, min_distance_m, holds
+        self._context, self._min_distance_m, self._orders_hold = context, min_distance_m, holds
         self._reported: set[tuple[str, str]] = set()
 
     async def run(self) -> None:
@@ -132,16 +129,16 @@ class DistanceMonitor:
         pair = (first, second)
         for member in pair:
             member.refresh()
-        holding = [member for member in pair if self._holds and member.is_flown_by_program]
+        holding = [member for member in pair if self._orders_hold and member.is_flown_by_program]
         for member in holding:
             self._context.hold(member, f"aerokit too close {member.name}")
         self._context.publish(
             TooClose(
-                self._context.now(),
-                first.vehicle.system_id,
-                first.name,
-                second.name,
-                distance_m,
-                tuple(member.name for member in holding),
+                at=self._context.now(),
+                system_id=first.vehicle.system_id,
+                member=first.name,
+                other=second.name,
+                distance_m=distance_m,
+                ordered=tuple(member.name for member in holding),
             )
         )

@@ -21,6 +21,7 @@ from aerokit.vehicle.rtk.rtk import send_rtcm
 if TYPE_CHECKING:
     from aerokit.connection.bus import Detach, Sink
     from aerokit.fleets.action import FleetContext
+    from aerokit.fleets.members import Member
 
 __all__ = ["Fleet", "Selection"]
 
@@ -56,6 +57,7 @@ class Selection(Actions, Missions, Formations, Shows):
         return self._select("role", name)
 
     def _select(self, attribute: str, name: str) -> Selection:
+        """Select the members whose attribute (``group`` or ``role``) has this value."""
         selected = tuple(member.name for member in self if getattr(member, attribute) == name)
         if not selected:
             existing = dict.fromkeys(getattr(member, attribute) for member in self if getattr(member, attribute))
@@ -147,15 +149,15 @@ class Fleet(Selection):
         event_types: tuple[type[Event], ...] = types or (FleetEvent, Event)
 
         def attach(sink: Sink) -> list[Detach]:
-            detach: list[Detach] = []
+            detachments: list[Detach] = []
             for event_type in event_types:
                 if event_type is MemberEvent:  # all events of vehicles
-                    detach += self._attach_member_events(Event, sink)
+                    detachments += self._attach_member_events(Event, sink)
                 elif not issubclass(event_type, FleetEvent):
-                    detach += self._attach_member_events(event_type, sink)
+                    detachments += self._attach_member_events(event_type, sink)
                 else:
-                    detach.append(self._context.bus.attach_event(event_type, sink))
-            return detach
+                    detachments.append(self._context.bus.attach_event(event_type, sink))
+            return detachments
 
         return Subscription(attach, capacity=capacity, overflow=overflow)
 
@@ -185,20 +187,20 @@ class Fleet(Selection):
                     raise InvalidArgument(f"names: {short_repr(name)} is not a state; docs/states.md lists them")
 
         def attach(sink: Sink) -> list[Detach]:
-            def publish(member_name: str, system_id: int, state: str, _: object, value: object) -> None:
-                sink(StateUpdate(self._context.now(), system_id, member_name, state, value))
+            def publish(member: Member, state: str, _: object, value: object) -> None:
+                sink(StateUpdate(self._context.now(), member.vehicle.system_id, member.name, state, value))
 
-            return [
-                member.vehicle.telemetry.cells[name].observe(
-                    partial(publish, member.name, member.vehicle.system_id, name), every_arrival=every_arrival
-                )
-                for member in self
-                for name in names
-            ]
+            detachments: list[Detach] = []
+            for member in self:
+                for name in names:
+                    cell = member.vehicle.telemetry.cells[name]
+                    detachments.append(cell.observe(partial(publish, member, name), every_arrival=every_arrival))
+            return detachments
 
         return Subscription(attach, capacity=capacity, overflow=overflow)
 
     def _attach_member_events(self, event_type: type[Event], sink: Sink) -> list[Detach]:
+        """Pass events of vehicles and links to a sink, as `MemberEvent` with the name of the member or network."""
         names = {(member.network, member.vehicle.system_id): member.name for member in self._context.members.values()}
 
         def publish(network: str, event: Event) -> None:

@@ -163,7 +163,8 @@ class Following:
         max_speed_m_s: float,
     ) -> None:
         self._context, self._leader, self._followers, self._formation = context, leader, followers, formation
-        self._period_s, self._rate_hz, self._max_speed_m_s = 1 / rate_hz, rate_hz, max_speed_m_s
+        self._rate_hz, self._period_s = rate_hz, 1 / rate_hz
+        self._max_speed_m_s = max_speed_m_s
         self._tasks = BackgroundTasks(self._on_error)
         self._stopped = asyncio.Event()
         self._was_entered = self._has_raised = False
@@ -224,6 +225,7 @@ class Following:
         self._stop_if_no_followers()
 
     async def _fly_follower(self, member: Member) -> None:
+        """Fly a member towards its place until following stops."""
         try:
             async with member.vehicle.guided.velocity(rate_hz=self._rate_hz) as stream:
                 while not self._stop_if_leader_lost():
@@ -237,6 +239,7 @@ class Following:
             asyncio.get_running_loop().call_soon(self._stop_if_no_followers)
 
     def _stop_if_no_followers(self) -> None:
+        """Stop following if no member follows any more, and give the failures as the reason."""
         if not self._action.active and self._action.program_error is None:
             result = self._action.result_so_far()
             failed = {name: str(error) for name, error in result.failed.items()}
@@ -262,6 +265,7 @@ class Following:
         return self._stopped.is_set()
 
     def _setpoint(self, member: Member) -> VelocitySetpoint:
+        """Return the velocity of the leader, plus a correction towards the member's place."""
         velocity = self._leader.vehicle.velocity.latest
         leader_velocity = (0.0, 0.0, 0.0)  # while the velocity is unknown
         if velocity is not None:
@@ -290,11 +294,13 @@ class Following:
             }
         )
         offset = self._formation.offset_of(member.name, leader.heading_deg.latest)
-        north, east, up = (
-            points["leader"][i] - points["member"][i] + metres
-            for i, metres in enumerate((offset.north_m, offset.east_m, offset.up_m))
-        )
-        # Extrapolate both positions: the leader has moved on since its position was measured, and so has the member.
+        leader_north, leader_east, leader_up = points["leader"]
+        member_north, member_east, member_up = points["member"]
+        north = leader_north + offset.north_m - member_north
+        east = leader_east + offset.east_m - member_east
+        up = leader_up + offset.up_m - member_up
+        # Both vehicles have moved on after their positions were measured. The leader's movement makes the vector
+        # longer, the member's own movement makes it shorter.
         for moving_vehicle, sign in ((leader, 1.0), (vehicle, -1.0)):
             velocity = moving_vehicle.velocity.latest
             if velocity is not None:
@@ -310,15 +316,13 @@ class Following:
             raise OperationRejected(f"the leader {self._leader.name} is {self._leader.status}")
 
     def _stop(self, reason: str, orders: Mapping[str, str], skipped: Mapping[str, str]) -> None:
+        """Record that following has stopped early, and publish it. Later calls do nothing."""
         if self._stopped.is_set():
             return
         self._reason = reason
         self._stopped.set()
-        leader = self._leader
-        event = FollowingStopped(
-            self._context.now(), leader.vehicle.system_id, leader.name, reason, dict(orders), dict(skipped)
-        )
-        self._context.publish(event)
+        now, system_id, name = self._context.now(), self._leader.vehicle.system_id, self._leader.name
+        self._context.publish(FollowingStopped(now, system_id, name, reason, dict(orders), dict(skipped)))
 
     def _on_error(self, error: Exception) -> None:
         holding = dict.fromkeys((member.name for member in self._followers if member.is_available), "hold")
@@ -350,15 +354,15 @@ class Formations(Travel):
             OperationRejected: the leader is unavailable, or paths come too close. Nothing was sent.
             ValueUnknownError: the position of the leader or of a follower is unknown.
         """
-        member, followers = self._leader_and_followers(formation, leader)
-        leader_position, heading = position_of(member), member.vehicle.heading_deg.latest
+        leader_member, followers = self._leader_and_followers(formation, leader)
+        leader_position = position_of(leader_member)
+        heading = leader_member.vehicle.heading_deg.latest
         targets: dict[str, Position] = {}
         for follower in followers:
             offset = formation.offset_of(follower.name, heading)
             target = leader_position.offset(north_m=offset.north_m, east_m=offset.east_m, up_m=offset.up_m)
             if target.altitude_amsl_m is not None:
-                # The target gets no altitude above the leader's home, because the followers' homes may be at other
-                # altitudes.
+                # An altitude above the leader's home is dropped, because a follower's home may be at another altitude.
                 target = Position(target.latitude_deg, target.longitude_deg, altitude_amsl_m=target.altitude_amsl_m)
             targets[follower.name] = target
         if speed_m_s is not None:

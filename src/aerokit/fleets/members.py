@@ -60,7 +60,7 @@ class Member:
         self._control_when_reclaimed: tuple[object, object] | None = None
         # MAV_STATE at the time of `reclaim`. If it was a failsafe, this failsafe does not count as a takeover.
         self._ignored_failsafe: int | None = None
-        self._detach: list[Detach] = []
+        self._detachments: list[Detach] = []
         self._publish: Callable[[FleetEvent], None] = lambda _: None
         self._on_unavailable: Callable[[Member], None] = lambda _: None
 
@@ -91,7 +91,7 @@ class Member:
         """Start updating the member's state. ``on_unavailable`` is called when the member is lost or taken over."""
         self._publish, self._on_unavailable = publish, on_unavailable
         vehicle, bus = self.vehicle, self.vehicle.connection.bus
-        self._detach = [
+        self._detachments = [
             bus.attach_event(VehicleSilent, self._on_silent),
             bus.attach_event(VehicleRecovered, self._on_recovered),
             vehicle.mode.observe(self._refresh_soon),
@@ -105,15 +105,17 @@ class Member:
 
     def stop_monitoring(self) -> None:
         """Stop updating the member's state."""
-        for detach in self._detach:
+        for detach in self._detachments:
             detach()
-        self._detach = []
+        self._detachments = []
 
     def refresh(self) -> None:
         """Update the state now, because the link may have closed or a pilot may have taken over."""
-        if self._detach and not self.vehicle.connection.is_open:
+        if not self._is_monitored:
+            return
+        if not self.vehicle.connection.is_open:
             self._set_lost(f"its link is closed, {self.vehicle.describe_link()}")
-        if self.is_available and self._detach and (reason := self._takeover_reason()):
+        if self.is_available and (reason := self._takeover_reason()):
             self._set_taken_over(reason)
             self._on_unavailable(self)
 
@@ -146,6 +148,10 @@ class Member:
         self._set_state(MemberState.RELEASED, reason)
 
     # --------------------------------------------------------------------------------- private
+
+    @property
+    def _is_monitored(self) -> bool:
+        return bool(self._detachments)
 
     def _takeover_reason(self) -> str:
         """Return why the member counts as taken over; an empty string if it does not."""
@@ -197,7 +203,7 @@ class Member:
         self._on_unavailable(self)
 
     def _set_active_again(self) -> None:
-        if self.state is not MemberState.LOST or not self._detach:
+        if self.state is not MemberState.LOST or not self._is_monitored:
             return
         if reason := self._takeover_reason():
             self._set_taken_over(reason)

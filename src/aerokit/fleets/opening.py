@@ -127,7 +127,8 @@ async def fleet(
         )
         members += [Member(f"{name}/{vehicle.system_id}", name, vehicle) for name, vehicle in connected]
         _check_names(members)
-        context = FleetContext(members, networks, rules, next(iter(networks.values())).now, _raise, min_distance_m)
+        now = next(iter(networks.values())).now
+        context = FleetContext(members, networks, rules, now=now, on_error=_raise, min_distance_m=min_distance_m)
         _assign(context, groups or {}, "group")
         _assign(context, roles or {}, "role")
         stack.push_async_callback(context.aclose)
@@ -155,12 +156,12 @@ def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[s
 
 
 def _members_of_vehicles(sources_by_name: Mapping[str, Source], networks: dict[str, Connection]) -> list[Member]:
-    """Return the members for vehicles among the sources, and add their connections to the networks."""
+    """Return a member for each vehicle object among the sources, and add the vehicles' connections to the networks."""
     members: list[Member] = []
     for name, source in sources_by_name.items():
         if isinstance(source, Vehicle):
-            same_connection = (key for key, connection in networks.items() if connection is source.connection)
-            network = next(same_connection, None)
+            names_of_connection = (key for key, connection in networks.items() if connection is source.connection)
+            network = next(names_of_connection, None)
             if network is None:
                 network = name
                 networks[name] = source.connection
@@ -203,6 +204,7 @@ def _check_names(members: list[Member]) -> None:
 
 
 def _assign(context: FleetContext, patterns_by_name: Mapping[str, Iterable[str]], attribute: str) -> None:
+    """Set the attribute ``group`` or ``role`` of the members that match each name's patterns."""
     for name, one_or_more in patterns_by_name.items():
         patterns = [one_or_more] if isinstance(one_or_more, str) else one_or_more
         for member in context.matching(*patterns):
@@ -241,7 +243,8 @@ async def find_systems(
         ConnectFailed: not enough vehicles were found in time.
     """
     searched = [name for name in networks if requested[name] is None]
-    # Maps each network to its system ids. The inner dicts serve as ordered sets.
+    # The system ids of each network: first those that were requested, then those that are found. The inner dicts serve
+    # as ordered sets.
     found: dict[str, dict[int, None]] = {name: dict.fromkeys(requested[name] or ()) for name in networks}
     changed = anyio.Event()
 
@@ -255,7 +258,7 @@ async def find_systems(
             return passed_count + sum(map(len, found.values())) >= count
         return all(found[name] for name in searched)
 
-    def progress() -> str:
+    def describe_progress() -> str:
         names = [f"{name}/{system_id}" for name, ids in found.items() for system_id in ids]
         listed = ", ".join(names)
         if count is not None:
@@ -268,29 +271,29 @@ async def find_systems(
         text = f"no vehicle was found on {silent_networks}"
         return f"{text}; found: {listed}" if names else text
 
-    detach = []
+    detachments = []
     try:
         for name in searched:
             connection = networks[name]
             connection.raise_if_ended()
-            detach.append(connection.bus.attach_event(VehicleFound, partial(on_found, name)))
+            detachments.append(connection.bus.attach_event(VehicleFound, partial(on_found, name)))
             for source, heartbeat in connection.heartbeats.items():
                 on_found(name, discovery_event(heartbeat, connection.now(), *source))
         with anyio.move_on_after(timeout):
-            with warn_while_waiting(timeout, progress):
+            with warn_while_waiting(timeout, describe_progress):
                 while not is_complete():
                     changed = anyio.Event()
                     await changed.wait()
             if searched and count is None:
                 await anyio.sleep(DISCOVERY_S)
     finally:
-        for function in detach:
-            function()
+        for detach in detachments:
+            detach()
     if not is_complete():
         reasons = "".join(
             f"\n  - network {name}: {explain_no_vehicle(networks[name], None)}" for name in searched if not found[name]
         )
-        raise ConnectFailed(f"within {timeout:g} s {progress()}{reasons}")
+        raise ConnectFailed(f"within {timeout:g} s {describe_progress()}{reasons}")
     return {name: sorted(ids) for name, ids in found.items()}
 
 
@@ -309,7 +312,7 @@ def warn_while_waiting(timeout: float, describe: Callable[[], str]) -> Iterator[
 
 
 class _BlockFailed(Exception):
-    """Raised in the ``async with`` block of each vehicle when the fleet's block has raised an exception."""
+    """Raised in each vehicle's block if the fleet's block has failed. A vehicle left flying then logs a warning."""
 
 
 class MemberConnections:
@@ -318,12 +321,12 @@ class MemberConnections:
     def __init__(self, timeout: float, rates: Mapping[type[Message], float] | None) -> None:
         self._timeout, self._rates = timeout, rates
         self._tasks = BackgroundTasks(self._on_error)
-        self._open: dict[int, tuple[str, Vehicle]] = {}  # by index in the list of systems
+        self._connected: dict[int, tuple[str, Vehicle]] = {}  # by index in the list of systems
         self._error: Exception | None = None
         self._changed = asyncio.Event()
         self._close = asyncio.Event()
         self._has_block_failed = False
-        self._running = 0
+        self._task_count = 0
         self._all_closed = asyncio.Event()
 
     async def open(self, systems: Sequence[tuple[str, Connection, int]]) -> list[tuple[str, Vehicle]]:
@@ -332,24 +335,21 @@ class MemberConnections:
         Returns the network and the vehicle of each system, in the same order.
         """
         for index, (network, connection, system_id) in enumerate(systems):
-            self._running += 1
+            self._task_count += 1
             self._tasks.start(partial(self._run, index, network, connection, system_id))
 
         def describe_missing() -> str:
-            names = (
-                f"{network}/{system_id}"
-                for index, (network, _, system_id) in enumerate(systems)
-                if index not in self._open
-            )
-            return f"no heartbeat of {', '.join(names)}"
+            names = [f"{network}/{system_id}" for network, _, system_id in systems]
+            missing = (name for index, name in enumerate(names) if index not in self._connected)
+            return f"no heartbeat of {', '.join(missing)}"
 
         with warn_while_waiting(self._timeout, describe_missing):
-            while len(self._open) < len(systems) and self._error is None:
+            while len(self._connected) < len(systems) and self._error is None:
                 self._changed.clear()
                 await self._changed.wait()
         if self._error is not None:
             raise self._error
-        return [self._open[index] for index in range(len(systems))]
+        return [self._connected[index] for index in range(len(systems))]
 
     async def aclose(
         self,
@@ -357,11 +357,12 @@ class MemberConnections:
         error: BaseException | None = None,
         traceback: TracebackType | None = None,
     ) -> None:
+        """Close all vehicles, and wait until they are closed. The arguments are the exception of the fleet's block."""
         self._has_block_failed = error is not None
         self._close.set()
-        is_every_vehicle_connected = len(self._open) == self._running
+        is_every_vehicle_connected = len(self._connected) == self._task_count
         # If a vehicle is not connected, opening has failed, and cancelling the tasks is enough.
-        if self._running and is_every_vehicle_connected:
+        if self._task_count and is_every_vehicle_connected:
             await run_shielded(self._wait_until_all_closed())
         await self._tasks.aclose()
 
@@ -369,9 +370,10 @@ class MemberConnections:
         await self._all_closed.wait()
 
     async def _run(self, index: int, network: str, connection: Connection, system_id: int) -> None:
+        """Connect one vehicle, and keep it connected until the fleet closes."""
         try:
             async with connect(connection, system_id=system_id, timeout=self._timeout, rates=self._rates) as vehicle:
-                self._open[index] = (network, vehicle)
+                self._connected[index] = (network, vehicle)
                 self._changed.set()
                 await self._close.wait()
                 if self._has_block_failed:
@@ -379,8 +381,8 @@ class MemberConnections:
         except _BlockFailed:
             pass
         finally:
-            self._running -= 1
-            if not self._running:
+            self._task_count -= 1
+            if not self._task_count:
                 self._all_closed.set()
 
     def _on_error(self, error: Exception) -> None:

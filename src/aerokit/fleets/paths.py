@@ -119,20 +119,22 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
             time; infinite: ignore times.
         below_m: if the distance is larger than this, it need not be exact; the result is then at least this distance.
     """
-    begin = min(path.begins_at_s, other.begins_at_s)
-    end = max(path.ends_at_s, other.ends_at_s)
-    best = Approach(math.inf, begin, begin)
-    other_legs = other.legs(begin, end)
-    for leg in path.legs(begin, end):
+    begin_s = min(path.begins_at_s, other.begins_at_s)
+    end_s = max(path.ends_at_s, other.ends_at_s)
+    best = Approach(math.inf, begin_s, begin_s)
+    other_legs = other.legs(begin_s, end_s)
+    for leg in path.legs(begin_s, end_s):
+        start, end = leg
         for other_leg in other_legs:
-            is_other_later = other_leg[0].t_s - slack_s > leg[1].t_s
-            is_other_earlier = other_leg[1].t_s + slack_s < leg[0].t_s
+            other_start, other_end = other_leg
+            is_other_later = other_start.t_s - slack_s > end.t_s
+            is_other_earlier = other_end.t_s + slack_s < start.t_s
             if is_other_later or is_other_earlier:  # the vehicles never fly these legs at the same time
                 continue
             if _lower_bound(leg, other_leg) >= min(best.distance_m, below_m):
                 # These legs are at least `below_m` apart, which is the result unless other legs are closer.
                 if best.distance_m == math.inf:
-                    best = Approach(below_m, leg[0].t_s, other_leg[0].t_s)
+                    best = Approach(below_m, start.t_s, other_start.t_s)
                 continue
             approach = _closest(leg, other_leg, slack_s)
             if approach is not None and approach.distance_m < best.distance_m:
@@ -148,23 +150,31 @@ def horizontal_distance(line: tuple[LocalPoint, LocalPoint], other: tuple[LocalP
 
 
 def _flat_leg(start: LocalPoint, end: LocalPoint) -> Leg:
-    return PathPoint(0.0, start[0], start[1], 0.0), PathPoint(0.0, end[0], end[1], 0.0)
+    """Return a leg between two points, with altitudes and times of 0."""
+    north_m, east_m, _ = start
+    end_north_m, end_east_m, _ = end
+    return PathPoint(0.0, north_m, east_m, 0.0), PathPoint(0.0, end_north_m, end_east_m, 0.0)
 
 
 def _lower_bound(leg: Leg, other: Leg) -> float:
-    """Return a lower bound of the distance of two legs: the distance of their midpoints minus half of their lengths."""
-    lengths = math.dist(leg[0].place, leg[1].place) + math.dist(other[0].place, other[1].place)
-    return math.dist(_midpoint(leg), _midpoint(other)) - lengths / 2
+    """Return a lower bound of the distance of two legs: the distance of their midpoints minus half of each length."""
+    return math.dist(_midpoint(leg), _midpoint(other)) - _length(leg) / 2 - _length(other) / 2
+
+
+def _length(leg: Leg) -> float:
+    start, end = leg
+    return math.dist(start.place, end.place)
 
 
 def _midpoint(leg: Leg) -> tuple[float, ...]:
-    return tuple((start + end) / 2 for start, end in zip(leg[0].place, leg[1].place, strict=True))
+    start, end = leg
+    return tuple((a + b) / 2 for a, b in zip(start.place, end.place, strict=True))
 
 
 def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
     """Return the closest approach of two legs, for pairs of times that differ by at most ``slack_s``.
 
-    None if there are no such times.
+    Return None if no pair of times on the two legs is that close.
 
     With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The time condition
     cuts a strip out of the unit square of (s, t). The minimum is inside the resulting polygon or on its border.
@@ -192,17 +202,14 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
         if slack_s < math.inf:
             corners = _clip(corners, lambda s, t: time_difference(s, t) - slack_s)
             corners = _clip(corners, lambda s, t: -time_difference(s, t) - slack_s)
-    best: tuple[float, float, float] | None = None  # the smallest distance so far, with its s and t
+    best: Approach | None = None
     for index, corner in enumerate(corners):
         previous = corners[index - 1]  # the last corner is before the first one
         s, t = _closest_on_edge(corner, previous, difference(*corner), difference(*previous))
         distance = math.hypot(*difference(s, t))
-        if best is None or distance < best[0]:
-            best = distance, s, t
-    if best is None:
-        return None
-    distance, s, t = best
-    return Approach(distance, begin.t_s + s * duration_s, other_begin.t_s + t * other_duration_s)
+        if best is None or distance < best.distance_m:
+            best = Approach(distance, begin.t_s + s * duration_s, other_begin.t_s + t * other_duration_s)
+    return best
 
 
 def _closest_inside(
@@ -248,12 +255,10 @@ def _closest_on_edge(
     ``difference`` and ``other_difference`` are the difference vectors at the corners of the edge.
     """
     step = [q - p for p, q in zip(difference, other_difference, strict=True)]
-    length = _dot(step, step)
-    fraction = 0.0 if length == 0 else min(1.0, max(0.0, -_dot(difference, step) / length))
-    return (
-        corner[0] + fraction * (other_corner[0] - corner[0]),
-        corner[1] + fraction * (other_corner[1] - corner[1]),
-    )
+    squared_length = _dot(step, step)
+    fraction = 0.0 if squared_length == 0 else min(1.0, max(0.0, -_dot(difference, step) / squared_length))
+    (s, t), (other_s, other_t) = corner, other_corner
+    return s + fraction * (other_s - s), t + fraction * (other_t - t)
 
 
 def _dot(vector: Sequence[float], other: Sequence[float]) -> float:

@@ -27,7 +27,7 @@ PolicyOrder = Literal["hold", "land", "return"]
 
 
 class MemberFailure(Snapshot):
-    """The failure of a ``member``, which belongs to ``group``, in ``action``.
+    """``member``, which belongs to ``group``, failed in ``action``.
 
     ``others`` are the members to which the policy may send orders.
     """

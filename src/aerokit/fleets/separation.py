@@ -113,7 +113,8 @@ def separate_by_altitude(
     reason = _vertical_conflict(routes, stationary, min_distance_m)
     if reason:
         return Deconfliction("refused", reason, min_distance_m, conflicts)
-    lowest_m = max(max(route.start[2], route.target[2]) for route in routes)
+    # The lowest layer is at the highest start or target, so that every vehicle climbs to its layer.
+    lowest_m = max(max(_altitude_m(route.start), _altitude_m(route.target)) for route in routes)
     layers: dict[str, int] = {}
     # Each route gets the lowest layer that no crossing route uses and no stationary vehicle blocks.
     for route in routes:
@@ -133,7 +134,7 @@ def separate_by_altitude(
         reason = f"the paths cross, and the layers would reach {highest:.0f} m, above {max_altitude_m:.0f} m"
         return Deconfliction("refused", reason, min_distance_m, conflicts)
     reason = f"{_describe_pairs(conflicts)} come too close; they cross in {len(set(layers.values()))} layers"
-    return Deconfliction("layers", reason, min_distance_m, conflicts, heights)
+    return Deconfliction("layers", reason, min_distance_m, conflicts, heights_m=heights)
 
 
 def separate_by_time(
@@ -159,17 +160,19 @@ def separate_by_time(
     if not conflicts:
         return Deconfliction("clear", "no paths come too close", min_distance_m)
     resting_paths = _resting_paths(stationary)
-    order, refusal = list(routes), ""
+    sequence, refusal = list(routes), ""
     for _ in routes:  # at most one try for each route
-        delays, blocked_route, blocker = _delays(order, resting_paths, min_distance_m, speed_m_s, slack_s, max_delay_s)
+        delays, blocked_route, blocker = _delays(
+            sequence, resting_paths, min_distance_m, speed_m_s, slack_s, max_delay_s
+        )
         if blocked_route is None:
-            delays = {route.name: delays[route.name] for route in routes}  # back in the order of `routes`
+            delays = {route.name: delays[route.name] for route in routes}  # in the sequence of `routes` again
             max_s = max(delays.values())
             reason = f"{_describe_pairs(conflicts)} come too close; starts are delayed by up to {max_s:g} s"
-            return Deconfliction("corridors", reason, min_distance_m, conflicts, {}, delays, slack_s)
+            return Deconfliction("corridors", reason, min_distance_m, conflicts, delays_s=delays, slack_s=slack_s)
         refusal = f"{blocked_route.name} would have to wait for {blocker} longer than {max_delay_s:g} s"
-        # Routes wait only for those before them in the order, so the next try begins with the blocked route.
-        order = [blocked_route, *(route for route in order if route is not blocked_route)]
+        # A route waits only for routes before it in the sequence, so the next try begins with the blocked route.
+        sequence = [blocked_route, *(route for route in sequence if route is not blocked_route)]
     return Deconfliction("refused", refusal, min_distance_m, conflicts)
 
 
@@ -195,20 +198,20 @@ def _resting_paths(stationary: Mapping[str, LocalPoint]) -> list[Path]:
 
 
 def _delays(
-    order: Sequence[Route],
+    sequence: Sequence[Route],
     resting_paths: Sequence[Path],
     min_distance_m: float,
     speed_m_s: float,
     slack_s: float,
     max_delay_s: float,
 ) -> tuple[dict[str, float], Route | None, str]:
-    """Return the delay of each route in seconds.
+    """Return the delay of each route in seconds, so that no route conflicts with those before it in the sequence.
 
     If a delay would exceed the maximum, also return its route, and the name of the vehicle that blocks this route.
     """
     delayed_paths: list[Path] = []
     delays: dict[str, float] = {}
-    for route in order:
+    for route in sequence:
         delay_s = 0.0
         while True:
             path = Path.straight(route.name, route.start, route.target, speed_m_s, delay_s)
@@ -229,13 +232,18 @@ def _vertical_conflict(routes: Sequence[Route], stationary: Mapping[str, LocalPo
         points: dict[str, LocalPoint] = {route.name: getattr(route, end) for route in routes}
         for name, point in points.items():
             # The vertical path leads upwards from the point, so stationary vehicles well below the point do not matter.
-            lowest_m = point[2] - min_distance_m
-            obstacles = {other: place for other, place in stationary.items() if place[2] > lowest_m}
+            lowest_m = _altitude_m(point) - min_distance_m
+            obstacles = {other: place for other, place in stationary.items() if _altitude_m(place) > lowest_m}
             for other, other_point in {**points, **obstacles}.items():
                 distance = math.dist(point[:2], other_point[:2])
                 if other != name and distance < min_distance_m:
                     return f"the {end} of {name} is {distance:.1f} m from that of {other} horizontally: too close"
     return ""
+
+
+def _altitude_m(point: LocalPoint) -> float:
+    _, _, up_m = point
+    return up_m
 
 
 def _paths_cross(route: Route, other: Route, min_distance_m: float) -> bool:
@@ -247,7 +255,7 @@ def _is_layer_blocked(
 ) -> bool:
     # A stationary vehicle counts as a path that ends where it begins: (point, point).
     return any(
-        abs(point[2] - height_m) < min_distance_m
+        abs(_altitude_m(point) - height_m) < min_distance_m
         and horizontal_distance((route.start, route.target), (point, point)) < min_distance_m
         for point in stationary.values()
     )
@@ -288,20 +296,21 @@ def pairs_within(points: Mapping[str, LocalPoint], max_distance_m: float) -> lis
     for name, (north, east, up) in points.items():
         cube = math.floor(north / max_distance_m), math.floor(east / max_distance_m), math.floor(up / max_distance_m)
         cubes.setdefault(cube, []).append(name)
-    index_of = {name: index for index, name in enumerate(points)}
-    near_pairs: list[tuple[str, str, float]] = []
+    all_names = list(points)
+    index_of = {name: index for index, name in enumerate(all_names)}
+    distances: dict[tuple[int, int], float] = {}  # by the indices of both points, the smaller index first
     for (x, y, z), names in cubes.items():
         candidates = list(combinations(names, 2))
         for dx, dy, dz in HALF_OF_NEIGHBOURS:
             neighbours = cubes.get((x + dx, y + dy, z + dz))
             if neighbours is not None:
                 candidates += product(names, neighbours)
-        for pair in candidates:
-            distance = math.dist(points[pair[0]], points[pair[1]])
+        for name, other in candidates:
+            distance = math.dist(points[name], points[other])
             if distance < max_distance_m:
-                first, second = sorted(pair, key=index_of.__getitem__)
-                near_pairs.append((first, second, distance))
-    return sorted(near_pairs, key=lambda near_pair: (index_of[near_pair[0]], index_of[near_pair[1]]))
+                index, other_index = index_of[name], index_of[other]
+                distances[min(index, other_index), max(index, other_index)] = distance
+    return [(all_names[first], all_names[second], distance) for (first, second), distance in sorted(distances.items())]
 
 
 def to_local_points(positions: Mapping[str, tuple[float, float, float]]) -> dict[str, LocalPoint]:

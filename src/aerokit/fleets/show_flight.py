@@ -61,8 +61,8 @@ POSITION_MAX_AGE_S = 2.0
 TIMESYNC_INTERVAL_S = 0.1
 TIMESYNC_TIMEOUT_S = 2.0
 
-# `time_boot_ms` is converted to our time with the result of TIMESYNC. If the result differs by more than this from the
-# time of arrival, the vehicle uses different clocks for `time_boot_ms` and TIMESYNC.
+# TIMESYNC gives the offset by which `time_boot_ms` is converted to the event loop's time. If the converted time differs
+# by more than this from the time of arrival, the vehicle uses different clocks for `time_boot_ms` and TIMESYNC.
 MAX_CLOCK_ERROR_S = 1.0
 
 
@@ -145,7 +145,7 @@ class ShowReport(Snapshot):
     """Result of a show. Positions have times of the vehicles' own clocks, which ``clocks`` relate to each other.
 
     ``lag_spread_s`` is the difference between the largest and the smallest lag. ``max_relative_error_m`` is the largest
-    deviation between two members: of the vector from one to the other. Both are None if unknown.
+    error of a vector from one member to another. Both are None if unknown.
     """
 
     result: FleetResult
@@ -171,7 +171,7 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
             error_times_velocity += sum(e * v for e, v in zip(error, velocity, strict=True))
             velocity_squared += sum(v * v for v in velocity)
     if not errors:
-        return TrackDeviation(math.nan, math.nan, None, 0)
+        return TrackDeviation(max_m=math.nan, rms_m=math.nan, lag_s=None, samples=0)
     rms = math.sqrt(sum(error * error for error in errors) / len(errors))
     lag_s = error_times_velocity / velocity_squared if velocity_squared else None
     return TrackDeviation(max(errors), rms, lag_s, len(errors))
@@ -192,11 +192,16 @@ def max_relative_error(
             point = _interpolate(samples.get(name, ()), at_s)
             if point is not None:
                 planned, _ = state_at(path, at_s)
-                errors.append((planned[0] - point[0], planned[1] - point[1], planned[2] - point[2]))
+                errors.append(_difference(planned, point))
         if len(errors) > 1:
             relative_errors = (math.dist(first, second) for first, second in combinations(errors, 2))
             largest_m = max(largest_m or 0.0, *relative_errors)
     return largest_m
+
+
+def _difference(point: LocalPoint, other: LocalPoint) -> LocalPoint:
+    """Return the vector to a point from another point."""
+    return point[0] - other[0], point[1] - other[1], point[2] - other[2]
 
 
 def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> LocalPoint | None:
@@ -216,7 +221,7 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
 
 
 class TrackRecorder:
-    """Records the positions of a vehicle (GLOBAL_POSITION_INT) in its ``with`` block: seconds of the show, and metres.
+    """Records a vehicle's positions (GLOBAL_POSITION_INT) in its ``with`` block, in seconds and metres of the show.
 
     Times are from the vehicle's clock (``time_boot_ms``), or those of arrival if the measured offset does not fit it.
     """
@@ -252,14 +257,15 @@ class TrackRecorder:
         Raises:
             StaleValueError: no position was received in the last two seconds.
         """
-        now = self._vehicle.connection.now()
-        if self._latest is None or now - self._latest[0] > POSITION_MAX_AGE_S:
-            raise StaleValueError(f"no GLOBAL_POSITION_INT was received in the last {POSITION_MAX_AGE_S:g} s")
-        measured_at, place, velocity = self._latest
-        age = now - measured_at
-        return place[0] + age * velocity[0], place[1] + age * velocity[1], place[2] + age * velocity[2]
+        if self._latest is not None:
+            measured_at, (north, east, up), (north_m_s, east_m_s, up_m_s) = self._latest
+            age = self._vehicle.connection.now() - measured_at
+            if age <= POSITION_MAX_AGE_S:
+                return north + age * north_m_s, east + age * east_m_s, up + age * up_m_s
+        raise StaleValueError(f"no GLOBAL_POSITION_INT was received in the last {POSITION_MAX_AGE_S:g} s")
 
     def _on_message(self, message: GlobalPositionInt) -> None:
+        """Record a position, unless it was measured before the start of the show."""
         frame = message.received_frame
         if frame is None or frame.component_id != self._vehicle.component_id:
             return
@@ -279,9 +285,10 @@ class TrackRecorder:
 def _metres_per_degree(origin: LocalOrigin, latitude: float, longitude: float) -> tuple[float, float]:
     """Return the metres per degree of latitude and per degree of longitude, for places within some hundred metres."""
     step = 1e-3
-    north = origin.to_local(Position(min(latitude + step, 90.0), longitude), 0.0)[0] / step
-    east = origin.to_local(Position(latitude, longitude + step), 0.0)[1] / step
-    return north or METRES_PER_DEGREE, east  # at the north pole, a step north has no length
+    north_m, _, _ = origin.to_local(Position(min(latitude + step, 90.0), longitude), 0.0)
+    _, east_m, _ = origin.to_local(Position(latitude, longitude + step), 0.0)
+    # At the north pole, a step north has no length.
+    return north_m / step or METRES_PER_DEGREE, east_m / step
 
 
 @checks_arguments
@@ -385,6 +392,7 @@ class Shows(Travel):
         }
 
     def _check_show(self, show: Show) -> None:
+        """Raise OperationRejected if a member is unavailable, or if tracks come too close."""
         for name in show.tracks:
             member = self.members[name]
             member.refresh()
@@ -404,6 +412,7 @@ class Shows(Travel):
 async def _fly_track(
     member: Member, path: Path, recorder: TrackRecorder, begin_at: float, rate_hz: float, lead_s: float
 ) -> None:
+    """Fly a member along its path, from the current time until the end of the path."""
     vehicle, period_s = member.vehicle, 1 / rate_hz
     with vehicle._session.streaming("position"):
         async with vehicle.guided.velocity(rate_hz=rate_hz) as stream:
@@ -421,7 +430,7 @@ def _setpoint(path: Path, at_s: float, lead_s: float, position: LocalPoint) -> V
     _, velocity = state_at(path, at_s + lead_s)
     speed = math.hypot(*velocity)
     north, east, up = follow_velocity(
-        (planned[0] - position[0], planned[1] - position[1], planned[2] - position[2]),
+        _difference(planned, position),
         velocity,
         gain=TRACK_GAIN,
         max_speed_m_s=max(CATCH_UP_FACTOR * speed, CATCH_UP_M_S) + CATCH_UP_M_S,

@@ -1,4 +1,4 @@
-"""``Travel`` and ``Missions``: flights to targets and flights of missions, whose paths are compared before."""
+"""``Travel`` and ``Missions``: flights to targets and of missions. Their paths are compared before the flight."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ class Travel(SelectionBase):
             positions,
             speed_m_s,
             timeout,
-            stagger_s,
-            separation,
+            stagger_s=stagger_s,
+            separation=separation,
             names=names,
             max_distance_m=max_distance_m,
         )
@@ -128,7 +128,9 @@ class Travel(SelectionBase):
             deconfliction = separate_by_altitude(routes, stationary, min_m, max_altitude_m=max_m)
             if by == "refuse" and deconfliction.decision == "layers":  # the paths cross
                 deconfliction = deconfliction.replace(decision="refused", heights_m={})
-        self._context.publish(PathsCompared(self._context.now(), 0, "", deconfliction))
+        self._context.publish(
+            PathsCompared(at=self._context.now(), system_id=0, member="", deconfliction=deconfliction)
+        )
         return deconfliction
 
     # --------------------------------------------------------------------------------------- private
@@ -214,6 +216,8 @@ class Travel(SelectionBase):
         stagger_s: float | None = None,
         corridors: Deconfliction | None = None,
     ) -> FleetResult:
+        """Fly members straight to their targets; in corridors, each member starts after its delay."""
+
         async def fly(member: Member) -> None:
             delay_s = corridors.delays_s.get(member.name, 0.0) if corridors else 0.0
             if delay_s:
@@ -239,13 +243,11 @@ class Travel(SelectionBase):
     ) -> FleetResult:
         """Fly up to the layers, across, and down. A leg begins when all members have finished the leg before."""
         starts = {name: position_of(self._context.members[name], math.inf) for name in heights_m}
-        legs: tuple[dict[str, Position], ...] = (
-            {name: _at_altitude(starts[name], height) for name, height in heights_m.items()},
-            {name: _at_altitude(targets[name], height) for name, height in heights_m.items()},
-            {name: targets[name] for name in heights_m},
-        )
+        climb = {name: _at_altitude(starts[name], height) for name, height in heights_m.items()}
+        crossing = {name: _at_altitude(targets[name], height) for name, height in heights_m.items()}
+        descent = {name: targets[name] for name in heights_m}
         result: FleetResult | None = None
-        for leg in legs:
+        for leg in (climb, crossing, descent):
             missing = [name for name in leg if not self.members[name].is_available]
             if missing:  # an unavailable member may be in the way of the others, so the flight ends
                 raise OperationRejected(
@@ -358,9 +360,7 @@ class Missions(SelectionBase):
         """
         names = tuple(name for name in self._context.missions if name in self.members)
         return await self._run(
-            "mission.wait_finished",
-            lambda member: member.vehicle.mission.wait_finished(timeout=timeout),
-            names=names,
+            "mission.wait_finished", lambda member: member.vehicle.mission.wait_finished(timeout=timeout), names=names
         )
 
     def compare_missions(
@@ -394,7 +394,9 @@ class Missions(SelectionBase):
         )
         reason = f"{pairs} come too close" if conflicts else "no paths come too close"
         deconfliction = Deconfliction("refused" if conflicts else "clear", reason, min_m, conflicts)
-        self._context.publish(PathsCompared(self._context.now(), 0, "", deconfliction))
+        self._context.publish(
+            PathsCompared(at=self._context.now(), system_id=0, member="", deconfliction=deconfliction)
+        )
         return deconfliction
 
     def _require_available(self, missions: Mapping[str, Any]) -> dict[str, Member]:
@@ -413,10 +415,10 @@ class Missions(SelectionBase):
 
 
 def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path | None:
-    """Return the path of a mission, whose points have no times; None if no item has a position."""
-    points = [
-        PathPoint(0.0, *origin.to_local(position, altitude_amsl(member, position)))
-        for position in (item.position for item in mission)
-        if position is not None and not math.isnan(position.latitude_deg)
-    ]
+    """Return the path of a mission, with time 0 for all points; None if no item has a position."""
+    points: list[PathPoint] = []
+    for item in mission:
+        position = item.position
+        if position is not None and not math.isnan(position.latitude_deg):
+            points.append(PathPoint(0.0, *origin.to_local(position, altitude_amsl(member, position))))
     return Path(member.name, points) if points else None

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest
     from aerokit.onboard.services import ComponentServices
 
-FORCE, FORCE_ARM = 21196, 2989
-"""Values of param 2: the standard's value, which forces arming or disarming, and ArduPilot's, which only forces arming.
-"""
+FORCE = 21196
+"""Value of param 2 in the MAVLink standard, which forces arming and disarming."""
+FORCE_ARM = 2989
+"""Value of param 2 in ArduPilot, which forces arming only."""
 _REBOOT, _SHUTDOWN = 1, 2
 
 
@@ -82,13 +83,13 @@ def add_autopilot(
         await call("arm" if is_armed else "disarm", is_forced)
         report(is_armed, None)
 
-    async def set_mode(request: CommandRequest, base_mode: float | None, custom_mode: int) -> None:
+    async def set_mode(_: CommandRequest, base_mode: float | None, custom_mode: int) -> None:
         await call("set_mode", custom_mode)
         report(None, custom_mode)
 
     async def take_off(request: CommandRequest) -> None:
-        altitude = request.params[6]
-        await call("take_off", None if math.isnan(altitude) else altitude)
+        *_, altitude_m = request.params
+        await call("take_off", None if math.isnan(altitude_m) else altitude_m)
 
     async def reboot(_: CommandRequest, action: int) -> None:
         if action not in (_REBOOT, _SHUTDOWN):

@@ -245,7 +245,7 @@ class CameraAdapter(CameraDevice):
 
     def expose(self, done: Callable[[Shot | None], None]) -> None:
         """Take a photo in a task, then call ``done`` with the result, or with None after an error."""
-        # The time of the order counts as the time of the picture.
+        # The picture gets the time of the command, because the camera does not report the time of its shutter.
         time_boot_ms, unix_time = self._host.time_boot_ms, self._host.connection.unix_time()
 
         async def take() -> None:
@@ -322,7 +322,8 @@ class CameraAdapter(CameraDevice):
         move to a percentage.
         """
         if kind == CameraZoomType.STEP and math.isfinite(current_percent):
-            kind, value = CameraZoomType.RANGE, max(0.0, min(100.0, current_percent + value * _STEP_PERCENT))
+            kind = CameraZoomType.RANGE
+            value = max(0.0, min(100.0, current_percent + value * _STEP_PERCENT))
         if kind == CameraZoomType.RANGE and 0.0 <= value <= 100.0:
             move = move_to
         elif kind == CameraZoomType.CONTINUOUS and -1.0 <= value <= 1.0:
@@ -353,9 +354,9 @@ def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
     """Return a function that creates the CAMERA_IMAGE_CAPTURED of a photo. Its arguments are the remaining fields."""
     if not isinstance(photo, Photo):
         raise InvalidArgument(f"take_photo returned {photo!r}, not a Photo")
-    place = photo.position
-    amsl_m = None if place is None else place.altitude_amsl_m
-    relative_m = None if place is None else place.altitude_relative_m
+    position = photo.position
+    amsl_m = None if position is None else position.altitude_amsl_m
+    relative_m = None if position is None else position.altitude_relative_m
     angles = (photo.roll_deg, photo.pitch_deg, photo.yaw_deg)
     known_angles = [math.radians(angle) for angle in angles if angle is not None]
     message = partial(
@@ -363,8 +364,8 @@ def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
         time_boot_ms=time_boot_ms,
         time_utc=round(unix_time * 1e6),
         camera_id=0,
-        lat=0 if place is None else round(place.latitude_deg * 1e7),
-        lon=0 if place is None else round(place.longitude_deg * 1e7),
+        lat=0 if position is None else round(position.latitude_deg * 1e7),
+        lon=0 if position is None else round(position.longitude_deg * 1e7),
         alt=0 if amsl_m is None else round(amsl_m * 1000),
         relative_alt=0 if relative_m is None else round(relative_m * 1000),
         q=UNKNOWN_ATTITUDE if len(known_angles) < 3 else quaternion_from_euler(*known_angles),

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from aerokit.onboard.host import ComponentHost
     from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
 
-_ABSOLUTE = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
-_RELATIVE = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
+_AMSL_FRAMES = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
+_RELATIVE_FRAMES = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
 
 
 class CommandResult(Snapshot):
@@ -59,6 +59,7 @@ class CommandRequest:
     def params(self) -> tuple[float, ...]:
         """Parameters 1 to 7; positions are in degrees for COMMAND_LONG and COMMAND_INT."""
         numbers = list(self._command.params)
+        # COMMAND_INT has latitude and longitude in 1e-7 degrees, but other values in the frames excluded here.
         if self._command.frame is not None and self._command.frame not in (MavFrame.MISSION, MavFrame.LOCAL_NED):
             numbers[4:6] = (number / 1e7 for number in numbers[4:6])
         return tuple(numbers)
@@ -73,9 +74,9 @@ class CommandRequest:
         frame = self._command.altitude_frame
         latitude, longitude, altitude = self.params[4:]
         altitude_m = altitude if math.isfinite(altitude) else None
-        if frame in _ABSOLUTE:
+        if frame in _AMSL_FRAMES:
             return Position(latitude, longitude, altitude_amsl_m=altitude_m)
-        if frame in _RELATIVE:
+        if frame in _RELATIVE_FRAMES:
             return Position(latitude, longitude, altitude_relative_m=altitude_m)
         raise InvalidArgument(f"frame = {frame} is not allowed: it must be a global MAV_FRAME")
 
@@ -86,11 +87,12 @@ class CommandRequest:
         self._report(percent)
 
     def __repr__(self) -> str:
-        return f"<CommandRequest {command_name(self.command)} from {self.sender[0]}/{self.sender[1]}>"
+        system_id, component_id = self.sender
+        return f"<CommandRequest {command_name(self.command)} from {system_id}/{component_id}>"
 
 
 def outcome_of(value: object) -> Outcome:
-    """Convert the return value of a handler to a result; None becomes ACCEPTED."""
+    """Convert the return value of a handler to a result: None and True mean ACCEPTED, False means FAILED."""
     if value is None or value is True:
         return Outcome(MavResult.ACCEPTED)
     if isinstance(value, CommandResult):
@@ -127,8 +129,7 @@ class ComponentCommands:
         self.server: CommandDispatcher = CommandDispatcher(host, self.handlers)
         self._running = RunningCommands(host, self.server)
         self._host, self._tasks = host, tasks
-        # Tasks of commands whose code runs in a thread now. They cannot be cancelled, because a thread cannot be
-        # stopped.
+        # Tasks that wait for a handler in a thread. They cannot be cancelled, because a thread cannot be stopped.
         self._tasks_in_threads: set[asyncio.Task[Any] | None] = set()
         host.knows_command = self.handlers.__contains__
 
@@ -143,7 +144,7 @@ class ComponentCommands:
         self.handlers[command] = partial(self._execute, function, arguments_of(function))
 
     def add_guarded(self, handlers: Mapping[int, CommandHandler]) -> None:
-        """Register handlers of a protocol server that call the program's code, whose exceptions become results."""
+        """Register handlers of a protocol server that call the program's code. Its exceptions become results."""
 
         def guard(handler: CommandHandler) -> CommandHandler:
             def guarded(command: ReceivedCommand) -> int | CommandProgress | None:
@@ -158,12 +159,12 @@ class ComponentCommands:
         self.handlers.update({command: guard(handler) for command, handler in handlers.items()})
 
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function or coroutine function of the program; with ``uses_threads``, a function runs in a thread."""
+        """Call a function of the program, in a thread if it may block (`uses_threads`), and wait for its result."""
         result = self.begin(function, *arguments)
         return await result if inspect.isawaitable(result) else result
 
     def begin(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Like `call`, but return the result of a plain function at once, and an awaitable for other functions."""
+        """Start a call like `call`: return the result if it is known at once, otherwise an awaitable for it."""
         if inspect.iscoroutinefunction(function) or not self.uses_threads:
             return function(*arguments)
         return self._call_in_thread(function, *arguments)
@@ -191,10 +192,12 @@ class ComponentCommands:
     def _execute(
         self, function: Callable[..., Any], arguments: tuple[CommandArgument, ...], command: ReceivedCommand
     ) -> None:
+        """Call a handler, and acknowledge the command when the handler returns, raises or is cancelled."""
         task: asyncio.Task[Any] | None = None
         is_cancelled = False
 
         def cancel() -> None:
+            """Cancel the handler because its sender or the end of the component requires it."""
             nonlocal is_cancelled
             if task in self._tasks_in_threads:
                 return  # The command cannot be cancelled. Its sender gets the result.
@@ -202,12 +205,12 @@ class ComponentCommands:
                 task.cancel()
             elif not is_cancelled:  # The task has not started yet.
                 is_cancelled = True
-                if inspect.iscoroutine(answer):
-                    answer.close()
+                if inspect.iscoroutine(returned):
+                    returned.close()
                 self._running.finish(started, Outcome(MavResult.CANCELLED))
 
         running = self._running.start(command, cancel)
-        if running is None:
+        if running is None:  # The command was already answered, because it is repeated or must wait.
             return
         started = running  # This name tells type checkers that the value is not None in the closure.
         loop = asyncio.get_running_loop() if self.uses_threads else None
@@ -221,12 +224,12 @@ class ComponentCommands:
         request = CommandRequest(command, report)
         try:
             values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]
-            answer = self.begin(function, request, *values)
+            returned = self.begin(function, request, *values)
         except Exception as error:
-            self._fail(running, function, error)
+            self._finish_with_error(running, function, error)
             return
-        if not inspect.isawaitable(answer):
-            self._running.finish(running, outcome_of(answer))
+        if not inspect.isawaitable(returned):
+            self._running.finish(running, outcome_of(returned))
             return
 
         async def run() -> None:
@@ -234,23 +237,25 @@ class ComponentCommands:
             if is_cancelled:
                 return
             task = asyncio.current_task()
-            await self._finish(running, function, answer)
+            await self._finish_when_done(running, function, returned)
 
         self._tasks.start(run, f"aerokit {command_name(command.command)}")
 
-    async def _finish(self, running: RunningCommand, function: Callable[..., Any], answer: Awaitable[Any]) -> None:
+    async def _finish_when_done(
+        self, running: RunningCommand, function: Callable[..., Any], returned: Awaitable[Any]
+    ) -> None:
         """Wait for the result of a handler, and acknowledge the command."""
         try:
-            outcome = outcome_of(await answer)
+            outcome = outcome_of(await returned)
         except asyncio.CancelledError:
             self._running.finish(running, Outcome(MavResult.CANCELLED))
             raise
         except Exception as error:
-            self._fail(running, function, error)
+            self._finish_with_error(running, function, error)
         else:
             self._running.finish(running, outcome)
 
-    def _fail(self, running: RunningCommand, function: Callable[..., Any], error: Exception) -> None:
+    def _finish_with_error(self, running: RunningCommand, function: Callable[..., Any], error: Exception) -> None:
         """Answer with the result for an error, and explain it in a status text."""
         name = getattr(function, "__name__", "run")
         if name == "run":  # The name of aerokit's own wrapper tells the sender nothing.

@@ -88,7 +88,7 @@ class OnboardComponent:
             self._identity.capabilities |= Capability.PARAM_ENCODE_BYTEWISE
         else:
             self._identity.capabilities |= Capability.PARAM_ENCODE_C_CAST
-        self._identity.offer(CompMetadataType.PARAMETER, PARAMETER_PATH, self.parameters.json)
+        self._identity.add_metadata(CompMetadataType.PARAMETER, PARAMETER_PATH, self.parameters.json)
 
     def _start(self) -> None:
         self._send_heartbeat()
@@ -105,7 +105,7 @@ class OnboardComponent:
             self._host.close()
 
     def _use_threads(self) -> None:
-        """Call plain functions of the program in threads, because it is a blocking program."""
+        """Call the program's plain functions in threads, because they may block. aerokit.sync calls this method."""
         self._commands.uses_threads = True
 
     # ------------------------------------------------------------------------------------ state
@@ -275,7 +275,7 @@ class OnboardComponent:
         """
         if len(content) > MAX_METADATA_BYTES:
             raise InvalidArgument(f"content has {len(content)} bytes; at most {MAX_METADATA_BYTES} are allowed")
-        self._identity.offer(CompMetadataType[kind.upper()], f"/{kind}.json", lambda: content)
+        self._identity.add_metadata(CompMetadataType[kind.upper()], f"/{kind}.json", lambda: content)
 
     def _is_congested(self) -> bool:
         return self.connection.unsent_bytes > MAX_UNSENT_BYTES
@@ -308,9 +308,9 @@ class OnboardComponent:
         """
         from aerokit.onboard.autopilot import add_autopilot  # Imported here, because few components need it.
 
-        add_autopilot(self._services, driver, self._report_flight)
+        add_autopilot(self._services, driver, self._set_flight_state)
 
-    def _report_flight(self, is_armed: bool | None, custom_mode: int | None) -> None:
+    def _set_flight_state(self, is_armed: bool | None, custom_mode: int | None) -> None:
         """Change the armed state or the mode in the heartbeat; None leaves it unchanged."""
         old = self._heartbeat
         flags = old.base_mode | MavModeFlag.CUSTOM_MODE_ENABLED

@@ -84,7 +84,7 @@ class WinchDriver:
         return WinchReport()
 
 
-_WINCH_CALLS: dict[int, str] = {
+_WINCH_METHODS: dict[int, str] = {
     WinchActions.RELAXED: "relax",
     WinchActions.RELATIVE_LENGTH_CONTROL: "pay_out",
     WinchActions.RATE_CONTROL: "set_rate",
@@ -106,7 +106,7 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
     async def do_winch(
         _: CommandRequest, instance: float | None, action: int, length: float | None, rate: float | None
     ) -> None:
-        method = _WINCH_CALLS.get(action, "")
+        method = _WINCH_METHODS.get(action, "")
         if not method or not overrides(winch, WinchDriver, method):
             raise NotSupported(f"this winch does not support action {action}")
         arguments: tuple[float | None, ...] = ()
@@ -156,9 +156,10 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
     """
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
+        sender_system, _ = request.sender
         try:
             # PX4 sends 0 instead of its system id (ArmAuthorization.cpp).
-            answer = await services.commands.call(authorize, system_id or request.sender[0])
+            answer = await services.commands.call(authorize, system_id or sender_system)
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")
             result = result_of(error)

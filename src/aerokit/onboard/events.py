@@ -46,19 +46,27 @@ class EventSender:
         self._sequence = (self._sequence + 1) & 0xFFFF
         levels = severity << 4 | severity  # four bits for logs and four bits for other programs
         time_ms, data = self._host.time_boot_ms, bytes(arguments).ljust(MAX_ARGUMENT_BYTES, b"\0")
-        destination = (0, 0)  # the message is for all components
-        event = m.Event(*destination, event_id, time_ms, self._sequence, levels, data)
+        event = m.Event(
+            destination_component=0,  # all components
+            destination_system=0,
+            id=event_id,
+            event_time_boot_ms=time_ms,
+            sequence=self._sequence,
+            log_levels=levels,
+            arguments=data,
+        )
         self._sent.append(event)
         self._host.send(event)
-        if is_first:  # From now on, announce the last sequence number regularly, so that receivers notice losses.
+        if is_first:
             self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
 
     def _send_sequence(self) -> None:
-        """Announce the last sequence number, so that receivers notice lost events."""
-        self._host.send(m.CurrentEventSequence(self._sequence, 0))
+        """Announce the last sequence number now and every five seconds, so that receivers notice lost events."""
+        self._host.send(m.CurrentEventSequence(self._sequence, flags=0))
         self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
 
     def _on_request(self, request: m.RequestEvent, channel: Channel) -> None:
+        """Send requested events again; answer with an error if none of them is stored any more."""
         # Sequence numbers have 16 bits and wrap around, so `last_sequence` may be below `first_sequence`.
         count = ((request.last_sequence - request.first_sequence) & 0xFFFF) + 1
         requested = {(request.first_sequence + i) & 0xFFFF for i in range(min(count, MAX_STORED_EVENTS))}

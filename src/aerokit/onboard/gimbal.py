@@ -114,8 +114,8 @@ class GimbalAdapter(GimbalMount):
         if yaw == _FULL_TURN_DEG:
             self.capabilities |= DeviceCapFlags.SUPPORTS_INFINITE_YAW
         self._gimbal, self._host = gimbal, host
-        self._is_locked = False
-        self._followed = 0  # id of the system at which the gimbal points; 0 for none
+        self._is_yaw_locked = False
+        self._followed_system_id = 0  # the gimbal points at this system; 0: none
 
     @property
     def host(self) -> ServerHost:
@@ -127,7 +127,7 @@ class GimbalAdapter(GimbalMount):
 
     @property
     def is_yaw_locked(self) -> bool:
-        return self._is_locked
+        return self._is_yaw_locked
 
     def angles(self) -> Angles:
         roll, pitch, yaw = map(math.radians, self._gimbal.attitude())
@@ -137,12 +137,12 @@ class GimbalAdapter(GimbalMount):
         return math.radians(self._gimbal.heading())
 
     def point(self, angles: Angles, flags: int, *, locked: bool) -> None:
-        limited = [max(low, min(high, angle)) for angle, (low, high) in zip(angles, self.limits, strict=True)]
-        if locked:
-            limited[2] = angles[2]  # A locked yaw is relative to north, but the yaw limits are relative to the nose.
-        roll, pitch, yaw = map(math.degrees, limited)
+        roll, pitch, yaw = (max(low, min(high, angle)) for angle, (low, high) in zip(angles, self.limits, strict=True))
+        if locked:  # A locked yaw is relative to north, but the yaw limits are relative to the nose.
+            _, _, yaw = angles
+        angles_deg = (math.degrees(roll), math.degrees(pitch), math.degrees(yaw))
         is_retracted = bool(flags & ManagerFlags.RETRACT)
-        target = GimbalTarget((roll, pitch, yaw), rates=None, yaw_locked=locked, is_retracted=is_retracted)
+        target = GimbalTarget(angles_deg, rates=None, yaw_locked=locked, is_retracted=is_retracted)
         self._apply(target, flags)
 
     def turn(self, rates: Angles, flags: int, *, locked: bool) -> None:
@@ -152,7 +152,7 @@ class GimbalAdapter(GimbalMount):
 
     def _apply(self, target: GimbalTarget, flags: int) -> None:
         self._gimbal.point(target)
-        self.flags, self._is_locked = flags, target.yaw_locked
+        self.flags, self._is_yaw_locked = flags, target.yaw_locked
 
     def look_at(self, place: Place | None) -> None:
         if place is None:
@@ -162,16 +162,18 @@ class GimbalAdapter(GimbalMount):
             position = Position(latitude_e7 / 1e7, longitude_e7 / 1e7, altitude_amsl_m=altitude_amsl_m)
         self._gimbal.look_at(position)
         self.flags: int = 0
-        self._is_locked = position is not None  # While the gimbal looks at a position, the vehicle does not turn it.
-        self._followed = 0
+        self._is_yaw_locked = (
+            position is not None
+        )  # While the gimbal looks at a position, the vehicle does not turn it.
+        self._followed_system_id = 0
 
     def follow(self, system_id: int) -> None:
-        self._followed = system_id
+        self._followed_system_id = system_id
 
     def update_followed(self, system_id: int, place: Place) -> None:
-        if system_id == self._followed:
+        if system_id == self._followed_system_id:
             self.look_at(place)
-            self._followed = system_id  # `look_at` has reset it.
+            self._followed_system_id = system_id  # `look_at` has reset it.
 
 
 _ROLL = DeviceCapFlags.HAS_ROLL_AXIS | DeviceCapFlags.HAS_ROLL_LOCK | DeviceCapFlags.HAS_ROLL_FOLLOW

@@ -21,12 +21,13 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-TEXT_SIZE = 50
+CHUNK_SIZE = 50
+"""Maximum number of characters in one STATUSTEXT message."""
 MAX_TEXT_SIZE = 254
 """Maximum number of characters of a status text; longer texts are cut."""
 MAX_COMMAND_AGE_S = 5.0
 """Maximum age in seconds of a command that is executed. Senders give up earlier."""
-_COMMANDS = (m.CommandLong.ID, m.CommandInt.ID)
+_COMMAND_MESSAGE_IDS = (m.CommandLong.ID, m.CommandInt.ID)
 
 
 class ComponentHost:
@@ -74,23 +75,26 @@ class ComponentHost:
         self._detachments.append(self.connection.bus.attach(message_class, on_message))
 
     def _is_addressed(self, message: Message, sender: tuple[int, int]) -> bool:
+        """Return True if this component must process a message from this sender."""
+        sender_system, _ = sender
+        if sender == (self.system_id, self.component_id) or sender_system == 0:  # System id 0 is not a valid sender.
+            return False
+        if self._accepts is not None and sender_system not in self._accepts:
+            return False
         # A message without target fields is for all systems and components (0).
-        target_system, target_component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
-        if sender == (self.system_id, self.component_id) or sender[0] == 0:  # System id 0 is not a valid sender.
-            return False
-        if self._accepts is not None and sender[0] not in self._accepts:
-            return False
+        target_system = getattr(message, "target_system", 0)
+        target_component = getattr(message, "target_component", 0)
         if target_system not in (0, self.system_id) or target_component not in (0, self.component_id):
             return False
-        # If this component does not know a command to all components, it ignores the command, which another may know.
-        is_command_to_all = target_component == 0 and message.ID in _COMMANDS
+        # A command to all components is ignored if this component does not know it: another component may execute it.
+        is_command_to_all = target_component == 0 and message.ID in _COMMAND_MESSAGE_IDS
         return not is_command_to_all or self.knows_command(message.command)  # type: ignore[attr-defined]
 
     def _is_late(self, message: Message) -> bool:
         """Return True for a command that may have waited too long while the event loop was blocked."""
         frame = message.received_frame
         age_s = 0.0 if frame is None else self.now - frame.received_at
-        if message.ID not in _COMMANDS or age_s <= MAX_COMMAND_AGE_S:
+        if message.ID not in _COMMAND_MESSAGE_IDS or age_s <= MAX_COMMAND_AGE_S:
             return False
         ids = (self.system_id, self.component_id)
         logger.warning("component %d/%d: a command that may be %.0f s old was not executed", *ids, age_s)
@@ -100,7 +104,9 @@ class ComponentHost:
         """Send a message to one system, or to all if ``channel`` is None. Does nothing after the connection ended."""
         if self._is_closed or not self.connection.is_open:
             return
-        to = None if channel is None else channel[0]
+        to = None
+        if channel is not None:
+            to, _ = channel
         if self._encoder is None:
             self.connection.send(message, to=to)
         else:
@@ -108,21 +114,19 @@ class ComponentHost:
 
     def send_text(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT to all programs. A text of more than 50 characters is sent in chunks."""
-        data = "".join(char if char.isprintable() else " " for char in text)
-        data = data.encode("ascii", "replace").decode()[:MAX_TEXT_SIZE]
-        if len(data) <= TEXT_SIZE:
-            self.send(m.Statustext(severity, data, id=0, chunk_seq=0))  # id 0 means that the text has only one chunk.
+        printable = "".join(char if char.isprintable() else " " for char in text)
+        text = printable.encode("ascii", "replace").decode()[:MAX_TEXT_SIZE]
+        if len(text) <= CHUNK_SIZE:
+            self.send(m.Statustext(severity, text, id=0, chunk_seq=0))  # id 0 means that the text has only one chunk.
             return
         self._text_id = self._text_id % 0xFFFF + 1
-        for number, start in enumerate(range(0, len(data), TEXT_SIZE)):
-            self.send(m.Statustext(severity, data[start : start + TEXT_SIZE], self._text_id, number))
-        if len(data) % TEXT_SIZE == 0:  # A full chunk does not end the text, so an empty chunk must follow.
-            self.send(m.Statustext(severity, "", self._text_id, len(data) // TEXT_SIZE))
+        for number, start in enumerate(range(0, len(text), CHUNK_SIZE)):
+            self.send(m.Statustext(severity, text[start : start + CHUNK_SIZE], self._text_id, number))
+        if len(text) % CHUNK_SIZE == 0:  # A full chunk does not end the text, so an empty chunk must follow.
+            self.send(m.Statustext(severity, "", self._text_id, len(text) // CHUNK_SIZE))
 
     def report_error(self, subject: str, error: Exception) -> None:
-        """Send an exception of the program's code as a status text. Log the exception unless it is one of aerokit's
-        errors.
-        """
+        """Send an exception of the program's code as a status text, and log it unless it is an AerokitError."""
         text = f"{subject}: {error_text(error)}"
         if not isinstance(error, AerokitError):
             logger.error("component %d/%d: %s", self.system_id, self.component_id, text, exc_info=error)
@@ -148,7 +152,7 @@ class ComponentHost:
         self._detachments.clear()
 
     def _guarded(self, action: Callable[[], Any]) -> None:
-        """Run a server's code; log an exception, so that the component continues."""
+        """Run code of a protocol server. An exception is logged, and the component continues."""
         try:
             action()
         except AerokitError as error:

@@ -49,7 +49,7 @@ class Identity(Snapshot):
 
     @property
     def version_number(self) -> int:
-        """The version in the form of AUTOPILOT_VERSION, which has one byte for each number."""
+        """The version as an integer with one byte for each number, as AUTOPILOT_VERSION has it."""
         parts = [*self.version.split("."), "0", "0", "0"][:4]
         if not all(part.isdecimal() and int(part) <= 255 for part in parts):
             raise InvalidArgument(
@@ -60,7 +60,7 @@ class Identity(Snapshot):
 
 
 class IdentityMessages:
-    """Builders of the messages that identify a component."""
+    """Builds the messages that identify a component, and writes its metadata files."""
 
     def __init__(self, host: ComponentHost, identity: Identity, memory: FileTree) -> None:
         self.capabilities: int = int(Capability.MAVLINK2 | Capability.COMMAND_INT)
@@ -70,6 +70,7 @@ class IdentityMessages:
         self._host, self._identity, self._memory = host, identity, memory
 
     def builders(self) -> dict[int, Builder]:
+        """Return the function that builds each message, by message id."""
         return {
             m.AutopilotVersion.ID: lambda _: [self._version()],
             m.ComponentInformationBasic.ID: lambda _: [self._basic()],
@@ -122,7 +123,7 @@ class IdentityMessages:
         checksum = self.update_files()
         return [m.ComponentMetadata(self._host.time_boot_ms, checksum, f"mftp://{GENERAL_PATH}")]
 
-    def offer(self, kind: CompMetadataType, path: str, content: Callable[[], bytes]) -> None:
-        """Serve a metadata file. ``content()`` returns its content and is called for each request."""
+    def add_metadata(self, kind: CompMetadataType, path: str, content: Callable[[], bytes]) -> None:
+        """Serve a metadata file. ``content()`` returns its content; it is called again for each COMPONENT_METADATA."""
         self.metadata[kind] = (path, content)
         self.update_files()

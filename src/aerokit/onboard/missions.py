@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest, ComponentCommands
     from aerokit.onboard.host import ComponentHost
 
-_NAMES = {"mission": MavMissionType.MISSION, "fence": MavMissionType.FENCE, "rally": MavMissionType.RALLY}
+_TYPES_BY_KIND = {"mission": MavMissionType.MISSION, "fence": MavMissionType.FENCE, "rally": MavMissionType.RALLY}
 
 
 @checks_arguments
@@ -65,8 +65,8 @@ class ComponentMissions:
     def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
         """Decorator: ``function(index)`` continues the mission at an item.
 
-        Requests to change the current item are refused if the function returns False or raises, or if there is no such
-        function.
+        A request to change the current item is refused if the function returns False or raises an exception. Without a
+        function, all requests are refused.
         """
         self._on_current = function
         return function
@@ -97,7 +97,8 @@ class ComponentMissions:
     def _accept_or_refuse(
         self, mission_type: int, items: tuple[MissionItem, ...], answer: Callable[[int], None]
     ) -> None:
-        kind = next(name for name, number in _NAMES.items() if number == mission_type)
+        """Ask the program's function about an upload, and call ``answer`` with the MAV_MISSION_RESULT, now or later."""
+        kind = next(name for name, number in _TYPES_BY_KIND.items() if number == mission_type)
         function = self._on_upload
         verdict: Any = None
         try:
@@ -111,7 +112,7 @@ class ComponentMissions:
             answer(_result_of(verdict))
             return
 
-        async def wait() -> None:
+        async def answer_later() -> None:
             result = int(MavMissionResult.OPERATION_CANCELLED)  # the answer if this task is cancelled
             try:
                 result = _result_of(await verdict)
@@ -120,7 +121,7 @@ class ComponentMissions:
             finally:
                 answer(result)
 
-        self._tasks.start(wait, "aerokit mission upload")
+        self._tasks.start(answer_later, "aerokit mission upload")
 
     def _report_refusal(self, subject: str, error: Exception) -> int:
         """Send the error as a status text, and return the MAV_MISSION_RESULT for it."""
@@ -129,6 +130,7 @@ class ComponentMissions:
         return MavMissionResult.INVALID if is_invalid else MavMissionResult.ERROR
 
     def _set_current(self, index: int) -> bool:
+        """Ask the program to continue the mission at an item; return False if it refuses."""
         if self._on_current is None:
             return False
         try:
@@ -153,6 +155,6 @@ def _result_of(verdict: object) -> int:
 
 
 def _type_of(kind: str) -> int:
-    if kind not in _NAMES:
+    if kind not in _TYPES_BY_KIND:
         raise InvalidArgument(f"kind = {kind!r} is not allowed: it must be 'mission', 'fence' or 'rally'")
-    return _NAMES[kind]
+    return _TYPES_BY_KIND[kind]

@@ -110,7 +110,7 @@ async def component(
                     reconnect=reconnect,
                     peers=peers,
                     may_move=may_move,
-                    heartbeat=None,
+                    heartbeat=None,  # The component sends its own heartbeat.
                 )
             )
         connection.raise_if_ended()
@@ -141,4 +141,6 @@ def _heartbeat(type_: int, autopilot: int) -> Heartbeat:
     for name, value in (("type", type_), ("autopilot", autopilot)):
         if not 0 <= value <= 255:
             raise InvalidArgument(f"{name} = {value} is not allowed: it must be 0 to 255")
-    return Heartbeat(type_, autopilot, 0, 0, MavState.ACTIVE, MAVLINK_VERSION)
+    return Heartbeat(
+        type_, autopilot, base_mode=0, custom_mode=0, system_status=MavState.ACTIVE, mavlink_version=MAVLINK_VERSION
+    )

@@ -48,20 +48,20 @@ class _Row:
 class ComponentParameters(Mapping[str, ParameterValue]):
     """Parameters of a component, a mapping of names to values. Other programs read and set them by MAVLink.
 
-    PARAM serves numbers, PARAM_EXT numbers and texts. A value that is out of range, of another type, or refused by
+    PARAM serves numbers, PARAM_EXT numbers and strings. A value that is out of range, of another type, or refused by
     ``on_set`` is not stored. PARAM_ERROR or PARAM_EXT_ACK then reports the reason to the sender.
     """
 
     def __init__(self, host: ComponentHost, path: Path | None, *, bytewise: bool) -> None:
         self._host, self._path = host, path
         self._rows: dict[str, _Row] = {}
-        self._small_names: list[str] = []  # names of the parameters that are not texts, which PARAM_VALUE can carry
+        self._small_names: list[str] = []  # names of the parameters that are not strings, which PARAM_VALUE can carry
         self._stored: dict[str, Any] = _read_stored(path)
         self._is_dirty = False
-        self._saving: asyncio.Task[None] | None = None
+        self._save_task: asyncio.Task[None] | None = None
         self._param_server = TypedParameterServer(host, _Store(self), bytewise=bytewise, list_rate_hz=LIST_RATE_HZ)
         self._param_ext_server: TypedExtendedServer | None = None
-        self._is_excluded = False
+        self._has_camera_settings = False
 
     def add(
         self,
@@ -98,7 +98,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
                 1000 parameters.
         """
         check_name(name)
-        if self._is_excluded:
+        if self._has_camera_settings:
             raise InvalidArgument("a component cannot have both parameters and the settings of a camera definition")
         if name in self._rows:
             raise InvalidArgument(f"this component already has a parameter {name}")
@@ -112,8 +112,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             name,
             short_description=description,
             unit=unit,
-            minimum=_as_stored(minimum, default),
-            maximum=_as_stored(maximum, default),
+            minimum=_rounded_limit(minimum, default),
+            maximum=_rounded_limit(maximum, default),
             default=None if isinstance(default, str) else default,
             values={} if values is None else dict(values),
             reboot_required=reboot_required,
@@ -136,10 +136,10 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             self._param_ext_server = TypedExtendedServer(self._host, _Store(self))
 
     def _forbid_parameters(self) -> None:
-        """Accept no parameters from now on, because the settings of a camera definition use PARAM_EXT."""
+        """Refuse calls of :meth:`add` from now on, because the settings of a camera definition use PARAM_EXT."""
         if self._rows:
             raise InvalidArgument("a component cannot have both parameters and the settings of a camera definition")
-        self._is_excluded = True
+        self._has_camera_settings = True
 
     def set(self, name: str, value: int | float | str) -> None:
         """Change a value, and announce it to other programs. ``on_set`` is not called.
@@ -199,8 +199,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         row.value = value
         if self._path is not None:
             self._is_dirty = True
-            if self._saving is None:
-                self._saving = asyncio.get_running_loop().create_task(self._save(self._path))
+            if self._save_task is None:
+                self._save_task = asyncio.get_running_loop().create_task(self._save(self._path))
 
     def _file_text(self) -> str:
         values = {name: row.value for name, row in self._rows.items() if not row.metadata.read_only}
@@ -217,12 +217,12 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             logger.error("the parameters of the component could not be saved: %s", error)
             self._host.send_text(MavSeverity.ERROR, f"parameters could not be saved: {error.strerror}")
         finally:
-            self._saving = None
+            self._save_task = None
 
     async def aclose(self) -> None:
         """Wait until the file contains the last change."""
-        if self._saving is not None:
-            await self._saving
+        if self._save_task is not None:
+            await self._save_task
 
     def json(self) -> bytes:
         """Return the parameter metadata file (https://mavlink.io/en/services/component_information.html)."""
@@ -276,8 +276,8 @@ class _Store:
         self._parameters._store(name, self._parameters._checked(self._parameters._rows[name], value))
 
 
-def _as_stored(limit: float | None, default: ParameterValue) -> float | None:
-    """Round a limit to 32 bits, as values are rounded, so that the limit itself is an allowed value."""
+def _rounded_limit(limit: float | None, default: ParameterValue) -> float | None:
+    """Round a float parameter's limit to 32 bits. Values are rounded too, so a value at the limit is allowed."""
     return to_float32(limit) if limit is not None and isinstance(default, float) else limit
 
 

@@ -52,17 +52,18 @@ def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapt
         services.parameters._forbid_parameters()  # The camera's settings use the same messages.
         DefinedSettings(host, definition, camera.on_setting)
         services.memory.put(DEFINITION_PATH, camera.definition)
-        adapter.definition_version, adapter.definition_uri = definition.version, f"mftp://{DEFINITION_PATH}"
+        adapter.definition_version = definition.version
+        adapter.definition_uri = f"mftp://{DEFINITION_PATH}"
     streams.builders.update(camera_builders(adapter))
     for command, handler in camera_commands(adapter).items():
         if command == MavCmd.STORAGE_FORMAT and not overrides(camera, CameraDriver, "format_storage"):
             continue  # The command stays UNSUPPORTED.
-        services.commands.add_raw(command, partial(_run, handler))
+        services.commands.add_raw(command, partial(_run_if_implemented, handler))
     services.commands.handlers.update(legacy_requests(streams))
     return adapter
 
 
-async def _run(handler: AsyncHandler, command: ReceivedCommand) -> int:
+async def _run_if_implemented(handler: AsyncHandler, command: ReceivedCommand) -> int:
     try:
         return await handler(command)
     except NotImplementedError:  # The program's class does not override the method.

@@ -24,7 +24,7 @@ MIN_STREAM_INTERVAL_S = 0.005
 
 
 class ComponentServices:
-    """Commands, streams, parameters and files in memory of one component."""
+    """The command handlers, message streams, parameters and in-memory files of one component."""
 
     def __init__(self, host: ComponentHost, tasks: BackgroundTasks, parameters: ComponentParameters) -> None:
         self.host: ComponentHost = host

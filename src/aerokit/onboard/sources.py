@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from aerokit._internal.arguments import checks_arguments
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import AdsbFlags, LandingTargetType, MavFrame
+from aerokit.mavlink.enums import AdsbAltitudeType, AdsbFlags, LandingTargetType, MavFrame
 from aerokit.protocols.rtcm import fragments, rtcm_messages
 
 if TYPE_CHECKING:
@@ -67,13 +67,17 @@ class ComponentSources:
         nothing_in_range = round(max_m * 100) + 1  # defined by OBSTACLE_DISTANCE
         values = [_centimetres(distance, nothing_in_range) for distance in distances_m]
         values += [_NOT_MEASURED] * (MAX_DISTANCES - len(values))
-        limits_cm = (round(min_m * 100), round(max_m * 100))
-        # Receivers use the float instead of this older field of 8 bits.
-        increment = min(255, round(increment_deg))
-        frame = MavFrame.BODY_FRD
         self._send(
             m.ObstacleDistance(
-                self._time_us(), sensor_type, values, increment, *limits_cm, increment_deg, first_deg, frame
+                time_usec=self._time_us(),
+                sensor_type=sensor_type,
+                distances=values,
+                increment=min(255, round(increment_deg)),  # an older field of 8 bits; receivers use `increment_f`
+                min_distance=round(min_m * 100),
+                max_distance=round(max_m * 100),
+                increment_f=increment_deg,
+                angle_offset=first_deg,
+                frame=MavFrame.BODY_FRD,
             )
         )
 
@@ -124,18 +128,18 @@ class ComponentSources:
         self._send(
             m.AdsbVehicle(
                 icao,
-                round(position.latitude_deg * 1e7),
-                round(position.longitude_deg * 1e7),
-                1,  # ADSB_ALTITUDE_TYPE_GEOMETRIC
-                round((altitude or 0.0) * 1000),
-                round((heading_deg or 0.0) * 100),
-                round((speed_m_s or 0.0) * 100),
-                round((climb_m_s or 0.0) * 100),
-                callsign,
-                emitter_type,
-                age_s,
-                int(flags),
-                squawk or 0,
+                lat=round(position.latitude_deg * 1e7),
+                lon=round(position.longitude_deg * 1e7),
+                altitude_type=AdsbAltitudeType.GEOMETRIC,
+                altitude=round((altitude or 0.0) * 1000),
+                heading=round((heading_deg or 0.0) * 100),
+                hor_velocity=round((speed_m_s or 0.0) * 100),
+                ver_velocity=round((climb_m_s or 0.0) * 100),
+                callsign=callsign,
+                emitter_type=emitter_type,
+                tslc=age_s,
+                flags=int(flags),
+                squawk=squawk or 0,
             )
         )
 
@@ -160,11 +164,19 @@ class ComponentSources:
                 raise InvalidArgument(f"{name} = {angle} is not allowed: it must be -90 to 90")
         if not 0 <= distance_m < math.inf:
             raise InvalidArgument(f"distance_m = {distance_m} is not allowed: it must be 0 or more")
-        angles = (math.radians(right_deg), math.radians(down_deg))
-        kind = LandingTargetType.LIGHT_BEACON
-        frame = MavFrame.BODY_FRD
-        size = (0.0, 0.0)  # The size of the target is unknown.
-        self._send(m.LandingTarget(self._time_us(), target_number, frame, *angles, distance_m, *size, type=kind))
+        self._send(
+            m.LandingTarget(
+                time_usec=self._time_us(),
+                target_num=target_number,
+                frame=MavFrame.BODY_FRD,
+                angle_x=math.radians(right_deg),
+                angle_y=math.radians(down_deg),
+                distance=distance_m,
+                size_x=0.0,  # 0 means that the size is unknown.
+                size_y=0.0,
+                type=LandingTargetType.LIGHT_BEACON,
+            )
+        )
 
     def send_corrections(self, rtcm: bytes) -> None:
         """Send GNSS corrections (RTCM 3) in GPS_RTCM_DATA messages.

@@ -113,7 +113,7 @@ TwinT = TypeVar("TwinT", bound="ConnectionTwin | VehicleTwin")
 
 
 class TwinOf(ReadOnly, Generic[AsyncT]):
-    """Blocking twin of an asynchronous object, whose methods it calls on the loop thread."""
+    """Blocking twin of an asynchronous object. It calls the object's methods on the loop thread."""
 
     def __init__(self, loop: LoopThread, aio: AsyncT) -> None:
         self._loop, self._aio = loop, aio
@@ -182,7 +182,8 @@ class IteratorTwin(TwinOf[IteratorT], Generic[IteratorT, ItemT]):
         item_or_nothing = self._loop.run(read)
         if not item_or_nothing:
             raise StopIteration
-        return item_or_nothing[0]
+        (item,) = item_or_nothing
+        return item
 
 
 class ChangesTwin(IteratorTwin["Changes[T]", T], Generic[T]):

@@ -58,7 +58,7 @@ __all__ = [
 class ComponentParameters(TwinOf["AsyncComponentParameters"]):
     """Parameters of a component, a mapping of names to values. Other programs read and set them by MAVLink.
 
-    PARAM serves numbers, PARAM_EXT numbers and texts. A value that is out of range, of another type, or refused by
+    PARAM serves numbers, PARAM_EXT numbers and strings. A value that is out of range, of another type, or refused by
     ``on_set`` is not stored. PARAM_ERROR or PARAM_EXT_ACK then reports the reason to the sender.
     """
 
@@ -173,8 +173,8 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
     def on_set_current(self, function: Callable[[int], object]) -> Callable[[int], object]:
         """Decorator: ``function(index)`` continues the mission at an item.
 
-        Requests to change the current item are refused if the function returns False or raises, or if there is no such
-        function.
+        A request to change the current item is refused if the function returns False or raises an exception. Without a
+        function, all requests are refused.
         """
         return self._loop.call(self.aio.on_set_current, function)
 

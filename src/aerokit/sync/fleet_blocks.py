@@ -111,7 +111,7 @@ def opened_fleet(
 
 
 def _original(source: Any) -> Any:
-    """Return the asynchronous object of a source that is a twin; other sources unchanged. Also convert mappings."""
+    """Return the asynchronous object of a twin; another source unchanged. In a mapping, the values are converted."""
     if isinstance(source, Mapping):
         return {name: _original(entry) for name, entry in source.items()}
     return source.aio if isinstance(source, TwinOf) else source

@@ -5,9 +5,9 @@ Fleets are in ``sync/fleet_twins.py`` and components in ``sync/component_twins.p
     python -m aerokit.sync.generator            # write the files
     python -m aerokit.sync.generator --check    # compare; exit code 1 if they differ
 
-The twin of a coroutine method runs it on the loop; the twin of another method calls it there. A return value whose
-class has a twin is wrapped in it. ``originals.py`` lists the classes. Arguments, defaults and docstrings are copied;
-annotations are imported from the modules that the original class imports them from.
+The twin of a coroutine method awaits it on the loop; the twin of a plain method calls it there. If the class of a
+return value has a twin, the value is wrapped in it. ``originals.py`` lists the classes. Arguments, defaults and
+docstrings are copied; annotations are imported from the modules that the original class imports them from.
 """
 
 from __future__ import annotations
@@ -92,12 +92,14 @@ def arguments_of(arguments: ast.arguments) -> list[str]:
     positional = [*arguments.posonlyargs, *arguments.args]
     no_defaults: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults))
     # Only the last positional arguments have defaults.
-    texts = [_argument(*pair) for pair in zip(positional, [*no_defaults, *arguments.defaults])]  # noqa: B905
+    defaults = [*no_defaults, *arguments.defaults]
+    texts = [_argument(argument, default) for argument, default in zip(positional, defaults, strict=True)]
     if arguments.vararg is not None:
         texts.append("*" + _argument(arguments.vararg, None))
     elif arguments.kwonlyargs:
         texts.append("*")
-    texts += [_argument(*pair) for pair in zip(arguments.kwonlyargs, arguments.kw_defaults)]  # noqa: B905
+    for argument, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True):
+        texts.append(_argument(argument, default))
     if arguments.kwarg is not None:
         texts.append("**" + _argument(arguments.kwarg, None))
     return texts
@@ -195,6 +197,7 @@ class Page:
                 self._import_name(text, modules, at_run_time)
 
     def _import_name(self, name: str, modules: tuple[str, ...], at_run_time: bool) -> None:
+        """Add the import of one name, unless the file defines it or it is built in."""
         if name in self._page_of_other_twins and self._page_of_other_twins[name] == "twins":
             self.at_run_time.add(("aerokit.sync.twins", name))
             return
@@ -202,9 +205,9 @@ class Page:
             return
         imports = (imports_of(module) for module in modules)
         origin = next((imported[name] for imported in imports if name in imported), (modules[0], name))
-        # If several modules export a name, it is always imported from the module that was found first. `origin[1]` is
-        # empty if the name is that of a module, which is imported itself.
-        origin = self._import_sources.setdefault(origin[1] or name, origin)
+        _, original_name = origin  # an empty string for a module, which is imported itself
+        # If several modules export a name, it is always imported from the module that was found first.
+        origin = self._import_sources.setdefault(original_name or name, origin)
         if at_run_time:
             self.at_run_time.add(origin)
         else:
@@ -363,7 +366,7 @@ def _opener(page: Page, path: str) -> str:
 
 
 def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
-    """Return import statements in the order of ruff."""
+    """Return import statements in the order that ruff requires."""
     parts: list[str] = []
     for is_ours in (False, True):
         modules = {module for module, _ in names if module.startswith("aerokit") == is_ours}
@@ -374,6 +377,7 @@ def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
 
 
 def _from_lines(module: str, names: set[tuple[str, str]], indent: str) -> str:
+    """Return the ``from … import`` statements for the names of one module."""
     imported = sorted((name for name_module, name in names if name_module == module and name), key=_by_kind)
     plain_names = [name for name in imported if " as " not in name]
     # Statements are sorted by their first imported name, which is the key in `statements`. As in ruff's format, each
@@ -395,7 +399,8 @@ def _by_kind(name: str) -> tuple[bool, bool, str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m aerokit.sync.generator")
     parser.add_argument("--check", action="store_true", help="compare with the committed file, write nothing")
-    is_check, exit_code = parser.parse_args(arguments).check, 0
+    is_check = parser.parse_args(arguments).check
+    exit_code = 0
     for name, file in FILES.items():
         text = generate(name)
         if not is_check:

@@ -173,7 +173,7 @@ class LoopThread:
             self.activity.feed()
 
     def call_soon(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Schedule a synchronous function on the loop, in order, from any thread. It must not raise.
+        """Schedule a synchronous function on the loop, in order, from any thread. The function must not raise.
 
         Raises:
             ConnectionClosed: the loop was closed.

@@ -26,9 +26,9 @@ class Twin:
         only: generate only these members.
         without: do not generate these members.
         special: generate these dunder methods, too.
-        direct: methods that only read; called on the caller's thread.
-        called: properties that are read on the loop.
-        parts: properties whose value is created on the loop on first access.
+        direct: methods that only read, and that the twin calls on the caller's thread.
+        called: properties that the twin reads on the loop.
+        parts: properties that the twin reads on the loop once, because the first access creates their value.
         parameter: type argument of the base class.
         page: the file that it is written to.
     """
@@ -241,13 +241,14 @@ def _own_members(cls: type) -> Iterator[ClassMember]:
             assert isinstance(node.target, ast.Name)
             assert isinstance(node.annotation, ast.Subscript)
             type_ = ast.Subscript(ast.Name("StateCell"), node.annotation.slice)
-            yield ClassMember(node.target.id, (cls.__module__,), None, type_, _text_below(body, index), is_cell=True)
+            text = _text_below(body, index)
+            yield ClassMember(node.target.id, (cls.__module__,), node=None, returns=type_, text=text, is_cell=True)
 
 
 def _attributes(init: ast.FunctionDef, module: tuple[str, ...]) -> Iterator[ClassMember]:
     """Yield the public attributes that ``__init__`` sets, with the docstrings below them.
 
-    The type is the annotation; without one, it is the class whose call is assigned.
+    The type of an attribute is its annotation or, without one, the class that is called to create the value.
     """
     for index, node in enumerate(init.body):
         target: ast.expr | None = node.target if isinstance(node, ast.AnnAssign) else None
@@ -260,7 +261,7 @@ def _attributes(init: ast.FunctionDef, module: tuple[str, ...]) -> Iterator[Clas
             type_ = node.annotation
         elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Call):
             type_ = node.value.func
-        yield ClassMember(target.attr, module, None, type_, _text_below(init.body, index))
+        yield ClassMember(target.attr, module, node=None, returns=type_, text=_text_below(init.body, index))
 
 
 def _text_below(body: Sequence[ast.stmt], index: int) -> str | None:

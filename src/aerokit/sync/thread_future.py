@@ -1,4 +1,4 @@
-"""``ThreadFuture``: a result that one thread waits for and another one sets."""
+"""``ThreadFuture``: a result that one thread sets and another thread waits for."""
 
 from __future__ import annotations
 

@@ -90,7 +90,12 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         """
         source = (next_due, asyncio.Handle(run, (), self))
         self._sources.append(source)
-        return lambda: self._sources.remove(source) if source in self._sources else None
+
+        def remove() -> None:
+            if source in self._sources:
+                self._sources.remove(source)
+
+        return remove
 
     def _run_once(self) -> None:
         """Run one iteration of the loop. Without sockets, poll only rarely, to notice signals and other threads."""
@@ -142,20 +147,21 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
         Stop when a callback is ready or the selector must be polled.
         """
-        sources, ready, has_run = self._sources, self._ready, False  # type: ignore[attr-defined]
-        can_skip_polls = self._can_skip_polls
+        sources, ready = self._sources, self._ready  # type: ignore[attr-defined]
+        can_skip_polls, has_run = self._can_skip_polls, False
         while sources and not ready:
-            earliest_due, earliest = math.inf, sources[0][1]
+            earliest_due = math.inf
+            _, earliest_handle = sources[0]
             for next_due, handle in sources:
                 due = next_due()
                 if due < earliest_due:
-                    earliest_due, earliest = due, handle
+                    earliest_due, earliest_handle = due, handle
             # If a timer is due earlier or at the same instant, stop here: the iteration that runs the timer also runs
             # the event sources of its instant.
             if earliest_due + self._clock_resolution >= self._next_timer():
                 break
             self._now = max(self._now, earliest_due)
-            earliest._run()
+            earliest_handle._run()
             has_run = True
             self._iterations += 1
             if self._iterations >= _POLL_EVERY or not can_skip_polls:  # Real sockets must be polled before every jump.
@@ -193,6 +199,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return events
 
     def _wait(self, poll: Callable[[float], list[Any]], timeout: float | None) -> list[Any]:
+        """Return events of the selector. Without events, run event sources or else advance the clock by ``timeout``."""
         events = poll(0)
         if events or (timeout is not None and timeout <= 0):
             return events
@@ -205,7 +212,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         if self._ready:  # type: ignore[attr-defined]  # Another thread has called the loop since the poll.
             return []
         if timeout is None:
-            raise DeadlockError(self._deadlock("the loop has nothing left to wait for"))
+            raise self._deadlock_error("the loop has nothing left to wait for")
         self._now += timeout
         return []
 
@@ -215,17 +222,18 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
     def _wait_in_real_time(self, poll: Callable[[float], list[Any]]) -> list[Any]:
         events = poll(self._deadlock_timeout_s)
         if not events:
-            raise DeadlockError(
-                self._deadlock(f"no socket or thread has woken the loop for {self._deadlock_timeout_s} real seconds")
+            raise self._deadlock_error(
+                f"no socket or thread has woken the loop for {self._deadlock_timeout_s} real seconds"
             )
         return events
 
     def _may_be_woken(self) -> bool:
+        """Return True if a socket or another thread could still wake the loop."""
         return len(self._registered) != self._own_registered_count or threading.active_count() > 1
 
-    def _deadlock(self, reason: str) -> str:
+    def _deadlock_error(self, reason: str) -> DeadlockError:
         waiting = "".join(f"\n  - {_name_and_line(task)}" for task in asyncio.all_tasks(self))
-        return f"at {self._now} virtual seconds: {reason}; waiting tasks:{waiting or ' none'}"
+        return DeadlockError(f"at {self._now} virtual seconds: {reason}; waiting tasks:{waiting or ' none'}")
 
 
 def run_virtual(coroutine: Coroutine[Any, Any, T]) -> T:

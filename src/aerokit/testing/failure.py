@@ -1,4 +1,4 @@
-"""Report on a failed test: its flights, their texts, and the paths of pictures and recordings."""
+"""Report on a failed test: its flights, their status texts, and the paths of pictures and recordings."""
 
 from __future__ import annotations
 
@@ -92,17 +92,17 @@ def _recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: 
         try:
             path.write_bytes(recording.to_bytes())
             lines.append(f"recording in {path}")
-            lines += [_report(path, flight, len(group)) for flight in group]
+            lines += [_report(path, flight, shares_recording=len(group) > 1) for flight in group]
         except Exception as error:  # For example, the recording is empty or the disk is full.
             lines.append(f"no report: {error}")
     return lines
 
 
-def _report(path: Path, flight: Flight | ServedFlight, count: int) -> str:
+def _report(path: Path, flight: Flight | ServedFlight, *, shares_recording: bool) -> str:
+    """Write the report on one vehicle of a recording, and return the line about it."""
     from aerokit.logs.report import write_report
 
     system_id = flight.simulated.system_id
-    shares_recording = count > 1
     target = path.with_suffix(f".{system_id}.html" if shares_recording else ".html")
     try:
         write_report(path, target, system_id=system_id, force=True)

@@ -100,7 +100,7 @@ class FaultyPath:
         self._started_at = now
 
     def carry(self, data: bytes, now: float) -> list[tuple[float, bytes]]:
-        """Return when which bytes of a write or datagram arrive, as (time, bytes), in the order of sending."""
+        """Return the frames of a write or datagram that arrive, as pairs (time, bytes), in the order of sending."""
         if self._started_at is None:
             self.start(now)
         arrivals: list[tuple[float, bytes]] = []
@@ -109,11 +109,14 @@ class FaultyPath:
         return arrivals
 
     def _carry_frame(self, frame: bytes, now: float) -> list[tuple[float, bytes]]:
+        """Return the arrivals of one frame: none if it is lost, two if it is duplicated."""
         # Draw five random numbers for every frame, even for a lost frame. A change of one share then does not change
         # which frames the other faults affect.
         model, chance = self.model, self._chance
-        is_lost, is_duplicated = chance() < model.loss, chance() < model.duplication
-        is_reordered, is_corrupted = chance() < model.reordering, chance() < model.corruption
+        is_lost = chance() < model.loss
+        is_duplicated = chance() < model.duplication
+        is_reordered = chance() < model.reordering
+        is_corrupted = chance() < model.corruption
         jitter = chance() * model.jitter_s
         self.frames += 1
         self.bytes += len(frame)

@@ -33,7 +33,7 @@ class FaultInjector:
         self._schedule_with = schedule_with
 
     def when(self, condition: Callable[[TrackPoint], bool]) -> FaultInjector:
-        """Return an injector whose faults start when the true state of the vehicle first meets a condition.
+        """Return an injector that starts its faults when the true state of the vehicle first meets a condition.
 
         ``after_s`` counts from that moment. The condition is checked ten times per simulated second:
         ``faults.when(lambda point: point.altitude_m > 15).lose_gps()``.
@@ -55,30 +55,30 @@ class FaultInjector:
 
     def lose_gps(self, *, after_s: float = 0.0, for_s: float | None = None) -> None:
         """Lose the GPS fix. Some seconds later, the estimator has no position any more."""
-        self._set("gps_lost", True, False, after_s, for_s)
+        self._set("gps_lost", True, after_s, for_s)
 
     def lose_rc(self, *, after_s: float = 0.0, for_s: float | None = None) -> None:
         """Switch the pilot's transmitter off."""
-        self._set("rc_lost", True, False, after_s, for_s)
+        self._set("rc_lost", True, after_s, for_s)
 
     def fail_motor(self, *, after_s: float = 0.0) -> None:
         """Stop a motor, so that the vehicle cannot fly any more."""
-        self._set("motor_failed", True, False, after_s, None)
+        self._set("motor_failed", True, after_s)
 
     def drop_packets(self, share: float, *, after_s: float = 0.0, for_s: float | None = None) -> None:
         """Lose a share of the packets, from 0 to 1, in both directions. The vehicle's seed determines which ones."""
         if not 0.0 <= share <= 1.0:
             raise InvalidArgument(f"share = {share!r} is not allowed: it must be 0 to 1")
-        self._set("loss", share, 0.0, after_s, for_s)
-        self._set("loss_incoming", share, 0.0, after_s, for_s)
+        self._set("loss", share, after_s, for_s, healthy_value=0.0)
+        self._set("loss_incoming", share, after_s, for_s, healthy_value=0.0)
 
     def go_silent(self, for_s: float | None = None, *, after_s: float = 0.0) -> None:
         """Interrupt the radio in both directions, by default until :meth:`end`. The vehicle flies on."""
-        self._set("silent", True, False, after_s, for_s)
+        self._set("silent", True, after_s, for_s)
 
     def hang(self, for_s: float | None = None, *, after_s: float = 0.0) -> None:
         """Freeze the autopilot, by default until :meth:`end`. It then does not receive, move or send."""
-        self._set("frozen", True, False, after_s, for_s)
+        self._set("frozen", True, after_s, for_s)
 
     def fail_prearm(self, reason: str, *, after_s: float = 0.0, for_s: float | None = None) -> None:
         """Make an arming check fail for this reason."""
@@ -107,10 +107,13 @@ class FaultInjector:
     def end(self, *, after_s: float = 0.0) -> None:
         """End the faults of GPS, radios, motor and processor."""
         for name in ("gps_lost", "rc_lost", "motor_failed", "silent", "frozen"):
-            self._set(name, False, False, after_s, None)
+            self._set(name, False, after_s)
         self.drop_packets(0.0, after_s=after_s)
 
-    def _set(self, name: str, value: object, healthy_value: object, after_s: float, for_s: float | None) -> None:
+    def _set(
+        self, name: str, value: object, after_s: float, for_s: float | None = None, *, healthy_value: object = False
+    ) -> None:
+        """Set an attribute of `Faults` after some seconds and, after ``for_s`` more, set it to its healthy value."""
         end_s = None if for_s is None else after_s + _duration(for_s)
         self._schedule(partial(setattr, self.all, name, value), after_s)
         if end_s is not None:

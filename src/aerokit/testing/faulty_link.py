@@ -158,7 +158,7 @@ class FaultyLink(Link):
         self._is_closed = False
         self._stalled_queue: StalledQueue | None = None  # None before the first call of `stall`.
         self._stalled_at: float | None = None
-        self._expired = 0
+        self._expired_writes = 0
         self._drained = asyncio.Event()
         self._drained.set()
 
@@ -173,7 +173,7 @@ class FaultyLink(Link):
 
         Frames that were lost in transit do not count.
         """
-        return self.link.dropped_writes + self.outgoing.overflowed + self._expired
+        return self.link.dropped_writes + self.outgoing.overflowed + self._expired_writes
 
     @property
     def unsent_bytes(self) -> int:
@@ -235,7 +235,7 @@ class FaultyLink(Link):
         if in_flight is None:
             return
         for due, piece in self.outgoing.carry(bytes(data), in_flight.loop.time()):
-            in_flight.put(due, lambda piece=piece: self.link.write(piece, peer))  # type: ignore[misc]
+            in_flight.put(due, partial(self.link.write, piece, peer))
 
     def keep_peer(self, peer: Peer) -> None:
         """See `Link.keep_peer`."""
@@ -275,9 +275,10 @@ class FaultyLink(Link):
         await self.link.wait_closed()
 
     def _count_expired(self, writes: int) -> None:
-        self._expired += writes
+        self._expired_writes += writes
 
     def _on_stalled(self, is_stalled: bool) -> None:
+        """Report to the receiver that the link stalls or is drained."""
         now, stalled_at = asyncio.get_running_loop().time(), self._stalled_at
         was_stalled = stalled_at is not None
         if self._incoming_path is None or is_stalled == was_stalled:  # Report only a change, and only while open.
@@ -304,8 +305,8 @@ class FaultyLink(Link):
 class _IncomingPath:
     """The receiver of the wrapped link. It applies the faults of the incoming direction."""
 
-    def __init__(self, path: FaultyPath, receiver: Receiver, when_lost: Callable[[], None]) -> None:
-        self._path, self._receiver, self._when_lost = path, receiver, when_lost
+    def __init__(self, path: FaultyPath, receiver: Receiver, on_lost: Callable[[], None]) -> None:
+        self._path, self._receiver, self._on_lost = path, receiver, on_lost
         self.keeps_peers = keeps_peers(receiver)
         self._in_flight = _DeliveryQueue(asyncio.get_running_loop())
         self._is_closed = False
@@ -315,11 +316,11 @@ class _IncomingPath:
         for due, piece in self._path.carry(data, self._in_flight.loop.time()):
             if self._is_closed:  # The receiver has closed the link while it processed the previous piece.
                 return
-            self._in_flight.put(due, lambda piece=piece: self._receiver.bytes_received(piece, peer))  # type: ignore[misc]
+            self._in_flight.put(due, partial(self._receiver.bytes_received, piece, peer))
 
     def link_lost(self, error: LinkLost) -> None:
         """See `Receiver`. Frames in transit are delivered first."""
-        self._when_lost()
+        self._on_lost()
         if not self._is_closed:
             self._in_flight.put(self._in_flight.latest_due, lambda: self._receiver.link_lost(error))
 
@@ -374,7 +375,7 @@ class _DeliveryQueue:
             action()
             return
         self.latest_due = max(self.latest_due, due)
-        self._count += 1
+        self._count += 1  # Actions with the same due time run in the order in which they were queued.
         heappush(self._waiting, (due, self._count, action))
         self._schedule()
 
@@ -385,19 +386,25 @@ class _DeliveryQueue:
         self._timer = None
 
     def _schedule(self) -> None:
-        due = self._waiting[0][0]
+        """Set the timer to the due time of the first action."""
+        due, _, _ = self._waiting[0]
         if self._timer is not None:
             if self._timer_at <= due:
                 return
             self._timer.cancel()
-        self._timer, self._timer_at = self.loop.call_at(due, self._run), due
+        self._timer = self.loop.call_at(due, self._run)
+        self._timer_at = due
 
     def _run(self) -> None:
         self._timer = None
-        now = max(self.loop.time(), self._waiting[0][0])  # A timer may fire slightly early.
+        first_due, _, _ = self._waiting[0]
+        now = max(self.loop.time(), first_due)  # A timer may fire slightly early.
         try:
-            while self._waiting and self._waiting[0][0] <= now:
-                _, _, action = heappop(self._waiting)
+            while self._waiting:
+                due, _, action = self._waiting[0]
+                if due > now:
+                    break
+                heappop(self._waiting)
                 action()
         finally:  # The other actions must run even if one raises an exception, which the loop then reports.
             if self._waiting:

@@ -51,7 +51,7 @@ class Flight:
         self.track: Track = fleet._scheduler.tracks[number]
         """True track of the vehicle."""
         self.journal: Journal = fleet._scheduler.journals[number]
-        """Texts that the vehicle sent and messages that it received."""
+        """Status texts that the vehicle sent, and messages that it received."""
         self.faults: FaultInjector = FaultInjector(self.simulated, fleet._schedule_with)
         """Injects faults."""
         self._vehicle: aerokit.Vehicle | None = None
@@ -130,7 +130,8 @@ class SimulatedFleet(Sequence[Flight]):
     @property
     def min_distance_m(self) -> float:
         """Minimum distance of any two vehicles in space, in metres. It is infinite for fewer than two vehicles."""
-        return self._closest_approach()[0]
+        closest_m, _, _ = self._closest_approach()
+        return closest_m
 
     def assert_stayed_apart(self, distance_m: float) -> None:
         """Assert that the distance of any two vehicles in space was never below ``distance_m``."""

@@ -48,7 +48,7 @@ class Interruption:
 
     @contextlib.contextmanager
     def on_error(self) -> Iterator[None]:
-        """Block on another thread than the main one: an exception that leaves it interrupts the main thread."""
+        """For a block on another thread: an exception that leaves the block interrupts the main thread."""
         try:
             yield
         except Exception:
@@ -78,8 +78,8 @@ class Interruption:
 def _is_sigint_available() -> bool:
     """Return True if an Interruption may replace the handler of SIGINT.
 
-    This is the default handler, that of another Interruption, or none because the signal is ignored (as in jobs of a
-    script).
+    It may replace the default handler, the handler of another Interruption, and SIG_IGN, which shells set for
+    background jobs of a script.
     """
     handler = signal.getsignal(signal.SIGINT)
     return handler in (signal.default_int_handler, signal.SIG_IGN) or isinstance(

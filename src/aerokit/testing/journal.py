@@ -1,4 +1,4 @@
-"""`Journal`: texts that a simulated vehicle sent, and messages that it received."""
+"""`Journal`: status texts that a simulated vehicle sent, and messages that it received."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ReceivedMessage:
 
 
 class Journal:
-    """Texts that a vehicle sent and messages that it received, from the oldest to the newest.
+    """Status texts that a vehicle sent, and messages that it received, from the oldest to the newest.
 
     The journal grows while the vehicle runs. Assertions raise AssertionError.
     """
@@ -58,7 +58,7 @@ class Journal:
 
     @property
     def texts(self) -> list[SentText]:
-        """Texts that the vehicle sent."""
+        """Status texts that the vehicle sent."""
         return list(self._texts)
 
     @property

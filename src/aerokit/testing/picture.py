@@ -168,8 +168,10 @@ class _Axes:
             self.y_range = _widened(self.y_range, scale * self.height)
 
     def place(self, x: float, y: float) -> tuple[float, float]:
-        from_left = (x - self.x_range[0]) / _span(self.x_range) * self.width
-        from_bottom = (y - self.y_range[0]) / _span(self.y_range) * self.height
+        min_x, _ = self.x_range
+        min_y, _ = self.y_range
+        from_left = (x - min_x) / _span(self.x_range) * self.width
+        from_bottom = (y - min_y) / _span(self.y_range) * self.height
         return self.left + from_left, self.top + self.height - from_bottom
 
     def grid(self, x_unit: str, y_unit: str) -> list[_Shape]:
@@ -189,7 +191,7 @@ class _Axes:
 
 
 def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
-    # All tracks are drawn relative to the first home: east to the right, north upwards.
+    """Draw the tracks from above, relative to the first home: east to the right, north upwards."""
     paths = [[(east, north) for north, east, _ in track.local(tracks[0].home)] for track in tracks]
     outlines = [outline for track in tracks for outline in _outlines(track, tracks[0].home)]
     all_places = [place for path in paths + outlines for place in path]
@@ -207,7 +209,7 @@ def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
 
 
 def _outlines(track: Drawable, origin: Position) -> list[list[tuple[float, float]]]:
-    """Return the outline of the circle or polygon of the failed assertion, in metres east and north."""
+    """Return the outlines of the circle and the polygon of the failed assertion, in metres east and north."""
     failure = track.failure
     if failure is None:
         return []
@@ -275,6 +277,7 @@ class _Labels:
 
 
 def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
+    """Draw the altitudes of the tracks over time, and the altitude limit of the first failed assertion."""
     paths = [[(point.time_s, point.altitude_m) for point in track] for track in tracks]
     limits = [track.failure.altitude_m for track in tracks if track.failure is not None]
     limit = next((altitude for altitude in limits if altitude is not None), None)
@@ -314,21 +317,23 @@ def _with_margin(values: Sequence[float]) -> tuple[float, float]:
 
 
 def _widened(bounds: tuple[float, float], span: float) -> tuple[float, float]:
-    middle = (bounds[0] + bounds[1]) / 2
+    low, high = bounds
+    middle = (low + high) / 2
     return middle - span / 2, middle + span / 2
 
 
 def _span(bounds: tuple[float, float]) -> float:
-    return bounds[1] - bounds[0]
+    low, high = bounds
+    return high - low
 
 
 def _ticks(bounds: tuple[float, float], max_count: int) -> list[float]:
     """Return at most ``max_count`` + 1 round numbers in a range, as labels of an axis."""
-    min_step = _span(bounds) / max_count
+    low, high = bounds
+    min_step = (high - low) / max_count
     power_of_ten: float = 10.0 ** math.floor(math.log10(min_step))
     step = next(factor * power_of_ten for factor in (1.0, 2.0, 5.0, 10.0) if factor * power_of_ten >= min_step)
-    first = math.ceil(bounds[0] / step)
-    return [round(number * step, 6) for number in range(first, math.floor(bounds[1] / step) + 1)]
+    return [round(number * step, 6) for number in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
 def _save_png(shapes: Sequence[_Shape], path: str | PathLike[str]) -> None:

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from aerokit.testing.flights import Flight, SimulatedFleet
     from aerokit.testing.served import ServedFlight
 
-_MARKER, _PICTURES = "simulated", "--flight-pictures"
+_MARKER = "simulated"
+_PICTURES_OPTION = "--flight-pictures"
 # Name of an attribute of a test function that pytest-asyncio will run. The value of the attribute is a version of the
 # test that opens the flights.
 _OPENING_TEST = "_aerokit_opening_test"
@@ -37,7 +38,7 @@ _REPORTED_CLASSES = ("SimulatedFleet", "Flight", "ServedFlight")
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the option ``--flight-pictures``."""
     parser.getgroup("aerokit").addoption(
-        _PICTURES,
+        _PICTURES_OPTION,
         metavar="DIR",
         help="for each failed test, write a picture of its flights (.svg), their recordings (.tlog) and reports (.html)"
         " to this directory",
@@ -114,7 +115,7 @@ def dronekit_address(served_flight: ServedFlight) -> str:
 
 @pytest.fixture
 def dronekit() -> Iterator[ModuleType]:
-    """`aerokit.dronekit`, which ``import dronekit`` imports meanwhile, unless DroneKit itself was imported before."""
+    """`aerokit.dronekit`. In the test, ``import dronekit`` imports it, unless DroneKit itself was imported before."""
     import sys
 
     import aerokit.dronekit as package
@@ -156,7 +157,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     if flights:
         from aerokit.testing.failure import failure_report
 
-        directory = item.config.getoption(_PICTURES)
+        directory = item.config.getoption(_PICTURES_OPTION)
         report.sections.append(("simulated flights", failure_report(flights, item.nodeid, directory)))
     return report
 
@@ -165,7 +166,7 @@ def _requested(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[st
     """Return the kinds and options of the test's marker ``simulated``."""
     marker = request.node.get_closest_marker(_MARKER)
     kinds, options = (marker.args, dict(marker.kwargs)) if marker else ((), {})
-    options.setdefault("record", request.config.getoption(_PICTURES) is not None)
+    options.setdefault("record", request.config.getoption(_PICTURES_OPTION) is not None)
     return kinds or ("copter",), options
 
 
@@ -271,6 +272,7 @@ def _on_virtual_time(test: Callable[..., Any], *, try_first: Callable[..., Any] 
 
 @contextlib.contextmanager
 def _function_replaced(item: pytest.Function, test: Callable[..., Any]) -> Iterator[None]:
+    """Within the block, ``item`` runs ``test`` instead of its own function."""
     original, item.obj = item.obj, test
     try:
         yield
@@ -279,5 +281,6 @@ def _function_replaced(item: pytest.Function, test: Callable[..., Any]) -> Itera
 
 
 def _raising_vehicle_errors(item: pytest.Function) -> contextlib.AbstractContextManager[None]:
+    """Return the `ServedFlight.raising_vehicle_errors` of a test with a served flight, else an empty context."""
     served = [value for value in _flight_fixtures(item) if hasattr(value, "raising_vehicle_errors")]
     return served[0].raising_vehicle_errors() if served else contextlib.nullcontext()

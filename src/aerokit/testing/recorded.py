@@ -63,7 +63,8 @@ class RecordedParameters(ParameterProtocolServer):
     def value_message(self, name: str, index: int) -> m.ParamValue:
         """Return the latest PARAM_VALUE that was written or played or, before that, the first recorded one."""
         position, recorded = self._vehicle.position_s, self._recorded[name]
-        latest = next((value for time, value in reversed(recorded) if time <= position), recorded[0][1])
+        _, first_value = recorded[0]
+        latest = next((value for time, value in reversed(recorded) if time <= position), first_value)
         written = self._written.get(name, latest.param_value)
         return m.ParamValue(name, written, latest.param_type, len(self.names), index)
 
@@ -85,7 +86,7 @@ class RecordedParameters(ParameterProtocolServer):
     def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
         name = request.param_id
         if name not in self.names:
-            self._refuse(request, -1, channel)
+            self._refuse(request, index=-1, channel=channel)  # -1: the request has no index
             return
         # If the recording has no successful write of the parameter, the vehicle keeps and answers the present value.
         if name in self._vehicle.recording.settable:
@@ -93,6 +94,7 @@ class RecordedParameters(ParameterProtocolServer):
         self.send(name, self.names.index(name), None)
 
     def _refuse(self, request: m.ParamRequestRead | m.ParamSet, index: int, channel: Channel) -> None:
+        """Answer with PARAM_ERROR, if the recorded vehicle does so. Otherwise there is no answer."""
         if self._vehicle.recording.has_parameter_errors:
             self.send_error(sender_of(request), request.param_id, index, MavParamError.DOES_NOT_EXIST, channel)
 
@@ -183,8 +185,8 @@ def _item_message(item: AnyItem, seq: int, client: tuple[int, int], as_float: bo
         place = (item.x, item.y) if is_float else (item.x / scale, item.y / scale)
         return item_message_float(item_from(item), place, seq, client, item.mission_type, item.current)
     x, y = (round(item.x * scale), round(item.y * scale)) if is_float else (int(item.x), int(item.y))
-    params = (item.param1, item.param2, item.param3, item.param4)
     header = (*client, seq, item.frame, item.command, item.current, item.autocontinue)
+    params = (item.param1, item.param2, item.param3, item.param4)
     return m.MissionItemInt(*header, *params, x, y, item.z, item.mission_type)
 
 
@@ -230,8 +232,8 @@ class RecordedVehicle(SimulatedVehicle):
             components=components,
         )
         self._start, self._repeat = start_s, repeat
-        self._next = 0
-        self._began_at = 0.0
+        self._next = 0  # index of the next frame in `recording.stream`
+        self._began_at = 0.0  # the vehicle's time at which playing began
         self._answered_counts: dict[int, int] = {}
         self.parameters: RecordedParameters = RecordedParameters(self)
         """Current parameters."""
@@ -274,15 +276,19 @@ class RecordedVehicle(SimulatedVehicle):
     def _schedule_next(self) -> None:
         stream = self.recording.stream
         if self._next < len(stream):
-            self.call_at(self._began_at + stream[self._next][0] - self._start, self._play)
+            time, _ = stream[self._next]
+            self.call_at(self._began_at + time - self._start, self._play)
         else:
             self.call_at(self._began_at + self.recording.duration_s - self._start, self._end)
 
     def _play(self) -> None:
+        """Send the next frame, and the frames after it that have the same time."""
         stream = self.recording.stream
-        due_at = stream[self._next][0]
-        while self._next < len(stream) and stream[self._next][0] <= due_at:  # Frames may have the same time.
-            _, frame = stream[self._next]
+        due_at, _ = stream[self._next]
+        while self._next < len(stream):
+            time, frame = stream[self._next]
+            if time > due_at:
+                break
             self.send(STANDARD.decode(frame), sender=(frame.system_id, frame.component_id))
             self._next += 1
         self._schedule_next()
@@ -294,6 +300,7 @@ class RecordedVehicle(SimulatedVehicle):
             self._is_on = False
 
     def _on_command(self, command: ReceivedCommand) -> int | None:
+        """Send the recorded acknowledgements of a command with their delays; return UNSUPPORTED if there are none."""
         answer = self._answer_to(command)
         if answer is None:
             return MavResult.UNSUPPORTED
@@ -308,9 +315,9 @@ class RecordedVehicle(SimulatedVehicle):
         """Return the recorded answer to a command. Equal commands get successive answers. The last answer repeats."""
         answers = self.recording.answers.get(command.command, [])
         params = (command.param1, command.param2, command.param3, command.param4)
-        # The params are compared as texts, because NaN is not equal to NaN.
+        # The params are compared by repr(), because NaN is not equal to NaN.
         candidates = [answer for answer in answers if repr(answer.params) == repr(params)]
-        # A message request matches an answer for the same message, whose id is param 1.
+        # A request for a message matches any answer for that message. Param 1 is the id of the message.
         if not candidates and command.command in _MESSAGE_REQUESTS:
             candidates = [answer for answer in answers if answer.params[:1] == params[:1]]
         elif not candidates:  # Use the answers to the same command with other params.
@@ -346,13 +353,13 @@ class RecordedVehicle(SimulatedVehicle):
             self.send(FtpPacket.parse(message).refuse(MavFtpErr.UNKNOWNCOMMAND).message(), channel)
 
     def _on_log_list(self, message: m.LogRequestList, channel: Channel) -> None:
-        self.send(m.LogEntry(0, 0, 0, 0, 0), channel)
+        self.send(m.LogEntry(id=0, num_logs=0, last_log_num=0, time_utc=0, size=0), channel)
 
     def _on_timesync(self, message: m.Timesync, channel: Channel) -> None:
-        if message.tc1 == 0:
+        if message.tc1 == 0:  # A TIMESYNC with another value is an answer.
             nanoseconds = int(self.position_s * 1e9)
             self.send(m.Timesync(nanoseconds, message.ts1), channel)
 
     def _on_ping(self, message: m.Ping, channel: Channel) -> None:
-        if message.target_system == 0:
+        if message.target_system == 0:  # A PING with a target is an answer.
             self.send(m.Ping(message.time_usec, message.seq, *sender_of(message)), channel)

@@ -22,7 +22,7 @@ MAX_GAP_S = 60.0
 _ITEMS = (m.MissionItemInt, m.MissionItem)
 _COMMANDS = (m.CommandLong, m.CommandInt)
 # Messages that answer requests of the recorded client. The played vehicle does not send them by itself.
-_ANSWERS = frozenset(
+_ANSWER_IDS = frozenset(
     kind.ID
     for kind in (
         m.CommandAck, m.CommandLong, m.CommandInt, m.ParamValue, m.ParamError, m.MissionCount, m.MissionItem,
@@ -30,7 +30,7 @@ _ANSWERS = frozenset(
         m.LogData, m.Timesync, m.Ping,
     )
 )  # fmt: skip
-_REQUESTS = frozenset(
+_REQUEST_IDS = frozenset(
     kind.ID
     for kind in (*_COMMANDS, *_ITEMS, m.ParamSet, m.MissionCount, m.MissionClearAll)
 )  # fmt: skip
@@ -49,7 +49,7 @@ class RecordedAnswer:
 
 @dataclass(frozen=True)
 class RecordedPlan:
-    """A mission, fence or list of rally points, and the time from which on the vehicle had it."""
+    """A mission, fence or list of rally points, and the time at which the vehicle got it."""
 
     since: float
     mission_type: int
@@ -57,7 +57,7 @@ class RecordedPlan:
 
 
 class RecordedFlight:
-    """Content of a recording about one vehicle. Times are seconds since the vehicle's first message, without long gaps.
+    """Content of a recording that concerns one vehicle. Times are seconds since its first message, without long gaps.
 
     If ``system_id`` is None, the vehicle is the first autopilot with a HEARTBEAT. Raises InvalidArgument if the
     recording contains no such vehicle, and OSError if the file cannot be read.
@@ -95,18 +95,19 @@ class RecordedFlight:
         self._read(frames)
 
     def _read(self, frames: list[tuple[float, Frame]]) -> None:
-        now, previous_stamp = 0.0, None
-        for stamp, frame in frames:
+        now = 0.0  # seconds since the vehicle's first message, without long gaps
+        previous_unix_s = None
+        for unix_s, frame in frames:
             is_of_vehicle = frame.system_id == self.system_id
-            if previous_stamp is not None:
-                now += min(max(stamp - previous_stamp, 0.0), MAX_GAP_S)
+            if previous_unix_s is not None:
+                now += min(max(unix_s - previous_unix_s, 0.0), MAX_GAP_S)
             elif not is_of_vehicle:
                 continue  # Messages before the first message of the vehicle are skipped.
-            previous_stamp = stamp
+            previous_unix_s = unix_s
             if not is_of_vehicle:
-                if frame.message_id in _REQUESTS:
+                if frame.message_id in _REQUEST_IDS:
                     self._read_request(STANDARD.decode(frame), now)
-            elif frame.message_id in _ANSWERS:
+            elif frame.message_id in _ANSWER_IDS:
                 self._read_answer(STANDARD.decode(frame), now)
             else:
                 self.stream.append((now, frame))
@@ -121,6 +122,7 @@ class RecordedFlight:
         self.answers = {command: answers for command, answers in acknowledged.items() if answers}
 
     def _read_request(self, message: Message, now: float) -> None:
+        """Record a request of a client, which later answers of the vehicle refer to."""
         if isinstance(message, _COMMANDS):
             is_repetition = isinstance(message, m.CommandLong) and message.confirmation > 0
             answers = self.answers.setdefault(message.command, [])
@@ -137,6 +139,7 @@ class RecordedFlight:
             self._clearing.add(message.mission_type)
 
     def _read_answer(self, message: Message, now: float) -> None:
+        """Record a message of the vehicle that answers a request."""
         readers: dict[type[Message], Callable[..., None]] = {
             m.CommandAck: self._read_ack,
             m.ParamValue: self._read_value,
@@ -176,7 +179,7 @@ class RecordedFlight:
             self._add_plan(item.mission_type, items, now)
 
     def _read_mission_ack(self, ack: m.MissionAck, now: float) -> None:
-        # If an upload is in progress, the acknowledgement ends the upload, and otherwise a deletion.
+        # The acknowledgement ends the upload that is in progress. Without an upload, it answers MISSION_CLEAR_ALL.
         if ack.mission_type in self._uploads:
             items = self._uploads.pop(ack.mission_type)
             self.uploads.setdefault(ack.mission_type, []).append(ack.type)
@@ -191,8 +194,12 @@ class RecordedFlight:
 
 
 def _frames(source: str | PathLike[str] | BinaryIO) -> list[tuple[float, Frame]]:
+    """Return the frames of a recording with their times, in seconds since 1970."""
     framer = Framer()
-    return [(stamp, frame) for stamp, raw in read_tlog(source) for frame in framer.receive(raw, stamp)]
+    frames: list[tuple[float, Frame]] = []
+    for unix_s, raw in read_tlog(source):
+        frames += [(unix_s, frame) for frame in framer.receive(raw, unix_s)]
+    return frames
 
 
 def _autopilot(frames: list[tuple[float, Frame]], system_id: int | None) -> tuple[int, int]:

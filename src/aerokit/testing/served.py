@@ -41,17 +41,13 @@ class ServedFlight:
         self.track: Track = scheduler.tracks[0]
         """True track of the vehicle."""
         self.journal: Journal = scheduler.journals[0]
-        """Texts that the vehicle sent and messages that it received."""
+        """Status texts that the vehicle sent, and messages that it received."""
         self.faults: FaultInjector = FaultInjector(vehicle, lambda plan: portal.call(self._schedule_with, plan))
         """Injects faults."""
         self.recording: FlightRecording | None = recording
         """Recording of the vehicle's link; None without ``record=True``."""
-        self._portal, self._server, self._scheduler, self._interruption = (
-            portal,
-            server,
-            scheduler,
-            interruption,
-        )
+        self._portal, self._server = portal, server
+        self._scheduler, self._interruption = scheduler, interruption
         self._is_raised = False
         scheduler.refresh_with(lambda: portal.call(self._refresh))
 

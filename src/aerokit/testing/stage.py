@@ -22,7 +22,7 @@ _POLL_INTERVAL_S = 0.1
 
 
 class FlightScheduler(SimulatedVehicle):
-    """Runs scheduled actions. For the server, the scheduler is a further vehicle on the links, which sends nothing.
+    """Runs scheduled actions. The server treats the scheduler as one more vehicle, which sends nothing.
 
     The actions survive a reboot of a vehicle, and are not delayed while a vehicle is frozen. Pass the scheduler to the
     server before the vehicles, because the scheduler advances the vehicles to the time of each action.
@@ -91,9 +91,8 @@ class FlightRecording:
     def __init__(self) -> None:
         self._file = BytesIO()
         self._writer = TlogWriter(self._file)
-        self._framers = Framer(), Framer()  # One for the received bytes, one for the sent bytes.
-        for framer in self._framers:
-            framer.keep_unknown = True
+        self._sent_framer, self._received_framer = Framer(), Framer()
+        self._sent_framer.keep_unknown = self._received_framer.keep_unknown = True
 
     def attach(self, server: SimulatorServer) -> None:
         """Record the traffic of this server from now on."""
@@ -104,5 +103,6 @@ class FlightRecording:
         return self._file.getvalue()
 
     def _write(self, time_s: float, data: bytes, is_sent: bool) -> None:
-        for frame in self._framers[is_sent].receive(data, time_s):
+        framer = self._sent_framer if is_sent else self._received_framer
+        for frame in framer.receive(data, time_s):
             self._writer.write(frame.raw, _UTC_AT_START + time_s)

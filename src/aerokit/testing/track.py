@@ -96,7 +96,8 @@ class Track(Sequence[TrackPoint]):
     @property
     def max_distance_m(self) -> float:
         """Maximum distance from home in metres, along the ground."""
-        return self._farthest(self.home)[0]
+        distance_m, _ = self._farthest(self.home)
+        return distance_m
 
     @property
     def modes(self) -> list[str]:
@@ -147,7 +148,8 @@ class Track(Sequence[TrackPoint]):
 
         The distance is in space if the position has an ``altitude_relative_m``, otherwise along the ground.
         """
-        return self._nearest(place)[0]
+        distance_m, _ = self._nearest(place)
+        return distance_m
 
     def assert_reached_altitude(self, altitude_m: float, *, within_m: float = 1.0) -> None:
         """Assert that the vehicle was at least ``altitude_m - within_m`` metres above home at some time."""
@@ -238,7 +240,7 @@ class Track(Sequence[TrackPoint]):
     def assert_modes(self, *names: str) -> None:
         """Assert that the vehicle was in these modes in this order. Other modes in between are allowed."""
         __tracebackhide__ = True
-        modes = iter(self.modes)
+        modes = iter(self.modes)  # `in` consumes the modes up to the name, so the order of the names counts.
         for name in names:
             assert name in modes, f"{name} is missing in {' → '.join(names)}: the modes were {' → '.join(self.modes)}"
 
@@ -290,14 +292,14 @@ def true_point(vehicle: SimulatedVehicle) -> TrackPoint:
     place = true_place(vehicle)
     autopilot = cast("Any", vehicle)  # A vehicle with a true position also has the attributes that are read here.
     return TrackPoint(
-        vehicle.now,
-        place.latitude_e7 * 1e-7,
-        place.longitude_e7 * 1e-7,
-        place.altitude_m - autopilot.frame.origin.altitude_m,
-        autopilot.is_armed,
-        _mode_name(vehicle),
-        math.hypot(autopilot.motion.velocity_north, autopilot.motion.velocity_east),
-        autopilot.battery.percent,
+        time_s=vehicle.now,
+        latitude_deg=place.latitude_e7 * 1e-7,
+        longitude_deg=place.longitude_e7 * 1e-7,
+        altitude_m=place.altitude_m - autopilot.frame.origin.altitude_m,
+        armed=autopilot.is_armed,
+        mode=_mode_name(vehicle),
+        speed_m_s=math.hypot(autopilot.motion.velocity_north, autopilot.motion.velocity_east),
+        battery_percent=autopilot.battery.percent,
     )
 
 

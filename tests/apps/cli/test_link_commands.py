@@ -13,7 +13,7 @@ from flight_harness import Wire
 import aerokit
 from aerokit import messages as m
 from aerokit.apps.cli import main
-from aerokit.apps.cli.listening import _kept_is_printed
+from aerokit.apps.cli.listening import _printing_kept_name
 from aerokit.apps.cli.output import TIMED_OUT
 from aerokit.connection.frame_observers import keep_existing
 from aerokit.mavlink.enums import CopterMode, MavCmd
@@ -215,7 +215,7 @@ def test_record_without_frames_keeps_existing_file(capsys: pytest.CaptureFixture
 
 def test_monitor_names_kept_recording_at_its_end(capsys: pytest.CaptureFixture[str]) -> None:
     Path("flight.tlog").write_text("mine")
-    with _kept_is_printed("flight.tlog"):
+    with _printing_kept_name("flight.tlog"):
         keep_existing("flight.tlog")
     assert capsys.readouterr().err == "flight.tlog existed and was kept as flight.1.tlog\n"
 

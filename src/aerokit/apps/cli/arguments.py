@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 DEFAULT_SIM_ADDRESS = "tcpin:127.0.0.1:{5760+10n}"
 """Default address template of ``aerokit sim``. Its ports are those of SITL instances: 5760, 5770, 5780 …"""
+_MAX_WIND_M_S = 50.0
 _TEMPLATE_FIELD = re.compile(r"\{(?:(\d{1,5})\+)?(\d{0,3})(n|id)\}")
 
 
@@ -129,10 +130,12 @@ def wind(text: str) -> tuple[float, ...]:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = ()
-    are_gusts_positive = min(values[2:], default=0) >= 0
-    is_in_range = all(abs(value) <= 50 for value in values) and are_gusts_positive
+    gusts = values[2:]  # empty, or one value
+    is_in_range = all(abs(value) <= _MAX_WIND_M_S for value in values) and all(gust >= 0 for gust in gusts)
     if len(values) not in (2, 3) or not is_in_range:
-        raise ArgumentTypeError(f"{text!r} is not NORTH,EAST or NORTH,EAST,GUSTS with numbers in m/s up to 50")
+        raise ArgumentTypeError(
+            f"{text!r} is not NORTH,EAST or NORTH,EAST,GUSTS with numbers in m/s up to {_MAX_WIND_M_S:g}"
+        )
     return values
 
 
@@ -153,7 +156,7 @@ def number(low: float, high: float) -> Callable[[str], float]:
         try:
             value = float(text)
         except ValueError:
-            value = math.nan
+            value = math.nan  # in no range
         if not low <= value <= high:
             raise ArgumentTypeError(f"{text!r} is not a number from {low:g} to {high:g}")
         return value
@@ -282,7 +285,7 @@ def add_conditions(command: argparse._ActionsContainer) -> None:
 
 
 def conditions(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the conditions as arguments of a simulated vehicle, which `add_conditions` has added."""
+    """Return the values of the options of `add_conditions`, as arguments of a simulated vehicle."""
     from aerokit.sim import SimulatedWind
 
     optional = {

@@ -63,7 +63,10 @@ def kinds() -> tuple[str, ...]:
 
 def parameter_names(autopilot: str | None = None) -> list[str]:
     """Return the sorted parameter names of the simulated vehicles of "ArduPilot" or "PX4", by default of both."""
-    paths = _PARAMETER_TABLES.get(autopilot or "") or [path for group in _PARAMETER_TABLES.values() for path in group]
+    paths: list[str] = []
+    for name, paths_of_autopilot in _PARAMETER_TABLES.items():
+        if autopilot in (name, None):
+            paths += paths_of_autopilot
     names = set()
     for path in paths:
         lines = files("aerokit").joinpath(path).read_text(encoding="utf-8").splitlines()

@@ -48,8 +48,8 @@ async def _check_only_vehicle(vehicle: Vehicle, options: argparse.Namespace) -> 
         return
     system_ids = {vehicle.system_id}
     with anyio.move_on_after(_OTHER_VEHICLES_TIMEOUT_S):
-        async for found in vehicle.connection.vehicles():
-            system_ids.add(found.system_id)
+        async for discovery in vehicle.connection.vehicles():
+            system_ids.add(discovery.system_id)
             if len(system_ids) > 1:
                 listed = ", ".join(map(str, sorted(system_ids)))
                 raise InvalidArgument(
@@ -231,13 +231,7 @@ async def connect_to(
     async with AsyncExitStack() as stack:
         async with waiting(options, address, _CONNECT_TIMEOUT_S):
             vehicle = await stack.enter_async_context(
-                connect(
-                    link,
-                    system_id=options.system_id,
-                    timeout=_CONNECT_TIMEOUT_S,
-                    baud=options.baud,
-                    **connecting,
-                )
+                connect(link, system_id=options.system_id, timeout=_CONNECT_TIMEOUT_S, baud=options.baud, **connecting)
             )
         if changes:
             await _check_only_vehicle(vehicle, options)
@@ -295,11 +289,11 @@ async def await_vehicle(connection: Connection, options: argparse.Namespace, pat
 
 
 def _simulator_hint(connection: Connection) -> str:
-    """Return a hint on how to start a simulated vehicle for a link that listens and received nothing, else ""."""
-    place = connection.link.address.replace("0.0.0.0", "127.0.0.1")
-    if not place.startswith("udpin:127.0.0.1:") or any(peer.bytes for peer in connection.statistics()):
+    """Return a hint on how to simulate a vehicle, if the link is a UDP port that has received nothing, else ""."""
+    link_address = connection.link.address.replace("0.0.0.0", "127.0.0.1")
+    if not link_address.startswith("udpin:127.0.0.1:") or any(peer.bytes for peer in connection.statistics()):
         return ""
-    return f" (to simulate one, in another terminal: aerokit sim {place.replace('udpin', 'udpout')})"
+    return f" (to simulate one, in another terminal: aerokit sim {link_address.replace('udpin', 'udpout')})"
 
 
 async def await_end(connection: Connection, seconds: float | None, work: asyncio.Task[None] | None = None) -> bool:

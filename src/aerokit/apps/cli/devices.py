@@ -118,7 +118,8 @@ async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -
     record = {name: value for name, value in capture.to_dict().items() if name != "received_at"}
     emit(options, "picture", record, text)
     if folder is None or not capture.success:
-        return capture.success is not False  # None counts as success: the camera has not reported the result
+        has_failed = capture.success is False  # None: the camera has not reported the result
+        return not has_failed
     name = _file_name(capture)
     if name is None:
         not_fetched = {"index": capture.index, "file": None, "bytes": None}
@@ -188,10 +189,7 @@ def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
     run = command_action("gimbal point", "pointing at pitch {pitch:g}°, yaw {yaw:g}°", _point, _gimbal)
     point = add_action(actions, "point", run, "Point the gimbal, and hold the direction.")
     point.add_argument(
-        "pitch",
-        type=number(-360, 360),
-        metavar="PITCH",
-        help="degrees from the horizon: -90 is straight down",
+        "pitch", type=number(-360, 360), metavar="PITCH", help="degrees from the horizon: -90 is straight down"
     )
     point.add_argument(
         "yaw", type=number(-360, 360), nargs="?", default=0.0, metavar="YAW", help="degrees to the right (default: 0)"
@@ -264,5 +262,6 @@ def _information_lines(information: GimbalInformation) -> list[str]:
     for axis in ("roll", "pitch", "yaw"):
         limits = getattr(information, f"{axis}_deg")
         if limits is not None:
-            lines.append(f"{axis:>6}  {limits[0]:.0f} to {limits[1]:.0f} degrees")
+            low, high = limits
+            lines.append(f"{axis:>6}  {low:.0f} to {high:.0f} degrees")
     return lines

@@ -102,7 +102,7 @@ def _programs_using(device: str) -> list[str]:
     if sys.platform != "linux" or os.path.realpath(device).startswith("/dev/pts/"):
         return programs  # a pseudo-terminal is always open in the program that created it
     for process in glob("/proc/[0-9]*"):
-        process_id = int(process.rpartition("/")[2])
+        process_id = int(Path(process).name)
         if process_id == os.getpid():
             continue
         try:

@@ -141,7 +141,8 @@ class LinkExamination:
         source = frame.system_id, frame.component_id
         self._frames[source] += 1
         self._versions.setdefault(source, set()).add(frame.version)
-        self._signed[source] += is_signed_with_a_key(frame)
+        if is_signed_with_a_key(frame):
+            self._signed[source] += 1
 
     def _on_heartbeat(self, heartbeat: Heartbeat) -> None:
         frame = heartbeat.received_frame
@@ -214,18 +215,16 @@ class LinkExamination:
                     "give each vehicle a unique system id",
                 )
         if _PROGRAM_IDS in self._frames:
+            system, component = _PROGRAM_IDS
             yield Finding(
                 "note",
                 "ids",
-                f"another ground station uses the ids of aerokit programs ({_PROGRAM_IDS[0]}/{_PROGRAM_IDS[1]})",
+                f"another ground station uses the ids of aerokit programs ({system}/{component})",
                 "vehicles cannot distinguish it from your program: close it, or set source_system=254 in your program",
             )
         if any(system == 0 for system, _ in self._frames):
             yield Finding(
-                "problem",
-                "ids",
-                "a sender uses system id 0, which means broadcast",
-                "give it an id from 1 to 255",
+                "problem", "ids", "a sender uses system id 0, which means broadcast", "give it an id from 1 to 255"
             )
 
     def _senders(self) -> Iterator[Finding]:
@@ -259,9 +258,8 @@ class LinkExamination:
             if problems := self._connection.describe_signature_problems():
                 yield Finding("problem", "signing", problems, "check that the key is the vehicle's (docs/signing.md)")
             return
-        signed = sorted(source for source, count in self._signed.items() if count)
-        if signed:
-            names = ", ".join(f"{system}/{component}" for system, component in signed)
+        if self._signed:
+            names = ", ".join(f"{system}/{component}" for system, component in sorted(self._signed))
             yield Finding(
                 "problem",
                 "signing",
@@ -274,8 +272,8 @@ class LinkExamination:
         for statistics in self._connection.statistics():
             unknown_messages.update(statistics.unknown_messages)
         if unknown_messages:
-            first = sorted(unknown_messages.items())[:10]
-            listed = ", ".join(f"{message_id} ({count})" for message_id, count in first)
+            first_messages = sorted(unknown_messages.items())[:10]
+            listed = ", ".join(f"{message_id} ({count})" for message_id, count in first_messages)
             yield Finding(
                 "note",
                 "dialect",
@@ -294,7 +292,7 @@ class LinkExamination:
 
     def _loss(self) -> Iterator[Finding]:
         is_serial = self._connection.link.address.startswith(("serial:", "/dev/", "COM"))
-        for system in sorted({system for system, _ in self._frames} - {self._own_ids[0]}):
+        for system in sorted({system for system, _ in self._frames} - {self._connection.source_system}):
             received, lost = self._connection.counts(system)
             if received + lost < _MIN_FRAMES_FOR_LOSS:
                 continue

@@ -31,9 +31,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     put = add_action(actions, "put", _put, "Upload a file.")
     put.add_argument("file", help="local file")
     put.add_argument("path", help="path on the vehicle")
-    remove = command_action("files rm", "removed {path}", _call("remove"))
-    rmdir = command_action("files rmdir", "removed {path}", _call("remove_directory"))
-    mkdir = command_action("files mkdir", "created {path}", _call("make_directory"))
+    remove = command_action("files rm", "removed {path}", _action_on_path("remove"))
+    rmdir = command_action("files rmdir", "removed {path}", _action_on_path("remove_directory"))
+    mkdir = command_action("files mkdir", "created {path}", _action_on_path("make_directory"))
     rename = command_action(
         "files mv",
         "renamed {path} to {new_path}",
@@ -51,7 +51,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     move.add_argument("new_path", help="path on the vehicle")
 
 
-def _call(method: str) -> Callable[[Vehicle, argparse.Namespace], Awaitable[object]]:
+def _action_on_path(method: str) -> Callable[[Vehicle, argparse.Namespace], Awaitable[object]]:
+    """Return an action that calls a method of `vehicle.files` with the path that was given."""
     return lambda vehicle, options: getattr(vehicle.files, method)(options.path, idle_timeout_s=options.patience)
 
 
@@ -81,6 +82,7 @@ async def _get(options: argparse.Namespace) -> int:
 
 
 def _destination(options: argparse.Namespace) -> Path:
+    """Return the local file to write; in a directory, it gets the name that it has on the vehicle."""
     name = PurePosixPath(options.path).name
     target = Path(options.to or name)
     return target / name if target.is_dir() else target
@@ -149,6 +151,7 @@ async def _get_logs(options: argparse.Namespace) -> int:
 
 
 def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequence[LogEntry]:
+    """Return the logs to download: those with the given ids, all with ``--all``, by default the newest."""
     if options.all:
         return entries
     if not options.ids:

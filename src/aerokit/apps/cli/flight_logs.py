@@ -43,6 +43,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def _convert(options: argparse.Namespace) -> int:
+    # Without a suffix, OUT is a folder of tables.
     module = _REQUIRED_MODULES.get(options.out.suffix.lower() or f".{options.tables}")
     if module is not None:
         import_extra(module, "convert")

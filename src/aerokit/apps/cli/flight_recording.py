@@ -65,8 +65,8 @@ async def record_to_end(
             await anyio.sleep(_POLL_INTERVAL_S)
         return DONE
 
-    why = "interrupted" if await interrupts.run(wait) is None else "end of the recording"
-    print_line(f"{why}: {vehicle.describe_now()}")
+    reason = "interrupted" if await interrupts.run(wait) is None else "end of the recording"
+    print_line(f"{reason}: {vehicle.describe_now()}")
 
 
 class _StillNearGround:
@@ -74,13 +74,14 @@ class _StillNearGround:
 
     def __init__(self, vehicle: Vehicle, max_still_s: float) -> None:
         self._vehicle, self._max_still_s = vehicle, max_still_s
-        self._place, self._since = vehicle.position.latest, vehicle.connection.now()
+        self._position, self._still_since = vehicle.position.latest, vehicle.connection.now()
 
     def has_lasted(self) -> bool:
+        """Return True if the vehicle has been still for the whole time. Must be called regularly."""
         here, now = self._vehicle.position.latest, self._vehicle.connection.now()
         if here is None:
             return False
-        moved = self._place is None or here.distance_to(self._place) > _MAX_DRIFT_M
-        if moved or abs(here.altitude_relative_m or 0.0) > _MAX_HEIGHT_M:
-            self._place, self._since = here, now
-        return now - self._since >= self._max_still_s
+        has_moved = self._position is None or here.distance_to(self._position) > _MAX_DRIFT_M
+        if has_moved or abs(here.altitude_relative_m or 0.0) > _MAX_HEIGHT_M:
+            self._position, self._still_since = here, now
+        return now - self._still_since >= self._max_still_s

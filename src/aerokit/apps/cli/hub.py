@@ -131,9 +131,10 @@ def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
     for option in ("read_only", "patient", "signed"):
         for name in getattr(options, option):
             _check_known(name, names)
-    for name in (name for option in ("only", "block", "rate") for name, _ in getattr(options, option)):
-        if name:
-            _check_known(name, names)
+    for option in ("only", "block", "rate"):
+        for name, _ in getattr(options, option):
+            if name:  # "" stands for all endpoints
+                _check_known(name, names)
     if options.signed and signing_of(options) is None:
         raise InvalidArgument(f"--signed needs a key: give --signing-key FILE, or set ${SIGNING_KEY_VARIABLE}")
     return [
@@ -154,7 +155,11 @@ def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
 
 def _patterns_for(name: str, filters: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[str, ...]:
     """Return the patterns of the filters that apply to this endpoint; a filter with the name "" applies to all."""
-    return tuple(pattern for endpoint, patterns in filters if endpoint in ("", name) for pattern in patterns)
+    patterns: list[str] = []
+    for endpoint, filter_patterns in filters:
+        if endpoint in ("", name):
+            patterns += filter_patterns
+    return tuple(patterns)
 
 
 def _rates_for(name: str, filters: Sequence[tuple[str, dict[str, float]]]) -> dict[str, float]:
@@ -177,10 +182,10 @@ def _emit_hub_event(options: argparse.Namespace, event: HubEvent) -> None:
 
 def _emit_statistics(options: argparse.Namespace, hub: Hub) -> None:
     for endpoint in hub.endpoints:
-        emit(options, "endpoint", endpoint.to_dict(), _line(endpoint))
+        emit(options, "endpoint", endpoint.to_dict(), _statistics_line(endpoint))
 
 
-def _line(endpoint: EndpointStatistics) -> str:
+def _statistics_line(endpoint: EndpointStatistics) -> str:
     systems = ", ".join(f"{system}/{component}" for system, component in endpoint.systems) or "none"
     text = (
         f"{endpoint.name}: {endpoint.frames_in} frames in, {endpoint.frames_out} out, {endpoint.lost} lost;"

@@ -60,9 +60,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("file", type=log_file, metavar="FILE", help="flight.tlog; directly after ADDRESS")
     add_seconds(command, "stop after S seconds (at Ctrl-C)")
     command.add_argument(
-        "--as-is",
-        action="store_true",
-        help="request nothing; by default, request aerokit's usual message rates",
+        "--as-is", action="store_true", help="request nothing; by default, request aerokit's usual message rates"
     )
 
 
@@ -100,6 +98,7 @@ async def _record_link(options: argparse.Namespace) -> int:
 
 
 async def _record(connection: Connection, options: argparse.Namespace) -> bool:
+    """Wait for the end of the recording. Unless ``--as-is``, connect to the vehicles, which requests message rates."""
     if options.as_is:
         return await await_end(connection, options.seconds)
     from aerokit.vehicle.connect import vehicles_on
@@ -156,6 +155,7 @@ async def run_events(options: argparse.Namespace) -> int:
 
 
 async def _print_all(connection: Connection, options: argparse.Namespace) -> None:
+    """Print the events of a connection until it ends, with a countdown before the first event."""
     unix_time_at_0 = connection.unix_time() - connection.now()
     async with AsyncExitStack() as stack:
         events = stack.enter_context(connection.subscribe(Event, capacity=_MAX_WAITING_EVENTS))
@@ -188,12 +188,7 @@ def _emit_event(event: Event, unix_s: float, options: argparse.Namespace) -> Non
     }
     time = datetime.fromtimestamp(unix_s, timezone.utc).astimezone()
     system = "  -" if event.system_id == 0 else f"{event.system_id:>3}"
-    emit(
-        options,
-        "event",
-        record,
-        f"{time:%H:%M:%S}.{time.microsecond // 1000:03}  {system}  {_event_text(event)}",
-    )
+    emit(options, "event", record, f"{time:%H:%M:%S}.{time.microsecond // 1000:03}  {system}  {_event_text(event)}")
 
 
 def _event_text(event: Event) -> str:
@@ -219,7 +214,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
         raise InvalidArgument("aerokit monitor needs a terminal, but stdin or stdout is redirected")
     with ExitStack() as stack:
 
-        def exit_soon(signal_number: int) -> None:
+        def force_exit_later(signal_number: int) -> None:
             if signal_number == getattr(signal, "SIGHUP", None):
                 _detach_terminal()
             timer = threading.Timer(EXIT_TIMEOUT_S, os._exit, (INTERRUPTED,))
@@ -228,18 +223,18 @@ async def run_monitor(options: argparse.Namespace) -> int:
             stack.callback(timer.cancel)
 
         stack.enter_context(new_recording(options.record))
-        stack.enter_context(_kept_is_printed(options.record))
+        stack.enter_context(_printing_kept_name(options.record))
         return await run(
             options.address,
             baud=options.baud,
             signing=signing_of(options),
             record=options.record,
-            on_start=lambda app: stack.enter_context(on_interrupt(app.exit, exit_soon)),
+            on_start=lambda app: stack.enter_context(on_interrupt(app.exit, force_exit_later)),
         )
 
 
 @contextmanager
-def _kept_is_printed(path: str | None) -> Iterator[None]:
+def _printing_kept_name(path: str | None) -> Iterator[None]:
     """After the block, print the new name of an earlier recording. In the block, Textual hides log messages."""
     if path is None or not os.path.isfile(path):
         yield

@@ -124,11 +124,7 @@ COMMANDS = (
         "Serve vehicles to the browser. The page shows map, state, missions and parameters, and sends"
         " orders; there is also an HTTP and WebSocket API. Orders need the token that is printed.",
     ),
-    CliCommand(
-        "gimbal",
-        "devices:add_gimbal_arguments",
-        "Show where a vehicle's gimbal points, and point it.",
-    ),
+    CliCommand("gimbal", "devices:add_gimbal_arguments", "Show where a vehicle's gimbal points, and point it."),
     CliCommand("bridge", "bridge", "Publish the vehicles on a link to Foxglove, zenoh or MQTT."),
     CliCommand(
         "report",
@@ -141,11 +137,7 @@ COMMANDS = (
         "flight_logs",
         "Convert a flight log (.tlog, .bin, .ulg) to MCAP for Foxglove, CSV, Parquet, GPX or KML.",
     ),
-    CliCommand(
-        "completion",
-        "completion",
-        "Print a script that completes commands, options and names in your shell.",
-    ),
+    CliCommand("completion", "completion", "Print a script that completes commands, options and names in your shell."),
 )
 
 
@@ -178,7 +170,7 @@ class Parser(argparse.ArgumentParser):
                 self.error(problem)
         namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            self._fail_unrecognized(unknown)
+            self._exit_unrecognized(unknown)
         return namespace, unknown
 
     def _check_option_names(self, args: Sequence[str]) -> None:
@@ -188,9 +180,9 @@ class Parser(argparse.ArgumentParser):
         names = [option.partition("=")[0] for option in options if option.startswith("--")]
         for name in names:
             if name != "--connect" and not any(known.startswith(name) for known in self._option_string_actions):
-                self._fail_unrecognized([name])
+                self._exit_unrecognized([name])
 
-    def _fail_unrecognized(self, unknown: Sequence[str]) -> NoReturn:
+    def _exit_unrecognized(self, unknown: Sequence[str]) -> NoReturn:
         options = [argument for argument in unknown if argument.startswith("-")]
         hint = suggestion(options[0].partition("=")[0], self._option_string_actions) if options else ""
         self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")

@@ -50,19 +50,19 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
     command = parser.prog.split()
     if parser._subparsers is not None:
         return _address_before_action(parser, words) if words and is_address(words[0]) else None
-    has_connect = "--connect" in parser._option_string_actions
+    takes_connect = "--connect" in parser._option_string_actions
     # Some commands take the address as a positional argument, without --connect.
-    if not has_connect and any("address" in action.dest or action.dest == "endpoints" for action in parser._actions):
-        is_connected = any(word.partition("=")[0] == "--connect" for word in words)
+    if not takes_connect and any("address" in action.dest or action.dest == "endpoints" for action in parser._actions):
+        is_connect_given = any(word.partition("=")[0] == "--connect" for word in words)
         line = shlex.join([*command, *(word.removeprefix("--connect=") for word in words if word != "--connect")])
-        return f"`{parser.prog}` takes the address without --connect: {line}" if is_connected else None
+        return f"`{parser.prog}` takes the address without --connect: {line}" if is_connect_given else None
     for index, word in enumerate(words):
         # `aerokit files` takes paths on the vehicle, which may begin with /dev.
         is_path = word.startswith("/") and command[1] == "files"
         is_option_value = index > 0 and _takes_value(parser, words[index - 1])
         if is_path or not is_address(word) or is_option_value:
             continue
-        if not has_connect:
+        if not takes_connect:
             return f"`{parser.prog}` takes no address; to record a link: aerokit record {shlex.quote(word)} flight.tlog"
         if any(argument.startswith("--connect") for argument in words):
             return f"{word!r} is a second address, after --connect"
@@ -74,11 +74,11 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
 
 def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) -> str:
     """Return the error text if an address is before the action, as in ``aerokit params udpin:… list``."""
-    address, action, *arguments = [*words, "ACTION"] if len(words) == 1 else words
+    address, action, *arguments = words if len(words) > 1 else [*words, "ACTION"]
     actions = next(item.choices for item in parser._actions if isinstance(item, argparse._SubParsersAction))
     action_parser = actions.get(action) or next(iter(actions.values()))
-    has_connect = "--connect" in action_parser._option_string_actions
-    address_words = ["--connect", address] if has_connect else [address]
+    takes_connect = "--connect" in action_parser._option_string_actions
+    address_words = ["--connect", address] if takes_connect else [address]
     line = shlex.join([*parser.prog.split(), action, *address_words, *arguments])
     return f"{address!r} is an address, but an action comes first: {line}"
 

@@ -31,9 +31,7 @@ if TYPE_CHECKING:
 
 def add_json(command: argparse._ActionsContainer) -> None:
     command.add_argument(
-        "--json",
-        action="store_true",
-        help="print JSON, one object a line, instead of text (docs/command-line.md)",
+        "--json", action="store_true", help="print JSON, one object a line, instead of text (docs/command-line.md)"
     )
 
 
@@ -230,7 +228,8 @@ def near_names(name: str, known: Iterable[str], count: int = 1) -> list[str]:
     """Return the known names that begin with ``name`` or are similar to it, the most similar first."""
     from difflib import SequenceMatcher
 
-    plain_name, ratios = name.strip("-").upper(), dict[str, float]()
+    plain_name = name.strip("-").upper()
+    ratios: dict[str, float] = {}
     for known_name in known:
         plain_known_name = known_name.strip("-").upper()
         is_beginning = len(plain_name) >= 3 and plain_known_name.startswith(plain_name)

@@ -171,7 +171,7 @@ async def _set(options: argparse.Namespace) -> int:
         check_allowed(metadata, dict(options.values))  # with a file of metadata, already before connecting
     async with connected(options, changes=True) as vehicle:
         if metadata is None:
-            metadata = await metadata_for_check(vehicle, None, options)
+            metadata = await metadata_for_check(vehicle, from_file=None, options=options)
             check_allowed(metadata, dict(options.values))
         results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
         known = await _names_for_hints(vehicle, results.values())
@@ -188,7 +188,8 @@ async def _set(options: argparse.Namespace) -> int:
 async def _load(options: argparse.Namespace) -> int:
     from aerokit.parameters import read_parameter_file
 
-    file_values, file_metadata = read_parameter_file(options.file), load_metadata_option(options)
+    file_values = read_parameter_file(options.file)
+    file_metadata = load_metadata_option(options)
     async with connected(options, changes=True) as vehicle:
         _check_file(file_values, await _download(vehicle, options), vehicle)
         metadata = await metadata_for_check(vehicle, file_metadata, options)
@@ -212,7 +213,7 @@ async def _load(options: argparse.Namespace) -> int:
     return code
 
 
-def _check_file(wanted: ParameterFile, table: ParameterTable, vehicle: Vehicle) -> None:
+def _check_file(file_values: ParameterFile, table: ParameterTable, vehicle: Vehicle) -> None:
     """Check that all values of a file fit the types of the vehicle's parameters.
 
     Raises:
@@ -221,15 +222,16 @@ def _check_file(wanted: ParameterFile, table: ParameterTable, vehicle: Vehicle) 
     """
     names_are_upper_case = vehicle.autopilot.name == "ArduPilot"
     invalid, unknown = [], []
-    for name, value in wanted.items():
-        place, found = wanted.places[name], resolve_known(name.upper() if names_are_upper_case else name, table)
-        if found is None:
-            unknown.append(f"{place}: the vehicle has no parameter {name}{suggestion(name, table, 3)}")
+    for name, value in file_values.items():
+        line = file_values.places[name]
+        known = resolve_known(name.upper() if names_are_upper_case else name, table)
+        if known is None:
+            unknown.append(f"{line}: the vehicle has no parameter {name}{suggestion(name, table, 3)}")
             continue
         try:
-            checked_value(name, found.to_vehicle(value), found.parameter.type)
+            checked_value(name, known.to_vehicle(value), known.parameter.type)
         except InvalidArgument as error:
-            invalid.append(f"{place}: {error}")
+            invalid.append(f"{line}: {error}")
     if invalid:
         raise InvalidArgument("\n".join([*invalid, *unknown, "nothing was set"]))
 
@@ -255,7 +257,7 @@ async def _names_for_hints(vehicle: Vehicle, results: Iterable[ParameterWrite]) 
 
 
 def _is_unknown_name(error: Exception | None) -> bool:
-    """Return True if the vehicle does not have a parameter: it said so, or does not answer for this name only."""
+    """Return True if the error says that the vehicle has no parameter of this name."""
     if not isinstance(error, ParameterRejected):
         return False
     return error.code == MavParamError.DOES_NOT_EXIST or "has no parameter" in str(error)
@@ -277,11 +279,12 @@ def _with_hint(name: str, error: Exception, known: Collection[str]) -> str:
     # A text with "replaced by" or "its name on" already contains the right name.
     if not _is_unknown_name(error) or "replaced by" in text or "its name on" in text:
         return text
-    bare = text.partition(" (did you mean")[0]  # the error suggests only parameters that were already read
+    # The error's own suggestions are replaced, because they include only parameters that were already read.
+    bare_text, _, _ = text.partition(" (did you mean")
     beginnings = [other for other in known if len(other) >= _MIN_BEGINNING and name.upper().startswith(other)]
     names = dict.fromkeys([*beginnings, *near_names(name, known, 3)])
     hint = " or ".join(map(repr, list(names)[:3]))
-    return f"{bare} (did you mean {hint}?)" if hint else f"{bare}; `aerokit params list` shows all names"
+    return f"{bare_text} (did you mean {hint}?)" if hint else f"{bare_text}; `aerokit params list` shows all names"
 
 
 def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter], metadata: Metadata | None) -> None:

@@ -25,23 +25,23 @@ _SYSTEM_ID_NAMES = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
 _READ_TIMEOUT_S = 10.0
 
 
-_PX4_PLACE = "is parameters.json, which `make parameters_metadata` writes in PX4's sources"
+_PX4_FILE = "FILE is parameters.json, which `make parameters_metadata` writes in PX4's sources"
 
 
 def metadata_source(vehicle: Vehicle) -> str:
     """Return one sentence that says where the file of ``--metadata`` comes from."""
     if vehicle.autopilot.name == "PX4":
-        place = _PX4_PLACE
+        file = _PX4_FILE
     else:
-        place = f"is https://autotest.ardupilot.org/Parameters/{vehicle.autopilot.firmware}/apm.pdef.xml"
-    return f"ranges were not checked: --metadata FILE checks them; FILE {place} (docs/how-to/parameters.md)"
+        file = f"FILE is https://autotest.ardupilot.org/Parameters/{vehicle.autopilot.firmware}/apm.pdef.xml"
+    return f"ranges were not checked: --metadata FILE checks them; {file} (docs/how-to/parameters.md)"
 
 
 def defaults_source(vehicle: Vehicle) -> str:
     """Return one sentence that says why the vehicle's defaults are unknown, and what to do instead."""
     if vehicle.autopilot.name == "PX4":
         return (
-            f"PX4 does not report the defaults of its parameters: --metadata FILE has them; FILE {_PX4_PLACE}. To"
+            f"PX4 does not report the defaults of its parameters: --metadata FILE has them; {_PX4_FILE}. To"
             " compare with a file of `aerokit params save` instead: aerokit params diff FILE"
         )
     return (
@@ -108,13 +108,15 @@ def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
     """Return a note on what is needed until a new value takes effect, such as a reboot; empty if nothing is known."""
     if name.upper() in _SYSTEM_ID_NAMES:
         return f"the system id changes at the next reboot at the latest; then connect with --system-id {value:g}"
-    entry = None if metadata is None else metadata_entry(metadata, name)[0]
+    if metadata is None:
+        return ""
+    entry, _ = metadata_entry(metadata, name)
     return "takes effect after a reboot" if entry is not None and entry.reboot_required else ""
 
 
 def metadata_facts(metadata: Metadata | None, parameter: Parameter) -> dict[str, object]:
     """Return the unit, range and meaning of a parameter as fields for its record; None if unknown."""
-    # Does not look under the parameter's other names, whose metadata may have another unit.
+    # The parameter's other names are not tried, because their metadata may have another unit.
     entry = None if metadata is None else metadata.get(parameter.name)
     if entry is None:
         return {"unit": None, "minimum": None, "maximum": None, "meaning": None}

@@ -92,6 +92,7 @@ async def _serve_vehicles(uvicorn: Any, serve: Any, options: argparse.Namespace,
 
 @asynccontextmanager
 async def _connection(options: argparse.Namespace) -> AsyncIterator[Connection]:
+    """Open the connection to the vehicles or, with ``--sim``, to simulated ones."""
     from aerokit.connection.opening import open_connection
 
     async with AsyncExitStack() as stack:
@@ -164,6 +165,8 @@ async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> in
 
 
 def _server_class(uvicorn: Any) -> Any:
+    """Return a subclass of uvicorn's server that leaves signals alone, and calls ``on_started`` with its port."""
+
     class Server(uvicorn.Server):  # type: ignore[misc]
         @contextmanager
         def capture_signals(self) -> Iterator[None]:
@@ -172,7 +175,8 @@ def _server_class(uvicorn: Any) -> Any:
         async def startup(self, sockets: Any = None) -> None:
             await super().startup(sockets=sockets)
             if self.started:
-                self.on_started(self.servers[0].sockets[0].getsockname()[1])
+                _, port, *_ = self.servers[0].sockets[0].getsockname()
+                self.on_started(port)
 
     return Server
 

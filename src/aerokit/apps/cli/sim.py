@@ -23,7 +23,7 @@ from aerokit.apps.cli.arguments import (
     system_id,
 )
 from aerokit.apps.cli.connecting import add_signing_key
-from aerokit.apps.cli.output import add_json, emit
+from aerokit.apps.cli.output import DONE, add_json, emit
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavComponent, MavType
@@ -100,13 +100,13 @@ def simulated_fleet(
     if system_id + count - 1 > 255:
         last = system_id + count - 1
         raise InvalidArgument(f"{count} vehicles from system id {system_id} need ids up to {last}; the maximum is 255")
-    home = home or HOME
-    frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
+    latitude_deg, longitude_deg, altitude_m = home or HOME
+    frame = LocalFrame(GlobalPoint(round(latitude_deg * 1e7), round(longitude_deg * 1e7), altitude_m))
     homes = [frame.to_global(0.0, number * spacing_m, 0.0) for number in range(count)]
     return [
         simulated_vehicle(
             name,
-            home=(vehicle_home.latitude_e7 / 1e7, vehicle_home.longitude_e7 / 1e7, home[2]),
+            home=(vehicle_home.latitude_e7 / 1e7, vehicle_home.longitude_e7 / 1e7, altitude_m),
             system_id=system_id + number,
             seed=seed + number,
             components=components(),
@@ -179,10 +179,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     _add_devices(command)
     add_conditions(command)
     command.add_argument(
-        "--boot-time",
-        type=number(0, 600),
-        metavar="S",
-        help="simulated seconds until the vehicle is ready to arm",
+        "--boot-time", type=number(0, 600), metavar="S", help="simulated seconds until the vehicle is ready to arm"
     )
     add_signing_key(command, "signing key of the vehicles; ArduPilot's first port accepts unsigned messages too")
     command.add_argument(
@@ -254,7 +251,7 @@ async def run_sim(options: argparse.Namespace) -> int:
         save_picture(tracks, options.picture)
         record = {"file": options.picture, "what": "track", "count": len(tracks)}
         emit(options, "saved", record, f"track written to {options.picture}")
-    return 0
+    return DONE
 
 
 @asynccontextmanager
@@ -271,7 +268,7 @@ async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namesp
     """Begin the faults of ``--fault`` at their times."""
     loop = asyncio.get_running_loop()
     started_at = loop.time()
-    for name, value, at_s in sorted(options.faults, key=lambda fault: fault[2]):
+    for name, value, at_s in sorted(options.faults, key=_begin_of):
         await asyncio.sleep(started_at + at_s / options.speedup - loop.time())
         for vehicle in vehicles:
             if isinstance(value, list):
@@ -280,6 +277,11 @@ async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namesp
                 setattr(vehicle.faults, name, value)
         begin = f"{at_s:g} s" if at_s else "from the start"
         emit(options, "fault", {"name": name, "value": value, "seconds": at_s}, f"{begin}: fault {name}")
+
+
+def _begin_of(fault: tuple[str, object, float]) -> float:
+    _, _, at_s = fault
+    return at_s
 
 
 def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:
@@ -323,22 +325,24 @@ def _server(vehicles: Sequence[SimulatedVehicle], addresses: Sequence[str], spee
 
 
 def _emit(server: SimulatorServer, options: argparse.Namespace) -> None:
+    """Print the addresses of the vehicles, and commands to try."""
     for address, vehicles in zip(server.addresses, server.vehicles_on, strict=True):
         record = {
             "system_ids": [vehicle.system_id for vehicle in vehicles],
             "address": address,
             "speedup": options.speedup,
         }
-        same = [place for place, others in zip(server.addresses, server.vehicles_on, strict=True) if others == vehicles]
+        # Without --json, the addresses that serve the same vehicles are printed together on one line.
+        same = [other for other, others in zip(server.addresses, server.vehicles_on, strict=True) if others == vehicles]
         text = f"{_systems(vehicles)} on {' and '.join(same)}, speed {options.speedup:g}x"
         emit(options, "simulated", record, text if address == same[0] else None)
     if not options.json:
         vehicles = server.vehicles_on[0]
-        place = _client_address(server.addresses[0], options.addresses[0])
+        client = _client_address(server.addresses[0], options.addresses[0])
         choice = f" --system-id {vehicles[0].system_id}" if len(vehicles) > 1 else ""
-        print(f"try: aerokit demo --connect {place}{choice}", flush=True)
-        if place != _SERIAL_END:
-            print(f"or:  aerokit status {place}, aerokit monitor {place}, aerokit serve {place}", flush=True)
+        print(f"try: aerokit demo --connect {client}{choice}", flush=True)
+        if client != _SERIAL_END:
+            print(f"or:  aerokit status {client}, aerokit monitor {client}, aerokit serve {client}", flush=True)
 
 
 def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:

@@ -62,7 +62,7 @@ _MIN_STEP_M = 1.0
 class SupervisedFlight(ABC):
     """Arms and flies a vehicle, and brings it to a safe state after a failure or Ctrl-C.
 
-    Never commands a vehicle that was already armed before, or whose mode another party has changed.
+    It never commands a vehicle that was armed before the flight, or that another party has put into another mode.
     """
 
     _prints_reasons = True  # False if the command prints the error with its reasons when it ends
@@ -73,7 +73,7 @@ class SupervisedFlight(ABC):
         self._on_interrupt = on_interrupt
         self.armed_by_us: bool = False
         """True once this program has sent an arm command."""
-        self._may_arm_late = False  # True if an arm command was sent whose result is unknown
+        self._may_arm_late = False  # True while the result of a sent arm command is unknown
         self._modes_armed_in: set[str] = set()
         self._has_started = False  # True once a command of this program has changed the mode after arming
 
@@ -115,6 +115,7 @@ class SupervisedFlight(ABC):
             raise OperationRejected(f"the vehicle was armed by another party ({now}); nothing was started")
 
     async def _arm(self) -> None:
+        """Arm the vehicle, and record this before the command is sent, because its result may remain unknown."""
         self._check_disarmed()
         self.armed_by_us = self._may_arm_late = True
         self._modes_armed_in.add(self._vehicle.mode_name)
@@ -221,7 +222,7 @@ class SupervisedFlight(ABC):
 
 
 class FlightReport:
-    """Prints the progress of a flight and the vehicle's texts, and measures the track.
+    """Prints the progress of a flight and the vehicle's status texts, and measures the track.
 
     ``speedup`` is the speed of the simulation, 1.0 for a real vehicle. Durations are in simulated time.
     """
@@ -254,8 +255,8 @@ class FlightReport:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Within the block, print the vehicle's texts, mode changes and status lines."""
-        detach_all = [
+        """Within the block, print the vehicle's status texts, mode changes and status lines."""
+        detachments = [
             self._vehicle.position.observe(self._on_position),
             self._vehicle.armed.observe(self._on_armed),
             self._vehicle.velocity.observe(self._on_velocity, every_arrival=True),
@@ -267,7 +268,7 @@ class FlightReport:
         try:
             yield
         finally:
-            for detach in detach_all:
+            for detach in detachments:
                 detach()
             for task in tasks:
                 task.cancel()
@@ -289,7 +290,7 @@ class FlightReport:
         is_unknown_simulation = self.speedup == 1.0 and not is_real_time(measured)
         speed = measured if is_unknown_simulation else self.speedup
         seconds = speed * (vehicle.connection.now() - self._started_at)
-        self._on_armed(None, False)  # if the vehicle is still armed, adds the time since arming
+        self._on_armed(None, is_armed=False)  # if the vehicle is still armed, adds the time since arming
         version = vehicle.version.latest
         batteries = vehicle.batteries.latest or ()
         record = {
@@ -330,7 +331,7 @@ class FlightReport:
         self._emit("flight_summary", record, "\n".join(lines))
 
     def _describe_armed(self, speed: float) -> str:
-        """Return a clause such as "armed for 47 s", with the time until an impact, and with that of a simulation."""
+        """Return a clause such as "armed for 47 s". Notes give the time until an impact, and that of a simulation."""
         notes = []
         if self._impact_s is not None:
             notes.append(f"{_duration(speed * self._impact_s)} until the impact")
@@ -375,7 +376,8 @@ class FlightReport:
             if not self.prints_status or vehicle.connection.now() - self._last_line_at < _STATUS_INTERVAL_S:
                 continue
             if vehicle.heartbeat_age > SILENT_AFTER_S:
-                height = vehicle.position.latest and vehicle.position.latest.altitude_relative_m
+                here = vehicle.position.latest
+                height = None if here is None else here.altitude_relative_m
                 last = "" if height is None else f" at {height:.1f} m"
                 seconds = self.speedup * vehicle.heartbeat_age
                 self.print_line(f"  silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}")
@@ -400,7 +402,8 @@ class FlightReport:
             return
         step_m = 0.0 if self._previous_position is None else position.distance_to(self._previous_position)
         if self._previous_position is None or step_m >= _MIN_STEP_M:
-            self._flown_m, self._previous_position = self._flown_m + step_m, position
+            self._flown_m += step_m
+            self._previous_position = position
         self._highest_m = max(self._highest_m, position.altitude_relative_m or 0.0)
         self._fastest_m_s = max(self._fastest_m_s, self._vehicle.ground_speed_m_s.latest or 0.0)
 

@@ -61,6 +61,7 @@ def _discard_typed_input() -> None:
 
 
 async def _read_line() -> str:
+    """Read a line from stdin while the event loop runs; return an empty string at the end of the input."""
     loop = asyncio.get_running_loop()
     line: asyncio.Future[str] = loop.create_future()
 

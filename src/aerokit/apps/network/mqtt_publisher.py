@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import ssl
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from aerokit._internal.arguments import checked
@@ -67,9 +67,9 @@ def parse_broker(text: str, *schemes: str) -> BrokerAddress:
     """
     allowed = schemes or tuple(PORTS)
 
-    def fail(reason: str) -> NoReturn:
+    def error(reason: str) -> InvalidArgument:
         shown_address = f"{scheme}://…" if "@" in text else text  # without the password
-        raise InvalidArgument(
+        return InvalidArgument(
             f"address = {shown_address!r} is not allowed: {reason}; expected"
             f" {allowed[0]}://10.0.0.5:{PORTS[allowed[0]]}/fleet/alpha (% and @ : / ? # in a password: %25, %40 …)"
         )
@@ -78,22 +78,25 @@ def parse_broker(text: str, *schemes: str) -> BrokerAddress:
     if scheme not in allowed:
         if "@" in text:
             scheme = "…"  # not shown, because it may be a part of a password
-        fail(f"the scheme is not {' or '.join(f'{name}://' for name in allowed)}")
+        raise error(f"the scheme is not {' or '.join(f'{name}://' for name in allowed)}")
     try:
         parts = urlsplit(text.strip())
         host, port = parts.hostname, parts.port
     except ValueError:
-        fail("host and port cannot be parsed")
+        raise error("host and port cannot be parsed") from None
     if not host or port == 0:
-        fail("host or port is missing")
+        raise error("host or port is missing")
     if parts.query or parts.fragment:
-        fail("MQTT addresses have no options")
+        raise error("MQTT addresses have no options")
     fleet, _, name = parts.path.strip("/").partition("/")
     try:
         key_space = KeySpace(check_name("fleet", fleet), check_name("name", name))
     except InvalidArgument:
-        fail("fleet and name must be up to 63 letters, digits, '_', '.' and '-', starting with a letter or digit")
-    user, password = (None if part is None else unquote(part) for part in (parts.username, parts.password))
+        raise error(
+            "fleet and name must be up to 63 letters, digits, '_', '.' and '-', starting with a letter or digit"
+        ) from None
+    user = None if parts.username is None else unquote(parts.username)
+    password = None if parts.password is None else unquote(parts.password)
     return BrokerAddress(scheme, host, port or PORTS[scheme], key_space, user, password)
 
 
@@ -120,16 +123,18 @@ class MqttLink(BaseLink):
         if self._receiver is None or (name not in self._unsent and len(self._unsent) >= MAX_WAITING):
             self._drop(1)
             return
-        self._drop(int(name in self._unsent))  # the new value replaces an unsent one
+        if name in self._unsent:  # the new value replaces the unsent one
+            self._drop(1)
         self._unsent[name] = data
         self._send_unsent()
 
-    def _refused(self, error: OSError) -> LinkOpenError:
+    def _open_error(self, error: OSError) -> LinkOpenError:
         is_refused = error.errno == errno.ECONNREFUSED
         hint = "nothing listens there; is the broker running, and is this its port?" if is_refused else ""
         return link_open_error(self.address, error, hint)
 
     async def _connect(self) -> None:
+        """Open the socket in a thread, then wait until the broker accepts or refuses the connection."""
         mqtt = import_optional(self.address, "paho.mqtt.client", "paho-mqtt", "mqtt")
         broker, loop = self._broker, asyncio.get_running_loop()
         client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, reconnect_on_failure=False)
@@ -148,7 +153,7 @@ class MqttLink(BaseLink):
         try:
             await open_in_thread(connect, _close_socket)
         except OSError as error:
-            raise self._refused(error) from error
+            raise self._open_error(error) from error
         if (sock := client.socket()) is None:
             raise LinkOpenError(f"cannot open {self.address}: the broker closed the connection")
         self._client = client
@@ -170,8 +175,9 @@ class MqttLink(BaseLink):
         client.publish(self._alive_topic, b"online", retain=True)
 
     def _send_unsent(self) -> None:
+        """Publish the buffered values until the socket accepts no more data; continue when it does."""
         client = self._client
-        # publish() may detect a lost connection, whose callback sets self._client to None.
+        # publish() may detect that the connection is lost, and call _on_disconnect(), which resets self._client.
         while self._client is not None and self._unsent and not client.want_write():
             name = next(iter(self._unsent))
             client.publish(self._broker.key_space.state(name), self._unsent.pop(name))
@@ -187,14 +193,15 @@ class MqttLink(BaseLink):
     def _read(self, client: Any, sock: Any) -> None:
         try:
             client.loop_read()
-            # TLS may hold more decrypted data, which the loop does not report, because it has left the socket.
+            # The event loop does not report data that TLS has decrypted already, because it has left the socket.
             while client.socket() is sock and isinstance(sock, ssl.SSLSocket) and sock.pending():
                 client.loop_read()
         except Exception as error:  # paho 2.1 raises arbitrary errors for malformed packets
             _close_socket(client)
-            self._on_disconnect(client, None, None, f"malformed MQTT packet: {error}", None)
+            self._on_connection_end(f"malformed MQTT packet: {error}")
 
     def _poll(self, client: Any) -> None:
+        """Let paho send pings and detect missing answers, now and at intervals."""
         client.loop_misc()
         if client is self._client:
             self._timer = asyncio.get_running_loop().call_later(_POLL_INTERVAL_S, self._poll, client)
@@ -203,6 +210,9 @@ class MqttLink(BaseLink):
         self._finish_connecting(f"the broker refuses: {reason}" if reason.is_failure else "")
 
     def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        self._on_connection_end(reason)
+
+    def _on_connection_end(self, reason: object) -> None:
         self._finish_connecting("the broker closed the connection")
         if self._is_accepted:
             self._lose(f"the connection to the broker has ended ({reason})")
@@ -215,9 +225,10 @@ class MqttLink(BaseLink):
         if client is self._client:
             discard_on_close(sock)
 
-    def _finish_connecting(self, text: str) -> None:
+    def _finish_connecting(self, refusal: str) -> None:
+        """End the wait of `_connect`. ``refusal`` is the reason of a failure; "" for success."""
         if self._connect_result is not None and not self._connect_result.done():
-            self._connect_result.set_result(text)
+            self._connect_result.set_result(refusal)
 
     def _release(self) -> None:
         """Close the connection, and publish "offline" if that is possible without waiting."""
@@ -246,7 +257,8 @@ def _close_socket(client: Any) -> None:
 
 
 class _NullReceiver:
-    # These methods do nothing: `ReconnectingLink` already logs that the connection is lost or restored.
+    """Ignores everything. `ReconnectingLink` itself logs that the connection is lost or restored."""
+
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         pass
 

@@ -43,7 +43,7 @@ _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=Fa
 
 
 def publisher_for(address: str) -> AbstractAsyncContextManager[Publisher]:
-    """Return the publisher for an address, to be opened by ``async with``. Unknown schemes are left to zenoh's."""
+    """Return the publisher for an address, to be entered by ``async with``. zenoh's publisher rejects other schemes."""
     scheme = address.partition(":")[0].strip().lower()
     return PUBLISHERS.get(scheme, zenoh_publisher)(address)
 
@@ -83,11 +83,13 @@ class Publishing:
             self._publish("link", overview(self._vehicle)["link"], 0.0, now)
 
     def _is_repeat_due(self, name: str, now: float) -> bool:
-        return now - self._sent.get(name, (-math.inf, None))[0] >= REPEAT_INTERVAL_S
+        sent_at, _ = self._sent.get(name, (-math.inf, None))
+        return now - sent_at >= REPEAT_INTERVAL_S
 
     def _publish(self, name: str, value: object, age_s: float, now: float) -> None:
         """Publish a state, unless its value is unchanged and a repetition is not due."""
-        if name in self._sent and self._sent[name][1] == value and not self._is_repeat_due(name, now):
+        _, sent_value = self._sent.get(name, (-math.inf, None))
+        if value == sent_value and not self._is_repeat_due(name, now):
             return
         self._sent[name] = (now, value)
         system_id = self._vehicle.system_id

@@ -54,7 +54,7 @@ def document() -> dict[str, Any]:
     cell_types = typing.get_type_hints(States)
     states = {}
     for name, (_, text) in documentation().items():
-        value_type = typing.get_args(cell_types[name])[0]
+        (value_type,) = typing.get_args(cell_types[name])
         states[name] = _message(name, text, _enum_schema(name) or _schema_of(value_type, definitions))
     states["link"] = _message("link", "State and statistics of the link to the vehicle.", _LINK)
     return {
@@ -138,7 +138,7 @@ def _enum_schema(name: str) -> dict[str, Any] | None:
 
 
 def _snapshot_schema(value_type: type[Snapshot], definitions: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return the schema of a class of values, whose fields may be inherited."""
+    """Return the schema of a class of values, including its inherited fields."""
     annotations: dict[str, Any] = {}
     for base in reversed(value_type.__mro__):
         if issubclass(base, Snapshot) and base is not Snapshot:

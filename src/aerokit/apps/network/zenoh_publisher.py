@@ -31,7 +31,8 @@ class _ZenohPublisher(Publisher):
         self._drop: Any = None
         self._session: Any = None
 
-    def prepare(self, zenoh: Any, session: Any) -> None:
+    def use_session(self, zenoh: Any, session: Any) -> None:
+        """Publish to this session of the module ``zenoh`` from now on."""
         self._drop = zenoh.CongestionControl.DROP
         self._session = session
 
@@ -66,7 +67,7 @@ async def zenoh_publisher(address: str) -> AsyncIterator[Publisher]:
         )
     fleet, _, name = parsed.path.partition("/")
     publisher = _ZenohPublisher(KeySpace(fleet, name))
-    session = await open_session(address, network_options(parsed), publisher.prepare)
+    session = await open_session(address, network_options(parsed), publisher.use_session)
     try:
         yield publisher
     finally:
@@ -104,9 +105,9 @@ async def discover(
     """
     check_name("fleet", fleet)
     keys: set[str] = set()
-    subscribers: list[Any] = []  # a reference, because zenoh ends a subscription whose subscriber is garbage collected
+    subscribers: list[Any] = []  # keeps the subscriber alive, because zenoh ends a garbage-collected subscription
 
-    def prepare(zenoh: Any, session: Any) -> None:
+    def subscribe(zenoh: Any, session: Any) -> None:
         def on_sample(sample: Any) -> None:  # runs on a zenoh thread; set.add and set.discard are atomic
             key = str(sample.key_expr)
             if sample.kind == zenoh.SampleKind.PUT:
@@ -118,7 +119,7 @@ async def discover(
         subscribers.append(session.liveliness().declare_subscriber(all_names, on_sample, history=True))
 
     options = NetworkOptions(tuple(connect), tuple(listen), "", config)
-    session = await open_session(f"zenoh://{fleet}", options, prepare)
+    session = await open_session(f"zenoh://{fleet}", options, subscribe)
     closed = asyncio.Event()
     try:
         await anyio.sleep(wait)
@@ -126,4 +127,8 @@ async def discover(
         subscribers.clear()
         close_session(session, closed.set)
     await closed.wait()
-    return sorted({key.split("/")[2] for key in keys})  # keys are aerokit/FLEET/NAME/…
+    names: set[str] = set()
+    for key in keys:
+        _, _, name, *_ = key.split("/")  # aerokit/FLEET/NAME/…
+        names.add(name)
+    return sorted(names)

@@ -141,7 +141,7 @@ def _writer_for(target: Path, tables: str) -> Callable[[Path, LogReader], _Write
 
 
 def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], object]) -> tuple[int, float, float, int]:
-    """Write all records of a log. Return their number, the first and the last time, and the writer's count."""
+    """Write all records of a log. Return their number, their first and last time, and the writer's ``written``."""
     entries, begins_at, ends_at = 0, 0.0, 0.0
     try:
         for entry in log.entries(on_bytes):

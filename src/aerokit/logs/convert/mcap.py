@@ -28,11 +28,13 @@ class McapWriter:
         self._writer.start(profile="", library="aerokit")
         self._channels: dict[str, int] = {}
         self._schemas: dict[bytes, int] = {}
-        self._latest: dict[int, dict[str, Any]] = {}
+        self._latest: dict[int, dict[str, Any]] = {}  # by system id: the latest value of each state
+        self._map_positions: dict[int, tuple[float, float, float]] = {}  # by system id: metres east, north and up
         self._map_frame = topics.MapFrame()
         self.written: int = 0
 
     def write(self, record: LogRecord) -> None:
+        """Write a record, and the states that it changes."""
         message, system_id = record.message, record.system_id
         if message is not None:
             message_class = STANDARD[message.ID]
@@ -57,6 +59,7 @@ class McapWriter:
         self._file.close()
 
     def _write_states(self, record: LogRecord) -> None:
+        """Write the changed states, and Foxglove's topics that depend on them: texts, location and pose."""
         system_id, unix_s = record.system_id, record.unix_s
         latest = self._latest.setdefault(system_id, {})
         for state, value in record.states:
@@ -80,11 +83,11 @@ class McapWriter:
             heading, velocity = latest.get("heading_deg"), latest.get("velocity")
             fix = topics.location_fix(unix_s, system_id, position, heading, velocity)
             self._put_foxglove(unix_s, system_id, "location", fix, topics.LOCATION_FIX)
-            latest["metres"] = self._map_frame.east_north_up_m(position)
-        metres = latest["metres"]
-        transform = topics.frame_transform(unix_s, system_id, metres, attitude)
+            self._map_positions[system_id] = self._map_frame.east_north_up_m(position)
+        map_position = self._map_positions[system_id]
+        transform = topics.frame_transform(unix_s, system_id, map_position, attitude)
         self._put_foxglove(unix_s, system_id, "transform", transform, topics.FRAME_TRANSFORM)
-        pose = topics.pose_in_frame(unix_s, metres, attitude)
+        pose = topics.pose_in_frame(unix_s, map_position, attitude)
         self._put_foxglove(unix_s, system_id, "pose", pose, topics.POSE_IN_FRAME)
 
     def _put_foxglove(
@@ -103,6 +106,7 @@ class McapWriter:
         self.written += 1
 
     def _register(self, topic: Topic) -> int:
+        """Register a channel for a topic, and its schema unless it is registered; return the id of the channel."""
         data = topics.encoded(topic.schema)
         schema = self._schemas.get(data)
         if schema is None:

@@ -84,7 +84,7 @@ class CsvTable:
         self._writer.writerow([_csv_cell(column.name) for column in columns])
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
-        """Add a row, whose time is written as ISO 8601 in UTC with microseconds."""
+        """Add a row. The time is written as ISO 8601 in UTC with microseconds."""
         # Most values are numbers, for which a call of _csv_cell would be slow. `value == value` is False for NaN.
         cells = [value if type(value) in _NUMBER_TYPES and value == value else _csv_cell(value) for value in values]
         self._writer.writerow([_iso_time(unix_s), *cells])
@@ -99,7 +99,7 @@ class CsvTable:
         self._file.close()
 
     def _flush(self) -> None:
-        self._file.write("".join([line[:-2] + "\n" for line in self._lines]))
+        self._file.write("".join([line.removesuffix("\r\n") + "\n" for line in self._lines]))
         self._lines.clear()
 
 
@@ -249,7 +249,7 @@ def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[L
 
 
 def _cell(value: Any) -> Any:
-    """Convert a value for a table: bytes become hexadecimal digits, and a list becomes a text."""
+    """Convert a value for a table: bytes become hexadecimal digits, and a list becomes a string."""
     if isinstance(value, bytes):
         return value.hex()
     is_array = hasattr(value, "typecode")

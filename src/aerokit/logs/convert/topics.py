@@ -179,7 +179,7 @@ def encoded(fields: Mapping[str, Any]) -> bytes:
 
 
 def state_fields(value: object) -> dict[str, Any]:
-    """Return the message of a state: its fields or, for a number, text or list, ``{"value": …}``."""
+    """Return the message of a state: its fields or, for a number, string or list, ``{"value": …}``."""
     if isinstance(value, Snapshot):
         return {name: _plain(getattr(value, name)) for name in value.__match_args__}
     converted = to_jsonable(value)

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.flights.flight import Waypoint
-from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionType
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _AMSL_FRAMES = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
 _RELATIVE_FRAMES = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
-_TERRAIN_FRAMES = frozenset((MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT))
+_GLOBAL_FRAMES = _AMSL_FRAMES | _RELATIVE_FRAMES | {MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT}
 
 
 def _waypoint_name(waypoint: Waypoint) -> str:
@@ -37,6 +37,8 @@ def _altitude_amsl_m(waypoint: Waypoint, home_amsl_m: float | None) -> float | N
 
 
 class _Track:
+    """The positions and the mission of one vehicle."""
+
     def __init__(self) -> None:
         self.points: list[tuple[datetime, Position]] = []
         self.waypoints: dict[int, Waypoint] = {}
@@ -74,8 +76,9 @@ class _TrackWriter:
         self._path.write_text(self._text(), encoding="utf-8")
 
     def _add_item(self, record: LogRecord) -> None:
+        """Add a mission item that has a position to the vehicle that received or sent it."""
         item: Any = record.message
-        if item is None or item.mission_type or item.frame not in _AMSL_FRAMES | _RELATIVE_FRAMES | _TERRAIN_FRAMES:
+        if item is None or item.mission_type != MavMissionType.MISSION or item.frame not in _GLOBAL_FRAMES:
             return
         if item.target_system in self._tracks:  # sent to the vehicle
             system_id = item.target_system
@@ -89,10 +92,11 @@ class _TrackWriter:
         is_valid = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
         if is_valid and math.isfinite(item.z):
             self._tracks[system_id].waypoints[item.seq] = Waypoint(
-                item.seq, item.command, latitude, longitude, item.z, item.frame
+                item.seq, item.command, latitude, longitude, altitude_m=item.z, frame=item.frame
             )
 
     def _text(self) -> str:
+        """Return the content of the file."""
         raise NotImplementedError
 
 

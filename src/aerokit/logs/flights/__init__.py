@@ -99,23 +99,23 @@ def read_flight(
 
 def _complete(flight: FlightLog) -> None:
     """Complete the flight once the whole log is read: end open time spans, and compute home, heights and failsafes."""
-    is_armed_at_end = bool(flight.armed) and math.isinf(flight.armed[-1][1])
-    if is_armed_at_end:
-        flight.armed[-1] = (flight.armed[-1][0], flight.duration_s)
+    _, last_disarmed_s = flight.armed[-1] if flight.armed else (0.0, 0.0)
+    is_armed_at_end = math.isinf(last_disarmed_s)
+    flight.set_armed(flight.duration_s, armed=False)  # ends an open span
     if flight.home is None and len(flight.track):  # use the position at the first arming, or else the first position
-        first_armed_row = max(flight.track.index_at(flight.armed[0][0]), 0) if flight.armed else 0
+        first_armed_s, _ = flight.armed[0] if flight.armed else (-math.inf, -math.inf)
+        row = max(flight.track.index_at(first_armed_s), 0)
         columns = ("latitude_deg", "longitude_deg", "altitude_amsl_m")
-        position = (flight.track[name][first_armed_row] for name in columns)
-        flight.set_home(flight.track.times[first_armed_row], *position)
+        flight.set_home(flight.track.times[row], *(flight.track[name][row] for name in columns))
     _complete_altitudes(flight)
     if is_armed_at_end:
-        flight.notes.append(_armed_at_end(flight))
+        flight.notes.append(_armed_at_end_note(flight))
     flight.failsafe_evidence += evidence_in_texts(flight.texts) + evidence_in_fixes(flight)
     flight.failsafe_evidence.sort(key=lambda evidence: evidence.time_s)
 
 
-def _armed_at_end(flight: FlightLog) -> str:
-    """Return a note that the log ends while the vehicle is armed, and on what is unknown for that reason."""
+def _armed_at_end_note(flight: FlightLog) -> str:
+    """Return a note that the log ends while the vehicle is armed, and what is therefore unknown."""
     note = "the log ends while the vehicle is armed"
     height_m = flight.track.at("altitude_relative_m", flight.duration_s, not_older_s=math.inf)
     if height_m < _FLYING_HEIGHT_M:  # False if the height is unknown (NaN)
@@ -126,8 +126,8 @@ def _armed_at_end(flight: FlightLog) -> str:
     mode = flight.mode_at(flight.duration_s)
     in_mode = f" in {mode}" if mode else ""
     is_silent = bool(flight.silences) and flight.silences[-1].ends_s >= flight.duration_s
-    age = f", {flight.duration_s - flight.silences[-1].begins_s:.0f} s before its end" if is_silent else ""
-    state = f"{where}{in_mode}{motion}{age}"
+    when = f", {flight.duration_s - flight.silences[-1].begins_s:.0f} s before its end" if is_silent else ""
+    state = f"{where}{in_mode}{motion}{when}"
     return f"{note}{state}: the rest of the flight, and with it a landing or a crash, was not recorded"
 
 
@@ -139,17 +139,16 @@ def _complete_altitudes(flight: FlightLog) -> None:
     home_amsl_m = flight.home.altitude_amsl_m if flight.home is not None else None
     if home_amsl_m is None:
         return
-    for columns in (flight.track, flight.position_target):
-        amsl, relative = columns["altitude_amsl_m"], columns["altitude_relative_m"]
+    for series in (flight.track, flight.position_target):
+        amsl, relative = series["altitude_amsl_m"], series["altitude_relative_m"]
         for row, relative_m in enumerate(relative):
             amsl_m = amsl[row]
             if math.isnan(relative_m):
                 relative[row] = amsl_m - home_amsl_m
-            # Home is not near sea level, so the altitudes above sea level and above home must differ. If they do not,
-            # the log has the same altitude in both columns.
+            # Unless home is near sea level, the two altitudes must differ. If they do not, the log has the same
+            # altitude in both columns.
             elif abs(home_amsl_m) > _SAME_ALTITUDE_M and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
-                # An altitude that is closer to home's altitude above sea level than to 0 is above sea level. Any other
-                # altitude is above home.
+                # A value near home's altitude above sea level is above sea level. A value near 0 is above home.
                 if abs(amsl_m - home_amsl_m) < abs(amsl_m):
                     relative[row] = amsl_m - home_amsl_m
                 else:

@@ -67,8 +67,8 @@ MODE_REASONS: Mapping[int | None, tuple[str, str | None, bool | None]] = {
     54: ("automatic landing", None, True),
     55: ("fence re-enabled", None, True),
 }
-"""Maps a reason's number to its description, the kind of failsafe (or None), and whether the autopilot itself changed
-the mode."""
+"""Maps a reason's number to its description, the kind of failsafe (or None), and True if the autopilot itself changed
+the mode (None if unknown)."""
 
 ERRORS: Mapping[int, tuple[str, str]] = {
     1: ("general", "main loop"),
@@ -112,10 +112,10 @@ _ERROR_DETAILS: Mapping[tuple[int, int], str] = {
     (18, 2): "glitch",
 }
 
-# Subsystems with special error codes. In this order, the code is the number of the refused mode, the number of the new
-# estimator, and bits of AC_FENCE_TYPE.
-_MODE_CHANGE, _ESTIMATOR_SWITCH, _FENCE = 10, 24, 9
-# Bits of AC_FENCE_TYPE.
+# Subsystems whose error code is a number with its own meaning.
+_MODE_CHANGE = 10  # the number of the refused mode
+_ESTIMATOR_SWITCH = 24  # the number of the new estimator
+_FENCE = 9  # bits of AC_FENCE_TYPE
 _FENCE_TYPES = {
     1: "above the maximum altitude",
     2: "outside the circle",
@@ -214,8 +214,8 @@ _ACTIONS: dict[str, dict[str, tuple[str, ...]]] = {
 def failsafe_action(vehicle: str, parameter: str, value: float) -> str:
     """Return the meaning of a failsafe parameter's value; empty if unknown. ``vehicle`` begins with the firmware."""
     firmware = next((firmware for firmware in _ACTIONS if firmware in vehicle), "")
-    of_lost_station = GCS_FAILSAFE_ACTIONS.get(firmware, {}).get(parameter)
-    if of_lost_station is not None:
-        return of_lost_station.get(value, "")
+    gcs_meanings = GCS_FAILSAFE_ACTIONS.get(firmware, {}).get(parameter)
+    if gcs_meanings is not None:
+        return gcs_meanings.get(value, "")
     meanings = _ACTIONS.get(firmware, {}).get(parameter, ())
     return meanings[int(value)] if value in range(len(meanings)) else ""

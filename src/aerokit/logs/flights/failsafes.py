@@ -1,4 +1,4 @@
-"""Detects failsafes of a flight from texts, modes, errors and flags, and collects the values before each of them."""
+"""Detects failsafes of a flight by status texts, modes, errors and flags, and collects the values before each."""
 
 from __future__ import annotations
 
@@ -21,10 +21,15 @@ if TYPE_CHECKING:
 _SAME_KIND_GAP_S = 8.0
 # Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart.
 _GENERAL_GAP_S = 3.0
-# The same for failsafes with a delayed reaction. Without satellites, autopilots continue with dead reckoning for some
-# seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
+# Some reactions are delayed, so general evidence is added for longer. Without satellites, autopilots continue with dead
+# reckoning for some seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
 _DELAYED_REACTION_GAP_S = 10.0
-_REACTION_TIMEOUT_S = 12.0
+# A reaction is a mode change or disarming within these times after the last evidence.
+_REACTION_TIMEOUT_S, _DISARMING_TIMEOUT_S = 12.0, 3.0
+# The reaction may be logged this long before the first evidence of the failsafe.
+_EARLY_MODE_CHANGE_S, _EARLY_DISARMING_S = 2.5, 0.5
+# Evidence counts from this long before arming until this long after disarming.
+_BEFORE_ARMING_S, _AFTER_DISARMING_S = 1.0, 2.0
 # A failsafe is shown with values that were measured in this time before it.
 _BEFORE_S = 10.0
 # A mode change within this time after a failsafe is attributed to the autopilot, even if the log has no cause.
@@ -109,7 +114,7 @@ _LIMIT_PARAMETERS: dict[str, tuple[str, ...]] = {
 
 
 def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
-    """Return the evidence of failsafes that the vehicle's texts contain."""
+    """Return the evidence of failsafes that status texts contain."""
     evidence = []
     for text in texts:
         kind = failsafe_kind(text.text)
@@ -120,16 +125,18 @@ def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
 
 
 def evidence_in_fixes(flight: FlightLog) -> list[FailsafeEvidence]:
-    """Return the times at which a satellite receiver lost its 3D fix."""
+    """Return evidence for each time at which a satellite receiver lost its 3D fix."""
     evidence = []
     for number, gps in flight.gps.items():
         had_fix, had_satellites = False, math.nan
         for time_s, fix_type, satellites in zip(gps.times, gps["fix_type"], gps["satellites"], strict=True):
             has_fix = fix_type >= GpsFixType.TYPE_3D_FIX
             if had_fix and fix_type < GpsFixType.TYPE_3D_FIX:
-                counts = "" if math.isnan(satellites) else f", {satellites:.0f} satellites"
-                counts += "" if math.isnan(had_satellites) or not counts else f" instead of {had_satellites:.0f}"
-                text = f"receiver {number + 1} has no 3D fix any more{counts}"
+                text = f"receiver {number + 1} has no 3D fix any more"
+                if not math.isnan(satellites):
+                    text += f", {satellites:.0f} satellites"
+                    if not math.isnan(had_satellites):
+                        text += f" instead of {had_satellites:.0f}"
                 evidence.append(FailsafeEvidence(time_s, "gps", text))
             if not math.isnan(fix_type):
                 had_fix, had_satellites = has_fix, satellites
@@ -141,7 +148,9 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
     groups: list[list[FailsafeEvidence]] = []
     recent_groups: list[list[FailsafeEvidence]] = []
     for evidence in flight.failsafe_evidence:
-        was_armed = any(begin - 1 <= evidence.time_s <= end + 2 for begin, end in flight.armed)
+        was_armed = any(
+            begin - _BEFORE_ARMING_S <= evidence.time_s <= end + _AFTER_DISARMING_S for begin, end in flight.armed
+        )
         if not was_armed:
             continue
         recent_groups = [
@@ -161,6 +170,7 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
 
 
 def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -> bool:
+    """Return True if evidence belongs to the same failsafe as an earlier group of evidence."""
     kind, gap_s = _kind_of(group), evidence.time_s - group[-1].time_s
     if "general" in (kind, evidence.kind):
         is_reaction_delayed = kind == "gps" or "entering Hold" in group[-1].text
@@ -171,15 +181,21 @@ def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -
 
 
 def _kind_of(group: Sequence[FailsafeEvidence]) -> str:
+    """Return the first specific kind in a group of evidence; "general" if there is none."""
     return next((evidence.kind for evidence in group if evidence.kind != "general"), "general")
 
 
 def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_of_kind: bool) -> Failsafe:
+    """Return the failsafe for a group of evidence, with the reaction and the facts that explain it."""
     kind, time_s = _kind_of(group), group[0].time_s
     reaction, is_sure = _reaction(flight, time_s, group)
     acted = is_sure or any(evidence.is_action for evidence in group)
-    facts = [*_location(flight, time_s), *_CONTEXTS.get(kind, _general_context)(flight, time_s)]
-    facts += _limit_parameters(flight, kind, time_s) or (_missing_parameters(flight, kind) if is_first_of_kind else [])
+    context_of_kind = _CONTEXTS.get(kind, _general_context)
+    facts = [*_location(flight, time_s), *context_of_kind(flight, time_s)]
+    parameters = _limit_parameters(flight, kind, time_s)
+    if not parameters and is_first_of_kind:
+        parameters = _missing_parameters(flight, kind)
+    facts += parameters
     facts += _texts_before(flight, time_s)
     return Failsafe(time_s, kind, acted, tuple(group), reaction or "no mode change followed", tuple(facts))
 
@@ -192,7 +208,7 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
     """
     last_s = group[-1].time_s
     for change in flight.modes:
-        is_near = time_s - 2.5 <= change.time_s <= last_s + _REACTION_TIMEOUT_S
+        is_near = time_s - _EARLY_MODE_CHANGE_S <= change.time_s <= last_s + _REACTION_TIMEOUT_S
         # Some autopilots change the mode after disarming, which is no reaction to a failsafe.
         was_armed = any(begin <= change.time_s < end for begin, end in flight.armed)
         if is_near and was_armed and change.by_autopilot is not False:
@@ -201,7 +217,8 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
                 is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
                 cause = "" if is_sure else "; cause not logged"
                 return _mode_change_text(change, previous_mode, time_s) + cause, is_sure
-    disarmed_s = next((end for _, end in flight.armed if time_s - 0.5 <= end <= last_s + 3), None)
+    until_s = last_s + _DISARMING_TIMEOUT_S
+    disarmed_s = next((end for _, end in flight.armed if time_s - _EARLY_DISARMING_S <= end <= until_s), None)
     if disarmed_s is not None and disarmed_s < flight.duration_s:
         is_sure = _kind_of(group) in CRASH_KINDS
         cause = "" if is_sure else "; cause not logged"
@@ -240,15 +257,19 @@ def distance_from_home_m(flight: FlightLog, time_s: float) -> float | None:
     return math.hypot(*plane.metres(latitude, longitude))
 
 
+# Each of the following functions describes the values that may explain a failsafe at `time_s`.
+
+
 def _battery_context(flight: FlightLog, time_s: float) -> list[str]:
     facts = []
     for number, battery in sorted(flight.batteries.items()):
-        voltage, earlier = battery.at("voltage_v", time_s), battery.at("voltage_v", time_s - 60, not_older_s=30)
+        voltage = battery.at("voltage_v", time_s)
         if math.isnan(voltage):
             continue
         text = f"{battery_name(number)}: {voltage:.2f} V"
-        if not math.isnan(earlier):
-            text += f", {earlier:.2f} V one minute before"
+        earlier_voltage = battery.at("voltage_v", time_s - 60, not_older_s=30)
+        if not math.isnan(earlier_voltage):
+            text += f", {earlier_voltage:.2f} V one minute before"
         for name, template in (
             ("current_a", "{:.1f} A"),
             ("remaining_percent", "{:.0f} % left"),
@@ -284,11 +305,12 @@ def _gps_context(flight: FlightLog, time_s: float) -> list[str]:
         if math.isnan(satellites) and math.isnan(fix_type):
             continue
         text = f"receiver {number + 1}: {satellites:.0f} satellites, fix type {fix_type:.0f}"
-        hdop, earlier = gps.at("hdop", time_s), gps.at("satellites", time_s - _BEFORE_S)
+        hdop = gps.at("hdop", time_s)
         if not math.isnan(hdop):
             text += f", HDOP {hdop:.1f}"
-        if not math.isnan(earlier):
-            text += f"; {earlier:.0f} satellites {_BEFORE_S:.0f} s before"
+        earlier_satellites = gps.at("satellites", time_s - _BEFORE_S)
+        if not math.isnan(earlier_satellites):
+            text += f"; {earlier_satellites:.0f} satellites {_BEFORE_S:.0f} s before"
         facts.append(text)
     return facts
 
@@ -386,10 +408,15 @@ def _missing_parameters(flight: FlightLog, kind: str) -> list[str]:
 
 def configured_by(flight: FlightLog, kind: str) -> list[str]:
     """Return the names of the autopilot's parameters for this kind of failsafe; empty if none are known."""
-    is_px4 = {"PX4": True, "ArduPilot": False}.get(flight.autopilot)
-    return [name for name in _LIMIT_PARAMETERS.get(kind, ()) if is_px4 in (None, name.startswith(_PX4_PREFIXES))]
+    names = _LIMIT_PARAMETERS.get(kind, ())
+    if flight.autopilot == "PX4":
+        return [name for name in names if name.startswith(_PX4_PREFIXES)]
+    if flight.autopilot == "ArduPilot":
+        return [name for name in names if not name.startswith(_PX4_PREFIXES)]
+    return list(names)
 
 
 def _texts_before(flight: FlightLog, time_s: float) -> list[str]:
+    """Return the last texts of the 15 s before a failsafe, without the text that reports the failsafe itself."""
     texts = [text for text in flight.texts if time_s - 15 <= text.time_s < time_s - 0.05]
     return [f"text {time_s - text.time_s:.1f} s before: {text.text}" for text in texts[-4:]]

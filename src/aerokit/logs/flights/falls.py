@@ -1,4 +1,4 @@
-"""Detects the falls and hard landings of a flight from heights, sink rates and the autopilot's texts."""
+"""Detects the falls and hard landings of a flight by heights, sink rates and status texts."""
 
 from __future__ import annotations
 
@@ -23,6 +23,10 @@ _FALL_SINK_M_S = 6.0
 _IMPACT_S = 0.6
 _SAME_HEIGHT_M = 1.5
 _DISARM_TIMEOUT_S = 30.0
+# Disarming and texts up to this long before a descent may explain it, and texts up to this long after its end.
+_REASON_BEFORE_S, _TEXT_AFTER_S = 3.0, 5.0
+# Disarming later than this before the end of a descent may be caused by the impact.
+_IMPACT_DISARM_S = 0.3
 _NEAR_HOME_HEIGHT_M = 3.0  # above this height, an armed vehicle that keeps its height may be hovering
 
 
@@ -38,12 +42,11 @@ class Fall(Snapshot):
     sink_m_s: float
     """Sink rate at the end of the descent."""
     is_hard_landing: bool
-    """True for a hard landing: the sink rate was below 6 m/s, and there are no ``reasons``.
-    """
+    """True for a hard landing: the sink rate was below 6 m/s, and there are no ``reasons``."""
     has_impact: bool
     """False if the log ends during the descent."""
     reasons: tuple[str, ...]
-    """Evidence of a fall: disarming in the air, and texts that report a crash, a motor failure or a termination."""
+    """Evidence of a fall: disarming in the air, and status texts about a crash, a motor failure or a termination."""
 
     @property
     def title(self) -> str:
@@ -75,7 +78,8 @@ def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
             continue
         if down_m_s >= _MIN_SINK_M_S:
             is_recent = time_s - last_fast_s <= _IMPACT_S
-            last_fast_s, sink_m_s = time_s, max(down_m_s, sink_m_s if is_recent else 0.0)
+            sink_m_s = max(sink_m_s, down_m_s) if is_recent else down_m_s
+            last_fast_s = time_s
         elif down_m_s < _STOPPED_M_S:
             max_stop_s = max(_IMPACT_S, 1.5 * (time_s - previous_s))  # longer if the log has few values
             if last_fast_s > begin_s and time_s - last_fast_s <= max_stop_s:
@@ -87,7 +91,7 @@ def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
 
 
 def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_impact: bool) -> Fall | None:
-    """Return the fall or hard landing that a descent is; None if the vehicle may have continued to fly."""
+    """Return the fall or hard landing in which a descent ends; None if the vehicle may have continued to fly."""
     begin_height_m = flight.track.at("altitude_relative_m", begin_s)
     end_height_m = flight.track.at("altitude_relative_m", end_s)
     lost_height_m = begin_height_m - end_height_m
@@ -115,14 +119,13 @@ def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
 
 
 def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
-    """Return the log's evidence of a fall: disarming in the air, and texts."""
-    # Disarming is a reason only if it may have caused the descent. Just before the end of the descent or later, the
-    # impact may have caused the disarming.
+    """Return the log's evidence of a fall: disarming in the air, and status texts."""
+    earliest_s = begin_s - _REASON_BEFORE_S
     reasons = [
         "disarmed in the air"
         for armed_s, disarmed_s in flight.armed
-        if armed_s < begin_s and begin_s - 3 <= disarmed_s <= end_s - 0.3
+        if armed_s < begin_s and earliest_s <= disarmed_s <= end_s - _IMPACT_DISARM_S
     ]
-    texts = [text for text in flight.texts if begin_s - 3 <= text.time_s <= end_s + 5]
+    texts = [text for text in flight.texts if earliest_s <= text.time_s <= end_s + _TEXT_AFTER_S]
     crash_texts = dict.fromkeys(item.text for item in evidence_in_texts(texts) if item.kind in CRASH_KINDS)
     return reasons + list(crash_texts)[:3]  # three texts are enough

@@ -117,7 +117,7 @@ class TangentPlane:
 
 
 def battery_name(number: int) -> str:
-    """Return the name of a battery to display. Names count from 1, as ArduPilot's texts and parameters do."""
+    """Return the name of a battery to display. Names count from 1, as ArduPilot's status texts and parameters do."""
     return f"battery {number + 1}"
 
 
@@ -192,7 +192,7 @@ class FailsafeEvidence(Snapshot):
 class FlightLog:
     """One flight: time series and lists. Times are seconds since ``begins_at``.
 
-    Series, lists and texts that the log does not contain are empty.
+    What the log does not contain is an empty series, list or string.
     """
 
     path: Path
@@ -202,8 +202,8 @@ class FlightLog:
     ends_at: float = 0.0
     """UTC of the last entry, in seconds since 1970."""
     speed: float = 1.0
-    """Simulated seconds for each recorded second: not 1 only in a ``.tlog`` of a simulation that is not in real time.
-    All times of the flight are then in simulated seconds.
+    """Simulated seconds for each recorded second. It differs from 1 only in a ``.tlog`` of a simulation that did not
+    run in real time. All times of the flight are then in simulated seconds.
     """
     vehicle: str = ""
     """Firmware and its version, if known: ``"ArduCopter V4.5.7"``."""
@@ -258,7 +258,7 @@ class FlightLog:
     mission: list[Waypoint] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     """Problems of the log, and known reasons for missing data."""
-    _latest: dict[str, float] = field(default_factory=dict, repr=False)
+    _latest_parameters: dict[str, float] = field(default_factory=dict, repr=False)
 
     @property
     def duration_s(self) -> float:
@@ -310,11 +310,12 @@ class FlightLog:
 
     def set_armed(self, time_s: float, armed: bool) -> None:
         """Record the arming state. A span ends at infinity until the vehicle is disarmed."""
-        is_open = bool(self.armed) and math.isinf(self.armed[-1][1])
+        begin_s, end_s = self.armed[-1] if self.armed else (0.0, 0.0)
+        is_open = math.isinf(end_s)
         if armed and not is_open:
             self.armed.append((time_s, math.inf))
         elif not armed and is_open:
-            self.armed[-1] = (self.armed[-1][0], time_s)
+            self.armed[-1] = (begin_s, time_s)
 
     def set_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
         """Record home until shortly after the first arming. ArduPilot moves home with a disarmed vehicle."""
@@ -322,13 +323,14 @@ class FlightLog:
         if not is_valid:  # NaN is not valid, because it fails the comparisons
             return
         home = Position(latitude_deg, longitude_deg, amsl_m if math.isfinite(amsl_m) else None)
-        if self.home is None or not self.armed or time_s <= self.armed[0][0] + _HOME_AFTER_ARMING_S:
+        first_armed_s, _ = self.armed[0] if self.armed else (math.inf, math.inf)
+        if self.home is None or time_s <= first_armed_s + _HOME_AFTER_ARMING_S:
             self.home = home
 
     def set_parameter(self, time_s: float, name: str, value: float) -> None:
         """Record a parameter's value: its first value, or a change."""
-        before = self._latest.get(name)
-        self._latest[name] = value
+        before = self._latest_parameters.get(name)
+        self._latest_parameters[name] = value
         if name not in self.parameters:
             self.parameters[name] = value
             return

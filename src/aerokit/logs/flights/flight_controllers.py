@@ -73,6 +73,8 @@ States = tuple[tuple[str, Any], ...]
 class _RowReader(LogReader):
     """Base class of readers whose records have named fields."""
 
+    _skipped = 0  # the number of damaged rows
+
     def columns(self, entry: LogRecord) -> list[TableColumn]:
         """Return the columns of a table from its first record, with units if the log has them."""
         return [
@@ -83,12 +85,11 @@ class _RowReader(LogReader):
     def _unit(self, table: str, field: str) -> str:
         return ""
 
-    _skipped = 0
-
     def _is_plausible_time(self, unix_s: float) -> bool:
         """Return True if a row's time is possible. If it is not, count the row as damaged."""
         is_plausible = 0 <= unix_s < _MAX_UNIX_S
-        self._skipped += not is_plausible
+        if not is_plausible:
+            self._skipped += 1
         return is_plausible
 
     def _note_skipped(self) -> None:
@@ -126,7 +127,7 @@ class BinReader(_RowReader):
     _reader: Any = None
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield all records except the formats. Values are multiplied by the factors of their formats."""
+        """Yield all records except those that describe formats. Values are multiplied by the factors of the formats."""
         reader = self._reader = opened_bin(self.path)
         try:
             yield from self._rows(reader, on_bytes)
@@ -143,8 +144,11 @@ class BinReader(_RowReader):
             fields.pop("mavpackettype", None)
             if table not in ("FMT", "FMTU") and self._is_plausible_time(message._timestamp):
                 self._note_time(message._timestamp)
+                states = _ardupilot_states(table, fields, reader)
                 # A .bin contains no system and component id, so both are 1.
-                yield LogRecord(message._timestamp, 1, 1, table, fields, _ardupilot_states(table, fields, reader))
+                yield LogRecord(
+                    message._timestamp, system_id=1, component_id=1, table=table, fields=fields, states=states
+                )
         if not count:
             raise FileFormatError(f"{self.path} is not an ArduPilot log: it contains no message")
         if reader.data_len - reader.offset > _MAX_UNREADABLE_TAIL:
@@ -168,6 +172,7 @@ class BinReader(_RowReader):
 
 
 def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> States:
+    """Return the names and values of the states that a row changes."""
     decode = _ARDUPILOT.get(table)
     try:
         return () if decode is None else decode(fields, reader)
@@ -214,6 +219,8 @@ class _BinText(Snapshot):
 
 
 class _Mode:
+    """A flight mode of a ``.bin``, as the state ``mode``."""
+
     def __init__(self, name: str, number: int) -> None:
         self.name, self.custom_mode = str(name), int(number)
 
@@ -227,10 +234,8 @@ class UlogReader(_RowReader):
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         """Yield all rows of all topics, ordered by time."""
         try:
-            with (
-                self.path.open("rb") as file,
-                redirect_stdout(sys.stderr),
-            ):  # pyulog prints to stdout, which may be for JSON
+            # pyulog prints to stdout, which may be for JSON.
+            with self.path.open("rb") as file, redirect_stdout(sys.stderr):
                 log = import_module("pyulog").ULog(file)
         except Exception as error:  # pyulog raises arbitrary errors for other files
             raise FileFormatError(f"{self.path} is not a PX4 log: {error}") from error
@@ -243,16 +248,23 @@ class UlogReader(_RowReader):
         self._note_time(begins_s)
         system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
         decoder = _Px4States()
-        rows = heapq.merge(*(_rows(data) for data in log.data_list), _texts(log), key=lambda row: row[0])
-        size, total = self.path.stat().st_size, sum(len(data.data["timestamp"]) for data in log.data_list)
+        rows = heapq.merge(*(_rows(data) for data in log.data_list), _texts(log), key=_time_of)
+        size = self.path.stat().st_size
+        total = sum(len(data.data["timestamp"]) for data in log.data_list)
         for count, (time_us, table, fields) in enumerate(rows):
             if count % 1024 == 0:
                 on_bytes(size * count // max(total, 1))
             unix_s = begins_s + time_us / 1e6
             if self._is_plausible_time(unix_s):
-                yield LogRecord(unix_s, system_id, 1, table, fields, decoder.states(table, fields))
+                states = decoder.states(table, fields)
+                yield LogRecord(unix_s, system_id, component_id=1, table=table, fields=fields, states=states)
         self._note_skipped()
         on_bytes(size)
+
+
+def _time_of(row: tuple[int, str, dict[str, Any]]) -> int:
+    time_us, _, _ = row
+    return time_us
 
 
 def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
@@ -265,17 +277,21 @@ def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
 
 
 def _texts(log: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    """Yield the logged texts as rows of a table, like `_rows`."""
     for text in log.logged_messages:
-        # `log_level` is the character of a level of the Linux kernel ("6" is info), whose numbers are MAV_SEVERITY's.
+        # `log_level` is a digit: "6" is info. The Linux kernel's levels and MAV_SEVERITY have the same numbers.
         severity = max(0, min(7, int(text.log_level) - ord("0")))
         yield text.timestamp, "logged_messages", {"severity": severity, "message": text.message}
 
 
 class _Px4States:
+    """Derives aerokit's states from the rows of PX4's topics."""
+
     def __init__(self) -> None:
         self._home_amsl_m: float | None = None
 
     def states(self, table: str, row: Mapping[str, Any]) -> States:
+        """Return the names and values of the states that a row changes."""
         try:
             return self._states(table, row)
         except KeyError:  # the field has another name in this version of PX4
@@ -294,13 +310,14 @@ class _Px4States:
         elif table == "vehicle_local_position" and row.get("v_xy_valid", 1):
             return (("velocity", Velocity(row["vx"], row["vy"], row["vz"])),)
         elif table == "vehicle_status":
-            return (("armed", row["arming_state"] == 2),)
+            return (("armed", row["arming_state"] == 2),)  # ARMING_STATE_ARMED
         elif table == "battery_status":
             remaining = row["remaining"]
             percent = round(remaining * 100) if math.isfinite(remaining) and remaining >= 0 else None
             current_a = _finite_or_none(row["current_a"]) if row["current_a"] >= 0 else None  # -1: unknown
             voltage_v = _finite_or_none(row["voltage_v"]) if row["voltage_v"] > 0 else None  # 0: unknown
-            return (("batteries", (Battery(0, voltage_v, current_a, percent),)),)
+            battery = Battery(id=0, voltage_v=voltage_v, current_a=current_a, remaining_percent=percent)
+            return (("batteries", (battery,)),)
         elif table == "logged_messages":
             return (("status_text", StatusText(row["severity"], clean_text(row["message"]))),)
         return ()

@@ -35,7 +35,7 @@ _FIRMWARES = {
 }
 _ARMED, _DISARMED = 10, 11  # events (EV) that old logs have instead of ARM
 _HOME = 1
-# A position closer to 0° N 0° E means that the estimator has no position yet.
+# A position within this distance of 0° N 0° E is not real: the estimator has no position yet.
 _NULL_ISLAND_DEG = 0.01
 _INDEXING_SHARE = 0.3  # part of the progress that indexing the rows counts for
 
@@ -57,7 +57,7 @@ def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable
 
 
 class _Tables:
-    """The tables of a log, by pymavlink's index of their rows."""
+    """Reads the tables of a log by means of pymavlink's index of their rows."""
 
     def __init__(self, reader: Any) -> None:
         self._reader = reader
@@ -119,7 +119,8 @@ class _Tables:
 
     def _first_time(self) -> int:
         """Return the time of the first row in the file, which may be in any table."""
-        reader, first_rows = self._reader, []  # offset and time of the first row of each table
+        reader = self._reader
+        first_rows = []  # offset and time of the first row of each table
         for number in reader.name_to_id.values():
             offsets = reader.offsets[number]
             if not len(offsets) or "TimeUS" not in reader.formats[number].columns:
@@ -154,7 +155,7 @@ def _struct_pattern(row_format: Any, indices: Sequence[int]) -> str:
 
 
 def _scaled(values: Sequence[Any], scale: float | None) -> list[Any]:
-    """Decode the texts of a column, or convert its numbers to the unit of the table."""
+    """Decode the strings of a column, or convert its numbers to the unit of the table."""
     if values and isinstance(values[0], bytes):
         return [value.split(b"\0", 1)[0].decode("utf-8", "replace") for value in values]
     if scale is None:
@@ -171,18 +172,21 @@ def _wrapped(angles: Sequence[float]) -> list[float]:
 
 
 class _Reader:
+    """Fills a flight with the content of the tables."""
+
     def __init__(self, flight: FlightLog, tables: _Tables) -> None:
         self._flight, self._tables = flight, tables
 
     def read(self, on_share: Callable[[float], object]) -> None:
+        """Read all tables. ``on_share`` is called with the share of the work that is done, from 0 to 1."""
         flight, tables = self._flight, self._tables
         flight.autopilot = "ArduPilot"
         flight.begins_at = tables.unix_at_0 + tables.began_us / 1e6
         steps = (
-            *(self._texts, self._modes, self._armed, self._parameters, self._mission, self._home),
-            *(self._track, self._velocity, self._attitude, self._targets, self._air, self._batteries),
-            *(self._gps, self._vibration, self._estimator, self._radio, self._errors),
-        )
+            self._texts, self._modes, self._armed, self._parameters, self._mission, self._home,
+            self._track, self._velocity, self._attitude, self._targets, self._air, self._batteries,
+            self._gps, self._vibration, self._estimator, self._radio, self._errors,
+        )  # fmt: skip
         for done, step in enumerate(steps, 1):
             step()
             on_share(done / len(steps))
@@ -197,7 +201,7 @@ class _Reader:
     def _texts(self) -> None:
         flight = self._flight
         rows = self._tables.rows("MSG", "Message")
-        flight.texts = [LoggedText(time, None, clean_text(text)) for time, text in rows]
+        flight.texts = [LoggedText(time, severity=None, text=clean_text(text)) for time, text in rows]
         banners = (text.text for text in flight.texts if text.text.split(" ")[0] in _FIRMWARES)
         banner = next(banners, "")  # such as "ArduCopter V4.5.7 (2a3dc4b7)"
         flight.vehicle = " ".join(banner.split(" ")[:2]) or "ArduPilot"
@@ -208,13 +212,12 @@ class _Reader:
         has_reason = self._tables.has("MODE", "ModeNum", "Rsn")
         columns = ("ModeNum", "Rsn") if has_reason else ("ModeNum",)
         for time_s, mode_number, *reason_number in self._tables.rows("MODE", *columns):
-            key = reason_number[0] if has_reason else None
+            (key,) = reason_number or (None,)
             reason, failsafe, by_autopilot = MODE_REASONS.get(key, ("", None, None))
             name = modes.name_of(mode_number)
             if self._flight.add_mode(time_s, name, reason, by_autopilot) and failsafe:
-                self._flight.failsafe_evidence.append(
-                    FailsafeEvidence(time_s, failsafe, f"mode {name}, reason: {reason} (MODE)", True)
-                )
+                text = f"mode {name}, reason: {reason} (MODE)"
+                self._flight.failsafe_evidence.append(FailsafeEvidence(time_s, failsafe, text, is_action=True))
 
     def _armed(self) -> None:
         if self._tables.has("ARM", "ArmState"):
@@ -235,7 +238,9 @@ class _Reader:
             _, number, command, latitude, longitude, altitude, frame = row
             if not latitude and not longitude:
                 latitude = longitude = NAN  # the item has no position
-            items[number] = Waypoint(number, command, latitude, longitude, altitude, frame)
+            items[number] = Waypoint(
+                number, command, latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude, frame=frame
+            )
         self._flight.mission = [items[number] for number in sorted(items)]
 
     def _home(self) -> None:
@@ -260,7 +265,7 @@ class _Reader:
         table = next((table for table in ("XKF1", "NKF1") if self._tables.has(table, "VN", "VE", "VD")), "XKF1")
         core_columns = ("C",) if self._tables.has(table, "C") else ()
         for time_s, north, east, down, *core in self._tables.rows(table, "VN", "VE", "VD", *core_columns):
-            if not core or core[0] == 0:  # the first of several estimators
+            if not core or core == [0]:  # one estimator, or the first of several
                 self._flight.velocity.add(time_s, north, east, down)
 
     def _attitude(self) -> None:
@@ -270,13 +275,15 @@ class _Reader:
         self._flight.attitude_target.extend(times, roll_deg=roll, pitch_deg=pitch, yaw_deg=_wrapped(yaw))
 
     def _targets(self) -> None:
+        """Read the set-points of position and velocity. The log has them relative to the estimator's origin."""
         origin = self._origin()
         north_rows = list(self._tables.rows("PSCN", "TPN", "TVN"))
         east_rows = list(self._tables.rows("PSCE", "TPE", "TVE"))
         if origin is not None:
             plane = TangentPlane(*origin)
             for (time, north_m, north_m_s), (_, east_m, east_m_s) in zip(north_rows, east_rows):  # noqa: B905 - one may be cut off at the end
-                self._flight.position_target.add(time, *plane.degrees(north_m, east_m), NAN, NAN)
+                latitude, longitude = plane.degrees(north_m, east_m)
+                self._flight.position_target.add(time, latitude, longitude, NAN, NAN)  # _add_heights() adds altitudes
                 self._flight.velocity_target.add(time, north_m_s, east_m_s, NAN)
         self._add_heights(self._tables.rows("CTUN", "DAlt"))
 
@@ -307,8 +314,10 @@ class _Reader:
         percent_columns = ("RemPct",) if self._tables.has("BAT", "RemPct") else ()
         rows = self._tables.rows("BAT", instance, "Volt", "Curr", "CurrTot", *percent_columns)
         for time_s, number, voltage, current, used, *percent in rows:
-            is_known = percent and percent[0] != _NO_PERCENT
-            self._flight.battery(number).add(time_s, voltage, current, used, percent[0] if is_known else NAN)
+            (remaining,) = percent or (_NO_PERCENT,)
+            self._flight.battery(number).add(
+                time_s, voltage, current, used, NAN if remaining == _NO_PERCENT else remaining
+            )
 
     def _gps(self) -> None:
         # GPA has the accuracy for each row of GPS. Rows belong together if time and receiver are the same.
@@ -321,18 +330,20 @@ class _Reader:
     def _vibration(self) -> None:
         columns = ("VibeX", "VibeY", "VibeZ", "Clip", "IMU")
         for time, x, y, z, clips, number in self._tables.rows("VIBE", *columns):
-            if number == 0:
+            if number == 0:  # the first of several IMUs
                 self._flight.vibration.add(time, x, y, z, clips)
 
     def _estimator(self) -> None:
-        has_cores = self._tables.has("XKF4", "C", "PI")
         columns = ("SV", "SP", "SH", "SM", "SVT")
         table = "XKF4" if self._tables.has("XKF4", "SV") else "NKF4"
-        for time_s, *values in self._tables.rows(table, *columns, *(("C", "PI") if has_cores else ())):
-            ratios, core_and_primary = values[:5], values[5:]
-            # With several estimators, each row belongs to one of them (C), and PI is the number of the primary
-            # estimator. Only rows of the primary estimator are used. A negative PI stands for 0.
-            if not has_cores or core_and_primary[0] == max(core_and_primary[1], 0):
+        if not self._tables.has("XKF4", "C", "PI"):
+            for time_s, *ratios in self._tables.rows(table, *columns):
+                self._flight.estimator.add(time_s, *ratios)
+            return
+        # Each row belongs to one of several estimators (C), and PI is the number of the primary estimator. Only rows of
+        # the primary estimator are used. A negative PI stands for 0.
+        for time_s, *ratios, core, primary in self._tables.rows(table, *columns, "C", "PI"):
+            if core == max(primary, 0):
                 self._flight.estimator.add(time_s, *ratios)
 
     def _radio(self) -> None:

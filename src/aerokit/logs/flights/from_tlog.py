@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots import Autopilot, autopilot_for, is_armed
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 NAN = math.nan
 _U16, _E7, _METRES_PER_DEGREE = 0xFFFF, 1e7, 111_319.5
-# A position closer to 0° N 0° E means that the estimator has no position yet.
+# A position within this distance of 0° N 0° E is not real: the estimator has no position yet.
 _NULL_ISLAND_E7 = 100_000
 _HEARTBEAT_ID = b"\0\0\0"
 # Bits of a set-point's type mask. If they are set, the position, velocity or attitude is ignored.
@@ -51,6 +52,7 @@ def read_tlog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
 
 
 def _first_autopilot(flight: FlightLog, system_id: int | None) -> tuple[m.Heartbeat, Frame]:
+    """Return the first valid heartbeat of an autopilot (with this system id, unless it is None), and its frame."""
     records = 0
     for _, raw in read_tlog(flight.path):
         records += 1
@@ -74,6 +76,8 @@ def _is_valid(raw: bytes) -> bool:
 
 
 class _Reader:
+    """Fills a flight with the messages of one vehicle."""
+
     def __init__(self, flight: FlightLog, component_id: int, heartbeat: m.Heartbeat) -> None:
         self._flight = flight
         self._source = bytes((flight.system_id, component_id))
@@ -94,8 +98,8 @@ class _Reader:
         self._destinations = TimeSeries(*flight.position_target.names)
         self._link = LinkCounter(flight)
         self._mission = RecordedMission(flight)
-        # `commands` are not handled if the vehicle has sent them, because it sends them to its components. For example,
-        # PX4 informs its components when it has itself decided to return.
+        # Commands that the vehicle itself has sent are not handled, because it sends them to its components. For
+        # example, PX4 informs its components when it has decided to return.
         commands: dict[type[Message], Callable[[float, Any], None]] = {
             m.CommandLong: self._mode_commands.on_command,
             m.CommandInt: self._mode_commands.on_command,
@@ -114,7 +118,9 @@ class _Reader:
         self._handlers_of_vehicle = {_message_id_bytes(kind): handler for kind, handler in handlers.items()}
 
     def read(self, on_bytes: Callable[[int], object]) -> None:
-        # This loop is optimised, because a log has millions of messages. Most of them are not decoded.
+        """Read all messages of the log. ``on_bytes`` is called with the number of bytes read so far."""
+        # This loop is optimised, because a log has millions of messages. Most of them are not decoded: only the fields
+        # of the header are read.
         flight, source, link = self._flight, self._source, self._link
         handlers_of_vehicle, handlers_of_any_sender = self._handlers_of_vehicle, self._handlers_of_any_sender
         damaged = count = received = 0  # `received`: frames since the last call of link.count()
@@ -150,7 +156,7 @@ class _Reader:
                     handle = handlers_of_any_sender[message_id]
                 else:
                     if message_id == _HEARTBEAT_ID:
-                        self._count_other_heartbeat(unix_s - begins_at, sender[0], raw)
+                        self._record_other_heartbeat(unix_s - begins_at, sender[0], raw)
                     continue
                 message = _decoded(raw, unix_s)
                 if message is None:
@@ -163,6 +169,7 @@ class _Reader:
         self._finish(damaged)
 
     def _finish(self, damaged: int) -> None:
+        """Complete the flight after the last message. ``damaged`` is the number of damaged messages."""
         flight = self._flight
         self._add_texts(flight.duration_s, self._texts.expire(math.inf))
         self._add_destinations()
@@ -186,17 +193,18 @@ class _Reader:
         setpoints, destinations = self._flight.position_target, self._destinations
         if setpoints.has("latitude_deg"):
             return
-        has_heights = setpoints.has()
+        has_heights = setpoints.has()  # set-points without latitudes have only heights
         rows = list(zip(setpoints.times, *(setpoints[name] for name in setpoints), strict=True))
         columns = (destinations[name] for name in destinations)
         for time, latitude, longitude, amsl, relative in zip(destinations.times, *columns, strict=True):
             heights = (NAN, NAN) if has_heights else (amsl, relative)
             rows.append((time, latitude, longitude, *heights))
         self._flight.position_target = merged = TimeSeries(*setpoints.names)
-        for row in sorted(rows, key=lambda row: row[0]):
+        for row in sorted(rows, key=itemgetter(0)):  # by time
             merged.add(*row)
 
     def _vehicle_handlers(self) -> dict[type[Message], Callable[[float, Any], None]]:
+        """Return the handlers of messages that count only if the vehicle itself has sent them."""
         return {
             m.Heartbeat: self._on_heartbeat,
             m.GlobalPositionInt: self._on_global_position,
@@ -263,7 +271,7 @@ class _Reader:
             flight.failsafe_evidence.append(FailsafeEvidence(time_s, "general", text))
         self._system_status = status
 
-    def _count_other_heartbeat(self, time_s: float, system_id: int, raw: bytes) -> None:
+    def _record_other_heartbeat(self, time_s: float, system_id: int, raw: bytes) -> None:
         """Record a ground station's heartbeat, or that the log contains another vehicle."""
         vehicle_type = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]  # empty if the frame is too short
         if vehicle_type == bytes((MavType.GCS,)):
@@ -319,9 +327,9 @@ class _Reader:
 
     def _on_nav_controller_output(self, time_s: float, message: m.NavControllerOutput) -> None:
         if self._autopilot.name == "ArduPilot":
-            bearing = message.nav_bearing  # meaningful for fixed wings only
+            # The yaw is NaN, because `nav_bearing` is no yaw of the vehicle, but the course of a fixed wing.
             self._flight.attitude_target.add(time_s, message.nav_roll, message.nav_pitch, NAN)
-            if -180 <= bearing <= 360 and not math.isnan(self._relative_m):
+            if -180 <= message.nav_bearing <= 360 and not math.isnan(self._relative_m):
                 self._flight.position_target.add(time_s, NAN, NAN, NAN, self._relative_m + message.alt_error)
 
     def _on_attitude_target(self, time_s: float, message: m.AttitudeTarget) -> None:
@@ -409,9 +417,9 @@ class _Reader:
         )
 
     def _on_servo_output(self, time_s: float, message: m.ServoOutputRaw) -> None:
-        if message.port == 0:
+        if message.port == 0:  # the main outputs
             pulses = (getattr(message, f"servo{number}_raw") for number in range(1, 9))
-            self._flight.outputs.add(time_s, *(pulse or NAN for pulse in pulses))
+            self._flight.outputs.add(time_s, *(pulse or NAN for pulse in pulses))  # 0: the output is not used
 
     def _on_radio(self, time_s: float, message: m.RadioStatus | m.Radio) -> None:
         self._flight.radio.add(time_s, message.rssi, message.remrssi, message.noise, message.remnoise)

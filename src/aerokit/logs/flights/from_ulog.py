@@ -14,6 +14,7 @@ from aerokit.autopilots.px4 import Px4
 from aerokit.errors import FileFormatError
 from aerokit.logs.flights.codes import clean_text
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPlane
+from aerokit.mavlink.enums import GpsFixType
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -85,10 +86,7 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
     pyulog = import_module("pyulog")
     try:
         # pyulog prints about damage to stdout, which may be for JSON.
-        with (
-            io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file,
-            redirect_stdout(sys.stderr),
-        ):
+        with io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file, redirect_stdout(sys.stderr):
             log = pyulog.ULog(file, list(_TOPICS))
     except Exception as error:  # pyulog raises arbitrary errors for other files
         raise FileFormatError(f"{flight.path} is not a PX4 log: {error}") from error
@@ -146,6 +144,8 @@ class _Topic:
 
 
 class _Reader:
+    """Fills a flight with the content of a log that pyulog has loaded."""
+
     def __init__(self, flight: FlightLog, log: Any) -> None:
         self._flight, self._log = flight, log
         self._data = [data for data in log.data_list if len(data.data.get("timestamp", ()))]
@@ -156,14 +156,14 @@ class _Reader:
         flight, log = self._flight, self._log
         flight.autopilot = "PX4"
         flight.vehicle = _version(log)
-        utc = utc_at_boot(log)
-        flight.begins_at = utc + self._began_us / 1e6
-        flight.ends_at = utc + log.last_timestamp / 1e6
-        if not utc:
+        booted_at = utc_at_boot(log)
+        flight.begins_at = booted_at + self._began_us / 1e6
+        flight.ends_at = booted_at + log.last_timestamp / 1e6
+        if not booted_at:
             flight.notes.append("no GNSS time in the log: times count from power-on")
         flight.system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
         for text in log.logged_messages:
-            # `log_level` is the character of a level of the Linux kernel, whose numbers are those of MAV_SEVERITY.
+            # `log_level` is a digit: "6" is info. The Linux kernel's levels and MAV_SEVERITY have the same numbers.
             severity = max(0, min(7, int(text.log_level) - ord("0")))
             flight.texts.append(LoggedText(self._time(text.timestamp), severity, clean_text(str(text.message))))
         initial = [(log.start_timestamp, *item) for item in log.initial_parameters.items()]
@@ -198,7 +198,7 @@ class _Reader:
             for time_s, failsafe in status.changes("failsafe"):
                 if failsafe == 1:
                     flight.failsafe_evidence.append(
-                        FailsafeEvidence(time_s, "general", "failsafe active (vehicle_status.failsafe)", True)
+                        FailsafeEvidence(time_s, "general", "failsafe active (vehicle_status.failsafe)", is_action=True)
                     )
         self._failsafe_flags()
 
@@ -219,7 +219,8 @@ class _Reader:
         if flags is None:
             return
 
-        def is_armed(time_s: float) -> bool:  # flags on the ground are ignored, because many are set there
+        # Flags on the ground, until one second after arming, are ignored, because many are set there.
+        def is_armed(time_s: float) -> bool:
             return any(begin + 1 < time_s <= end for begin, end in flight.armed)
 
         for name, (kind, text) in _FAILSAFE_FLAGS.items():
@@ -247,13 +248,7 @@ class _Reader:
             if "lat_lon_valid" in position:
                 latitude[position.array("lat_lon_valid") == 0] = NAN
                 longitude[position.array("lat_lon_valid") == 0] = NAN
-            _extend(
-                flight.track,
-                position.times,
-                latitude_deg=latitude,
-                longitude_deg=longitude,
-                altitude_amsl_m=amsl,
-            )
+            _extend(flight.track, position.times, latitude_deg=latitude, longitude_deg=longitude, altitude_amsl_m=amsl)
         else:
             self._track_of_receiver()
         local = self._topic("vehicle_local_position")
@@ -273,7 +268,7 @@ class _Reader:
             fields = ("lat", "lon", "alt") if has_integers else ("latitude_deg", "longitude_deg", "altitude_msl_m")
             per_degree, per_metre = (1e7, 1e3) if has_integers else (1, 1)
             for time_s, fix_type, latitude, longitude, amsl in receiver.rows("fix_type", *fields):
-                if fix_type >= 3:
+                if fix_type >= GpsFixType.TYPE_3D_FIX:
                     self._flight.track.add(time_s, latitude / per_degree, longitude / per_degree, amsl / per_metre, NAN)
 
     def _angles(self, columns: TimeSeries, topic: _Topic | None, field: str) -> None:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 NAN = math.nan
 _MAX_SEQUENCE_GAP = 200
+_ALL_LOST = (100.0, 0)  # a row of the link's time series: the percentage of lost messages, and the received ones
 MIN_SILENCE_S = 3.0
 """Minimum seconds without a message that count as a silence. Autopilots send HEARTBEAT once a second."""
 
@@ -49,14 +50,14 @@ class LinkCounter:
 
     def __init__(self, flight: FlightLog) -> None:
         self._series, self._silences = flight.link, flight.silences
-        self._second = 0
+        self._second = 0  # the second that is being counted
         self._received = self._lost = 0
 
     def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
         """Count received and lost frames. Called after a gap in the sequence and at the start of a second.
 
         ``received`` frames arrived since the last call; the last of them has this time and sequence number. Returns the
-        start of the next second.
+        start of the next second. ``expected`` is negative for the first frame.
         """
         missing = (sequence - expected) & 0xFF if expected >= 0 else 0
         if missing > _MAX_SEQUENCE_GAP:  # not a loss, but a late frame or a frame of another link
@@ -71,27 +72,28 @@ class LinkCounter:
         self._lost += missing
         return self._second + 1
 
-    def add_silence(self, begins_s: float, ends_s: float, others: int) -> None:
-        """Record a silence of the vehicle. ``others`` is the number of messages of other systems during the silence."""
-        self._silences.append(Silence(begins_s, ends_s, others > 0))
+    def add_silence(self, begins_s: float, ends_s: float, other_messages: int) -> None:
+        """Record a silence of the vehicle, in which this many messages of other systems were received."""
+        self._silences.append(Silence(begins_s, ends_s, is_recorded=other_messages > 0))
 
-    def end(self, received: int, received_s: float, ends_s: float, others: int) -> None:
-        """Count the last frames of the log. A silence until the end of the log is also recorded as 100 % loss."""
+    def end(self, received: int, received_s: float, ends_s: float, other_messages: int) -> None:
+        """Count the frames up to ``received_s``. A silence from then until the end of the log counts as 100 % loss."""
         self._received += received
         if ends_s - received_s < MIN_SILENCE_S:
             self._add_row(self._second + 1)
             return
-        self.add_silence(received_s, ends_s, others)
+        self.add_silence(received_s, ends_s, other_messages)
         self._add_row(int(ends_s))
         if ends_s > self._second:
-            self._series.add(ends_s, 100.0, 0)
+            self._series.add(ends_s, *_ALL_LOST)
 
     def _add_row(self, second: int) -> None:
+        """Add the row of the counted second, and count ``second`` from now on. No frames arrived between the two."""
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
         if second - self._second > 1:  # the first and the last second without frames
-            self._series.add(self._second + 1, 100.0, 0)
-            self._series.add(second - 1, 100.0, 0)
+            self._series.add(self._second + 1, *_ALL_LOST)
+            self._series.add(second - 1, *_ALL_LOST)
         self._second, self._received, self._lost = second, 0, 0
 
 
@@ -130,10 +132,10 @@ def use_simulated_time(flight: FlightLog, speed: float) -> None:
 
 
 def _all_series(flight: FlightLog) -> list[TimeSeries]:
-    parts = [getattr(flight, part.name) for part in fields(flight)]
-    return [
-        series
-        for part in parts
-        for series in (part.values() if isinstance(part, dict) else (part,))
-        if isinstance(series, TimeSeries)
-    ]
+    """Return all time series of a flight, including those of each battery and receiver."""
+    all_series: list[TimeSeries] = []
+    for field in fields(flight):
+        value = getattr(flight, field.name)
+        values = value.values() if isinstance(value, dict) else (value,)
+        all_series += [series for series in values if isinstance(series, TimeSeries)]
+    return all_series

@@ -94,7 +94,8 @@ class TlogReader(LogReader):
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         """Yield all messages of the standard dialect that have a valid checksum.
 
-        ``param_value`` of PARAM_VALUE and PARAM_SET is the value of the parameter, also if PX4 sends its bits.
+        ``param_value`` of PARAM_VALUE and PARAM_SET is always the value of the parameter. PX4 sends an integer's bits
+        in this field, which are decoded.
         """
         framer, decode, count = self._framer, STANDARD.decode, 0
         states: tuple[tuple[str, Any], ...] = ()
@@ -114,9 +115,9 @@ class TlogReader(LogReader):
         self._check_and_note(count)
 
     def _decode_parameter(self, message: Message, system_id: int) -> Message:
-        """Return the message, in PARAM_VALUE and PARAM_SET with the decoded value.
+        """Replace the value in PARAM_VALUE and PARAM_SET by the decoded value. Other messages stay the same.
 
-        HEARTBEAT and AUTOPILOT_VERSION show how a vehicle encodes integer parameters.
+        HEARTBEAT and AUTOPILOT_VERSION are evaluated, because they show how a vehicle encodes integer parameters.
         """
         if isinstance(message, Heartbeat):
             if system_id not in self._autopilots and is_autopilot(message):
@@ -176,21 +177,24 @@ class _VehicleStates:
         self.component_id = component_id
         self._now = 0.0
         self._telemetry = Telemetry(lambda: self._now, system_id=system_id, component_id=component_id)
-        self._names: dict[str, tuple[str, ...]] = {
+        # Maps the name of a message class to the names of the states that are decoded from it.
+        self._states_by_message: dict[str, tuple[str, ...]] = {
             name: tuple(field.name for field, _ in rows) for name, rows in SOURCES.items()
         }
         self._expired_at = 0.0
 
     def update(self, unix_s: float, message: Message) -> tuple[tuple[str, Any], ...]:
+        """Decode a message; return the names and values of the states that it changes."""
         self._now = now = max(unix_s, self._now + 1e-6)  # always increases, although the clock may have been set back
         telemetry = self._telemetry
-        names = self._names.get(type(message).__name__, ())
+        names = self._states_by_message.get(type(message).__name__, ())
         if names:
             if message.received_frame is not None:
                 message.received_frame.received_at = now
             telemetry.receive(message)
         if now - self._expired_at > 1.0:
             telemetry.expire(now)  # publishes status texts whose last parts are missing
-            self._expired_at, names = now, (*names, "status_text")
+            self._expired_at = now
+            names = (*names, "status_text")
         cells = telemetry.cells
         return tuple((name, cells[name].latest) for name in names if cells[name].updated_at == now)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 MissionMessage: TypeAlias = "m.MissionItemInt | m.MissionItem | m.MissionCount | m.FileTransferProtocol"
 
 _DEGREES_E7 = 1e7
-_PATH = PACKED_PATHS[MavMissionType.MISSION].encode()
+_MISSION_PATH = PACKED_PATHS[MavMissionType.MISSION].encode()
 _OPENING = (MavFtpOpcode.OPENFILERO, MavFtpOpcode.OPENFILEWO, MavFtpOpcode.CREATEFILE)
 _READING = (MavFtpOpcode.READFILE, MavFtpOpcode.BURSTREADFILE)
 
@@ -53,7 +53,7 @@ class RecordedMission:
             return
         ftp = FtpMessage.decode(message.payload)
         if ftp.opcode in _OPENING:
-            self._is_file_open = ftp.data.rstrip(b"\0") == _PATH
+            self._is_file_open = ftp.data.rstrip(b"\0") == _MISSION_PATH
             self._file.clear()
             self._later_blocks.clear()
         elif self._is_file_open and ftp.data and ftp.offset >= len(self._file):
@@ -73,7 +73,7 @@ class RecordedMission:
             if len(self._file) < header.length:
                 return
             items = unpack_items(bytes(self._file[: header.length]), MavMissionType.MISSION)
-        except RemoteProtocolError:  # The file contains something else than a mission.
+        except RemoteProtocolError:  # The file does not contain a mission.
             self._is_file_open = False
             return
         self._is_file_open = False
@@ -86,12 +86,12 @@ class RecordedMission:
         scale = _DEGREES_E7 if isinstance(message, m.MissionItemInt) else 1.0
         has_position = bool(message.x or message.y)
         self._items[message.seq] = Waypoint(
-            message.seq,
-            message.command,
-            message.x / scale if has_position else math.nan,
-            message.y / scale if has_position else math.nan,
-            message.z,
-            message.frame,
+            number=message.seq,
+            command=message.command,
+            latitude_deg=message.x / scale if has_position else math.nan,
+            longitude_deg=message.y / scale if has_position else math.nan,
+            altitude_m=message.z,
+            frame=message.frame,
         )
 
     def _is_of_vehicle(self, message: MissionMessage) -> bool:

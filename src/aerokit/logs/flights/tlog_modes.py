@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 # A mode change counts as commanded if it happens within this time after a command that changes to the mode.
 _COMMAND_MAX_AGE_S = 5.0
+_ANY_MODE = ""
 _MODE_COMMANDS = frozenset(
     (
         MavCmd.DO_SET_MODE,
@@ -34,8 +35,8 @@ class RecordedModeCommands:
 
     def __init__(self, flight: FlightLog, autopilot: Autopilot) -> None:
         self._flight, self._autopilot = flight, autopilot
-        # Maps a mode to the times of commands that may change to this mode. The key "" is for commands that may change
-        # to any mode.
+        # Maps a mode to the times of commands that may change to this mode. The key _ANY_MODE is for commands that may
+        # change to any mode.
         self._command_times: dict[str, list[float]] = defaultdict(list)
         self.has_commands: bool = False
         """True if the recording contains any command to the vehicle."""
@@ -45,32 +46,33 @@ class RecordedModeCommands:
             self.has_commands = True
             if message.command in _MODE_COMMANDS:
                 params = (message.param1, message.param2, message.param3, message.param4)
-                modes = self._autopilot.modes_of_command(message.command, params)
-                for name in [mode.name for mode in modes] or [""]:
+                names = [mode.name for mode in self._autopilot.modes_of_command(message.command, params)]
+                for name in names or [_ANY_MODE]:
                     self._command_times[name].append(time_s)
 
     def on_set_mode(self, time_s: float, message: m.SetMode) -> None:
         if message.target_system in (0, self._flight.system_id):
             self.has_commands = True
-            self._command_times[self._autopilot.mode(message.custom_mode, message.base_mode).name].append(time_s)
+            mode = self._autopilot.mode(message.custom_mode, message.base_mode)
+            self._command_times[mode.name].append(time_s)
 
     def attribute_modes(self, speed: float) -> None:
         """Mark the mode changes that were commanded. ``speed`` is that of a simulation, 1.0 for a real vehicle.
 
-        Ages of commands are compared in the vehicle's seconds. A failsafe of a fast simulation may follow a command
-        within a second of the recording.
+        The age of a command is measured in the vehicle's seconds, because many of them pass in one recorded second of
+        a fast simulation.
         """
         for times in self._command_times.values():
             times.sort()
-        self._flight.modes = [
-            change.replace(reason="ordered", by_autopilot=False)
-            if min(self._command_age_s(change, name) for name in ("", change.name)) * speed < _COMMAND_MAX_AGE_S
-            else change
-            for change in self._flight.modes
-        ]
+        changes: list[ModeChange] = []
+        for change in self._flight.modes:
+            age_s = min(self._command_age_s(change, _ANY_MODE), self._command_age_s(change, change.name))
+            is_commanded = age_s * speed < _COMMAND_MAX_AGE_S
+            changes.append(change.replace(reason="ordered", by_autopilot=False) if is_commanded else change)
+        self._flight.modes = changes
 
-    def _command_age_s(self, change: ModeChange, name: str) -> float:
-        """Return the recorded seconds between a mode change and the last command to this mode; infinity without one."""
-        times = self._command_times.get(name, [])
+    def _command_age_s(self, change: ModeChange, mode: str) -> float:
+        """Return the recorded seconds from the last command to this mode until the change; infinity without one."""
+        times = self._command_times.get(mode, [])
         index = bisect_right(times, change.time_s)
         return change.time_s - times[index - 1] if index else math.inf

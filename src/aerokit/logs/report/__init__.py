@@ -84,11 +84,11 @@ def write_report(
     write_atomically(target_path, _render(flights, statistics, summaries))
     return Report(
         target_path,
-        target_path.stat().st_size,
-        tuple(map(tuple, summaries)),
-        tuple(statistics),
-        tuple(tuple(failsafes(flight)) for flight in flights),
-        tuple(tuple(falls(flight)) for flight in flights),
+        bytes=target_path.stat().st_size,
+        summaries=tuple(map(tuple, summaries)),
+        statistics=tuple(statistics),
+        failsafes=tuple(tuple(failsafes(flight)) for flight in flights),
+        falls=tuple(tuple(falls(flight)) for flight in flights),
     )
 
 
@@ -99,8 +99,9 @@ def report_html(flight: FlightLog) -> str:
 
 
 def _render(flights: list[FlightLog], statistics: list[FlightStatistics], summaries: list[list[str]]) -> str:
+    """Return the HTML of a report on one flight, or of a comparison of two."""
     if len(flights) == 1:
-        flight = flights[0]
+        (flight,) = flights
         optional_sections = [make_section(flight) for make_section in SECTIONS]
         sections = [section for section in optional_sections if section is not None]
         return page(
@@ -115,7 +116,8 @@ def _render(flights: list[FlightLog], statistics: list[FlightStatistics], summar
         (f"{name}: {flight.path.name}, {_heading(flight)}", sentences, findings(flight))
         for name, flight, sentences in zip(NAMES, flights, summaries, strict=True)
     ]
-    sections = comparison((first, second), (statistics[0], statistics[1]))
+    first_statistics, second_statistics = statistics
+    sections = comparison((first, second), (first_statistics, second_statistics))
     return page(f"{first.path.name} and {second.path.name}", headed_summaries, sections, COLOURS)
 
 

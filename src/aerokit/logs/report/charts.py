@@ -213,7 +213,7 @@ def simplification_note(deviation_m: float) -> list[Part]:
 def drawn_track(
     places: Sequence[tuple[float, float]], max_points: int = MAX_TRACK_POINTS, keep: Iterable[int] = ()
 ) -> tuple[list[int], float]:
-    """Return the rows of a track to draw, and the largest distance of any row from the drawn line."""
+    """Return the rows of a track to draw, including ``keep``, and the largest distance of any row from the line."""
     if len(places) <= MAX_POINTS:  # short lines are drawn completely
         has_known = any(rounded(north) is not None and rounded(east) is not None for north, east in places)
         rows = list(range(len(places))) if has_known else []
@@ -243,10 +243,11 @@ def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tu
     """Return a line for each mode, and the largest distance of a point of the track from these lines."""
     times, heights = flight.track.times, flight.track["altitude_relative_m"]
     changes = flight.modes or [ModeChange(0.0, "")]
-    starts = [0, *(bisect_left(times, change.time_s) for change in changes[1:]), len(places)]
-    rows, deviation_m = drawn_track(places, keep=(row for row in starts if row < len(places)))
+    # The rows at which the modes begin, and the end of the last mode.
+    boundaries = [0, *(bisect_left(times, change.time_s) for change in changes[1:]), len(places)]
+    rows, deviation_m = drawn_track(places, keep=(row for row in boundaries if row < len(places)))
     rows_by_mode: dict[str, list[int | None]] = {}  # None interrupts the line
-    for (start, end), change in zip(pairwise(starts), changes, strict=True):
+    for (start, end), change in zip(pairwise(boundaries), changes, strict=True):
         # The line of a mode ends at the first position of the next mode, so that the track has no gaps.
         part = rows[bisect_left(rows, start) : bisect_left(rows, end) + 1] if start < end else []
         if part:
@@ -283,6 +284,7 @@ def rounded(value: float) -> float | None:
 
 
 def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
+    """Return a dotted line through the position set-points; an empty list if there are none."""
     target = flight.position_target
     places = [
         plane.metres(latitude, longitude)
@@ -304,6 +306,7 @@ def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any
 
 
 def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
+    """Return a dashed line through the mission items without home; an empty list if there are none."""
     items = [item for item in flight.mission if not math.isnan(item.latitude_deg) and flight.item_label(item) != "home"]
     if not items:
         return []
@@ -341,6 +344,7 @@ def _circular_fence(flight: FlightLog) -> list[dict[str, Any]]:
 
 
 def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
+    """Return markers where the vehicle was at the times of failsafes and falls."""
     events_by_legend: tuple[tuple[str, str, Sequence[Failsafe | Fall]], ...] = (
         ("failsafe", "x", failsafes(flight)),
         ("fall", "triangle-down", falls(flight)),
@@ -350,7 +354,7 @@ def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) 
         event_places, names = [], []
         for event in events:
             row = flight.track.index_at(event.time_s)
-            if row >= 0 and not math.isnan(places[row][0]):
+            if row >= 0 and not math.isnan(math.hypot(*places[row])):
                 event_places.append(places[row])
                 names.append(f"{event.title}, {clock(event.time_s)}")
         if event_places:
@@ -366,6 +370,7 @@ def _marker(
     size: int,
     texts: Sequence[str] = (),
 ) -> dict[str, Any]:
+    """Return a trace of markers. ``texts`` has a text for each place to show on hovering; by default, the name."""
     return {
         **_coordinates(places),
         "mode": "markers",

@@ -90,7 +90,9 @@ def _first(by_number: dict[int, TimeSeries]) -> TimeSeries | None:
 
 
 def _armed_at(flight: FlightLog) -> float:
-    return flight.armed[0][0] if flight.armed else 0.0
+    """Return the time of the first arming; 0 if the vehicle was never armed."""
+    armed_s, _ = flight.armed[0] if flight.armed else (0.0, 0.0)
+    return armed_s
 
 
 def _differences(statistics: tuple[FlightStatistics, FlightStatistics]) -> Section:
@@ -115,7 +117,8 @@ def _maps(flights: Sequence[FlightLog]) -> Section:
         rows, deviation_m = drawn_track(places)
         deviations.append(deviation_m)
         if rows:
-            north, east = ([rounded(places[row][axis]) for row in rows] for axis in (0, 1))
+            north = [rounded(north_m) for north_m, _ in (places[row] for row in rows)]
+            east = [rounded(east_m) for _, east_m in (places[row] for row in rows)]
             traces.append({"x": east, "y": north, **_line_style(number)})
     title, missing = "Tracks", "Neither log has positions."
     if not traces:

@@ -133,7 +133,7 @@ def _resource(name: str) -> str:
 
 
 def _hash(script: str) -> str:
-    """Return the hash of a script for the Content-Security-Policy. Like browsers, normalizes line ends before."""
+    """Return the hash of a script for the Content-Security-Policy. Line ends are normalized first, as browsers do."""
     data = script.replace("\r\n", "\n").replace("\r", "\n").encode()
     return base64.b64encode(hashlib.sha256(data).digest()).decode()
 

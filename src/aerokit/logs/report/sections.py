@@ -26,7 +26,7 @@ _SEVERITIES = ("emergency", "alert", "critical", "error", "warning", "notice", "
 _FIX_NAMES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed")
 _MAX_TEXTS, _MAX_CHANGES, _MAX_PARAMETERS = 2000, 2000, 5000
 _MAX_OPEN_FAILSAFES = 10
-# Parameters whose names contain one of these texts are written by the autopilot itself.
+# The autopilot itself writes parameters with one of these strings in their names.
 _WRITTEN_BY_AUTOPILOT = (
     "STAT_",
     "_GND_PRESS",

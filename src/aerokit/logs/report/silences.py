@@ -65,13 +65,14 @@ def _sentence(flight: FlightLog, silence: Silence) -> str:
 
 
 def _state(flight: FlightLog, time_s: float) -> str:
+    """Return the height and the mode as text, such as "12.5 m above home in LOITER"; empty if both are unknown."""
     height_m, mode = flight.track.at("altitude_relative_m", time_s), flight.mode_at(time_s)
     parts = [] if math.isnan(height_m) else [f"{height_m:.1f} m above home"]
     return " ".join([*parts, *([f"in {mode}"] if mode else [])])
 
 
 def ground_station_failsafe(flight: FlightLog, time_s: float) -> str:
-    """Return a sentence about the vehicle's configured reaction to a lost ground station, also if it is unknown."""
+    """Return a sentence about the vehicle's configured reaction to a lost ground station, or that it is unknown."""
     firmware = next((name for name in GCS_FAILSAFE_ACTIONS if name in flight.vehicle), "")
     if not firmware:
         return "How the vehicle reacts to a lost ground station is unknown."
@@ -82,8 +83,8 @@ def ground_station_failsafe(flight: FlightLog, time_s: float) -> str:
             f"How the vehicle reacts to a lost ground station is unknown, because the log does not contain {names[0]};"
             f" look at {', '.join(names)}."
         )
-    decisive, action = gcs_failsafe(firmware, values.get)
+    decisive_name, action = gcs_failsafe(firmware, values.get)
     texts = {name: f"{name} = {value:g}" for name, value in values.items()}
-    if decisive is not None and action is not None:
-        texts[decisive] += f" ({action})"
+    if decisive_name is not None and action is not None:
+        texts[decisive_name] += f" ({action})"
     return f"The vehicle's reaction, if it lost the ground station too: {', '.join(texts.values())}."

@@ -53,14 +53,19 @@ def simplify(
         if last - first > 1 and known[first + 1]
     ]
     heapq.heapify(segments)
-    limit = -tolerance * tolerance
-    while segments and segments[0][0] < limit and len(selected) < max_points:
-        _, middle, first, last = heapq.heappop(segments)
+    while segments and len(selected) < max_points:
+        negative_square, middle, first, last = segments[0]
+        if negative_square >= -tolerance * tolerance:  # All deviations are within the tolerance.
+            break
+        heapq.heappop(segments)
         selected.add(middle)
         for begin, end in ((first, middle), (middle, last)):
             if end - begin > 1:
                 heapq.heappush(segments, (*_deviation(places, begin, end), begin, end))
-    largest_deviation = math.sqrt(-segments[0][0]) if segments else 0.0
+    largest_deviation = 0.0
+    if segments:
+        negative_square, *_ = segments[0]
+        largest_deviation = math.sqrt(-negative_square)
     return sorted({*selected, *gaps}), largest_deviation
 
 
@@ -70,7 +75,8 @@ def _deviation(places: Sequence[tuple[float, float]], first: int, last: int) -> 
     The segment is the straight line between the points ``first`` and ``last``.
     """
     x, y = places[first]
-    segment_x, segment_y = places[last][0] - x, places[last][1] - y
+    last_x, last_y = places[last]
+    segment_x, segment_y = last_x - x, last_y - y
     squared_length = segment_x * segment_x + segment_y * segment_y
     largest, largest_index = -1.0, first + 1
     for index in range(first + 1, last):

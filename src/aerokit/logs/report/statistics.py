@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from itertools import pairwise
 from statistics import median
 from typing import TYPE_CHECKING
 
@@ -138,7 +137,7 @@ def time_in_modes(flight: FlightLog) -> dict[str, float]:
 
 
 class _ArmedSpans:
-    """Selects the rows in which the vehicle was armed, or all rows if it was never armed."""
+    """Selects the rows of time series in which the vehicle was armed, or all rows if it was never armed."""
 
     def __init__(self, flight: FlightLog) -> None:
         self._spans = flight.armed or [(-math.inf, math.inf)]
@@ -161,7 +160,8 @@ class _ArmedSpans:
                 until_s = times[row + 1] if row + 1 < len(times) else times[row] + 1.0
                 seconds = min(until_s, end) - times[row]
                 if math.isfinite(values[row]):
-                    total, weight = total + values[row] * seconds, weight + seconds
+                    total += values[row] * seconds
+                    weight += seconds
         return total / weight if weight else None
 
 
@@ -178,16 +178,20 @@ def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> floa
     """Return the length in metres of the track's parts in these rows, without steps that are noise."""
     length_m = 0.0
     counted: tuple[float, float] | None = None  # the end of the last step that `length_m` includes
-    for previous_row, row in pairwise([-2, *rows]):  # -2: the first row has no previous row
+    previous_row = None
+    for row in rows:
+        is_start_of_span = previous_row != row - 1
+        previous_row = row
         point = north_east[row]
-        if math.isnan(point[0]):
+        if math.isnan(math.hypot(*point)):
             continue
-        if counted is None or row != previous_row + 1:  # an armed span begins here
+        if counted is None or is_start_of_span:
             counted = point
             continue
-        step = math.hypot(point[0] - counted[0], point[1] - counted[1])
+        step = math.dist(point, counted)
         if step >= _MIN_STEP_M:
-            length_m, counted = length_m + step, point
+            length_m += step
+            counted = point
     return length_m
 
 
@@ -211,7 +215,7 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
     angles = ("roll_deg", "pitch_deg")
     texts = []
     currents = _currents(flight, begin_s, end_s)
-    throttle = _span_and_before(flight.air, "throttle_percent", begin_s, end_s)
+    throttle = _descent_values(flight.air, "throttle_percent", begin_s, end_s)
     if throttle is not None:
         advice = ", so look at motors, propellers and battery" if throttle.high >= _HIGH_THROTTLE_PERCENT else ""
         if throttle.is_low and not any(current.is_low for current in currents.values()):
@@ -232,18 +236,18 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
     return texts
 
 
-def _currents(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _SpanAndBefore]:
+def _currents(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _DescentValues]:
     """Return the currents of the batteries in a descent. The keys are names for the text."""
     currents = {}
     for index, battery in sorted(flight.batteries.items()):
-        current = _span_and_before(battery, "current_a", begin_s, end_s)
+        current = _descent_values(battery, "current_a", begin_s, end_s)
         if current is not None:
             name = battery_name(index) if len(flight.batteries) > 1 else "battery"
             currents[f"{name} current"] = current
     return currents
 
 
-class _SpanAndBefore(Snapshot):
+class _DescentValues(Snapshot):
     """Lowest, median and highest value in a descent, and the median of the seconds before it (NaN if unknown)."""
 
     low: float
@@ -262,31 +266,32 @@ class _SpanAndBefore(Snapshot):
         return values if math.isnan(self.before) else f"{values} (before: {self.before:.0f} {unit})"
 
 
-def _span_and_before(series: TimeSeries, name: str, begin_s: float, end_s: float) -> _SpanAndBefore | None:
+def _descent_values(series: TimeSeries, name: str, begin_s: float, end_s: float) -> _DescentValues | None:
     """Return the values in a time span and before it; None if the series has no known value in the span."""
     values = series.between(name, begin_s, end_s)
     if not values:
         return None
     values_before = series.between(name, begin_s - _BEFORE_FALL_S, begin_s)
     before = median(values_before) if values_before else math.nan
-    return _SpanAndBefore(min(values), median(values), max(values), before)
+    return _DescentValues(min(values), median(values), max(values), before)
 
 
 def _motor_outputs(flight: FlightLog, begin_s: float, end_s: float) -> str:
     """Describe the motor outputs in a descent; empty if the log does not show which outputs drive motors."""
     armed_s = next((begin for begin, end in reversed(flight.armed) if begin < begin_s), math.nan)
-    motors: dict[str, _SpanAndBefore] = {}
+    motors: dict[str, _DescentValues] = {}
     for name in flight.outputs:
         idle_us = flight.outputs.at(name, armed_s - 0.1)  # just before arming
-        pulses = _span_and_before(flight.outputs, name, begin_s, end_s)
+        pulses = _descent_values(flight.outputs, name, begin_s, end_s)
         if pulses is not None and pulses.before - idle_us >= _MOTOR_RAISED_US:
-            motors[name.split("_")[1]] = pulses
+            _, number, _ = name.split("_")  # such as "output_3_us"
+            motors[number] = pulses
     if not motors:
         return ""
     by_pulse = sorted(motors, key=lambda output: motors[output].middle)
     lowest, highest = by_pulse[0], by_pulse[-1]
     low_us, high_us = motors[lowest].middle, motors[highest].middle
-    text = _SpanAndBefore(
+    text = _DescentValues(
         min(pulses.low for pulses in motors.values()),
         median(pulses.middle for pulses in motors.values()),
         max(pulses.high for pulses in motors.values()),
@@ -301,6 +306,7 @@ def _motor_outputs(flight: FlightLog, begin_s: float, end_s: float) -> str:
 
 
 def _attitude_errors(flight: FlightLog, name: str, begin_s: float, end_s: float) -> Iterator[float]:
+    """Yield the differences of an angle from its set-points in a time span, in degrees."""
     times, values = flight.attitude_target.times, flight.attitude_target[name]
     for row in range(bisect_left(times, begin_s), bisect_right(times, end_s)):
         error = math.remainder(values[row] - flight.attitude.at(name, times[row]), 360)
@@ -378,6 +384,7 @@ def _battery_sentence(statistics: FlightStatistics) -> str:
 
 
 def _failsafes_sentence(flight: FlightLog) -> str:
+    """Return sentences about the failsafes, the warnings, and missing parameters that would explain the warnings."""
     acted, warnings, kinds = [], [], []
     for failsafe in failsafes(flight):
         at = f"{failsafe.title} at {clock(failsafe.time_s)}"
