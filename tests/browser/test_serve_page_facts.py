@@ -328,7 +328,8 @@ def test_parameters_look_clickable_with_token_only(browser: Any, copters: tuple[
         for url, line, note in ((server["page"], "underline", " · click one to set it"), (server["url"], "none", "")):
             with opened(browser, url) as page:
                 page.get_by_role("tab", name="Parameters").click()
-                page.locator("#panel .note", has_text=re.compile(rf"^\d+ of \d+ parameters, received at [\d:]+{note}$")).wait_for()
+                text = re.compile(rf"^\d+ of \d+ parameters, received at [\d:]+{note}$")
+                page.locator("#panel .note", has_text=text).wait_for()
                 assert page.locator("#panel .link").first.evaluate(style) == line
                 if line == "underline":
                     check_contrast(page)

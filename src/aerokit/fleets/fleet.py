@@ -146,17 +146,17 @@ class Fleet(Selection):
         Raises:
             InvalidArgument: a type is not an event.
         """
-        event_types: tuple[type[Event], ...] = types or (FleetEvent, Event)
+        event_types: tuple[type[Event], ...] = types or (FleetEvent, MemberEvent)
 
         def attach(sink: Sink) -> list[Detach]:
             detachments: list[Detach] = []
             for event_type in event_types:
-                if event_type is MemberEvent:  # all events of vehicles
-                    detachments += self._attach_member_events(Event, sink)
-                elif not issubclass(event_type, FleetEvent):
-                    detachments += self._attach_member_events(event_type, sink)
-                else:
+                # The fleet's bus has only the fleet's own events. Those of vehicles arrive on the buses of their links.
+                if issubclass(event_type, FleetEvent) and event_type is not MemberEvent:
                     detachments.append(self._context.bus.attach_event(event_type, sink))
+                else:
+                    vehicle_event_type = Event if event_type is MemberEvent else event_type
+                    detachments += self._attach_member_events(vehicle_event_type, sink)
             return detachments
 
         return Subscription(attach, capacity=capacity, overflow=overflow)

@@ -117,7 +117,7 @@ class Member:
             self._set_lost(f"its link is closed, {self.vehicle.describe_link()}")
         if self.is_available and (reason := self._takeover_reason()):
             self._set_taken_over(reason)
-            self._on_unavailable(self)
+            self._on_unavailable(self)  # `_set_lost` calls it itself.
 
     def record_failure(self, action: str, error: Exception) -> None:
         """Set the state to FAILED, unless the member is lost or taken over, and publish :class:`MemberFailed`."""

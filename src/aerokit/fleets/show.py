@@ -65,11 +65,12 @@ class Show(Snapshot):
         Raises:
             InvalidArgument: ``names`` lacks a track, or gives two tracks the same name.
         """
-        missing = [name for name in self.tracks if name not in names]
+        missing = [track for track in self.tracks if track not in names]
         if missing:
-            raise InvalidArgument(f"names has no member for the tracks {missing}")
-        if len(set(names.values())) < len(self.tracks):
-            raise InvalidArgument("names has the same member for two tracks")
+            raise InvalidArgument(f"names: no fleet member is given for these tracks: {', '.join(missing)}")
+        members = [names[track] for track in self.tracks]
+        if len(set(members)) < len(members):
+            raise InvalidArgument(f"names: two tracks are given the same fleet member: {', '.join(members)}")
         return type(self)({names[name]: track.replace(name=names[name]) for name, track in self.tracks.items()})
 
     @classmethod

@@ -115,7 +115,8 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         elif method == "set_rate":
             arguments = (rate,)
         if None in arguments:
-            raise InvalidArgument("length or rate is missing: this action needs it")
+            needed = "length and rate" if method == "pay_out" else "rate"
+            raise InvalidArgument(f"this action needs {needed}, but {needed} is not set")
         if method == "pay_out" and rate is not None and rate <= 0:
             raise InvalidArgument(f"rate = {rate:g} is not allowed: it must be above 0")
         await services.commands.call(getattr(winch, method), *arguments)

@@ -185,7 +185,7 @@ class FtpDownload(FtpExchange[int]):
         self._add(reply.offset, reply.data, now)
 
     def _record_block(self, burst: _Burst, number: int, now: float) -> None:
-        """Record that block ``number`` of a burst has arrived. It may count as progress, and measure the link."""
+        """Record that block ``number`` of a burst has arrived: as progress, and to estimate the speed of the link."""
         # Blocks that a repeated burst sends again also count as progress, because they show that the server works. The
         # number of repeated bursts is limited, so that the download cannot go on forever.
         if number > self._highest_blocks.get(burst.sequence, -1) and self._repeated_bursts <= MAX_REPEATED_BURSTS:
@@ -220,7 +220,8 @@ class FtpDownload(FtpExchange[int]):
             return
         if not is_latest:
             return
-        # Once the server has sent a block, it does support bursts, and these errors are failures.
+        # Before the first block, the errors in NO_BURST mean that the server does not support bursts. After it, they
+        # mean that the transfer has failed.
         has_no_block = self._reassembly.done == self._reassembly.start
         if has_no_block and reply.error_code in NO_BURST:
             self._supports_bursts = False
@@ -353,7 +354,7 @@ class FtpDownload(FtpExchange[int]):
         return self._size if self._reassembly.end is None else self._reassembly.end
 
     def _end(self) -> None:
-        """Process the end of the file. Fail if the server has announced a larger size when it opened the file."""
+        """Process the end of the file, which the server has reported before the announced size was reached."""
         end = self._reassembly.position
         if self._size is None:  # The size of a virtual file is known only now.
             self._finish(end)

@@ -290,7 +290,7 @@ async def test_tall_wide_terminal_lists_all_missing_reasons() -> None:
             it.app.update_view()
             await it.wait_drawn("vertical speed")
             assert all(name.split()[-1] in it.screen() for name in names)
-            assert "more)" not in it.app._state_rows()[1][1].plain
+            assert "more)" not in it.app._state_content()[1][1].plain
 
 
 @pytest.mark.exhaustive

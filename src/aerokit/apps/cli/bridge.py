@@ -17,6 +17,7 @@ from aerokit.transport.address import parse_address
 if TYPE_CHECKING:
     from aerokit.apps.foxglove import FoxgloveBridge
     from aerokit.connection.connection import Connection
+    from aerokit.mavlink.message import Message
     from aerokit.vehicle.vehicle import Vehicle
 
 _ADDRESS_HELP = "address of the vehicles: "
@@ -50,7 +51,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     )
     _add_common(foxglove, 10.0, "topic")
     zenoh = _add_publishing(actions, "zenoh", "to a zenoh network")
-    zenoh.set_defaults(extra=("zenoh", "zenoh"), network_text=str)
+    zenoh.set_defaults(module_and_extra=("zenoh", "zenoh"), network_text=str)
     zenoh.add_argument(
         "network",
         type=_network,
@@ -59,7 +60,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     )
     _add_common(zenoh, 5.0, "state")
     mqtt = _add_publishing(actions, "mqtt", "to an MQTT broker")
-    mqtt.set_defaults(extra=("paho", "mqtt"), network_text=_without_password)
+    mqtt.set_defaults(module_and_extra=("paho", "mqtt"), network_text=_without_password)
     mqtt.add_argument(
         "network",
         type=_broker,
@@ -138,7 +139,7 @@ async def _foxglove(options: argparse.Namespace) -> int:
                 port=options.port,
                 rate_hz=options.rate,
                 messages=options.messages,
-                rates={} if options.listen_only else None,
+                rates=_rates(options),
                 on_found=lambda vehicle: _emit_vehicle(options, vehicle),
             ) as bridge,
         ):
@@ -147,9 +148,13 @@ async def _foxglove(options: argparse.Namespace) -> int:
     return DONE
 
 
+def _rates(options: argparse.Namespace) -> dict[type[Message], float] | None:
+    """Return the rates to request: none for ``--listen-only``, otherwise None for the usual rates."""
+    return {} if options.listen_only else None
+
+
 async def _publish(options: argparse.Namespace) -> int:
-    module, extra = options.extra
-    import_extra(module, extra)
+    import_extra(*options.module_and_extra)
     from aerokit.apps.network import Publishing
     from aerokit.apps.network.publishing import publisher_for
     from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
@@ -166,7 +171,7 @@ async def _publish(options: argparse.Namespace) -> int:
             publisher_for(options.network) as publisher,
             vehicles_on(
                 connection,
-                rates={} if options.listen_only else None,
+                rates=_rates(options),
                 on_found=lambda vehicle: _emit_vehicle(options, vehicle),
             ) as vehicles,
         ):

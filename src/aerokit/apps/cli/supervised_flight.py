@@ -234,7 +234,7 @@ class FlightReport:
         # Seconds of this computer's clock, not of the vehicle's, which a simulation may speed up.
         self._armed_at: float | None = None
         self._armed_s = 0.0
-        self._fast_sink_at: float | None = None  # when the vehicle last sank as fast as before an impact
+        self._fast_sink_at: float | None = None  # when the vehicle last descended at IMPACT_M_S or faster
         self._impact_s: float | None = None  # seconds from arming to an impact on the ground
         self._started_at = self._last_line_at = vehicle.connection.now()
         self._highest_m = self._fastest_m_s = self._flown_m = 0.0

@@ -213,17 +213,15 @@ class Monitor(App[None]):
         return None if index is None else self._model.vehicles[self._listed_ids[index]]
 
     def update_view(self) -> None:
-        """Update the model, and the widgets whose content has changed."""
+        """Update the model, request arming checks that are due, and update the widgets whose content has changed."""
         self._model.update()
-        for vehicle in self._model.vehicles.values():
-            if self._arming_checks.are_due(vehicle):
-                self._commands.start(partial(run_arming_checks, vehicle))
+        self._request_arming_checks()
         base = self.screen_stack[0]
         self._update_list(base.query_one("#vehicles", OptionList))
         self._show("title", self._title())
-        rows = self._state_rows()
-        if self._has_changed("state", rows):
-            base.query_one("#state", Panel).show(_table(rows) if isinstance(rows, list) else rows)
+        state = self._state_content()
+        if self._has_changed("state", state):
+            base.query_one("#state", Panel).show(_table(state) if isinstance(state, list) else state)
         self._show_map(base.query_one("#map", Panel))
         self._show("rates", self._rates())
         texts = base.query_one("#texts", RichLog)
@@ -231,6 +229,11 @@ class Monitor(App[None]):
             texts.write(self._model.lines.popleft())
         if self._has_changed("slow", self._model.slow_streams):
             texts.border_subtitle = self._model.slow_streams
+
+    def _request_arming_checks(self) -> None:
+        for vehicle in self._model.vehicles.values():
+            if self._arming_checks.are_due(vehicle):
+                self._commands.start(partial(run_arming_checks, vehicle))
 
     def _has_changed(self, name: str, content: object) -> bool:
         """Return True if the content differs from that of the last call. Drawing only then saves CPU time."""
@@ -301,7 +304,8 @@ class Monitor(App[None]):
         text.append(state.value if state else UNKNOWN, LINK_STYLES[state] if state else "")
         return text.append(f"  {count} vehicle{'s' if count != 1 else ''}")
 
-    def _state_rows(self) -> list[tuple[str, Text]] | Text:
+    def _state_content(self) -> list[tuple[str, Text]] | Text:
+        """Return the rows of the table of the selected vehicle, or a text while there is no vehicle."""
         vehicle = self.selected
         if vehicle is not None:
             return VehicleText(vehicle).rows(more=self._is_wide, size=self._state_size())

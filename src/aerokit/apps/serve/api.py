@@ -379,7 +379,8 @@ class HttpApi:
             # If the vehicle reports another number of mission items, its mission has changed. MAVLink does not report
             # other changes.
             count = vehicle.mission.count.latest if kind == "mission" else None
-            if plan is None or is_refresh or count not in (None, len(plan.to_items())):
+            has_changed = plan is not None and count is not None and count != len(plan.to_items())
+            if plan is None or has_changed or is_refresh:
                 plan = await getattr(vehicle, kind).download()
                 read_at = vehicle.connection.now()
                 self._plans[vehicle, kind] = plan, read_at

@@ -37,7 +37,7 @@ _ARMED, _DISARMED = 10, 11  # events (EV) that old logs have instead of ARM
 _HOME = 1
 # A position within this distance of 0° N 0° E is not real: the estimator has no position yet.
 _NULL_ISLAND_DEG = 0.01
-_INDEXING_SHARE = 0.3  # part of the progress that indexing the rows counts for
+_INDEXING_SHARE = 0.3  # Indexing the rows is this fraction of the total progress.
 
 
 def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:

@@ -217,7 +217,7 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
     currents = _currents(flight, begin_s, end_s)
     throttle = _descent_values(flight.air, "throttle_percent", begin_s, end_s)
     if throttle is not None:
-        advice = ", so look at motors, propellers and battery" if throttle.high >= _HIGH_THROTTLE_PERCENT else ""
+        advice = ", so look at motors, propellers and battery" if throttle.maximum >= _HIGH_THROTTLE_PERCENT else ""
         if throttle.is_low and not any(current.is_low for current in currents.values()):
             advice = _STOPPED
         texts.append(f"throttle {throttle.text('%')}{advice}")
@@ -250,18 +250,18 @@ def _currents(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _Des
 class _DescentValues(Snapshot):
     """Lowest, median and highest value in a descent, and the median of the seconds before it (NaN if unknown)."""
 
-    low: float
-    middle: float
-    high: float
+    minimum: float
+    median: float
+    maximum: float
     before: float
 
     @property
     def is_low(self) -> bool:
         """True if the median in the descent is less than half of the median before it."""
-        return self.middle < _LOW_POWER_SHARE * self.before
+        return self.median < _LOW_POWER_SHARE * self.before
 
     def text(self, unit: str) -> str:
-        low, high = f"{self.low:.0f}", f"{self.high:.0f}"
+        low, high = f"{self.minimum:.0f}", f"{self.maximum:.0f}"
         values = f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
         return values if math.isnan(self.before) else f"{values} (before: {self.before:.0f} {unit})"
 
@@ -273,29 +273,37 @@ def _descent_values(series: TimeSeries, name: str, begin_s: float, end_s: float)
         return None
     values_before = series.between(name, begin_s - _BEFORE_FALL_S, begin_s)
     before = median(values_before) if values_before else math.nan
-    return _DescentValues(min(values), median(values), max(values), before)
+    return _DescentValues(minimum=min(values), median=median(values), maximum=max(values), before=before)
 
 
-def _motor_outputs(flight: FlightLog, begin_s: float, end_s: float) -> str:
-    """Describe the motor outputs in a descent; empty if the log does not show which outputs drive motors."""
-    armed_s = next((begin for begin, end in reversed(flight.armed) if begin < begin_s), math.nan)
+def _motors_in_descent(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _DescentValues]:
+    """Return the pulses of the motors by number of output. Outputs that arming has raised count as motors."""
+    armings = [armed_at for armed_at, _ in flight.armed if armed_at < begin_s]
     motors: dict[str, _DescentValues] = {}
+    if not armings:
+        return motors
     for name in flight.outputs:
-        idle_us = flight.outputs.at(name, armed_s - 0.1)  # just before arming
+        idle_us = flight.outputs.at(name, armings[-1] - 0.1)  # just before arming
         pulses = _descent_values(flight.outputs, name, begin_s, end_s)
         if pulses is not None and pulses.before - idle_us >= _MOTOR_RAISED_US:
             _, number, _ = name.split("_")  # such as "output_3_us"
             motors[number] = pulses
+    return motors
+
+
+def _motor_outputs(flight: FlightLog, begin_s: float, end_s: float) -> str:
+    """Describe the motor outputs in a descent; empty if the log does not show which outputs drive motors."""
+    motors = _motors_in_descent(flight, begin_s, end_s)
     if not motors:
         return ""
-    by_pulse = sorted(motors, key=lambda output: motors[output].middle)
-    lowest, highest = by_pulse[0], by_pulse[-1]
-    low_us, high_us = motors[lowest].middle, motors[highest].middle
+    lowest = min(motors, key=lambda output: motors[output].median)
+    highest = max(motors, key=lambda output: motors[output].median)
+    low_us, high_us = motors[lowest].median, motors[highest].median
     text = _DescentValues(
-        min(pulses.low for pulses in motors.values()),
-        median(pulses.middle for pulses in motors.values()),
-        max(pulses.high for pulses in motors.values()),
-        median(pulses.before for pulses in motors.values()),
+        minimum=min(pulses.minimum for pulses in motors.values()),
+        median=median(pulses.median for pulses in motors.values()),
+        maximum=max(pulses.maximum for pulses in motors.values()),
+        before=median(pulses.before for pulses in motors.values()),
     ).text("µs")
     if high_us - low_us < _UNEQUAL_US:
         return f"motor outputs {text}"

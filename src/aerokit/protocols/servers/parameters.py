@@ -52,26 +52,31 @@ class ParameterLists:
     def start_list(self, channel: Channel) -> None:
         """Send all parameters on a channel. If the list is already being sent there, it restarts."""
         self._list_number += 1
-        self._lists[channel] = number = self._list_number
+        number = self._list_number
+        self._lists[channel] = number
         if self.starts_at_once:
-            self._send_from(0, channel, number)
+            self._send_group(0, channel, number)
         else:
-            self._host.call_later(self.burst / self.list_rate_hz, lambda: self._send_from(0, channel, number))
+            self._host.call_later(self._group_interval_s, lambda: self._send_group(0, channel, number))
 
     def stop_list(self, channel: Channel) -> None:
         self._lists.pop(channel, None)
 
-    def _send_from(self, index: int, channel: Channel, number: int) -> None:
-        """Send the group of parameters from ``index`` on, and schedule the next group of list ``number``."""
+    @property
+    def _group_interval_s(self) -> float:
+        return self.burst / self.list_rate_hz
+
+    def _send_group(self, start: int, channel: Channel, number: int) -> None:
+        """Send ``burst`` parameters from index ``start`` on, and schedule the next group of list ``number``."""
         if self._lists.get(channel) != number:  # The list was stopped, or restarted with another number.
             return
-        names, end = self._listed.names, index + self.burst
-        for position, name in enumerate(names[index:end], start=index):
-            self.send(name, position, channel)
+        names, end = self._listed.names, start + self.burst
+        for index, name in enumerate(names[start:end], start=start):
+            self.send(name, index, channel)
         if end >= len(names):
             self.stop_list(channel)
             return
-        self._host.call_later(self.burst / self.list_rate_hz, lambda: self._send_from(end, channel, number))
+        self._host.call_later(self._group_interval_s, lambda: self._send_group(end, channel, number))
 
     def requested(self, name: str, index: int) -> tuple[str, int] | None:
         """Return name and index of the parameter that a request selects: by ``name`` if ``index`` is negative.
@@ -227,7 +232,7 @@ class ExtendedParameterServer(ParameterLists):
         raise NotImplementedError
 
     def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
-        """Set a value; return PARAM_ACK, and the value (encoded) and MAV_PARAM_EXT_TYPE to report."""
+        """Set a value. Return what the reply reports: PARAM_ACK, the encoded value and its MAV_PARAM_EXT_TYPE."""
         raise NotImplementedError
 
     def _on_list(self, _: m.ParamExtRequestList, channel: Channel) -> None:
