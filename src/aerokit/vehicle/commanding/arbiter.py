@@ -36,28 +36,24 @@ STEERING, ACTION = "steering", "action"
 def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
     """Return True if the order that the vehicle accepted at ``accepted_at`` has armed it.
 
-    ``disarmed_at`` is the time of the last report of disarmed. If it is later than an effect of the order can be, the
-    order did not arm the vehicle: another party did.
+    ``disarmed_at`` is the time of the last report of disarmed. If HEARTBEAT still reports disarmed more than
+    ``ARM_HEARTBEAT_DELAY_S`` after the acceptance, the order had no effect, and another party has armed the vehicle.
     """
     return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
 
 
 class CommandArbiter:
-    """Keeps the orders to one vehicle, and updates them with each HEARTBEAT.
-
-    It also determines the newest order about each topic.
+    """Keeps the orders to one vehicle, updates them with each HEARTBEAT, and knows the newest order about each topic.
 
     Every order of the program is registered here: flight actions, set-points, devices, fleets and classic scripts.
     """
-
-    arming_orders: int
 
     def __init__(self, now: Callable[[], float], telemetry: Telemetry) -> None:
         self._now, self._telemetry = now, telemetry
         self.slept_since: Callable[[float], float] = lambda _: 0.0  # see `Connection._slept_since`
         self.newest: Order | None = None
         """The last steering order given by an action or a raw command."""
-        self.arming_orders = 0
+        self.arming_orders: int = 0
         """Number of arm and disarm commands sent."""
         self.mode_is_in_doubt: bool = False
         """True while the result of a mode change is unknown, so that the reported mode may still change."""
@@ -260,7 +256,10 @@ class CommandArbiter:
             self._arming_accepted_at = self._now()
 
     def _supersede_arming(self, armed: bool | None) -> None:
-        """End earlier orders to arm or disarm, because a command that does so is sent. None: some other command."""
+        """End earlier orders to arm or disarm, because a newer command arms or disarms the vehicle.
+
+        ``armed`` is None for a command that does neither. It ends no order.
+        """
         if armed is None:
             return
         self.arming_orders += 1
@@ -305,12 +304,14 @@ class CommandArbiter:
         order, topics = self.newest, self._ordered_since_disarmed
         # After an order without modes, such as a raw command, a mode change does not prove a takeover.
         was_taken_over = order is not None and order.modes and order.takeover_reason and order.is_newest
-        return "arm" in topics if was_taken_over else bool(topics)
+        if was_taken_over:  # Of the program's orders, only the one that armed the vehicle still has an effect.
+            return "arm" in topics
+        return bool(topics)
 
     @property
     def is_state_recent(self) -> bool:
         """True while the last HEARTBEAT is recent enough to describe the vehicle's state."""
-        self.slept_since(self._now())  # adds a sleep of the computer to the age
+        self.slept_since(self._now())  # If the computer has just slept, this call adds the sleep to all ages.
         return self._telemetry.armed.age <= MODE_MAX_AGE_S
 
     @contextmanager

@@ -147,7 +147,7 @@ class FlightCleanup:
             modes=() if self._holds_by_reposition else (mode,),
             attempt_timeout=HOLD_ACK_TIMEOUT_S,
             attempts=MAX_HOLD_RESENDS,
-            is_sent=True,
+            was_just_sent=True,
         )
 
     # ---------------------------------------------------------------------- abandoned orders
@@ -169,12 +169,12 @@ class FlightCleanup:
             return False
         if session.telemetry.is_confirmed_disarmed or order.end:  # A hold must not be sent.
             return False
-        is_sent = self._arbiter.is_state_recent
-        if is_sent:
+        can_send_now = self._arbiter.is_state_recent
+        if can_send_now:
             self._send_hold(mode)
             order = self._arbiter.order(*order.modes, mode)
             self._arbiter.doubt_mode()
-        self._task.start(partial(self._hold_after_heartbeat, mode, order, is_sent=is_sent))
+        self._task.start(partial(self._complete_hold, mode, order, is_sent=can_send_now))
         return True
 
     def _send_hold(self, mode: Mode) -> None:
@@ -185,8 +185,8 @@ class FlightCleanup:
                 MavCmd.DO_SET_MODE, *self._session.autopilot.mode_order(mode).params
             )
 
-    async def _hold_after_heartbeat(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
-        """Wait for the confirmation of a hold that was sent, or send it after the next HEARTBEAT.
+    async def _complete_hold(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
+        """Wait for the confirmation of a hold. If it was not sent yet, send it after the next HEARTBEAT.
 
         Without a confirmation, the hold is sent again after the next HEARTBEAT, unless the order has ended by then, for
         example because a pilot took over.

@@ -45,7 +45,7 @@ SetpointT = TypeVar("SetpointT")
 # times at the stream's rate, because one may be lost, and then at this interval.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 
-# Set-points that the autopilot executes with its own limits of acceleration.
+# Set-points that the autopilot executes with its own limits of acceleration. With these, a sudden stop is an impact.
 BRAKED_BY_AUTOPILOT = (
     VelocitySetpoint,
     BodyVelocitySetpoint,

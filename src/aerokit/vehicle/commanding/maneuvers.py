@@ -96,7 +96,8 @@ class ManeuverActions(VehicleBase):
         else:
             command, params, mode = self._circle_command("orbit", radius_m, speed_m_s, facing, clockwise=clockwise)
             flight = RoundFlight(self._context, "orbit", place, counter, turns, limits)
-            await flight.fly_by_command(command, params, mode, is_held=not self._is_on_wings, circle_m=radius_m)
+            holds_at_end = not self._is_on_wings
+            await flight.fly_by_command(command, params, mode, holds_at_end=holds_at_end, radius_m=radius_m)
 
     async def figure_eight(
         self,
@@ -152,7 +153,7 @@ class ManeuverActions(VehicleBase):
             major_m = major_radius_m if clockwise else -major_radius_m
             params = (major_m, minor_radius_m, 0, math.radians(axis_deg))
             mode = self._sender.mode_for("figure_eight", "hold")
-            await flight.fly_by_command(MavCmd.DO_FIGURE_EIGHT, params, mode, is_held=False)
+            await flight.fly_by_command(MavCmd.DO_FIGURE_EIGHT, params, mode, holds_at_end=False)
         else:
             path = Eight(major_radius_m, minor_radius_m, axis_deg, clockwise=clockwise)
             await flight.fly_by_setpoints(path, speed_m_s, "ahead")
@@ -220,8 +221,9 @@ class ManeuverActions(VehicleBase):
             command, params, mode = self._circle_command("loiter", radius_m, math.nan, "free", clockwise=clockwise)
         limits = (max_distance_m, timeout, max_silence_s)
         flight = RoundFlight(self._context, "loiter", center, counter, turns or 0.0, limits, center_name="target")
-        stay_s, circle_m = duration_s or 0.0, radius_m or 0.0
-        await flight.fly_by_command(command, params, mode, is_held=False, stay_s=stay_s, circle_m=circle_m)
+        await flight.fly_by_command(
+            command, params, mode, holds_at_end=False, stay_s=duration_s or 0.0, radius_m=radius_m or 0.0
+        )
 
     def follow(
         self,

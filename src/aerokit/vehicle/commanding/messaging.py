@@ -30,8 +30,10 @@ if TYPE_CHECKING:
     from aerokit.events import LinkState
     from aerokit.vehicle.session.session import VehicleSession
 
-# In REQUEST_DATA_STREAM, 0 means all groups of messages (``req_stream_id``) and all components (``target_component``).
+# In REQUEST_DATA_STREAM, 0 means all groups of messages (``req_stream_id``) and all components (``target_component``),
+# and 1 starts the streams (``start_stop``).
 ALL_GROUPS = ALL_COMPONENTS = 0
+START_STREAMS = 1
 
 # Seconds until the first streamed message must arrive after a request.
 FIRST_MESSAGE_TIMEOUT_S = 3.0
@@ -79,11 +81,20 @@ def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
 
 
 async def _request_repeatedly(session: VehicleSession, rate_hz: float, monitor: _StreamMonitor) -> None:
-    """Request all streams by REQUEST_DATA_STREAM. Repeat the request while none arrives, and after some events."""
+    """Request all streams by REQUEST_DATA_STREAM.
+
+    The request is repeated while no stream arrives, and after events such as a reboot, see `_StreamMonitor`.
+    """
     retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
-    rate = max(1, round(rate_hz))
+    request = m.RequestDataStream(
+        target_system=session.system_id,
+        target_component=ALL_COMPONENTS,
+        req_stream_id=ALL_GROUPS,
+        req_message_rate=max(1, round(rate_hz)),
+        start_stop=START_STREAMS,
+    )
     while True:
-        session.send(m.RequestDataStream(session.system_id, ALL_COMPONENTS, ALL_GROUPS, rate, 1))
+        session.send(request)
         monitor.reset()
         with anyio.move_on_after(retry_interval_s):
             await monitor.must_request.wait()
@@ -106,7 +117,7 @@ async def _request_missing(session: VehicleSession, rate_hz: float, cleanup: Exi
 
 
 class _StreamMonitor:
-    """Tracks whether streamed messages arrive, and decides whether the streams must be requested again."""
+    """Tracks whether streamed messages arrive, and sets ``must_request`` when the vehicle may have lost the request."""
 
     def __init__(self, session: VehicleSession, cleanup: ExitStack) -> None:
         self.has_received = False

@@ -45,6 +45,9 @@ MAX_RETRY_INTERVAL_S = 60.0
 # The number in place of a rate in Hz that lets the autopilot return to its own default rate.
 AUTOPILOT_DEFAULT = 0.0
 
+# Value of REQUEST_DATA_STREAM.start_stop.
+START_STREAM = 1
+
 
 def check_rate(message_type: type[Message], hz: float) -> None:
     """Raise InvalidArgument unless the rate is above 0 and at most 1000 Hz."""
@@ -97,7 +100,7 @@ class _Stream:
 
 
 class MessageRates:
-    """Keeps one component sending the requested messages, each at the highest requested rate.
+    """Makes one component send the requested messages, each at the highest requested rate.
 
     Uses MAV_CMD_SET_MESSAGE_INTERVAL, or REQUEST_DATA_STREAM if the vehicle does not support that command
     (https://mavlink.io/en/mavgen_python/howto_requestmessages.html). A stream that does not arrive, for example after a
@@ -252,8 +255,14 @@ class MessageRates:
             stream.mark_requested(self._connection.now(), stream.needed_hz)
         for group, hz in rates_by_group.items():
             if hz > 0:  # A rate of 0 would stop a group that another ground station may use.
-                rate = math.ceil(hz)
-                self._connection.send(RequestDataStream(self._system_id, self._component_id, group, rate, 1))
+                request = RequestDataStream(
+                    target_system=self._system_id,
+                    target_component=self._component_id,
+                    req_stream_id=group,
+                    req_message_rate=math.ceil(hz),
+                    start_stop=START_STREAM,
+                )
+                self._connection.send(request)
 
     def _rate_of_group(self, group: int) -> float:
         needed_rates_hz = (
@@ -299,8 +308,9 @@ class MessageRates:
             return
         # A stream that lacks only one message is not slow, because that message may have arrived just outside the
         # window.
-        min_messages = SLOW_FACTOR * stream.requested_hz * WATCH_WINDOW * WATCH_PERIOD_S - 1
-        received_messages = achieved_hz * WATCH_WINDOW * WATCH_PERIOD_S
+        window_s = WATCH_WINDOW * WATCH_PERIOD_S
+        min_messages = SLOW_FACTOR * stream.requested_hz * window_s - 1
+        received_messages = achieved_hz * window_s
         was_slow = stream.is_slow
         stream.is_slow = received_messages < min_messages
         if achieved_hz == 0 and stream.is_optional:  # An optional stream may be missing altogether.

@@ -52,8 +52,6 @@ MAX_OPEN_REQUESTS = 64
 class VehicleWatch:
     """Detects when one vehicle falls silent, is heard again, or reboots."""
 
-    reboots: int
-
     def __init__(
         self,
         connection: Connection,
@@ -71,7 +69,8 @@ class VehicleWatch:
         )
         self._state_tracker.record_activity(connection.now())
         self._is_reported_silent = self._has_ended = False
-        self.reboots = 0
+        self.reboots: int = 0
+        """Number of reboots detected."""
         # For each clock of the vehicle: its last reported time in milliseconds, and when the report was processed.
         self._last_times: dict[str, tuple[int, float]] = {}
         # The first ``time_boot_ms`` after a boot, and when its message was processed.
@@ -285,8 +284,9 @@ class LinkWatch:
         """Request the vehicle's time now, in addition to the requests that are sent every two seconds."""
         now = self._connection.now()
         self._next_request_at = now + TIMESYNC_PERIOD_S
-        self._open_requests.append(int(now * 1e9))
-        self._connection.send(Timesync(0, self._open_requests[-1]), to=self._system_id)
+        sent_at_ns = int(now * 1e9)
+        self._open_requests.append(sent_at_ns)
+        self._connection.send(Timesync(tc1=0, ts1=sent_at_ns), to=self._system_id)  # tc1 = 0 marks a request.
 
     def _on_timesync(self, message: Timesync) -> None:
         """Process the autopilot's answer to our request.
