@@ -91,10 +91,11 @@ class CaptureLog:
         self._highest: _Entry | None = None  # the entry with the highest plausible index
         self._outlier: _Entry | None = None  # the last entry, if its index is too far above `_highest`
         self._failed: _Entry | None = None  # the last failed picture
-        # Number of pictures, from CAMERA_CAPTURE_STATUS and from indices. `_is_count_used` is False until the camera
-        # has reported a number above 0.
-        self._count, self._is_count_used = 0, False
+        # Number of pictures, from CAMERA_CAPTURE_STATUS and from indices, and the camera's time when it reported the
+        # number. `_is_count_used` is False until the camera has reported a number above 0.
+        self._count = 0
         self._count_boot_ms = 0
+        self._is_count_used = False
         # Time of the event loop at the last reset. Captures from before the reset do not belong to this log.
         self.reset_at: float = -math.inf
         # True if the camera sends CAMERA_IMAGE_CAPTURED; CAMERA_TRIGGER is then ignored.

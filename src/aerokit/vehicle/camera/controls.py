@@ -147,7 +147,7 @@ class LensMixin(CameraMixin):
     ) -> None:
         await self._link.require_capability(action, capability)
         with self._link.new_order(ORDER_SUBJECTS[command]) as order:
-            await self._link.command(command, kind, value, self._link.device, order=order, attempts=attempts)
+            await self._link.command(command, kind, value, self._link.device_id, order=order, attempts=attempts)
 
     def _continuous(self, action: str, capability: str, command: int, kind: int, speed: float) -> CameraBlock:
         """Return a block that starts a zoom or focus movement and stops the movement at its end."""
@@ -156,8 +156,8 @@ class LensMixin(CameraMixin):
             link,
             ORDER_SUBJECTS[command],
             check=lambda: link.require_capability(action, capability),
-            start=lambda order: link.command(command, kind, speed, link.device, order=order),
-            stop_command=lambda: (command, kind, 0, link.device),
+            start=lambda order: link.command(command, kind, speed, link.device_id, order=order),
+            stop_command=lambda: (command, kind, 0, link.device_id),
         )
 
 
@@ -252,7 +252,7 @@ class TrackingMixin(CameraMixin):
 
     async def _track(self, command: int, *params: float) -> None:
         with self._link.new_order("tracking") as order:
-            await self._link.command(command, *params, self._link.device, order=order)
+            await self._link.command(command, *params, self._link.device_id, order=order)
 
     def _request_status(self, status_hz: float) -> None:
         self._release_status_rates()
@@ -317,7 +317,7 @@ class StorageMixin(CameraMixin):
         """
         await self._link.require_capability("set_mode", "has_modes")
         with self._link.new_order("mode") as order:
-            await self._link.command(MavCmd.SET_CAMERA_MODE, self._link.device, MODES[mode], order=order)
+            await self._link.command(MavCmd.SET_CAMERA_MODE, self._link.device_id, MODES[mode], order=order)
         reported = ""
         with anyio.move_on_after(timeout):
             while reported != mode:
@@ -391,7 +391,7 @@ class StorageMixin(CameraMixin):
         await self._link.identify()
         # The reset also changes the mode, so it ends the retries of an earlier order to change the mode.
         with self._link.new_order("mode") as order:
-            await self._link.command(MavCmd.RESET_CAMERA_SETTINGS, 1, self._link.device, order=order)  # 1: reset
+            await self._link.command(MavCmd.RESET_CAMERA_SETTINGS, 1, self._link.device_id, order=order)  # 1: reset
         await self._link.request(m.CameraSettings, timeout=MODE_REQUEST_TIMEOUT_S)
 
     def _on_settings(self, message: m.CameraSettings) -> None:

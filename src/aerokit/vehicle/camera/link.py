@@ -84,7 +84,7 @@ class CameraLink(CameraOrders):
     @property
     def video_stream(self) -> int:
         """Stream id for recording commands; 0 means all streams."""
-        return self.device if self._session.autopilot.video_addresses_camera else 0
+        return self.device_id if self._session.autopilot.video_addresses_camera else 0
 
     @property
     def telemetry(self) -> Any:
@@ -165,7 +165,7 @@ class CameraLink(CameraOrders):
 
     async def _request_information(self) -> None:
         try:
-            await self.requests.request(m.CameraInformation, self.device, where=self._is_from_this_camera)
+            await self.requests.request(m.CameraInformation, self.device_id, where=self._is_from_this_camera)
         except CommandRejected:
             # An autopilot may have no information about its camera. Information that was received earlier stays valid.
             # In both cases, the refusal is no error.

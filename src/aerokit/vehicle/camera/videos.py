@@ -83,7 +83,7 @@ class VideoMixin(CameraMixin):
             await self._start(order, status_hz, timeout)
 
     async def _start(self, order: Order, status_hz: float, timeout: float) -> None:
-        command = (START, self._link.video_stream, status_hz, self._link.device)
+        command = (START, self._link.video_stream, status_hz, self._link.device_id)
         await self._link.order_once(
             order, lambda: self._link.command(*command, order=order, attempts=1), self._is_recording
         )
@@ -123,9 +123,10 @@ class VideoMixin(CameraMixin):
         )
 
     def _stop_command(self) -> tuple[float, ...]:
-        return (STOP, self._link.video_stream, self._link.device)
+        return (STOP, self._link.video_stream, self._link.device_id)
 
     async def _is_recording(self) -> bool | None:
+        """Ask the camera whether it records; return None if it does not report that."""
         if self._link.is_autopilot_attached:  # ArduPilot always reports that it is not recording.
             return None
         message = await self._link.request(m.CameraCaptureStatus, timeout=1.0)
@@ -207,7 +208,7 @@ class VideoMixin(CameraMixin):
         check_range("stream", stream, 0, 255)
         await self._link.require_capability(action, "has_video_stream")
         with self._link.new_order("streams") as order:
-            await self._link.command(command, stream, self._link.device, order=order)
+            await self._link.command(command, stream, self._link.device_id, order=order)
         await self._link.request(m.VideoStreamStatus, stream, timeout=1.0)
 
     async def select_source(self, primary: SourceName, secondary: SourceName = "default") -> None:
