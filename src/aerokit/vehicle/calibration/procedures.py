@@ -188,7 +188,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
             percents[message.compass_id] = message.completion_pct
         has_changed = True
 
-    def has_news() -> bool:
+    def was_reported() -> bool:
         return has_changed
 
     def is_complete() -> bool:
@@ -196,13 +196,14 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         return bool(compasses) and all(number in reports for number in compasses)
 
     with ExitStack() as cleanup:
+        # The mask 0 means all compasses. The other zeros: no retry, no automatic saving, no delay, no reboot.
         await run.start(0, 0, 0, 0, 0, command=MavCmd.DO_START_MAG_CAL)
         for kind in (MagCalProgress, MagCalReport):
             cleanup.callback(run.session.connection.bus.attach(kind, on_message, system_id=run.session.system_id))
             cleanup.callback(run.session.rates.request(kind, REPORT_HZ, is_optional=True))
         yield run.step(0.0, "turn the vehicle slowly in all directions, about each of its axes")
         while not is_complete():
-            await run.wait(has_news)
+            await run.wait(was_reported)
             has_changed = False
             progress = min(percents.values(), default=0) / 100
             yield run.step(progress, "turn the vehicle slowly in all directions, about each of its axes")

@@ -63,6 +63,7 @@ class CalibrationRun:
         self._cannot_cancel_reason = ""
         self._started_at = math.inf
         self._cancel_sent_at: float | None = None
+        # The arbiter keeps the order to cancel, and its command, until this stack is closed.
         self._cancel_order_stack = ExitStack()
         self._sent_cancel: SentCommand | None = None
         self._has_rebooted = self._is_abandoned = False

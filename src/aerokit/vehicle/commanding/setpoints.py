@@ -225,10 +225,10 @@ class SetpointEncoder:
         if velocity is None:
             mask |= IGNORE_VELOCITY
         latitude, longitude, altitude, frame = self._position.global_target(setpoint.position, "position")
-        place = (latitude, longitude, altitude)
-        velocity_fields, acceleration_fields = velocity or ZERO, ZERO
-        vector_fields = (*place, *velocity_fields, *acceleration_fields)
-        return SetPositionTargetGlobalInt(self._time_ms(), *self._address, frame, mask, *vector_fields, yaw, yaw_rate)
+        place, vectors = (latitude, longitude), (*(velocity or ZERO), *ZERO)
+        return SetPositionTargetGlobalInt(
+            self._time_ms(), *self._address, frame, mask, *place, altitude, *vectors, yaw, yaw_rate
+        )
 
     def attitude(self, setpoint: AttitudeSetpoint) -> Message:
         """Return SET_ATTITUDE_TARGET with attitude and thrust."""

@@ -251,9 +251,10 @@ class PlanTransfer(Generic[PlanT]):
     async def clear(self) -> None:
         self._cache.forget(self._context.now())
         await self._channel.clear()
-        remaining = (await self._channel.receive(only=())).count - self._offset  # Requests only the count.
+        received = await self._channel.receive(only=())  # Without item numbers, only the count is requested.
+        remaining = received.count - self._offset
         if remaining > 0:
-            self._raise_mismatch((f"the vehicle still has items: {remaining}",))
+            raise self._mismatch((f"the vehicle still has items: {remaining}",))
 
     async def _read(self, method: str) -> tuple[MissionItem, ...]:
         """Read the plan into the cache, as a file if possible."""
@@ -405,12 +406,13 @@ class PlanTransfer(Generic[PlanT]):
                 texts = item_differences(item, vehicle_item, self._storage, single_precision=is_single_precision)
                 differences += [f"item {seq - self._offset} ({item.name}): {text}" for text in texts]
         if differences:
-            self._raise_mismatch(tuple(differences))
+            raise self._mismatch(tuple(differences))
 
-    def _raise_mismatch(self, differences: tuple[str, ...]) -> None:
+    def _mismatch(self, differences: tuple[str, ...]) -> VerificationFailed:
+        """Forget the vehicle's items, and return the error."""
         self._cache.forget(self._context.now())
         message = f"{self._name}: the vehicle confirmed the plan, but has other items"
-        raise VerificationFailed(message, differences=differences)
+        return VerificationFailed(message, differences=differences)
 
     @property
     def _name(self) -> str:

@@ -255,7 +255,8 @@ class NtripClient:
 
     async def _forward(self, response: _Response) -> int:
         """Send the corrections from one connection to the vehicle; return the number of messages."""
-        reader, count = RtcmReader(), 0
+        reader = RtcmReader()
+        message_count = 0
         reason = "the caster closed the connection"
         position_task = asyncio.ensure_future(self._report_position()) if self._sends_position else None
         body = response.body()
@@ -263,7 +264,7 @@ class NtripClient:
             while True:
                 data = await asyncio.wait_for(body.__anext__(), MAX_SILENCE_S)
                 for message in reader.feed(data):
-                    count += 1
+                    message_count += 1
                     if len(message) <= MAX_MESSAGE_SIZE:
                         self._send(message)
                     else:
@@ -279,8 +280,8 @@ class NtripClient:
                 position_task.cancel()
                 await asyncio.gather(position_task, return_exceptions=True)
             self._close()
-        self._report(f"{self._name}: {reason} after {count} messages")
-        return count
+        self._report(f"{self._name}: {reason} after {message_count} messages")
+        return message_count
 
     def _report(self, problem: str) -> None:
         self._problem = problem
