@@ -46,7 +46,7 @@ from aerokit.vehicle.commanding.setpoints import (
 )
 from aerokit.vehicle.connect import connect as connect_async
 from aerokit.vehicle.devices.winch import ACTION_TIMEOUT_S
-from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
+from aerokit.vehicle.files.logs import ERASE_TIMEOUT_S
 
 if TYPE_CHECKING:
     import os
@@ -1276,9 +1276,7 @@ class Gimbals(GimbalsTwin["Gimbal"]):
 
     @cached_property
     def first(self) -> Gimbal:
-        """The first gimbal. A gimbal attached to the autopilot takes precedence over gimbals with their own component
-        id.
-        """
+        """The first gimbal. A gimbal attached to the autopilot comes before gimbals with their own component id."""
         return Gimbal(self._loop, self.aio.first)
 
     @property
@@ -1475,8 +1473,7 @@ class Files(TwinOf["AsyncFiles"]):
         return self._loop.run(self.aio.list, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def crc32(self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> int:
-        """Return the CRC-32 of a file as computed by the vehicle: polynomial 0x04C11DB7, initial value 0, no final
-        XOR.
+        """Return the CRC-32 of a file, computed by the vehicle: polynomial 0x04C11DB7, initial value 0, no final XOR.
 
         ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF`` computes the same value.
 
@@ -1693,7 +1690,7 @@ class Logs(TwinOf["AsyncLogs"]):
             on_progress=on_progress,
         )
 
-    def erase(self, *, idle_timeout_s: float = ERASE_PATIENCE_S, timeout: float | None = None) -> None:
+    def erase(self, *, idle_timeout_s: float = ERASE_TIMEOUT_S, timeout: float | None = None) -> None:
         """Erase all logs and wait until they are gone, which can take minutes on some boards.
 
         LOG_ERASE is not acknowledged, so the list is polled. A log that was started meanwhile may remain.
@@ -2997,9 +2994,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
     @cached_property
     def mode(self) -> StateCell[str]:
-        """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your program uses
-        this value.
-        """
+        """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS), polled every 5 s while you use it."""
         return StateCell(self._loop, self.aio.mode)
 
     @cached_property
@@ -3082,9 +3077,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
     @cached_property
     def tracked_place(self) -> StateCell[TrackedPlace]:
-        """Position of the tracked object on earth, if the camera reports it; requested at the same rate as
-        ``tracking``.
-        """
+        """Position of the tracked object on earth, if the camera reports it; requested like ``tracking``."""
         return StateCell(self._loop, self.aio.tracked_place)
 
     def track_point(self, x: float, y: float, *, radius: float = 0.0, status_hz: float = 5.0) -> None:
@@ -3155,10 +3148,9 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.zoom_to_focal_length, millimetres)
 
     def zooming(self, speed: float = 1.0) -> CameraBlock:
-        """Zoom for the duration of an ``async with`` block. The end of the block stops the zoom, also under
-        cancellation.
+        """Zoom for the duration of an ``async with`` block.
 
-        Entering raises the errors of :meth:`zoom_step`.
+        The end of the block stops the zoom, also under cancellation. Entering raises as :meth:`zoom_step`.
 
         Args:
             speed: −1 (out) to 1 (in); many cameras support only these two values.
@@ -3260,10 +3252,9 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.stop_video, timeout=timeout)
 
     def video(self, *, status_hz: float = 1.0) -> CameraBlock:
-        """Record for the duration of an ``async with`` block. The end of the block stops recording, also under
-        cancellation.
+        """Record for the duration of an ``async with`` block.
 
-        Entering raises the errors of :meth:`start_video`.
+        The end of the block stops recording, also under cancellation. Entering raises as :meth:`start_video`.
 
         Raises:
             InvalidArgument: ``status_hz`` is not 0 to 10. Nothing was sent.
@@ -3271,8 +3262,7 @@ class Camera(TwinOf["AsyncCamera"]):
         return CameraBlock(self._loop, self._loop.call(self.aio.video, status_hz=status_hz))
 
     def load_streams(self) -> tuple[CameraStream, ...]:
-        """Request information about all video streams (VIDEO_STREAM_INFORMATION), one by one if the camera requires
-        that.
+        """Request information about all video streams (VIDEO_STREAM_INFORMATION), one by one if necessary.
 
         Raises:
             NotSupported: the camera has no video streams. Nothing was sent.
@@ -3499,8 +3489,7 @@ class Settings(TwinOf["AsyncSettings"]):
         )
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting that the known values of other settings allow, as a mapping of names to
-        values.
+        """Return the options of a setting, by name, that the known values of other settings allow.
 
         Empty without a definition, and for settings without options.
         """

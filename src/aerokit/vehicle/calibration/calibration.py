@@ -1,6 +1,4 @@
-"""``CalibrationControl``: starts the calibrations of a vehicle. ``Calibration``: iterates over the steps of a
-calibration.
-"""
+"""``CalibrationControl`` starts the calibrations of a vehicle; ``Calibration`` iterates over the steps of one."""
 
 from __future__ import annotations
 

@@ -30,8 +30,8 @@ CALIBRATE_AT_BOOT = 3
 END_GRACE_S = 3.0
 # Maximum seconds for restoring a parameter, because a cancelled call must end within two seconds.
 RESTORE_TIMEOUT_S = 1.5
-# ArduPilot repeats its request for a pose every second until it receives our confirmation. A request that arrives
-# within this many seconds after the confirmation was sent earlier, so it is ignored.
+# ArduPilot repeats its request for a pose every second until it receives our confirmation. The same request is ignored
+# for this many seconds after the confirmation, because it may have been sent before.
 POSE_REPEAT_S = 2.0
 POSES = {
     AccelcalVehiclePos.LEVEL: CalibrationPose.LEVEL,
@@ -264,8 +264,7 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
                 yield run.step((request - 1) / len(POSES), text, pose, remaining, needs_confirmation=True)
                 await run.command(MavCmd.ACCELCAL_VEHICLE_POS, request)
                 confirmed_pose, confirmed_at = request, now()
-                # While ArduPilot had not received the confirmation, it repeated its request. These requests are
-                # obsolete.
+                # ArduPilot has repeated its request until it received the confirmation. The repetitions are obsolete.
                 requests.clear()
 
 

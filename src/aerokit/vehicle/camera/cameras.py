@@ -212,9 +212,7 @@ class Cameras:
 
     @property
     def first(self) -> Camera:
-        """The camera that was found first. Low component ids take precedence; cameras attached to the autopilot come
-        last.
-        """
+        """The first camera found. Low component ids take precedence; cameras attached to the autopilot come last."""
         if not self._is_first_in_use and self._first_link.number in self._cameras:
             # `at` has already created an object for this camera.
             return self._cameras[self._first_link.number]

@@ -133,9 +133,7 @@ class CaptureLog:
         return None if entry is None else entry.capture
 
     async def _request(self, index: int) -> bool:
-        """Request the capture once. Returns True if another request is pointless, because the camera answers that it
-        does not have this capture.
-        """
+        """Request the capture once; return True if the camera answers that it does not have this capture."""
         request = self._link.requests.request
         try:
             if not self._link.is_autopilot_attached:
@@ -228,7 +226,7 @@ class CaptureLog:
         is_new = previous is None or previous.capture.success is False  # A failed picture's index may be used again.
         if previous is not None and not is_new:
             is_repeated = previous.kind is entry.kind
-            # CAMERA_TRIGGER contains nothing that CAMERA_IMAGE_CAPTURED of the same picture does not contain.
+            # CAMERA_IMAGE_CAPTURED contains everything that CAMERA_TRIGGER of the same picture contains.
             has_better_message = previous.kind is m.CameraImageCaptured
             if is_repeated or has_better_message:
                 return

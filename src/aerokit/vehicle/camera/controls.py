@@ -80,10 +80,9 @@ class LensMixin(CameraMixin):
         await self._set("zoom_to_focal_length", HAS_ZOOM, ZOOM, CameraZoomType.FOCAL_LENGTH, millimetres)
 
     def zooming(self, speed: float = 1.0) -> CameraBlock:
-        """Zoom for the duration of an ``async with`` block. The end of the block stops the zoom, also under
-        cancellation.
+        """Zoom for the duration of an ``async with`` block.
 
-        Entering raises the errors of :meth:`zoom_step`.
+        The end of the block stops the zoom, also under cancellation. Entering raises as :meth:`zoom_step`.
 
         Args:
             speed: −1 (out) to 1 (in); many cameras support only these two values.
@@ -175,9 +174,7 @@ class TrackingMixin(CameraMixin):
         self.tracked_place: StateCell[TrackedPlace] = link.new_cell(
             "camera.tracked_place", "CAMERA_TRACKING_GEO_STATUS"
         )
-        """Position of the tracked object on earth, if the camera reports it; requested at the same rate as
-        ``tracking``.
-        """
+        """Position of the tracked object on earth, if the camera reports it; requested like ``tracking``."""
         self._status_rates: list[Detach] = []  # functions that end the requests for the status messages
         link.listen(
             m.CameraTrackingImageStatus,
@@ -280,9 +277,7 @@ class StorageMixin(CameraMixin):
     def __init__(self, link: CameraLink) -> None:
         super().__init__(link)
         self.mode: StateCell[str] = link.polled_cell("camera.mode", m.CameraSettings, SETTINGS_POLL_INTERVAL_S)
-        """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your program uses
-        this value.
-        """
+        """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS), polled every 5 s while you use it."""
         self.zoom_percent: StateCell[float | None] = link.polled_cell(
             "camera.zoom_percent", m.CameraSettings, SETTINGS_POLL_INTERVAL_S
         )

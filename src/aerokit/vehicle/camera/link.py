@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # A camera with a component id sends a HEARTBEAT within this time.
 DISCOVERY_TIMEOUT_S = 2.5
 
-# If a camera sends no heartbeat for more seconds than this, another camera may be using its component id.
+# After a silence of more than this many seconds, another camera may be using the component id.
 MAX_SILENCE_S = 5.0
 
 
@@ -299,8 +299,8 @@ class ActiveOperation:
         """Record that the camera has accepted the start."""
         self.order.commit()
 
-    def may_run_despite(self, error: BaseException) -> bool:
-        """Record that the start failed. Return True if the camera may nevertheless execute it, and must be stopped."""
+    def record_failed_start(self, error: BaseException) -> bool:
+        """Record that the start failed; return True if the camera may have started anyway, and must be stopped."""
         was_sent, was_refused = self.order.may_move, isinstance(error, CommandRejected)
         if not was_sent or was_refused:
             self.order.withdraw()
@@ -356,7 +356,8 @@ class CameraBlock:
         try:
             await self._start(operation.order)
         except BaseException as error:
-            if operation.may_run_despite(error):
+            must_stop = operation.record_failed_start(error)
+            if must_stop:
                 # Raise the error without delay: the stop command is sent at once, and retried in the background.
                 await operation.stop(is_awaited=False)
             raise

@@ -165,8 +165,9 @@ class Shutter:
     async def start_series(self, order: Order, seconds: float, count: int, before: CameraStatus | None) -> None:
         """Start a series; repeat the order only if the camera reports that it has not started."""
         if self.link.is_trigger:
-            await self.link.command(TRIGGER_INTERVAL, seconds * 1000.0, UNCHANGED)  # milliseconds, shutter time
-            await self.link.command(TRIGGER, 1, UNCHANGED, 0, 0, order=order)  # 1 enables the trigger.
+            interval_ms, shutter_time, enable = seconds * 1000.0, UNCHANGED, 1
+            await self.link.command(TRIGGER_INTERVAL, interval_ms, shutter_time)
+            await self.link.command(TRIGGER, enable, UNCHANGED, 0, 0, order=order)
             return
 
         async def has_started() -> bool | None:
@@ -231,7 +232,8 @@ class PhotoInterval:
             await self._begin(operation)
         except BaseException as error:
             self._new_captures.__exit__()
-            if operation.may_run_despite(error):
+            must_stop = operation.record_failed_start(error)
+            if must_stop:
                 # Raise the error without delay: the stop command is sent at once, and retried in the background.
                 await operation.stop(is_awaited=False)
             raise

@@ -105,10 +105,9 @@ class VideoMixin(CameraMixin):
             await self._wait_recording(timeout, expected=False)
 
     def video(self, *, status_hz: float = 1.0) -> CameraBlock:
-        """Record for the duration of an ``async with`` block. The end of the block stops recording, also under
-        cancellation.
+        """Record for the duration of an ``async with`` block.
 
-        Entering raises the errors of :meth:`start_video`.
+        The end of the block stops recording, also under cancellation. Entering raises as :meth:`start_video`.
 
         Raises:
             InvalidArgument: ``status_hz`` is not 0 to 10. Nothing was sent.
@@ -147,8 +146,7 @@ class VideoMixin(CameraMixin):
         raise self._link.timeout_error(f"accepted the order, but {outcome} after {timeout:g} s")
 
     async def load_streams(self) -> tuple[CameraStream, ...]:
-        """Request information about all video streams (VIDEO_STREAM_INFORMATION), one by one if the camera requires
-        that.
+        """Request information about all video streams (VIDEO_STREAM_INFORMATION), one by one if necessary.
 
         Raises:
             NotSupported: the camera has no video streams. Nothing was sent.

@@ -115,7 +115,7 @@ class FlightCleanup:
         self._session, self._arbiter, self._sender = session, arbiter, sender
         self.stop_stream: Callable[[str], None] | None = None
         self._flight: Order | None = None
-        self._task = BackgroundTask(session, "aerokit hold", "before a hold was confirmed")
+        self._task = BackgroundTask(session, "aerokit hold", warning_clause="before a hold was confirmed")
         # A new steering order makes the confirmation of an earlier hold pointless.
         arbiter.on_steering(self._task.cancel)
 
@@ -247,7 +247,7 @@ class FlightCleanup:
             raise BusyError("another set-point stream is open: leave it first; nothing was sent")
 
     @contextmanager
-    def preparing(self, mode: Mode) -> Iterator[Order]:
+    def preparing_stream(self, mode: Mode) -> Iterator[Order]:
         """Give the order to change to ``mode``. The caller prepares a stream in the `with` block, and may wait there.
 
         Raises:
@@ -294,8 +294,9 @@ class ArmCleanup:
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender) -> None:
         self._session, self._arbiter, self._sender = session, arbiter, sender
-        warning_clause = "while an arm command may still be executed"
-        self._task = BackgroundTask(session, "aerokit late arming", warning_clause)
+        self._task = BackgroundTask(
+            session, "aerokit late arming", warning_clause="while an arm command may still be executed"
+        )
 
     def hint(self) -> str:
         """Return the hint for error texts that an arm command may still be executed."""

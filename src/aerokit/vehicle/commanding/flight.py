@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots import TakeOff
     from aerokit.vehicle.commanding.order import Order
 
-# Maps the values of MAV_LANDED_STATE that mean that the vehicle is flying to their names in error texts.
+# Maps each MAV_LANDED_STATE of a flying vehicle to its name in error texts.
 IN_THE_AIR: dict[int | None, str] = {
     MavLandedState.IN_AIR: "in the air",
     MavLandedState.TAKEOFF: "taking off",

@@ -200,7 +200,7 @@ class RoundFlight:
         try:
             with self._session.streaming("position", "local_position"), anyio.move_on_after(self._timeout) as scope:
                 mode = self._context.sender.mode_for(self._operation, "setpoint")
-                with self._context.flight_cleanup.preparing(mode) as order:
+                with self._context.flight_cleanup.preparing_stream(mode) as order:
                     flight = await self._path_flight(path, speed_m_s, facing)
                 await self._stream(flight, order)
         except SetpointStreamStopped as error:
@@ -236,6 +236,7 @@ class RoundFlight:
         return heading
 
     async def _stream(self, flight: PathFlight, order: Order) -> None:
+        """Stream the set-points of the flight until the vehicle itself has flown the rounds."""
         stream = Guided(self._context).trajectory(
             flight.advance(0.0), rate_hz=SETPOINT_RATE_HZ, valid_for_s=VALID_FOR_S, max_lag_s=VALID_FOR_S
         )
@@ -252,7 +253,7 @@ class RoundFlight:
                     raise OperationTimeout(
                         f"{self._operation}: the vehicle did not follow its set-points; {self._describe()}"
                     )
-                await self._supply(stream, flight.advance(0.0))
+                await self._supply(stream, flight.advance(0.0))  # the set-point at the end, once more
 
     async def _supply(self, stream: SetpointStream[TrajectorySetpoint], setpoint: TrajectorySetpoint) -> None:
         stream.set(setpoint)

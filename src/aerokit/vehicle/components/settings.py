@@ -149,8 +149,7 @@ class Settings:
             return self.load(parse_definition(data, uri), locale=locale)
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting that the known values of other settings allow, as a mapping of names to
-        values.
+        """Return the options of a setting, by name, that the known values of other settings allow.
 
         Empty without a definition, and for settings without options.
         """

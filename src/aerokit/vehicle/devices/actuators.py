@@ -291,7 +291,7 @@ class Actuators(ReadOnly):
             ParachuteAction.RELEASE,
             topic="parachute",
             is_done=lambda text, _: text.startswith("Parachute: Released"),
-            # `is_done` has not accepted the text, and all other texts about the parachute are reasons for a refusal.
+            # A text that `is_done` accepts ends the wait. All other texts about the parachute are refusals.
             is_refusal=lambda text: text.startswith("Parachute: "),
             timeout=PARACHUTE_TIMEOUT_S,
         )

@@ -99,7 +99,7 @@ async def land_on(
                 await landing.await_disarmed(order, timeout, max_silence_s)
             finally:
                 reader.cancel()
-                # Even if the call is cancelled, it waits until the program's source has ended. Hence the shield.
+                # The shield makes even a cancelled call wait until the program's source has ended.
                 with anyio.CancelScope(shield=True):
                     await asyncio.wait([reader])
         return landing.report(is_used=stream.sent > sent_before, texts=session.texts_since(order.given_at))

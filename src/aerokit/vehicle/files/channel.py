@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# Maximum number of times that a transfer opens its file, because the vehicle may close a file at any time.
+# The vehicle may close a file at any time. A transfer then opens it again, up to this many times in total.
 MAX_OPEN_ATTEMPTS = 3
 # Error codes with which vehicles refuse to open a file while another file is open.
 SESSION_IN_USE = (MavFtpErr.FAIL, MavFtpErr.INVALIDSESSION, MavFtpErr.NOSESSIONSAVAILABLE)
@@ -125,7 +125,7 @@ class FileChannel:
                 self._close_soon(file.session, path)
                 raise
             except Exception:
-                with suppress(FileTimeout):  # The error of the transfer tells more than that of closing.
+                with suppress(FileTimeout):  # The error of the transfer must reach the caller, not an error of closing.
                     await self._close(file.session, path, min(idle_timeout_s, CLOSE_TIMEOUT_S))
                 raise
             except BaseException:  # A cancelled call must not wait.

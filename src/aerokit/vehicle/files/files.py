@@ -156,8 +156,7 @@ class Files:
         return tuple(entries.values())
 
     async def crc32(self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> int:
-        """Return the CRC-32 of a file as computed by the vehicle: polynomial 0x04C11DB7, initial value 0, no final
-        XOR.
+        """Return the CRC-32 of a file, computed by the vehicle: polynomial 0x04C11DB7, initial value 0, no final XOR.
 
         ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF`` computes the same value.
 

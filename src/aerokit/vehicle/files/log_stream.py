@@ -135,9 +135,7 @@ class LogStream(ReadOnly):
         self._detach()
 
     def _acknowledge(self, message: LoggingDataAcked) -> None:
-        """Acknowledge a message at once. PX4 repeats an unacknowledged message every 50 ms, and stops after 50
-        attempts.
-        """
+        """Acknowledge a message at once. PX4 repeats a message every 50 ms, and stops after 50 attempts."""
         session = self._context.session
         session.send(LoggingAck(session.system_id, session.component_id, message.sequence))
 
@@ -145,8 +143,8 @@ class LogStream(ReadOnly):
         is_stopped = False
         try:
             if error is None:
-                # STOP is sent while log messages are still acknowledged, which `_close` ends: PX4 answers STOP only
-                # after the acknowledgement of its last log message (logger.cpp).
+                # `_close` ends the acknowledgements, so STOP is sent before. PX4 answers STOP only after its last log
+                # message was acknowledged (logger.cpp).
                 await STOP.send(self._context)
                 is_stopped = True
         finally:

@@ -131,8 +131,7 @@ class ReleaseCommand:
             detach()
 
 
-# The manager's confirmation of our control is requested if it does not arrive within the first number of seconds. The
-# second number is the maximum wait in total.
+# Seconds after which the manager's confirmation of our control is requested, and seconds to wait for it in total.
 STATUS_TIMEOUT_S, CONFIRM_TIMEOUT_S = 0.5, 3.0
 
 STATUS_HZ = 1.0

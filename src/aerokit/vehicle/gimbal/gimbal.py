@@ -275,9 +275,7 @@ class Gimbals:
         self._registry = GimbalRegistry(context)
         self._gimbals: dict[tuple[int, int], Gimbal] = {}
         self.first: Gimbal = Gimbal(context, self._registry, None)
-        """The first gimbal. A gimbal attached to the autopilot takes precedence over gimbals with their own component
-        id.
-        """
+        """The first gimbal. A gimbal attached to the autopilot comes before gimbals with their own component id."""
 
     @property
     def ids(self) -> tuple[int, ...]:

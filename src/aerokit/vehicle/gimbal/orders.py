@@ -83,7 +83,7 @@ class GimbalOrders:
 
     @property
     def rules(self) -> GimbalRules:
-        """What the manager supports. A manager other than the autopilot is expected to follow the standard."""
+        """Capabilities of the manager. A manager other than the autopilot is expected to follow the standard."""
         is_autopilot = self.manager_id == self.session.component_id
         return self.session.autopilot.gimbals if is_autopilot else STANDARD_RULES
 

@@ -40,7 +40,7 @@ SECOND_APPROACH_S = 1.0
 # After a landing, a vehicle may report another item than the last one for up to this many seconds, until it disarms.
 FINAL_ITEM_MAX_AGE_S = 3.0
 
-# After a second start of its mission, a vehicle may still report for this long that the mission is complete.
+# For this many seconds after a second start of its mission, a vehicle may still report that the mission is complete.
 STALE_STATE_S = 3.0
 
 

@@ -296,8 +296,9 @@ class PlanTransfer(Generic[PlanT]):
         self._cache.set(items, self._context.now())
         if (result.is_confirmed and not verify) or await self._has_checksum_of(items):
             return
+        received = await self._read(method)
         try:
-            self._compare(dict(enumerate(items)), dict(enumerate(await self._read(method))))
+            self._compare(dict(enumerate(items)), dict(enumerate(received)))
         except VerificationFailed as error:
             if result.is_confirmed:
                 raise

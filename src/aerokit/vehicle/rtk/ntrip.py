@@ -65,9 +65,7 @@ class Caster:
 
     @classmethod
     def parse(cls, url: str) -> Caster:
-        """Parse ``ntrip://user:password@host:port/MOUNT``. Error texts show the expected format, but never the URL
-        itself.
-        """
+        """Parse ``ntrip://user:password@host:port/MOUNT``. Error texts do not contain the URL or its password."""
         try:
             parts = urlsplit(url)
             host, port = parts.hostname, parts.port

@@ -134,9 +134,9 @@ class VehicleSession:
             connection,
             system_id,
             component_id,
-            self.describe_link,
-            lambda: self.link_watch.round_trip_s,
-            self.autopilot.acks_per_command,
+            describe=self.describe_link,
+            round_trip_s=lambda: self.link_watch.round_trip_s,
+            acks_per_command=self.autopilot.acks_per_command,
         )
         self.rates: MessageRates = MessageRates(
             connection, self.commands, system_id, component_id, self.autopilot.stream_groups

@@ -224,12 +224,13 @@ def simulation_state(message: messages.SimState) -> Position | None:
 def altitude(message: messages.Altitude) -> Altitude:
     terrain, clearance = finite(message.altitude_terrain), finite(message.bottom_clearance)
     return Altitude(
-        finite(message.altitude_monotonic),
-        finite(message.altitude_amsl),
-        finite(message.altitude_local),
-        finite(message.altitude_relative),
-        None if terrain is None or terrain < NO_TERRAIN_M else terrain,
-        None if clearance is None or clearance < 0 else clearance,  # A negative value means "not measured".
+        monotonic_m=finite(message.altitude_monotonic),
+        amsl_m=finite(message.altitude_amsl),
+        local_m=finite(message.altitude_local),
+        relative_m=finite(message.altitude_relative),
+        terrain_m=None if terrain is None or terrain < NO_TERRAIN_M else terrain,
+        # A negative value means "not measured".
+        bottom_clearance_m=None if clearance is None or clearance < 0 else clearance,
     )
 
 
