@@ -56,7 +56,8 @@ class _Entry:
         else:
             stamp: int = getattr(message, "time_usec", 0)  # UTC, or the time since boot if the sender has no UTC
             is_utc = stamp >= SECONDS_IN_1990 * 1_000_000
-            self.utc_us, self.boot_us = (stamp, 0) if is_utc else (0, stamp)
+            self.utc_us = stamp if is_utc else 0
+            self.boot_us = 0 if is_utc else stamp
 
     def reports_same_picture(self, other: _Entry) -> bool:
         # PX4 reports each picture by two messages of different types, which arrive in quick succession.
@@ -215,6 +216,7 @@ class CaptureLog:
         return has_wrapped or entry.was_taken_later(highest)
 
     def _add(self, message: Message, capture: Capture) -> None:
+        """Store a capture and publish it, unless another message about the same picture was better."""
         entry = _Entry(message, capture)
         if capture.success is False:
             self._add_failed(message, entry)

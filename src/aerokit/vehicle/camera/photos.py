@@ -315,7 +315,8 @@ class PhotoInterval:
             first = self._first_after_reset(capture)
             if first is not None:  # The series goes on with the new indices.
                 self._known_reset_at = self._log.reset_at
-                self._next_index, self._is_start_guessed = first.index, False
+                self._next_index = first.index
+                self._is_start_guessed = False
                 self._newest_index, self._newest_at = first.index, self._link.now()
                 self._waiting = {first.index: first}
             # Without a status, the first capture determines the start. A later capture with a much lower index shows

@@ -188,7 +188,8 @@ class CommandArbiter:
         its subjects and, if it steers, the action in progress.
         """
         first_subject = subjects[0]
-        is_steering, disarms = first_subject != "arm", armed is False
+        is_steering = first_subject != "arm"
+        disarms = armed is False
         if is_steering:
             self._notify_steering()
             if self.newest is not None:  # A change to a mode of the posted order is not a takeover.
@@ -256,10 +257,7 @@ class CommandArbiter:
             self._arming_accepted_at = self._now()
 
     def _supersede_arming(self, armed: bool | None) -> None:
-        """End earlier orders to arm or disarm, because a newer command arms or disarms the vehicle.
-
-        ``armed`` is None for a command that does neither. It ends no order.
-        """
+        """End earlier orders to arm or disarm if a newer command does so; ``armed`` is None for any other command."""
         if armed is None:
             return
         self.arming_orders += 1

@@ -283,7 +283,8 @@ class ArmingActions(VehicleBase):
 
     async def _change_to_arming_mode(self, mode: Mode) -> None:
         """Change the mode for arming; raise if the order to arm was superseded meanwhile."""
-        order, arming_orders_before = self._arbiter.order(mode), self._arbiter.arming_orders
+        order = self._arbiter.order(mode)
+        arming_orders_before = self._arbiter.arming_orders
         await self._sender.ensure_mode(mode, order)
         await self._wait_until_armable()
         self._sender.raise_if_ended(order)

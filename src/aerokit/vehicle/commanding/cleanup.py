@@ -310,6 +310,7 @@ class ArmCleanup:
         self._task.start(partial(self._watch_arming, order, was_armed, self._arbiter.arming_orders))
 
     async def _watch_arming(self, order: Order, was_armed: bool, arming_orders_before: int) -> None:
+        """Disarm the vehicle if the abandoned order arms it within `ARM_WATCH_S`."""
         armed = self._session.telemetry.armed
         last_disarmed_at = order.given_at
 

@@ -109,7 +109,8 @@ class PathFlight:
         self._change_speed(seconds, length_m - self._flown_m)
         self._flown_m += self._present_speed_m_s * seconds
         if self._flown_m >= length_m:
-            self.is_on_path, self._present_speed_m_s, self._flown_m = True, 0.0, length_m
+            self.is_on_path = True
+            self._present_speed_m_s, self._flown_m = 0.0, length_m
         fraction = self._flown_m / length_m if length_m else 1.0
         north, east, down = (
             coordinate + fraction * component for coordinate, component in zip(self._start, to_path, strict=True)

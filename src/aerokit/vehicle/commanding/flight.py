@@ -237,7 +237,8 @@ class FlightActions(VehicleBase):
         """
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
-        landing_failure, ground = self._sender.landing_failure(order), GroundCheck(self._session)
+        landing_failure = self._sender.landing_failure(order)
+        ground = GroundCheck(self._session)
 
         def is_down() -> bool:
             is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at

@@ -177,7 +177,8 @@ class Guided:
             NotSupported: this firmware ignores the message, or its version is not known yet. Nothing was sent.
         """
         session = self._context.session
-        version, supported_before = session.telemetry.version.latest, session.autopilot.actuators_until
+        version = session.telemetry.version.latest
+        supported_before = session.autopilot.actuators_until
         if supported_before is None or version is None or version.number[:2] >= supported_before:
             version_text = "of unknown version" if version is None else str(version.firmware)
             raise NotSupported(

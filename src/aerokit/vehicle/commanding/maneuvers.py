@@ -87,7 +87,8 @@ class ManeuverActions(VehicleBase):
         check_range("speed_m_s", speed_m_s, 0, MAX_SPEED_M_S, above=True)
         if turns is not None:
             check_range("turns", turns, 0, MAX_ROUNDS, above=True)
-        place, counter = travel_target(center), TurnCounter(radius_m, clockwise=clockwise)
+        place = travel_target(center)
+        counter = TurnCounter(radius_m, clockwise=clockwise)
         limits = (max_distance_m, timeout, max_silence_s)
         if self.autopilot.circles_by == "setpoints":
             flight = RoundFlight(self._context, "orbit", place, counter, turns, limits)
@@ -147,7 +148,8 @@ class ManeuverActions(VehicleBase):
         is_flown_by_px4 = self._is_on_wings and self.autopilot.circles_by == "orbit"
         if not is_flown_by_px4 and (self._is_on_wings or not self.autopilot.setpoints.trajectory):
             raise NotSupported(f"figure_eight: {self.autopilot.firmware} has no such manoeuvre; nothing was sent")
-        counter, limits = LobeCounter(major_radius_m, axis_deg), (max_distance_m, timeout, max_silence_s)
+        counter = LobeCounter(major_radius_m, axis_deg)
+        limits = (max_distance_m, timeout, max_silence_s)
         flight = RoundFlight(self._context, "figure_eight", travel_target(center), counter, rounds, limits)
         if is_flown_by_px4:
             major_m = major_radius_m if clockwise else -major_radius_m

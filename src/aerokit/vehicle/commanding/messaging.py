@@ -99,7 +99,7 @@ async def _request_repeatedly(session: VehicleSession, rate_hz: float, monitor: 
         with anyio.move_on_after(retry_interval_s):
             await monitor.must_request.wait()
             retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
-            continue
+            continue  # An event has occurred, so the streams are requested again at once.
         retry_interval_s = min(2 * retry_interval_s, MAX_RETRY_INTERVAL_S)
         if monitor.has_received:  # The vehicle streams, so only an event requires a new request.
             await monitor.must_request.wait()

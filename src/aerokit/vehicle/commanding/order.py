@@ -100,10 +100,7 @@ def subjects_of(message: Message) -> tuple[Subject, ...]:
 
 
 def is_worse_failsafe(state: int, state_before: int | None) -> bool:
-    """Return True if MAV_STATE changed to a failsafe, or to a more severe failsafe than before.
-
-    ``state_before`` is None if no MAV_STATE was reported before.
-    """
+    """Return True if MAV_STATE changed to a failsafe, or to a more severe one. ``state_before`` is None at first."""
     if state not in FAILSAFE_STATES:
         return False
     return state_before is None or state_before not in FAILSAFE_STATES or state > state_before

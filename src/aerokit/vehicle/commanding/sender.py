@@ -264,7 +264,8 @@ class OrderSender:
         ``modes``. The vehicle has three seconds to report one of the modes.
         """
         impact = self.impact_failure(order)
-        grace_until, settles_at = self._session.connection.now() + MODE_GRACE_S, self._arbiter.mode_settles_at
+        grace_until = self._session.connection.now() + MODE_GRACE_S
+        settles_at = self._arbiter.mode_settles_at
         was_in_mode = False
 
         def failure_reason() -> str | None:

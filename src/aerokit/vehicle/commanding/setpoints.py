@@ -206,7 +206,8 @@ class SetpointEncoder:
         """
         forward, right, frame = setpoint.forward_m_s, setpoint.right_m_s, MavFrame.BODY_NED
         if setpoint.yaw_deg is not None and self._session.autopilot.setpoints.body_yaw_is_relative:
-            heading, frame = math.radians(self._session.telemetry.heading_deg.value), MavFrame.LOCAL_NED
+            frame = MavFrame.LOCAL_NED
+            heading = math.radians(self._session.telemetry.heading_deg.value)
             forward, right = (
                 forward * math.cos(heading) - right * math.sin(heading),
                 forward * math.sin(heading) + right * math.cos(heading),
@@ -225,9 +226,9 @@ class SetpointEncoder:
         if velocity is None:
             mask |= IGNORE_VELOCITY
         latitude, longitude, altitude, frame = self._position.global_target(setpoint.position, "position")
-        place, vectors = (latitude, longitude), (*(velocity or ZERO), *ZERO)
+        vectors = (*(velocity or ZERO), *ZERO)  # velocity and acceleration
         return SetPositionTargetGlobalInt(
-            self._time_ms(), *self._address, frame, mask, *place, altitude, *vectors, yaw, yaw_rate
+            self._time_ms(), *self._address, frame, mask, latitude, longitude, altitude, *vectors, yaw, yaw_rate
         )
 
     def attitude(self, setpoint: AttitudeSetpoint) -> Message:

@@ -140,7 +140,8 @@ class Shell(ReadOnly):
             pass  # Discard earlier output.
         self.write(command)
         now = self._session.connection.now
-        deadline, text = now() + timeout, ""
+        deadline = now() + timeout
+        text = ""
         try:
             while not text.endswith(PROMPTS):
                 text += await self.read(timeout=max(0.0, deadline - now()))
@@ -150,5 +151,5 @@ class Shell(ReadOnly):
                 f"shell: {command!r} has not ended within {timeout:g} s; output: {text!r}; {link}"
             ) from None
         # The output begins with an echo of the command, and its last line is the prompt.
-        text = text.removeprefix(command).removeprefix("\n")
-        return text.rpartition("\n")[0] if "\n" in text else ""
+        output, _, _ = text.removeprefix(command).removeprefix("\n").rpartition("\n")
+        return output

@@ -201,6 +201,7 @@ class MessageRates:
         return min(due, key=lambda stream: (stream.failures, stream.is_optional), default=None)
 
     async def _request_by_command(self, stream: _Stream) -> None:
+        """Request the rate that a stream needs by MAV_CMD_SET_MESSAGE_INTERVAL."""
         hz = stream.needed_hz
         interval_us = 0.0 if hz == AUTOPILOT_DEFAULT else 1e6 / hz
         reset_count = self._reset_count
@@ -300,6 +301,7 @@ class MessageRates:
             self._has_due_streams.set()
 
     def _check_rate(self, stream: _Stream) -> None:
+        """Publish StreamSlow when a stream becomes slow."""
         if stream.requested_hz is None or len(stream.received_at_checks) <= WATCH_WINDOW:
             return
         achieved_hz = stream.achieved_hz()

@@ -339,6 +339,7 @@ class VehicleSession:
         self.connection.bus.publish(event_type(self.connection.now(), self.system_id, *fields))
 
     def _attach_telemetry(self) -> None:
+        """Let messages update the state cells, and publish some changes of the cells as events."""
         bus, streams = self.connection.bus, self.telemetry.streams
         for message_id, handler in self.telemetry.handles.items():
             message_type = bus.dialect.get(message_id)

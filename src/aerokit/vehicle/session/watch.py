@@ -226,7 +226,9 @@ class VehicleWatch:
         # The times from before the reboot are discarded. Compared with them, later messages would show the same reboot
         # again.
         self._last_times = {clock: (milliseconds, now)}
-        self._decreased_times, self._first_time, self._last_answer = {}, None, (now, 0)
+        self._decreased_times = {}
+        self._first_time = None
+        self._last_answer = (now, 0)
         self._expects_reboot = False
         self.reboots += 1
         self._on_reboot()
@@ -315,10 +317,10 @@ class LinkWatch:
         report = LinkReport(
             now,
             self._system_id,
-            100 * missing / (frames + missing) if frames + missing else None,
-            self._round_trip_s,
-            frames / seconds,
-            (total_bytes - total_bytes_before) / seconds,
+            loss_percent=100 * missing / (frames + missing) if frames + missing else None,
+            round_trip_s=self._round_trip_s,
+            frames_per_s=frames / seconds,
+            bytes_per_s=(total_bytes - total_bytes_before) / seconds,
         )
         self._on_report(report)
         self._connection.bus.publish(report)

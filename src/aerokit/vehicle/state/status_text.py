@@ -67,15 +67,13 @@ class StatusTextAssembler:
         self._recent.clear()
 
     def _add_chunk(self, message: Statustext, chunk: bytes, now: float) -> Iterator[StatusText]:
-        """Add a chunk to its text. Yield the text if it is now complete.
-
-        If the chunk begins a new text with the same id, first yield the previous text, whose end was lost.
-        """
+        """Add a chunk to its text. Yield the text if it is complete, and before it a text whose end was lost."""
         key = (_sender(message), message.id)
         text = self._incomplete.get(key)
         if text is not None and message.chunk_seq < text.next_seq:
             if message.chunk_seq == text.next_seq - 1 and text.last_chunk == chunk:
                 return  # This chunk has already arrived over another link.
+            # A new text with the same id begins, so the end of the previous text was lost.
             yield self._incomplete.pop(key).truncated(now)
             text = None
         if text is None:
