@@ -1037,7 +1037,7 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
 
 
 class Gimbal(TwinOf["AsyncGimbal"]):
-    """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
+    """One gimbal with the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
     ``vehicle.gimbal`` is the first gimbal, ``vehicle.gimbals`` has all gimbals. An order returns when the gimbal
     reports the ordered direction, and raises an error when another order is given. The gimbal keeps the direction while
@@ -1928,7 +1928,7 @@ class Winch(TwinOf["AsyncWinch"]):
 
     ArduCopter supports :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`. The other orders are for winches that are
     MAVLink components: ``vehicle.winch(component_id=169)``. PX4 itself drives no winch, but forwards the command to
-    such a component. An order is sent only once if a second transmission could pay out more line. A newer order for the
+    these components. An order is sent only once if a second transmission could pay out more line. A newer order for the
     winch ends the call that waits for the previous order. A cancelled call does not stop the winch: call
     ``set_rate(0)``.
     """
@@ -4196,10 +4196,10 @@ class Vehicle(VehicleTwin):
     def streams(self, rate_hz: float) -> AbstractContextManager[None]:
         """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        For recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot receives
-        REQUEST_DATA_STREAM (whole Hz, at least 1). aerokit repeats it after a reboot or a silence, and while no message
-        arrives. ArduPilot continues to stream after the block. Other autopilots stream by themselves; aerokit requests
-        common states that are missing, like :meth:`rate`.
+        Use it for recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot
+        gets REQUEST_DATA_STREAM (whole Hz, at least 1). aerokit repeats it after a reboot or a silence, and while no
+        message arrives. ArduPilot continues to stream after the block. Other autopilots stream by themselves; aerokit
+        requests only those common states that are missing.
 
         Raises:
             InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.
@@ -4391,9 +4391,9 @@ class Vehicle(VehicleTwin):
     def missing_for_flight(self) -> list[str]:
         """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
 
-        If its arming checks fail, includes the vehicle's texts about them of the last 35 seconds;
-        :meth:`why_not_armable` requests them. A vehicle may arm all the same: ArduCopter arms in STABILIZE without a
-        position.
+        If the vehicle's arming checks fail, the result includes its status texts about them of the last 35 seconds;
+        :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in STABILIZE
+        without a position.
         """
         return self._loop.call(self.aio.missing_for_flight)
 
@@ -4412,7 +4412,7 @@ class Vehicle(VehicleTwin):
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
 
         The present mode does not matter: if the vehicle cannot arm in it, :meth:`arm` changes the mode first.
-        :meth:`why_not_armable` reports such a mode.
+        :meth:`why_not_armable` reports a mode that does not allow arming.
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
@@ -4433,12 +4433,12 @@ class Vehicle(VehicleTwin):
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
         ArduCopter decides by AUTO_OPTIONS whether it arms in AUTO; if it refuses there, the mode is changed and the
-        command is sent again. Otherwise it is sent only once: a repetition might arm a vehicle that a pilot has just
-        disarmed. After a cancellation, or an error other than a refusal, the command may still be executed. aerokit
-        therefore monitors the vehicle for 15 seconds, as long as the connection is open. If this command arms the
-        vehicle after all, aerokit disarms it. Arming is attributed to this command if the vehicle accepts it, or
-        reports armed in the next HEARTBEAT without a takeover. A vehicle that was armed otherwise stays armed. Logger
-        "aerokit" warns about the outcome.
+        command is sent again. In all other cases the command is sent only once, because a repetition might arm a
+        vehicle that a pilot has just disarmed. After a cancellation, or an error other than a refusal, the command may
+        still be executed. aerokit therefore monitors the vehicle for 15 seconds, as long as the connection is open. If
+        this command arms the vehicle after all, aerokit disarms it. Arming is attributed to this command if the vehicle
+        accepts the command, or reports armed in the next HEARTBEAT without a takeover. A vehicle that was armed
+        otherwise stays armed. Logger "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
@@ -4555,8 +4555,8 @@ class Vehicle(VehicleTwin):
         orders the vehicle to hold.
 
         PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
-        ArduCopter has no such command, and its mode CIRCLE follows the throttle stick; aerokit therefore streams
-        set-points in GUIDED, and the vehicle stops if your program dies.
+        ArduCopter has no command for a circle, and its mode CIRCLE follows the throttle stick. aerokit therefore
+        streams set-points in GUIDED, and the vehicle stops if your program dies.
 
         Args:
             center: the middle of the circle, at the altitude of the circle. For home, or a position without altitude,
@@ -4894,7 +4894,7 @@ class Vehicle(VehicleTwin):
         """Move the home position, and wait until HOME_POSITION reports the new place.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
-        firmware that does not support this gets a COMMAND_LONG, which has a resolution of about a metre.
+        firmware without COMMAND_INT gets a COMMAND_LONG, which has a resolution of about a metre.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.
@@ -5302,7 +5302,7 @@ def connect(
 ) -> Vehicle:
     """Connect to a vehicle for the duration of the ``with`` block.
 
-    Returns at the vehicle's first heartbeat; ``await vehicle.wait_ready()`` waits until it could fly. Runs inside the
+    Returns at the vehicle's first heartbeat; ``await vehicle.wait_ready()`` waits until it can fly. Runs inside the
     running asyncio loop: nothing outlives the block, and exceptions raised in the block propagate unchanged.
 
     Args:

@@ -74,7 +74,7 @@ async def connect(
 ) -> AsyncIterator[Vehicle]:
     """Connect to a vehicle for the duration of the ``async with`` block.
 
-    Returns at the vehicle's first heartbeat; ``await vehicle.wait_ready()`` waits until it could fly. Runs inside the
+    Returns at the vehicle's first heartbeat; ``await vehicle.wait_ready()`` waits until it can fly. Runs inside the
     running asyncio loop: nothing outlives the block, and exceptions raised in the block propagate unchanged.
 
     Args:
@@ -268,8 +268,8 @@ _Found = tuple[VehicleContext, Vehicle, Heartbeat]
 class _Search:
     """Creates the vehicle while its first heartbeat is being delivered, so that no later message is missed.
 
-    Before a waiting task could create it, more messages may be delivered: a recording replayed at full speed delivers
-    many in one iteration of the loop.
+    A task that waits for the heartbeat would create the vehicle too late: a recording replayed at full speed delivers
+    many messages in one iteration of the loop.
     """
 
     def __init__(self, connection: Connection, system_id: int | None) -> None:

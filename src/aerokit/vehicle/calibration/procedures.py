@@ -198,9 +198,10 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     with ExitStack() as cleanup:
         # The mask 0 means all compasses. The other zeros: no retry, no automatic saving, no delay, no reboot.
         await run.start(0, 0, 0, 0, 0, command=MavCmd.DO_START_MAG_CAL)
-        for kind in (MagCalProgress, MagCalReport):
-            cleanup.callback(run.session.connection.bus.attach(kind, on_message, system_id=run.session.system_id))
-            cleanup.callback(run.session.rates.request(kind, REPORT_HZ, is_optional=True))
+        session = run.session
+        for message_type in (MagCalProgress, MagCalReport):
+            cleanup.callback(session.connection.bus.attach(message_type, on_message, system_id=session.system_id))
+            cleanup.callback(session.rates.request(message_type, REPORT_HZ, is_optional=True))
         yield run.step(0.0, "turn the vehicle slowly in all directions, about each of its axes")
         while not is_complete():
             await run.wait(was_reported)

@@ -254,10 +254,9 @@ class TrackingMixin(CameraMixin):
     def _request_status(self, status_hz: float) -> None:
         self._release_status_rates()
         information = self._link.information.latest
-        kinds: list[type[m.CameraTrackingImageStatus | m.CameraTrackingGeoStatus]] = [m.CameraTrackingImageStatus]
+        self._status_rates = [self._link.request_rate(m.CameraTrackingImageStatus, status_hz)]
         if information is None or information.can("has_tracking_geo_status"):
-            kinds.append(m.CameraTrackingGeoStatus)
-        self._status_rates = [self._link.request_rate(kind, status_hz) for kind in kinds]
+            self._status_rates.append(self._link.request_rate(m.CameraTrackingGeoStatus, status_hz))
 
     def _release_status_rates(self) -> None:
         while self._status_rates:

@@ -122,7 +122,7 @@ class CommandArbiter:
         was_flown = self.is_flown_by_program
         order = self._create_order(modes, (STEERING,), ends_flight or self._all_end_flight(modes))
         order.was_flown_before = was_flown
-        # If this order replaces another one in progress, the vehicle may already be moving.
+        # If this order replaces an order in progress, the vehicle may already be moving.
         order.may_move = self._is_steering()
         self._register(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
@@ -296,8 +296,8 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program.
 
-        Either the program armed the vehicle, and it was not disarmed since. Or the program steers the vehicle, and
-        there was no takeover.
+        This is so if the program armed the vehicle, and it was not disarmed since; or if the program steers the
+        vehicle, and there was no takeover.
         """
         order, topics = self.newest, self._ordered_since_disarmed
         # After an order without modes, such as a raw command, a mode change does not prove a takeover.
@@ -415,10 +415,10 @@ class CommandArbiter:
     def _on_arming(self) -> None:
         """Decide whether the program or another party has armed the vehicle."""
         self._armed_at = self._telemetry.armed.updated_at
-        is_unanswered = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
+        is_order_open = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
         was_accepted = math.isfinite(self._arming_accepted_at)
-        is_effect = was_accepted and was_armed_by_order(self._disarmed_at, self._arming_accepted_at)
-        was_armed_by_program = is_unanswered or is_effect
+        was_caused_by_order = was_accepted and was_armed_by_order(self._disarmed_at, self._arming_accepted_at)
+        was_armed_by_program = is_order_open or was_caused_by_order
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
         self._armed_by_program = self._create_order(modes, ()) if was_armed_by_program else None

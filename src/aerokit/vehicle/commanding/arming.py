@@ -54,9 +54,9 @@ class ArmingActions(VehicleBase):
     def missing_for_flight(self) -> list[str]:
         """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
 
-        If its arming checks fail, includes the vehicle's texts about them of the last 35 seconds;
-        :meth:`why_not_armable` requests them. A vehicle may arm all the same: ArduCopter arms in STABILIZE without a
-        position.
+        If the vehicle's arming checks fail, the result includes its status texts about them of the last 35 seconds;
+        :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in STABILIZE
+        without a position.
         """
         return self._health.missing_for_flight()
 
@@ -75,7 +75,7 @@ class ArmingActions(VehicleBase):
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
 
         The present mode does not matter: if the vehicle cannot arm in it, :meth:`arm` changes the mode first.
-        :meth:`why_not_armable` reports such a mode.
+        :meth:`why_not_armable` reports a mode that does not allow arming.
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
@@ -121,12 +121,12 @@ class ArmingActions(VehicleBase):
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
         ArduCopter decides by AUTO_OPTIONS whether it arms in AUTO; if it refuses there, the mode is changed and the
-        command is sent again. Otherwise it is sent only once: a repetition might arm a vehicle that a pilot has just
-        disarmed. After a cancellation, or an error other than a refusal, the command may still be executed. aerokit
-        therefore monitors the vehicle for 15 seconds, as long as the connection is open. If this command arms the
-        vehicle after all, aerokit disarms it. Arming is attributed to this command if the vehicle accepts it, or
-        reports armed in the next HEARTBEAT without a takeover. A vehicle that was armed otherwise stays armed. Logger
-        "aerokit" warns about the outcome.
+        command is sent again. In all other cases the command is sent only once, because a repetition might arm a
+        vehicle that a pilot has just disarmed. After a cancellation, or an error other than a refusal, the command may
+        still be executed. aerokit therefore monitors the vehicle for 15 seconds, as long as the connection is open. If
+        this command arms the vehicle after all, aerokit disarms it. Arming is attributed to this command if the vehicle
+        accepts the command, or reports armed in the next HEARTBEAT without a takeover. A vehicle that was armed
+        otherwise stays armed. Logger "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which

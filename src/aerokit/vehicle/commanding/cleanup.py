@@ -226,7 +226,7 @@ class FlightCleanup:
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
-        """Hold the vehicle if its `async with` block ends during this `with` block, in which a call awaits the order.
+        """Hold the vehicle if its `async with` block ends while a call awaits the order in this `with` block.
 
         The vehicle must also hold after it has hit the ground, because its target may still be in the air.
         """
@@ -370,8 +370,8 @@ class ArmCleanup:
         """
         if self._arbiter.slept_since(order.given_at) > 0:  # Another party had time to arm it while the computer slept.
             return False
-        reported_after_s = self._session.telemetry.armed.updated_at - order.given_at
-        if not order.end and reported_after_s <= ARM_HEARTBEAT_DELAY_S:
+        armed_after_s = self._session.telemetry.armed.updated_at - order.given_at
+        if not order.end and armed_after_s <= ARM_HEARTBEAT_DELAY_S:
             return True
         if not self._is_accepted(disarmed_at):
             await anyio.sleep(ARM_ACK_WAIT_S)

@@ -314,8 +314,8 @@ class ModeActions(VehicleBase):
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
             OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another mode.
         """
-        found_mode = self.autopilot.find_mode(mode, self.telemetry.mode_names)
-        await self._sender.change_mode(found_mode, self._arbiter.order(found_mode), timeout)
+        target_mode = self.autopilot.find_mode(mode, self.telemetry.mode_names)
+        await self._sender.change_mode(target_mode, self._arbiter.order(target_mode), timeout)
 
     async def hold(self) -> None:
         """Stop and stay (a fixed wing circles). Returns when HEARTBEAT reports the autopilot's hold mode.

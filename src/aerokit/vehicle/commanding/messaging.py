@@ -337,10 +337,10 @@ class MessagingActions(VehicleBase):
     def streams(self, rate_hz: float) -> Iterator[None]:
         """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        For recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot receives
-        REQUEST_DATA_STREAM (whole Hz, at least 1). aerokit repeats it after a reboot or a silence, and while no message
-        arrives. ArduPilot continues to stream after the block. Other autopilots stream by themselves; aerokit requests
-        common states that are missing, like :meth:`rate`.
+        Use it for recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot
+        gets REQUEST_DATA_STREAM (whole Hz, at least 1). aerokit repeats it after a reboot or a silence, and while no
+        message arrives. ArduPilot continues to stream after the block. Other autopilots stream by themselves; aerokit
+        requests only those common states that are missing.
 
         Raises:
             InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.

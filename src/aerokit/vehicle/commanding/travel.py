@@ -303,7 +303,7 @@ class TravelActions(VehicleBase):
         """Move the home position, and wait until HOME_POSITION reports the new place.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
-        firmware that does not support this gets a COMMAND_LONG, which has a resolution of about a metre.
+        firmware without COMMAND_INT gets a COMMAND_LONG, which has a resolution of about a metre.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.

@@ -34,7 +34,7 @@ class Winch(ReadOnly):
 
     ArduCopter supports :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`. The other orders are for winches that are
     MAVLink components: ``vehicle.winch(component_id=169)``. PX4 itself drives no winch, but forwards the command to
-    such a component. An order is sent only once if a second transmission could pay out more line. A newer order for the
+    these components. An order is sent only once if a second transmission could pay out more line. A newer order for the
     winch ends the call that waits for the previous order. A cancelled call does not stop the winch: call
     ``set_rate(0)``.
     """

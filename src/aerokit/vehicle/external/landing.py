@@ -114,6 +114,7 @@ class TargetLanding:
         # When the target was last visible, and the vehicle's height at that time.
         self._seen_at = -math.inf
         self._seen_height_m: float | None = None
+        # The lowest height so far, and the greatest climb above it.
         self._lowest_m, self._climbed_m = math.inf, 0.0
         self._losses: list[TargetLoss] = []
         self._source_error: Exception | None = None

@@ -80,10 +80,10 @@ class UlogAssembler:
         """Remove and return the complete messages: 2 bytes of length, 1 byte of type, content."""
         end = 0
         while len(self._buffer) >= end + 3:
-            size = 3 + int.from_bytes(self._buffer[end : end + 2], "little")
-            if len(self._buffer) < end + size:
+            message_size = 3 + int.from_bytes(self._buffer[end : end + 2], "little")
+            if len(self._buffer) < end + message_size:
                 break
-            end += size
+            end += message_size
         complete = bytes(self._buffer[:end])
         del self._buffer[:end]
         return complete

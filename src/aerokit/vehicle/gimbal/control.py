@@ -283,7 +283,7 @@ class GimbalControl:
             orders.ask_in_background(GimbalManagerStatus.ID)
             await wait(CONFIRM_TIMEOUT_S - STATUS_TIMEOUT_S)
         device = orders.device
-        # Another block may have been entered during the wait, or the first gimbal may now be another one.
+        # Another block may have been entered during the wait, or another gimbal may be the first one now.
         if self._is_primary in device.control_blocks:
             raise BusyError(f"{orders.name}: another block of this program already has control")
         self._device = device

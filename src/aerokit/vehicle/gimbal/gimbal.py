@@ -174,7 +174,7 @@ INFORMATION_TIMEOUT_S = 2.0
 
 @checks_arguments
 class Gimbal(ReadOnly, PointingMixin, RoiMixin):
-    """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
+    """One gimbal with the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
     ``vehicle.gimbal`` is the first gimbal, ``vehicle.gimbals`` has all gimbals. An order returns when the gimbal
     reports the ordered direction, and raises an error when another order is given. The gimbal keeps the direction while

@@ -64,7 +64,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._began_at = -math.inf
         self._order: Order | None = None
         self._taken: AerokitError | None = None
-        # Marks the gimbal as in use, so that ``vehicle.gimbal`` does not change to another one.
+        # Marks the gimbal as in use, so that ``vehicle.gimbal`` does not change to another gimbal.
         self._in_use = ExitStack()
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
@@ -114,7 +114,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         if reason:
             self._stop(reason, hold=False)
         if self._stop_error is None:
-            zero = self._zero_rates_command()  # Must precede `_end`, after which the first gimbal may be another one.
+            zero = self._zero_rates_command()  # for this gimbal; after `_end`, another gimbal may be the first one
             self._end()
             self._stop_error = SetpointStreamStopped("the block of these rates has ended")
             if error is None:

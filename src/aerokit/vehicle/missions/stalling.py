@@ -66,7 +66,7 @@ class MissionStallDetector:
         standstill = self._stall()  # None unless the vehicle has stood still for 12 s
         if standstill is not None and self._stall.follows_fast_descent and (should_move or self._is_on_ground):
             return standstill
-        if not should_move or current != self._moving_item:
+        if not should_move or current != self._moving_item:  # The vehicle may stand still here, or has moved on.
             self._moving_item = current if should_move else None
             self._should_move_since = self._session.connection.now()
             return None

@@ -119,8 +119,8 @@ class _Block:
                 reason = f" ({error})"
         not_restored = {param.name: param.value for param in saved if not _is_restored(param, answers.get(param.name))}
         if not_restored:
-            names = ", ".join(f"{name} = {value!r}" for name, value in not_restored.items())
-            raise RollbackFailed(f"could not restore{reason}: {names}", not_restored=not_restored) from cause
+            values = ", ".join(f"{name} = {value!r}" for name, value in not_restored.items())
+            raise RollbackFailed(f"could not restore{reason}: {values}", not_restored=not_restored) from cause
 
     async def _changed_by_others(self, saved: list[Parameter]) -> dict[str, object]:
         """Return the parameters that cannot be read, and those that another station has changed since the write.

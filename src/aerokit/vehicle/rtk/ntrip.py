@@ -134,10 +134,10 @@ class _Response:
             return
         while line := await self._reader.readline():
             size_text, _, _ = line.partition(b";")  # Extensions of the chunk may follow the size.
-            size = int(size_text or b"0", 16)
-            if not 0 < size <= MAX_CHUNK_SIZE:  # A chunk of size 0 ends the body.
+            chunk_size = int(size_text or b"0", 16)
+            if not 0 < chunk_size <= MAX_CHUNK_SIZE:  # A chunk of size 0 ends the body.
                 return
-            yield await self._reader.readexactly(size)
+            yield await self._reader.readexactly(chunk_size)
             await self._reader.readline()  # Skip the line break after the chunk.
 
 

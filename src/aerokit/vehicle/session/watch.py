@@ -50,7 +50,7 @@ MAX_OPEN_REQUESTS = 64
 
 
 class VehicleWatch:
-    """Detects when one vehicle falls silent, is heard again, or reboots."""
+    """Detects when one vehicle falls silent, ends its silence, or reboots."""
 
     def __init__(
         self,

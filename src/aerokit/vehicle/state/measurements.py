@@ -160,19 +160,19 @@ def highres_imu(message: messages.HighresImu, context: Context) -> Imu:
 def scaled_imu(message: messages.ScaledImu) -> Imu:
     """Return the readings in SCALED_IMU, whose units are thousandths of g, of rad/s and of gauss."""
     return Imu(
-        _scaled(MG_M_S2, message.xacc, message.yacc, message.zacc),
-        _scaled(RAD_DEG / 1000, message.xgyro, message.ygyro, message.zgyro),
-        _scaled(MGAUSS_UT, message.xmag, message.ymag, message.zmag),
-        divided(message.temperature, 100, unknown=UNKNOWN_TEMPERATURE),
+        acceleration_m_s2=_scaled(MG_M_S2, message.xacc, message.yacc, message.zacc),
+        rate_deg_s=_scaled(RAD_DEG / 1000, message.xgyro, message.ygyro, message.zgyro),
+        field_ut=_scaled(MGAUSS_UT, message.xmag, message.ymag, message.zmag),
+        temperature_c=divided(message.temperature, 100, unknown=UNKNOWN_TEMPERATURE),
     )
 
 
 def raw_imu(message: messages.RawImu) -> RawImu:
     return RawImu(
-        (message.xacc, message.yacc, message.zacc),
-        (message.xgyro, message.ygyro, message.zgyro),
-        (message.xmag, message.ymag, message.zmag),
-        divided(message.temperature, 100, unknown=UNKNOWN_TEMPERATURE),
+        acceleration=(message.xacc, message.yacc, message.zacc),
+        rate=(message.xgyro, message.ygyro, message.zgyro),
+        field=(message.xmag, message.ymag, message.zmag),
+        temperature_c=divided(message.temperature, 100, unknown=UNKNOWN_TEMPERATURE),
     )
 
 
@@ -198,10 +198,10 @@ def _covariance(values: tuple[float, ...]) -> tuple[float, ...] | None:
 
 def air_pressure(message: messages.ScaledPressure) -> AirPressure:
     return AirPressure(
-        message.press_abs * HPA_PA,
-        message.press_diff * HPA_PA,
-        message.temperature / 100,
-        divided(message.temperature_press_diff, 100, unknown=UNKNOWN_TEMPERATURE),
+        absolute_pa=message.press_abs * HPA_PA,
+        differential_pa=message.press_diff * HPA_PA,
+        temperature_c=message.temperature / 100,
+        differential_temperature_c=divided(message.temperature_press_diff, 100, unknown=UNKNOWN_TEMPERATURE),
     )
 
 
