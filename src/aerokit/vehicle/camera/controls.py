@@ -130,7 +130,7 @@ class LensMixin(CameraMixin):
 
         The end of the block stops the movement, also under cancellation.
 
-        Entering raises the errors of :meth:`focus_step`.
+        Entering raises as :meth:`focus_step`.
 
         Args:
             speed: −1 (nearer) to 1 (farther); many cameras support only these two values.
