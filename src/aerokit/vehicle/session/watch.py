@@ -168,12 +168,13 @@ class VehicleWatch:
         if frame is None or frame.component_id != self._component_id:
             return
         now = self._connection.now()
-        silent_for, self._heartbeat_read_at = self.silent_for_s, now
+        silent_for_s = self.silent_for_s  # It restarts at 0 with the next line.
+        self._heartbeat_read_at = now
         self.last_heartbeat_at = frame.received_at
         self._state_tracker.record_activity(now)
         if self._is_reported_silent:
             self._is_reported_silent = False
-            self._connection.bus.publish(VehicleRecovered(now, self._system_id, silent_for))
+            self._connection.bus.publish(VehicleRecovered(now, self._system_id, silent_for_s))
 
     def _on_link_interrupted(self, event: LinkInterrupted) -> None:
         self._state_tracker.mark_lost(event.at)
